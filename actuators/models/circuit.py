@@ -303,11 +303,8 @@ class CircuitModel(OilModel):
             momentum = speed + push * (lever * (bore - alpha * rod) + load)
             rub = push * (p["coulomb"] + excess * torch.exp(-speed.abs() / p["stribeck_speed"]))
             spring = push * lever * lever * (k_bore + alpha * alpha * k_rod)
-            speed = (
-                momentum.sign()
-                * (momentum.abs() - rub).clamp(min=0.0)
-                / (1.0 + spring + push * p["viscous"])
-            )
+            left = momentum.sign() * (momentum.abs() - rub).clamp(min=0.0)
+            speed = left / (1.0 + spring + push * p["viscous"])
             bore = (bore - k_bore * lever * speed).clamp(0.0, 1.0)
             rod = (rod + k_rod * alpha * lever * speed).clamp(0.0, 1.0)
             went = q + dt * self.plant.max_speed * speed
@@ -355,11 +352,8 @@ class CircuitModel(OilModel):
         lever = torch.sin(low + share * (high - low)) / length
         middle = 0.5 * (low + high)
         lever = lever * compute_cylinder_length(middle, sides) / torch.sin(middle)
-        shortest, longest = (
-            compute_cylinder_length(low, sides),
-            compute_cylinder_length(high, sides),
-        )
-        travel = longest - shortest
+        shortest = compute_cylinder_length(low, sides)
+        travel = compute_cylinder_length(high, sides) - shortest
         is_still = travel.abs() < 1e-6
         stroke = (length - shortest) / torch.where(is_still, torch.ones_like(travel), travel)
         return lever, torch.where(is_still, torch.full_like(stroke, 0.5), stroke).clamp(0.0, 1.0)

@@ -261,11 +261,8 @@ class HydraulicModel(OilModel):
             opening = opening * (1.0 - p["notch"] + p["notch"] * opening.abs())
             demand = opening.abs() * p["flow_share"]
             opening = opening / demand.sum(1, keepdim=True).clamp(min=1.0)
-            head = (
-                (1.0 - p["load_sensitivity"] * opening.sign() * force / supply)
-                .clamp(0.0, 2.0)
-                .sqrt()
-            )
+            head = 1.0 - p["load_sensitivity"] * opening.sign() * force / supply
+            head = head.clamp(0.0, 2.0).sqrt()
             flow_speed = opening * head * torch.where(opening > 0, extend_speed, retract_speed)
             force = force + dt * (self._stiffness * (flow_speed - speed) - p["leak_hz"] * force)
             force = force.clamp(-supply, supply)  # relief valves

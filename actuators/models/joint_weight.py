@@ -40,13 +40,10 @@ class JointWeight:
         sums = np.tril(np.abs(axes @ axes.T) > 1.0 - 1e-6) & hinges & hinges[:, None]
         signs = np.sign(axes @ axes.T)
         self.sums = torch.as_tensor((sums * signs).T, dtype=torch.float32, device=device)
-        lower, upper = (
-            torch.as_tensor(side, dtype=torch.float32, device=device)
-            for side in (machine.lower, machine.upper)
-        )
-        drawn = torch.rand(
-            NUM_POSES, machine.num_joints, generator=torch.Generator().manual_seed(0)
-        )
+        lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
+        upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
+        generator = torch.Generator().manual_seed(0)
+        drawn = torch.rand(NUM_POSES, machine.num_joints, generator=generator)
         q = drawn.to(device) * (upper - lower) + lower
         truth, waves = self._gravity.load(q) / self._force, self.build_waves(q)
         columns = torch.cat((waves, torch.ones_like(waves[:, :1])), 1).double().cpu()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 
 from actuators.models import checkpoint
 from actuators.models.joint_model import MemorylessModel
@@ -17,16 +18,12 @@ from brokk_rl.spec import NonNegative, spec
 
 
 @spec
-class Hold:
-    """Never moves: the error that any model must beat."""
+class Hold(MemorylessModel):
+    """Never moves, `q' = q`: the error that any model must beat."""
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HoldModel":
-        """Return the model."""
-        return HoldModel()
-
-
-class HoldModel(MemorylessModel):
-    """`q' = q`."""
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "Hold":
+        """Return itself: there is nothing to build."""
+        return self
 
     def step(self, history: History) -> torch.Tensor:
         """Return the newest position, shape `(N, J)`."""
@@ -139,13 +136,11 @@ class ArxFit:
             u, q = recording.u.astype(np.float64), recording.q.astype(np.float64)
             # (T - H, J, H)
             views = [
-                np.lib.stride_tricks.sliding_window_view(x, size, 0)[:-1]
-                for x in (u, np.abs(u) * u)
+                sliding_window_view(u, size, 0),
+                sliding_window_view(np.abs(u) * u, size, 0),
+                sliding_window_view(np.diff(q, axis=0), size - 1, 0),
             ]
-            increments = np.lib.stride_tricks.sliding_window_view(np.diff(q, axis=0), size - 1, 0)[
-                :-1
-            ]
-            rows.append(np.concatenate([*views, increments], 2))
+            rows.append(np.concatenate([view[:-1] for view in views], 2))
             targets.append(q[size:] - q[size - 1 : -1])
         if not rows:
             raise RecordingError(
@@ -159,11 +154,6 @@ class ArxFit:
             gram = (x / scale).T @ (x / scale) / len(x) + self.ridge * np.eye(x.shape[1])
             weight[j] = np.linalg.solve(gram, (x / scale).T @ target[:, j] / len(x)) / scale
         path = folder / f"{self.name}.safetensors"
-        checkpoint.write_checkpoint(
-            path,
-            "arx",
-            machine,
-            {"weight": torch.as_tensor(weight, dtype=torch.float32)},
-            {"ridge": self.ridge},
-        )
+        tensors = {"weight": torch.as_tensor(weight, dtype=torch.float32)}
+        checkpoint.write_checkpoint(path, "arx", machine, tensors, {"ridge": self.ridge})
         return Arx(checkpoint=str(path))

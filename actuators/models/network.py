@@ -47,14 +47,9 @@ class SharedFlow(nn.Module):
         self, num_joints: int, num_history: int, generator: torch.Generator | None = None
     ) -> None:
         super().__init__()
-        self.weight = nn.Parameter(
-            _initialise_weights(num_joints, num_history, COUPLING_WIDTH, generator=generator)
-        )
-        self.bias = nn.Parameter(
-            _initialise_weights(
-                num_joints, 1, COUPLING_WIDTH, fan_in=num_history, generator=generator
-            )
-        )
+        layer = COUPLING_WIDTH, num_history, generator
+        self.weight = _initialise_weights(num_joints, num_history, *layer)
+        self.bias = _initialise_weights(num_joints, 1, *layer)
         # summed up, a full command asks for about half of the pump: close enough to a shortage to
         # learn from it
         self.log_share = nn.Parameter(
@@ -83,22 +78,16 @@ class PoseLoad(nn.Module):
 
     def __init__(self, num_joints: int, generator: torch.Generator | None = None) -> None:
         super().__init__()
-        self.weight = nn.Parameter(
-            _initialise_weights(num_joints, num_joints, COUPLING_WIDTH, generator=generator)
-        )
-        self.bias = nn.Parameter(
-            _initialise_weights(
-                num_joints, 1, COUPLING_WIDTH, fan_in=num_joints, generator=generator
-            )
-        )
+        layer = COUPLING_WIDTH, num_joints, generator
+        self.weight = _initialise_weights(num_joints, num_joints, *layer)
+        self.bias = _initialise_weights(num_joints, 1, *layer)
         self.out = nn.Parameter(torch.zeros(num_joints, COUPLING_WIDTH, 2))
 
     def forward(self, position: torch.Tensor) -> torch.Tensor:
         """Return factors of both directions, `(J, B, 2)` in (0, 2), at positions `(J, B)`."""
         seen = position.T.expand(len(position), -1, -1)
-        return 2.0 * torch.sigmoid(
-            torch.bmm(torch.tanh(torch.baddbmm(self.bias, seen, self.weight)), self.out)
-        )
+        hidden = torch.tanh(torch.baddbmm(self.bias, seen, self.weight))
+        return 2.0 * torch.sigmoid(torch.bmm(hidden, self.out))
 
 
 class JointNetworks(nn.Module):
@@ -139,30 +128,16 @@ class JointNetworks(nn.Module):
     ) -> None:
         super().__init__()
         self.num_history, self.coupled = num_history, coupled
-        sizes = (2 * num_history, width, width, 1)
-        weight = []
-        for m, n in pairwise(sizes):
-            weight.append(_initialise_weights(num_joints, m, n, generator=generator))
-        bias = []
-        for m, n in pairwise(sizes):
-            bias.append(_initialise_weights(num_joints, 1, n, fan_in=m, generator=generator))
-        self.weight = nn.ParameterList([nn.Parameter(value) for value in weight])
-        self.bias = nn.ParameterList([nn.Parameter(value) for value in bias])
+        layers = list(pairwise((2 * num_history, width, width, 1)))
+        weight = [_initialise_weights(num_joints, m, n, m, generator) for m, n in layers]
+        bias = [_initialise_weights(num_joints, 1, n, m, generator) for m, n in layers]
+        self.weight, self.bias = nn.ParameterList(weight), nn.ParameterList(bias)
         self.flow = SharedFlow(num_joints, num_history, generator) if coupled else None
         self.load = PoseLoad(num_joints, generator) if coupled else None
-        for name in (
-            "command_scale",
-            "increment_scale",
-            "position_center",
-            "position_scale",
-            "quiet",
-        ):
-            self.register_buffer(
-                name,
-                torch.zeros(num_joints)
-                if name in ("position_center", "quiet")
-                else torch.ones(num_joints),
-            )
+        for name in ("command_scale", "increment_scale", "position_scale"):
+            self.register_buffer(name, torch.ones(num_joints))
+        for name in ("position_center", "quiet"):
+            self.register_buffer(name, torch.zeros(num_joints))
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """Return normalised increments `(J, B)` before the dead zone, for inputs `(J, B, 2 H)`."""
@@ -204,11 +179,8 @@ class JointNetworks(nn.Module):
         seen = (u / self.command_scale[:, None, None]).unfold(2, size, 1)  # (J, B, K, H)
         steps = seen.shape[2]
         seen = seen.reshape(num_joints, batch * steps, size)
-        from_commands = (
-            torch.baddbmm(self.bias[0], seen, of_command)
-            .view(num_joints, batch, steps, -1)
-            .unbind(2)
-        )
+        first = torch.baddbmm(self.bias[0], seen, of_command)
+        from_commands = first.view(num_joints, batch, steps, -1).unbind(2)
         shares = None if self.flow is None else self.flow(seen).view(batch, steps).unbind(1)
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
         at, path = q[..., -1], []
@@ -216,12 +188,10 @@ class JointNetworks(nn.Module):
             position = self._position(at)
             state = torch.cat([increments, position[..., None]], 2)
             output = self._head(torch.baddbmm(from_commands[k], state, of_state))
-            moved = self._moved(
-                self._hindered(output, position, None if shares is None else shares[k])
-            )
-            at = torch.addcmul(at, moved, self.increment_scale[:, None]).clamp(
-                lower[:, None], upper[:, None]
-            )
+            share = None if shares is None else shares[k]
+            moved = self._moved(self._hindered(output, position, share))
+            at = torch.addcmul(at, moved, self.increment_scale[:, None])
+            at = at.clamp(lower[:, None], upper[:, None])
             increments = torch.cat([increments[..., 1:], moved[..., None]], 2)
             path.append(at)
         return torch.stack(path, 2)
@@ -251,12 +221,11 @@ class JointNetworks(nn.Module):
 
 
 def _initialise_weights(
-    num_joints: int, *shape: int, fan_in: int | None = None, generator: torch.Generator | None
-) -> torch.Tensor:
-    """Draw weights `(J, …)` as `torch.nn.Linear` does."""
-    return (torch.rand(num_joints, *shape, generator=generator) * 2.0 - 1.0) / (
-        fan_in or shape[0]
-    ) ** 0.5
+    num_joints: int, rows: int, columns: int, fan_in: int, generator: torch.Generator | None
+) -> nn.Parameter:
+    """Draw weights `(J, rows, columns)` as `torch.nn.Linear` does."""
+    drawn = torch.rand(num_joints, rows, columns, generator=generator) * 2.0 - 1.0
+    return nn.Parameter(drawn / fan_in**0.5)
 
 
 @spec
@@ -276,9 +245,8 @@ class Mlp:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
                 NaN.
         """
-        return NetworkModel(
-            load_networks(self.checkpoint, "mlp", machine).to(device), machine, device
-        )
+        networks = load_networks(self.checkpoint, "mlp", machine)
+        return NetworkModel(networks.to(device), machine, device)
 
 
 class NetworkModel(MemorylessModel):
@@ -303,12 +271,8 @@ def load_networks(name: str, kind: str, machine: Machine) -> JointNetworks:
     """
     path = checkpoint.find_checkpoint(name)
     tensors, header = checkpoint.read_checkpoint(path, kind, machine)
-    networks = JointNetworks(
-        machine.num_joints,
-        machine.num_history,
-        int(header.get("width", 0)),
-        coupled=kind == "coupled",
-    )
+    width, coupled = int(header.get("width", 0)), kind == "coupled"
+    networks = JointNetworks(machine.num_joints, machine.num_history, width, coupled)
     try:
         networks.load_state_dict(tensors)
     except RuntimeError as error:
@@ -335,6 +299,5 @@ class Coupled:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
                 NaN.
         """
-        return NetworkModel(
-            load_networks(self.checkpoint, "coupled", machine).to(device), machine, device
-        )
+        networks = load_networks(self.checkpoint, "coupled", machine)
+        return NetworkModel(networks.to(device), machine, device)

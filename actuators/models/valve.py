@@ -25,6 +25,7 @@ import torch
 
 from actuators.models.joint_model import JointMemory, PlannableModel
 from actuators.models.joint_weight import build_joint_weight
+from actuators.models.machine_tensors import MachineTensors
 from actuators.models.parameters import (
     PerJoint,
     check_interface,
@@ -84,13 +85,8 @@ class ValveActuator:
     spread: dict[str, float]
 
     def check(self) -> None:
-        steps = np.diff(self.knots)
-        if (
-            len(self.knots) < 2
-            or self.knots[0] != 0.0
-            or self.knots[-1] != 1.0
-            or (steps <= 0).any()
-        ):
+        ends = self.knots[:1] + self.knots[-1:]
+        if ends != (0.0, 1.0) or (np.diff(self.knots) <= 0).any():
             raise ConfigError(
                 f"actuator.knots: expected strokes that rise from 0 to 1, got {list(self.knots)}"
             )
@@ -131,11 +127,7 @@ class PoseFeatures:
     """Features of the speed besides the command: load, its square, and all positions."""
 
     def __init__(self, machine: Machine, device: torch.device) -> None:
-        lower, upper = (
-            torch.as_tensor(side, dtype=torch.float32, device=device)
-            for side in (machine.lower, machine.upper)
-        )
-        self._middle, self._half = (lower + upper) / 2, (upper - lower) / 2
+        self._plant = MachineTensors(machine, device)
         self.size = machine.num_joints + (2 if machine.has_bodies else 0)
         self.weight = build_joint_weight(machine, device) if machine.has_bodies else None
 
@@ -166,50 +158,7 @@ class PoseFeatures:
 
     def place(self, q: torch.Tensor) -> torch.Tensor:
         """Return positions from the middle of the travel, in halves of it, `(N, J)`."""
-        return ((q - self._middle) / self._half).clamp(-BEYOND, BEYOND)
-
-
-class PoseFactor:
-    """Factor of the pose on the speed: 1 plus `PoseFeatures` times slopes of the side, not below 0.
-
-    Positions, weight, and what is linear in it are one product of matrices.
-
-    Args:
-        pose: The features.
-        slopes: Of the positive and the negative side, `(2, J, M)`.
-    """
-
-    def __init__(self, pose: PoseFeatures, slopes: torch.Tensor) -> None:
-        self._pose, joints = pose, slopes.shape[1]
-        place = slopes[..., -joints:].transpose(1, 2)  # (2, J, J)
-        self._one, self._bends = torch.ones(2 * joints, device=slopes.device), None
-        self._product = torch.cat((place[0], place[1]), 1)
-        if pose.weight is None:
-            return
-        self._bends = slopes[..., 1].contiguous()
-        weight, eye = pose.weight, torch.eye(joints, device=slopes.device)
-        # Columns: both sides, then the weight itself. Rows: positions, then waves or the weight.
-        linear, constant = weight.linear, weight.constant
-        if not weight.is_planar:
-            linear, constant = eye, torch.zeros_like(constant)
-        rows = torch.cat((linear * slopes[0, :, 0], linear * slopes[1, :, 0], linear), 1)
-        blank = torch.zeros_like(eye)
-        self._product = torch.cat((torch.cat((self._product, blank), 1), rows), 0)
-        parts = (1.0 + constant * slopes[0, :, 0], 1.0 + constant * slopes[1, :, 0], constant)
-        self._one = torch.cat(parts)
-
-    def at(self, q: torch.Tensor, extends: torch.Tensor) -> torch.Tensor:
-        """Return the factor at positions `q` where `extends` is the side, `(N, J)`."""
-        columns, weight, joints = self._pose.place(q), self._pose.weight, q.shape[1]
-        if weight is not None:
-            more = weight.build_waves(q) if weight.is_planar else weight.weigh(q)
-            columns = torch.cat((columns, more), 1)
-        found = torch.addmm(self._one, columns, self._product)
-        factor = torch.where(extends, found[:, :joints], found[:, joints : 2 * joints])
-        if self._bends is not None:
-            bend = torch.where(extends, self._bends[0], self._bends[1])
-            factor = torch.addcmul(factor, bend, found[:, 2 * joints :].square())
-        return factor.clamp(min=0.0)
+        return ((q - self._plant.middle) / self._plant.half_travel).clamp(-BEYOND, BEYOND)
 
 
 class ValveModel(PlannableModel):
@@ -244,7 +193,7 @@ class ValveModel(PlannableModel):
             for name in ("pose_extend", "pose_retract"):
                 rows = getattr(config, name) or {}
                 sides.append(_expand_rows(rows, machine, pose.size, f"actuator.{name}"))
-            self._pose = PoseFactor(pose, tensor(np.stack(sides)))
+            self._pose, self._slopes = pose, tensor(np.stack(sides))
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
@@ -291,7 +240,9 @@ class ValveModel(PlannableModel):
         """Return positions after step `k`, and the motion that the next one begins with."""
         wanted = drive.wanted[k]
         if self._pose:
-            wanted = wanted * self._pose.at(q, drive.extends[k])
+            both = (self._slopes[:, None] * self._pose.features(q)).sum(-1)
+            change = torch.where(drive.extends[k], both[0], both[1])
+            wanted = wanted * (1.0 + change).clamp(min=0.0)
         step = torch.lerp(wanted, memory["step"], solution)
         moved = q + step
         held = self.plant.hold_from(q, moved)
@@ -349,9 +300,8 @@ def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) 
     half = np.linspace(0.0, 1.0, CELLS // 2 + 1)
     rows = []
     for out, back in zip(extend, retract, strict=True):
-        rows.append(
-            np.concatenate([-np.interp(half[:0:-1], knots, back), np.interp(half, knots, out)])
-        )
+        negative, positive = np.interp(half[:0:-1], knots, back), np.interp(half, knots, out)
+        rows.append(np.concatenate([-negative, positive]))
     return np.stack(rows)
 
 
