@@ -78,9 +78,8 @@ class ValveCurveFit:
 
     def check(self) -> None:
         if self.knots[0] != 0.0 or self.knots[-1] != 1.0 or (np.diff(self.knots) <= 0).any():
-            raise ConfigError(
-                f"knots: expected strokes that rise from 0 to 1, got {list(self.knots)}"
-            )
+            given = list(self.knots)
+            raise ConfigError(f"knots: expected strokes that rise from 0 to 1, got {given}")
 
     def fit_curves(
         self,
@@ -186,13 +185,11 @@ def _fit_curve(
     start = np.concatenate([curve, dynamics])
     # The pull acts on the curve itself, not on its change.
     held = pull @ np.concatenate([curve, np.zeros(NUM_DYNAMICS)])
-    drawn = []
-    for row in draws:
-        drawn.append(
-            np.linalg.solve(np.tensordot(row, normal, 1) + pull, np.tensordot(row, right, 1) - held)
-        )
+    drawn = np.linalg.solve(
+        np.tensordot(draws, normal, 1) + pull, (draws @ right - held)[..., None]
+    )[..., 0]
     # The fit of the sample itself is the curve: its own small step is taken off.
-    away = np.stack(drawn) - drawn[0]
+    away = drawn - drawn[0]
     information = normal.sum(0)[: len(curve), : len(curve)] / noise
     sides = _find_known_sides(normal[:, : len(curve), : len(curve)])
     # A valve moves its joint one way: what a command that was never held leaves open is no speed.

@@ -38,6 +38,11 @@ NEEDS = {
     "square": {"stribeck", "direction"},
 }
 """Terms without which another is not tried. A weight that never changes tells no direction."""
+NEUTRAL = dict.fromkeys((*LINEAR, "stribeck_n", *LOADS), 0.0) | {
+    "stribeck_m_s": 1.0,
+    "stribeck_power": 1.0,
+}
+"""Numbers of terms that are not taken."""
 TIED = {"outside_load": "motor_load", "outside_load_at_rest": "motor_load_at_rest"}
 """Numbers that equal another one until they are fitted themselves."""
 LEAST_ROWS = 20
@@ -158,8 +163,8 @@ def _choose_terms(
             if term in taken or not NEEDS.get(term, set()) <= taken:
                 continue
             found = fit.solve((*names, *TERMS[term]), {**fit.start(), **known})
-            row: dict[str, Any] = {"term": term, "taken": False}
-            row["fitted_share"] = 1.0 - fit.measure(found) / fit.measure(known)
+            fitted_share = 1.0 - fit.measure(found) / fit.measure(known)
+            row: dict[str, Any] = {"term": term, "taken": False, "fitted_share": fitted_share}
             tried.append(row)
             if row["fitted_share"] < LEAST_SHARE:
                 continue
@@ -181,7 +186,7 @@ class _JointRegression:
     """The force of one joint in its recordings, as a function of the drive's numbers; arguments of `fit_drive`."""
 
     def __init__(self, machine: Machine, j: int, motions: Sequence[DriveMotion]) -> None:
-        self._motions, self._name = motions, machine.joint_names[j]
+        self._motions, name = motions, machine.joint_names[j]
         self._max_speed = float(machine.max_speed[j])
         slides = torch.tensor(machine.joints[j].kind == "slide")
         middle = torch.tensor(0.5 * (machine.upper[j] + machine.lower[j]))
@@ -190,10 +195,9 @@ class _JointRegression:
         self._poses = []
         for one in motions:
             sin, cos = read_pose(torch.from_numpy(one.q), middle, half, slides)
-            pose = [sin.numpy(), cos.numpy() - 1.0]
-            self._poses.append(pose)
-            ones = np.ones_like(one.q)
-            own = [one.acceleration, one.speed, np.sign(one.speed), ones, *pose]
+            self._poses.append((sin.numpy(), cos.numpy() - 1.0))
+            sign, ones = np.sign(one.speed), np.ones_like(one.q)
+            own = [one.acceleration, one.speed, sign, ones, *self._poses[-1]]
             columns.append(one.filter(np.stack(own, 1)))
             forces.append(one.filter(one.force))
             folds.append(np.arange(len(forces[-1])) * NUM_FOLDS // max(1, len(forces[-1])))
@@ -201,17 +205,16 @@ class _JointRegression:
         self._fold = np.concatenate(folds)
         if len(self._y) < LEAST_ROWS:
             raise RecordingError(
-                f"too little data: {len(self._y)} rows of joint {self._name} after filtering, {LEAST_ROWS} or more are needed"
+                f"too little data: {len(self._y)} rows of joint {name} after filtering, {LEAST_ROWS} or more are needed"
             )
-        size = np.sqrt(np.square(self._x[:, : len(ALWAYS)]).mean(0))
+        always = self._x[:, : len(ALWAYS)]
+        size = np.sqrt(np.square(always).mean(0))
         if (size[:3] < 1e-12).any():
-            raise RecordingError(
-                f"joint {self._name} never moves: nothing tells its mass and friction"
-            )
-        found, _, rank, _ = np.linalg.lstsq(self._x[:, : len(ALWAYS)] / size, self._y, rcond=1e-6)
+            raise RecordingError(f"joint {name} never moves: nothing tells its mass and friction")
+        found, _, rank, _ = np.linalg.lstsq(always / size, self._y, rcond=1e-6)
         if rank < len(ALWAYS):
             raise RecordingError(
-                f"joint {self._name}: its motion does not tell mass, friction and offset apart; record accelerations both ways"
+                f"joint {name}: its motion does not tell mass, friction and offset apart; record accelerations both ways"
             )
         self._least_squares = dict(zip(ALWAYS, (found / size).tolist(), strict=True))
         force = float(np.sqrt(np.square(self._y).mean()))
@@ -279,8 +282,8 @@ class _JointRegression:
         if name in ("offset_n", "pose_sin_n", "pose_cos_n"):
             return -np.inf, np.inf
         if name == "stribeck_m_s":
-            size = self._size[name]
-            return STRIBECK_RANGE[0] * size, STRIBECK_RANGE[1] * size
+            low, high = STRIBECK_RANGE
+            return low * self._size[name], high * self._size[name]
         if name in LOADS and "square" not in name:
             return 0.0, 1.0
         return 0.0, np.inf
@@ -292,17 +295,13 @@ class _JointRegression:
 
     def _filter_dry(self, numbers: dict[str, float]) -> np.ndarray:
         """Return the dry friction beyond Coulomb's at all rows."""
-        neutral = {"coulomb_n": 0.0, "stribeck_n": 0.0, "stribeck_m_s": 1.0, "stribeck_power": 1.0}
         tied = {name: numbers[other] for name, other in TIED.items() if other in numbers}
-        given = {**neutral, **dict.fromkeys(LOADS, 0.0), **tied, **numbers, "coulomb_n": 0.0}
+        given = {**NEUTRAL, **tied, **numbers, "coulomb_n": 0.0}
         value = {name: torch.tensor(one, dtype=torch.float64) for name, one in given.items()}
         parts = []
         for motion, (sin, cos) in zip(self._motions, self._poses, strict=True):
-            weight = given.get("offset_n", 0.0)
-            weight = weight + given.get("pose_sin_n", 0.0) * sin
-            weight = weight + given.get("pose_cos_n", 0.0) * cos
+            weight = given["offset_n"] + given["pose_sin_n"] * sin + given["pose_cos_n"] * cos
             speed, motor = torch.from_numpy(motion.speed), torch.from_numpy(motion.force)
-            outside = torch.as_tensor(weight, dtype=torch.float64)
-            dry = compute_dry_friction(value, speed, motor, outside, self._full)
+            dry = compute_dry_friction(value, speed, motor, torch.from_numpy(weight), self._full)
             parts.append(motion.filter(np.sign(motion.speed) * dry.numpy()))
         return np.concatenate(parts)

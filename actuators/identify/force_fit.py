@@ -15,9 +15,10 @@ import numpy as np
 import torch
 
 from actuators.identify.drive_regression import TERMS, DriveMotion, filter_low_pass, fit_drive
-from actuators.identify.option_file import write_option
+from actuators.identify.option_file import round_by_joint, write_option
 from actuators.models.force_drive import ForceDrive
 from actuators.models.friction import STRIBECK_SPEED
+from actuators.models.parameters import expand_per_joint
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -83,17 +84,17 @@ class ForceFit:
                 f"fit.motion_hz: {self.motion_hz:g} Hz cannot be filtered at a period of {machine.period_s:g} s; lower it"
             )
         self.actuator.build(machine, 1, torch.device("cpu"))  # refuses numbers that make no sense
-        dead_time_s = self.actuator.dead_time_s
-        given = machine.dead_time_s if dead_time_s is None else dead_time_s
+        given = self.actuator.dead_time_s
+        delays_s = expand_per_joint(
+            machine.dead_time_s if given is None else given, machine, "fit.actuator.dead_time_s"
+        )
         values: dict[str, dict[str, float]] = {}
         told: dict[str, dict[str, dict[str, float]]] = {}
         tried = {}
+        least = 4 * round(EDGE_S / machine.period_s)
+        long = [one for one in (*train, *validation) if one.num_samples >= least]
         for j, joint in enumerate(machine.joint_names):
-            delay_s = given[joint] if isinstance(given, dict) else given
-            motions = []
-            for recording in (*train, *validation):
-                if recording.num_samples >= 4 * round(EDGE_S / machine.period_s):
-                    motions.append(self._read_motion(machine, recording, j, delay_s))
+            motions = [self._read_motion(machine, one, j, delays_s[j]) for one in long]
             found = fit_drive(machine, j, motions, self.terms)
             tried[joint] = found.tried
             for name, value in found.value.items():
@@ -101,9 +102,10 @@ class ForceFit:
                 error = {"value": value, "standard_error": found.error[name]}
                 told.setdefault(name, {})[joint] = error
         for name, mine in values.items():  # joints that lack a term of another one
-            for joint, speed in zip(machine.joint_names, machine.max_speed, strict=True):
-                off = float(f"{STRIBECK_SPEED * speed:.5g}") if name == "stribeck_m_s" else 0.0
-                mine.setdefault(joint, off)
+            off = np.zeros(machine.num_joints)
+            if name == "stribeck_m_s":
+                off = STRIBECK_SPEED * machine.max_speed
+            values[name] = round_by_joint(machine, off) | mine
         fitted = dataclasses.replace(self.actuator, **values)  # pyright: ignore[reportArgumentType]
         facts = {"schema": 1, "parameters": told, "terms": tried}
         write_option(folder, self.name, fitted, f"fitted to {machine.name}", facts)
