@@ -9,6 +9,7 @@ from torch import nn
 from torch.nn.utils.rnn import pad_sequence
 
 from actuators.models.parameters import hash_uniform
+from actuators.recordings.inspection import estimate_step
 from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
@@ -216,26 +217,11 @@ def estimate_resting_noise(recordings: Sequence[Recording], machine: Machine) ->
             q = recording.q[:, joint].astype(np.float64)
             still.append(np.diff(q)[quiet[:-1]])
             moving.append(q[~quiet])
-        still, step = np.concatenate(still), _estimate_sensor_step(np.concatenate(moving))
-        noise[joint] = step / np.sqrt(6.0)
+        still, step = np.concatenate(still), estimate_step(np.concatenate(moving))
+        noise[joint] = np.nan_to_num(step) / np.sqrt(6.0)
         if len(still):
             noise[joint] = max(noise[joint], float(np.quantile(np.abs(still), 0.68)))
         else:
             text = "%s is never at rest in the recordings to fit to: its drift at rest will not be learned"
             log.warning(text, name)
     return noise
-
-
-def _estimate_sensor_step(q: np.ndarray) -> float:
-    """Return the step of a coarse sensor from its values `(T,)`; 0 for continuous values.
-
-    Neighbours among the values that occur are then whole multiples of the step apart, most often
-    one.
-    """
-    apart = np.diff(np.unique(q))
-    apart = apart[apart > 1e-9]
-    if len(apart) < 10:
-        return 0.0
-    step = float(np.quantile(apart, 0.05))
-    multiple = apart / step
-    return step if np.abs(multiple - np.round(multiple)).mean() < 0.1 else 0.0
