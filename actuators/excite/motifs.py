@@ -1,7 +1,7 @@
 """Motifs: short single-joint programs that separate effects which look alike otherwise."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import count
+from itertools import count, product
 from typing import Annotated
 
 import numpy as np
@@ -39,9 +39,8 @@ class Motif:
         before: Sequence[Segment],
     ) -> list[Segment]:
         """Return as many segments as fit into `duration_s`."""
-        return fill_duration(
-            type(self).__name__.lower(), self._candidates(machine, generator), duration_s, machine
-        )
+        candidates = self._candidates(machine, generator)
+        return fill_duration(type(self).__name__.lower(), candidates, duration_s, machine)
 
     def _candidates(self, machine: Machine, generator: np.random.Generator) -> Iterator[Segment]:
         number = count()
@@ -49,9 +48,7 @@ class Motif:
             found = self.programs(machine, generator)
             for i in generator.permutation(len(found)):
                 name, u = found[i]
-                yield Segment(
-                    name=f"{name}_{next(number):02d}", start=start, u=u, stops="inward", stop_margin=self.stop_margin
-                )  # fmt: skip
+                yield Segment(f"{name}_{next(number):02d}", start, u, "inward", self.stop_margin)
 
 
 def fill_duration(
@@ -91,10 +88,8 @@ def build_joint_programs(
 
 def hold_levels(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.ndarray:
     """Return each level held for its time, `(T,)`."""
-    return np.repeat(
-        np.asarray(levels, dtype=float),
-        np.maximum(1, np.round(np.asarray(holds_s) / period_s).astype(int)),
-    )
+    counts = np.maximum(1, np.round(np.asarray(holds_s) / period_s).astype(int))
+    return np.repeat(np.asarray(levels, dtype=float), counts)
 
 
 @spec
@@ -131,19 +126,16 @@ class Ramps(Motif):
                 # further
                 height = min(self.highest, np.sqrt(slope_per_s * way[joint]))
                 rise = max(1, round(height / slope_per_s / machine.period_s))
-                up, down = (
-                    np.linspace(0.0, height, rise + 1),
-                    np.linspace(height, -height, 2 * rise + 1),
-                )
+                up = np.linspace(0.0, height, rise + 1)
+                down = np.linspace(height, -height, 2 * rise + 1)
                 return generator.choice([-1.0, 1.0]) * np.concatenate([up, down[1:], -up[::-1][1:]])
 
             return program
 
-        return [
-            found
-            for slope_per_s in self.slopes_per_s
-            for found in build_joint_programs("ramps", machine, ramp(slope_per_s))
-        ]
+        found = []
+        for slope_per_s in self.slopes_per_s:
+            found += build_joint_programs("ramps", machine, ramp(slope_per_s))
+        return found
 
 
 @spec
@@ -164,9 +156,8 @@ class Holds(Motif):
         self, machine: Machine, generator: np.random.Generator
     ) -> list[tuple[str, np.ndarray]]:
         """Return one hold: the way to each pose does the rest."""
-        return [
-            ("holds", np.zeros((max(1, round(self.hold_s / machine.period_s)), machine.num_joints)))
-        ]
+        steps = max(1, round(self.hold_s / machine.period_s))
+        return [("holds", np.zeros((steps, machine.num_joints)))]
 
 
 @spec
@@ -194,13 +185,10 @@ class Reversals(Motif):
     ) -> list[tuple[str, np.ndarray]]:
         """Return all reversals of a joint in one program."""
         parts = []
-        for level in self.levels:
-            for hold_s in self.holds_s:
-                cycle = hold_levels([level, -level], [hold_s, hold_s], machine.period_s)
-                parts += [
-                    np.tile(cycle, self.num_cycles),
-                    hold_levels([0.0], [self.pause_s], machine.period_s),
-                ]
+        pause = hold_levels([0.0], [self.pause_s], machine.period_s)
+        for level, hold_s in product(self.levels, self.holds_s):
+            cycle = hold_levels([level, -level], [hold_s, hold_s], machine.period_s)
+            parts += [np.tile(cycle, self.num_cycles), pause]
         commands = np.concatenate(parts)
         return build_joint_programs("reversals", machine, lambda joint: commands)
 
@@ -226,13 +214,10 @@ class Staircase(Motif):
     stop_margin: float
 
     def check(self) -> None:
-        if (
-            not self.levels
-            or list(self.levels) != sorted(self.levels)
-            or not 0 < self.levels[0] <= self.levels[-1] <= 1
-        ):
+        levels = list(self.levels)
+        if not levels or levels != sorted(levels) or not 0 < levels[0] <= levels[-1] <= 1:
             raise ConfigError(
-                f"excitation: levels: expected rising commands in (0, 1], got {list(self.levels)}"
+                f"excitation: levels: expected rising commands in (0, 1], got {levels}"
             )
 
     def programs(
@@ -242,15 +227,9 @@ class Staircase(Motif):
         stairs = np.array([*self.levels, *self.levels[::-1]])
 
         def program(joint: int) -> np.ndarray:
-            way_s = (
-                self.reach
-                * (machine.upper[joint] - machine.lower[joint])
-                / machine.max_speed[joint]
-                / stairs
-            )
-            holds_s = np.minimum(self.hold_s, way_s)
-            return hold_levels(
-                np.stack([stairs, -stairs], 1).ravel(), np.repeat(holds_s, 2), machine.period_s
-            )
+            travel_s = (machine.upper[joint] - machine.lower[joint]) / machine.max_speed[joint]
+            holds_s = np.minimum(self.hold_s, self.reach * travel_s / stairs)
+            levels = np.stack([stairs, -stairs], 1).ravel()
+            return hold_levels(levels, np.repeat(holds_s, 2), machine.period_s)
 
         return build_joint_programs("staircase", machine, program)

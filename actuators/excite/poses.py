@@ -30,22 +30,17 @@ def draw_start_poses(
     """
     travel = machine.upper - machine.lower
     total = np.zeros(machine.num_joints)
+    lower, upper = machine.lower + margin * travel, machine.upper - margin * travel
     while True:
-        candidates = generator.uniform(
-            machine.lower + margin * travel,
-            machine.upper - margin * travel,
-            (NUM_CANDIDATES, len(travel)),
-        )
+        candidates = generator.uniform(lower, upper, (NUM_CANDIDATES, len(travel)))
         if not machine.has_bodies:
             yield candidates[0]
             continue
         pull = Gravity(machine).load(candidates)
         pull /= np.maximum(np.abs(pull).max(0), 1e-9)
         heavy = np.abs(pull).sum(1)
-        best = (
-            int(np.argmin(((total + pull) ** 2).sum(1) - heavy))
-            if total.any()
-            else int(np.argmax(heavy))
-        )
+        # With nothing to oppose yet, the heaviest comes first.
+        cost = ((total + pull) ** 2).sum(1) - heavy if total.any() else -heavy
+        best = int(np.argmin(cost))
         total += pull[best]
         yield candidates[best]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -42,13 +43,7 @@ class Repeat:
     ) -> list[Segment]:
         """Return the segments `before`, renamed; their length stays."""
         repeated = []
-        for i in range(1, self.times + 1):
-            for segment in before:
-                repeated.append(
-                    replace(
-                        segment,
-                        name=f"{segment.name}_repeat_{i}",
-                        repeat_of=segment.repeat_of or segment.name,
-                    )
-                )
+        for i, segment in product(range(1, self.times + 1), before):
+            name, original = f"{segment.name}_repeat_{i}", segment.repeat_of or segment.name
+            repeated.append(replace(segment, name=name, repeat_of=original))
         return repeated

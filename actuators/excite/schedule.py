@@ -47,15 +47,11 @@ class Approach:
         """Return the nominal time from `start` to `target`, each `(…, J)`, with the rest."""
         way = np.abs(target - start)
         far = way > self.tolerance * (machine.upper - machine.lower)
-        slowing_s = self.settle_s * np.log(
-            1.0 + way / (self.level * machine.max_speed * self.settle_s)
-        )
-        each_s = np.where(
-            far, way / (self.level * machine.max_speed) + slowing_s + machine.dead_time_s, 0.0
-        )
-        first_s, then_s = (
-            each_s[..., machine.is_exclusive == one].max(-1, initial=0.0) for one in (False, True)
-        )
+        going_s = way / (self.level * machine.max_speed)
+        slowing_s = self.settle_s * np.log(1.0 + going_s / self.settle_s)
+        each_s = np.where(far, going_s + slowing_s + machine.dead_time_s, 0.0)
+        first_s = each_s[..., ~machine.is_exclusive].max(-1, initial=0.0)
+        then_s = each_s[..., machine.is_exclusive].max(-1, initial=0.0)
         return first_s + then_s + self.rest_s
 
 
@@ -105,9 +101,8 @@ def plan_runs(
         for _ in range(NUM_TRIES):
             segments = _collect_segments(excitations, parts, machine, programs_s, int(seed))
             needed_s = _estimate_duration_s(segments, machine, approach)
-            tries.append(
-                (needed_s if needed_s <= run_s else run_s - needed_s, len(tries), tuple(segments))
-            )
+            fill_s = needed_s if needed_s <= run_s else run_s - needed_s
+            tries.append((fill_s, len(tries), tuple(segments)))
             programs_s *= run_s / needed_s
         runs.append(max(tries)[-1])
     return ExcitationPlan(runs=tuple(runs), run_s=run_s, names=tuple(excitations))

@@ -66,11 +66,7 @@ class Sine:
             u = np.zeros((steps, machine.num_joints))
             u[:, joint] = self._waves(steps, machine.period_s, generator)
             name = f"sine_{machine.joint_names[joint]}"
-            found.append(
-                Segment(
-                    name=name, start=machine.home, u=u, stops="home", stop_margin=self.stop_margin
-                )
-            )
+            found.append(Segment(name, machine.home, u, "home", self.stop_margin))
         return found
 
     def _waves(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
@@ -80,9 +76,8 @@ class Sine:
         while steps - at >= shortest:
             hz = np.exp(generator.uniform(np.log(self.lowest_hz), np.log(self.highest_hz)))
             # A sine may begin in either direction.
-            amplitude = generator.uniform(self.smallest, self.largest) * generator.choice(
-                [-1.0, 1.0]
-            )
+            amplitude = generator.uniform(self.smallest, self.largest)
+            amplitude *= generator.choice([-1.0, 1.0])
             count = min(max(round(1.0 / hz / period_s), shortest), steps - at)
             u[at : at + count] = amplitude * np.sin(2.0 * np.pi * np.arange(count) / count)
             at += count
