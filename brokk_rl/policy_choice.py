@@ -8,6 +8,7 @@ behaviour. A value that the caller typed and that contradicts the policy is refu
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from brokk_rl.policy_folder import (
     drop_targets,
     find_policy,
     format_value,
+    list_checkpoints,
     list_differences,
     name_target,
 )
@@ -53,11 +55,11 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     folder, or from a checkpoint, takes up the overrides of its run.
 
     Raises:
-        ConfigError: A key has another name now.
+        ConfigError: A key has another name now; the message ends with the command that works.
     """
     words = [word for word in arguments if "=" in word and not word.startswith("-")]
     given = {one.key_or_group: one for one in OverridesParser.create().parse_overrides(words)}
-    _refuse_old_keys(given)
+    _refuse_old_keys(arguments, given)
     prepared = list(arguments)
     is_whole = any(word.startswith(WHOLE) for word in arguments)
     for override in given.values():
@@ -107,15 +109,32 @@ def is_going_on(cfg: DictConfig, folder: Path) -> bool:
     return path is not None and _find_run(path).resolve() == folder.resolve()
 
 
-def _refuse_old_keys(given: Mapping[str, Override]) -> None:
+def _refuse_old_keys(arguments: Sequence[str], given: Mapping[str, Override]) -> None:
     is_training = _read_value(given, "mode") == "train" or not {"mode", "experiment"} & {*given}
     for key in OLD_KEYS:
-        if key in given and (key != "resume" or is_training):
-            value = _read_value(given, key)
-            out = f" session.out={value}" if key == "resume" and "session.out" not in given else ""
+        if key not in given or (key == "resume" and not is_training):
+            continue
+        line, value = str(given[key].input_line), _read_value(given, key)
+        works = [word for word in arguments if word != line]
+        works.append(f"policy={value}")
+        if key == "resume" and "session.out" not in given:
+            works.append(f"session.out={value}")
+        raise ConfigError(
+            f"{line}: '{key}' is now 'policy', in every mode. This works: "
+            f"{shlex.join(['brokk', *works])}"
+        )
+
+
+def _refuse_late_values(cfg: DictConfig, stored: StoredPolicy) -> None:
+    """Refuse values that count only when a training begins, where it goes on with others."""
+    trained = stored.contract.get("trained", {})
+    for key, began_with in trained.get("beginning", {}).items():
+        value = OmegaConf.select(cfg, key)
+        if value != began_with:
             raise ConfigError(
-                f"{given[key].input_line}: '{key}' is now 'policy', in every mode: give "
-                f"policy={value}{out}"
+                f"{key}={value} was asked for, but the training in {stored.name} began with "
+                f"{began_with}, and one that goes on keeps what it has made of it. Leave it out, or "
+                "begin anew with its network: policy=<run folder> session.out=<another folder>"
             )
 
 
@@ -190,6 +209,8 @@ def _take_over(cfg: DictConfig) -> DictConfig:
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
         return cfg
+    if cfg.get(RUN) == TRAIN and _is_resumed(cfg):
+        _refuse_late_values(cfg, stored)
     given = _list_given()
     brought = []
     if "task" in cfg:
@@ -201,6 +222,13 @@ def _take_over(cfg: DictConfig) -> DictConfig:
     if brought:
         log.info("the policy in %s brings %s", stored.name, " and ".join(brought))
     return cfg
+
+
+def _is_resumed(cfg: DictConfig) -> bool:
+    """Return whether a training goes on from a checkpoint."""
+    path, out = str(cfg.policy.path), OmegaConf.select(cfg, "session.out", default=None) or "."
+    has_begun = bool(list_checkpoints(_find_run(path)))
+    return path.endswith(".pt") or (has_begun and is_going_on(cfg, Path(out)))
 
 
 def _choose_option(

@@ -199,6 +199,7 @@ class Train(SimulatedPlant):
         )
         contract["trained"] = {
             "began_with": self._find_beginning(),
+            "beginning": self.rl.describe_beginning(),
             "seed": self.session.seed,
             "device": str(loop.device),
             "follower": describe_spec(self.follower),

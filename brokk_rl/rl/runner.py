@@ -174,7 +174,6 @@ class TrainingRunner(OnPolicyRunner):
             "fingerprint": self.env.machine.fingerprint(),
             "task": self.env.description.to_json(),
             "network": self.training.describe_network(),
-            "beginning": self.training.describe_beginning(),
             "answers": self.record_answers(),
         }
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
@@ -216,7 +215,6 @@ class TrainingRunner(OnPolicyRunner):
         Raises:
             CheckpointError: The file is missing, corrupt, holds NaN or belongs to another machine
                 or configuration.
-            ConfigError: A value was changed that counts only when a training begins.
         """
         content = read_checkpoint(Path(path), self.device)
         self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
@@ -227,7 +225,6 @@ class TrainingRunner(OnPolicyRunner):
             "resolved policy=<run> session.out=<run>",
         )
         try:
-            self._refuse_late_values(content["beginning"], path)
             self.alg.load(content, None, strict=True)
             own = [content, *content.get("others", [])][self.group.rank.index :][:1]
             # Empty where more processes continue than were stopped: the new ones start afresh.
@@ -244,15 +241,6 @@ class TrainingRunner(OnPolicyRunner):
                 "Resume with the run's own resolved.yaml."
             ) from error
         return {}
-
-    def _refuse_late_values(self, began_with: Mapping[str, Any], path: str) -> None:
-        for key, value in self.training.describe_beginning().items():
-            if value != began_with[key]:
-                raise ConfigError(
-                    f"{key}={value} was asked for, but {path} began with {began_with[key]}, and a "
-                    "training that goes on keeps what it has made of it. Leave it out, or begin "
-                    "anew with this network: policy=<run folder> session.out=<another folder>"
-                )
 
 
 @contextlib.contextmanager

@@ -344,6 +344,21 @@ def test_a_training_that_goes_on_takes_up_the_words_of_its_run(tmp_path: Path) -
     assert prepare_arguments(exact)[2:] == kept[:3]
 
 
+def test_a_value_that_counts_only_at_the_beginning_is_refused_before_the_run_is_touched(
+    brokk: Callable[..., Done], tmp_path: Path
+) -> None:
+    small = ("sim=native", "rl.num_envs=8", "rl.num_starts=16", "rl.budget.max_env_steps=192")
+    run = ("mode=train", "session.out=run", "session.device=cpu", "task.episode_s=1.0")
+    assert brokk(*run, *small, *FEW, "evaluation.episodes=1").code == 0
+    before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    for value in ("rl.runner.algorithm.learning_rate=0.001", "rl.output_gain=2.0"):
+        done = brokk("mode=train", "policy=run", "session.out=run", value)
+        assert done.code == 2 and f"{value} was asked for, but the training in run" in done.err
+    done = brokk("mode=train", "policy=run/model_1.pt", "session.out=new", value)
+    assert done.code == 2 and not (tmp_path / "new").exists()
+    assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
+
+
 def test_answers_hold_many_phases(newest: Path) -> None:
     golden = json.loads((newest / "golden.json").read_text())
     assert len(golden["command"]) == 16

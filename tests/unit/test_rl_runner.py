@@ -288,23 +288,6 @@ def test_a_weight_that_the_last_update_spoils_is_named_and_not_written(
     assert not list_checkpoints(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("changes", "key"),
-    [
-        ({"learning_rate": 1e-3}, "rl.runner.algorithm.learning_rate=0.001"),
-        ({}, "rl.output_gain=2.0"),
-    ],
-)
-def test_a_value_that_cannot_take_effect_any_more_is_refused(
-    changes: dict[str, float], key: str, checkpoint: Path, machine: Machine
-) -> None:
-    runner = runs.small(max_env_steps=1).runner
-    runner["algorithm"] |= changes
-    gain = 1.0 if changes else 2.0
-    with pytest.raises(ConfigError, match=rf"{key} was asked for, .*model_1\.pt began with"):
-        loading(machine, checkpoint, runner=runner, output_gain=gain)
-
-
 def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(
     machine: Machine, tmp_path: Path
 ) -> None:
