@@ -35,12 +35,14 @@ log = logging.getLogger(__name__)
 JOINT_COLUMNS = {
     "lower": "lower",
     "upper": "upper",
+    "home": "home",
     "max_speed": "max speed",
     "travel_s": "travel, s",
     "largest_weight": "weight",
     "yield_force": "yield force",
 }
-"""Figures of a joint in the printed table."""
+"""Figures of a joint in the table."""
+JOINT_UNITS = "rad, rad/s, Nm; of a slide m, m/s, N. The yield force counts beyond the weight."
 
 
 @spec
@@ -126,10 +128,33 @@ class MachineCheck:
             return "It can be simulated, but not trained with this task and actuator."
         return f"It can be simulated and trained. Missing, guessed or mended: {len(self.missing)}."
 
-    def list_remarks(self) -> list[tuple[str, str]]:
-        """Return all findings, each with its kind."""
+    def group_remarks(self) -> dict[str, list[str]]:
+        """Return all findings by their kind, where there are some."""
         kinds = {"problem": self.problems, "not fitting": self.unfit, "remark": self.missing}
-        return [(kind, text) for kind, texts in kinds.items() for text in texts]
+        return {kind: texts for kind, texts in kinds.items() if texts}
+
+    def list_joints(self) -> list[list[str | None]]:
+        """Return the rows of the table of joints."""
+        rows = []
+        for name, figures in self.joints.items():
+            values = [figures[key] for key in JOINT_COLUMNS]
+            rows.append(
+                [name, *(None if one is None else f"{round(one, 9):.4g}" for one in values)]
+            )
+        return rows
+
+    def list_facts(self) -> dict[str, str]:
+        """Return reach, contact and starts in words."""
+        facts = {}
+        if reach := self.reach:
+            facts["reach"] = f"{reach['nearest_m']:.2f} to {reach['furthest_m']:.2f} m"
+            facts["height"] = f"{reach['lowest_m']:.2f} to {reach['highest_m']:.2f} m"
+            facts["above the ground"] = f"{reach['share_above_ground']:.0%} of random poses"
+        facts["touches, and feels it"] = ", ".join(self.contact) or "nothing"
+        if self.starts:
+            shares = [f"{name} {share:.1%}" for name, share in self.starts.items()]
+            facts["starts of the task, of candidates"] = ", ".join(shares)
+        return facts
 
 
 @spec
@@ -369,75 +394,33 @@ def _write_report(
 ) -> None:
     tone = "bad" if found.problems or found.unfit else "good"
     page = Report(f"Check of {machine.name}", found.summarise(), tone)
-    page.add_facts(
-        {"machine": machine.title, "task": facts["task"] or "none", "actuator": facts["actuator"]}
-    )
-    headings = {
-        "Problems": found.problems,
-        "Not fitting": found.unfit,
-        "Missing, guessed or mended": found.missing,
-    }
-    for heading, texts in headings.items():
-        if texts:
-            page.add_heading(heading)
-            page.add_list(texts)
+    task = facts["task"] or "none"
+    about = {"machine": machine.title, "task": task, "actuator": facts["actuator"]}
+    page.add_facts(about | found.list_facts())
+    for heading, texts in found.group_remarks().items():
+        page.add_heading(heading.capitalize())
+        page.add_list(texts)
     if found.tips_m is not None:
-        page.add_heading("Reach")
         page.add_picture(
             folder / "workspace.png", f"Tool points of {len(found.tips_m)} random poses"
         )
-        page.add_facts(
-            {
-                key.replace("_m", ", m").replace("_", " "): f"{value:.2f}"
-                for key, value in found.reach.items()
-            }
-        )
-    if found.starts:
-        page.add_heading("Starts of the task")
-        page.add_facts(
-            {f"{key}, of candidates": f"{share:.1%}" for key, share in found.starts.items()}
-        )
     page.add_heading("Joints")
-    columns = list(next(iter(found.joints.values())))
-    rows = [[name, *figures.values()] for name, figures in found.joints.items()]
-    page.add_table(
-        ["joint", *(column.replace("_s", ", s").replace("_", " ") for column in columns)],
-        rows,
-        "rad, rad/s, Nm; of a sliding joint m, m/s, N. The yield force counts beyond the weight.",
-        digits=5,
-    )
-    page.add_heading("Contact")
-    page.add_text(
-        f"These links may touch the block, and a touch sensor feels them: {', '.join(found.contact)}."
-        if found.contact
-        else "No link touches anything."
-    )
+    page.add_table(["joint", *JOINT_COLUMNS.values()], found.list_joints(), JOINT_UNITS)
     page.write(folder / "check.html")
 
 
 def _show(machine: Machine, found: MachineCheck) -> None:
     """Print the verdict, the joints, and every remark."""
-    cells = []
-    for name, figures in found.joints.items():
-        cells.append([name, *(_format_figure(figures[key]) for key in JOINT_COLUMNS)])
     print_text(f"{machine.name}: {found.summarise()}")
-    print_table(["joint", *JOINT_COLUMNS.values()], cells)
-    print_text("rad, rad/s, Nm; of a slide m, m/s, N")
-    if reach := found.reach:
-        print_text(
-            f"reach {reach['nearest_m']:.2f} to {reach['furthest_m']:.2f} m, "
-            f"height {reach['lowest_m']:.2f} to {reach['highest_m']:.2f} m"
-        )
-    print_text(f"touches: {', '.join(found.contact) or 'nothing'}")
-    if found.starts:
-        shares = [f"{name} {share:.1%}" for name, share in found.starts.items()]
-        print_text(f"starts of the task: {', '.join(shares)}")
-    if remarks := found.list_remarks():
+    print_table(["joint", *JOINT_COLUMNS.values()], found.list_joints())
+    print_text(JOINT_UNITS)
+    for name, text in found.list_facts().items():
+        print_text(f"{name}: {text}")
+    remarks = []
+    for kind, texts in found.group_remarks().items():
+        remarks += [(kind, text) for text in texts]
+    if remarks:
         print_table([], remarks)
-
-
-def _format_figure(value: float | None) -> str | None:
-    return None if value is None else f"{round(value, 9):.4g}"
 
 
 def _draw_workspace(machine: Machine, found: MachineCheck) -> Figure | None:
@@ -449,29 +432,19 @@ def _draw_workspace(machine: Machine, found: MachineCheck) -> Figure | None:
     figure = make_figure(11.0, 5.0)
     side, top = figure.subplots(1, 2)
 
-    def flatten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def look_from_side(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.hypot(points[:, 0], points[:, 1]), points[:, 2]
 
     def look_down(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return points[:, 0], points[:, 1]
 
-    for axis, project in ((side, flatten), (top, look_down)):
-        axis.plot(
-            *project(found.tips_m),
-            ".",
-            color=GREY,
-            markersize=1.5,
-            label="tool point",
-            rasterized=True,
-        )
-        if found.targets_m is not None:
-            axis.plot(
-                *project(found.targets_m),
-                ".",
-                color=ORANGE,
-                markersize=4,
-                label="target that can be reached",
-            )
+    clouds = [(found.tips_m, "tool point", GREY, 1.5)]
+    if found.targets_m is not None:
+        clouds.append((found.targets_m, "target that can be reached", ORANGE, 4.0))
+    for axis, project in ((side, look_from_side), (top, look_down)):
+        for points, label, color, size in clouds:
+            style = {"color": color, "markersize": size, "rasterized": True}
+            axis.plot(*project(points), ".", label=label, **style)
         axis.plot(*project(arm), "-o", color=BLUE, linewidth=3, label="arm at home")
         axis.set_aspect("equal", adjustable="datalim")
         remove_frame(axis)
