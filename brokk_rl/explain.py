@@ -123,7 +123,9 @@ def _explain_bad_choice(error: BaseException) -> str:
     for argument in sys.argv[1:]:
         group, _, value = argument.partition("=")
         names = [option.name for option in options if option.group == group]
-        if names and (value in ("null", "true", "false") or re.fullmatch(r"[\d.eE+-]+", value)):
+        if names and value == "null":
+            return f"{group}=null: ~{group} takes a group out; {list_choices('', names)}"
+        if names and (value in ("true", "false") or re.fullmatch(r"[\d.eE+-]+", value)):
             keys = [key for key in _find_keys(compose_choices(), group) if "." in key]
             if keys:
                 return (

@@ -36,6 +36,8 @@ from pydantic_core import ArgsKwargs, CoreSchema, PydanticCustomError, core_sche
 from brokk_rl.errors import ConfigError, list_choices
 
 T = TypeVar("T")
+MOST_NAMED = 6
+"""Fields of a table that a message still names. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -322,6 +324,8 @@ def describe_hint(hint: Any) -> str:
         return f"a list of {', '.join(items)}"
     if origin is dict and arguments[1] is not Any:
         return f"a table, each value {describe_hint(arguments[1])}"
+    if is_dataclass(hint) and len(fields(hint)) <= MOST_NAMED:
+        return f"a table with {', '.join(field.name for field in fields(hint))}"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
     words |= {type(None): "null", Any: "a value", tuple: "a list", list: "a list", dict: "a table"}
     return words.get(origin or hint) or getattr(hint, "__name__", str(hint))

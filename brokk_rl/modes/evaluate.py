@@ -54,7 +54,7 @@ class Evaluate(SimulatedPlant):
     def check(self) -> None:
         if self.target is not None and not hasattr(self.target, "sense"):
             raise ConfigError(
-                f"target={name_spec(self.target)}: mode=evaluate takes target=null or "
+                f"target={name_spec(self.target)}: mode=evaluate takes none, or "
                 "target=perceived; the others are for mode=deploy"
             )
 

@@ -146,7 +146,7 @@ class ControlLoop(VecEnv):
         self.machine, self.world, self.task = machine, world, task
         self.sensor = sensor
         if sensor:
-            task.require("take_estimate", "give target=null")
+            task.require("take_estimate", "leave the target out")
         self.description = description
         self.actuator, self.follower = actuator, follower
         self.num_envs = world.num_worlds

@@ -118,6 +118,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     (*COMPARE, "session.device=gpu"): ("session.device", "cpu", "'gpu'"),
     ("rl.runner.algorithm.num_mini_batches=100000",): ("num_mini_batches: expected at most 98304",),
     ("mode=evaluate", "sim=native", "sim.num_worlds=1e12"): ("sim.num_worlds: expected", "1e+07"),
+    ("mode=evaluate", "target=null"): ("~target takes a group out", "perceived"),
     ("mode=board", "board.rows=0"): ("expected a whole number of 2 or more, got 0",),
 }
 """A command, and parts of its message."""
