@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: size of the gap, location, paths, growth, rivals and tip error.
+"""Figures of a diagnosis: size of the gap, speed curves, location, paths and rivals.
 
 Black is the measurement, red the simulator as it was, blue the simulator with the effects, grey the
 floor.
@@ -13,13 +13,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter, NullFormatter
 
 from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, make_joint_panels, remove_frame
 from diagnosis.answer import Answer, Outcome, format_error
-from diagnosis.error_growth import READINGS, compute_rmse_curve
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.sanity import name_recording
 
@@ -129,7 +127,7 @@ CURVE_WORDS = {
 def draw_gap_map(answer: Answer, before: WindowedRuns, machine: Machine) -> Figure:
     """Draw the gap by joint and regime, and the error of each joint over the running time."""
     location = answer.more["location"]
-    parts = location["parts"]["regime"]
+    parts = location["parts"]
     joints, regimes = (
         list(machine.joint_names),
         list(dict.fromkeys(part["category"] for part in parts)),
@@ -218,50 +216,17 @@ def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
     return figure
 
 
-def draw_growth(outcome: Outcome, machine: Machine) -> Figure:
-    """Draw the error over the time of a free run with its kind of growth, one panel a joint."""
-    figure, axes = make_joint_panels(machine, "xy")
-    curves = {"before": outcome.before, "after": outcome.after, "floor": outcome.floor}
-    t_s = machine.period_s * np.arange(1, outcome.before.simulated.shape[1] + 1)
-    told = outcome.answer.more["location"]["growth"]
-    for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
-        for (name, runs), colour in zip(curves.items(), (BEFORE, AFTER, FLOOR), strict=True):
-            if runs is not None:
-                rmse = (
-                    100.0 * compute_rmse_curve(runs)[:, j] / (machine.upper[j] - machine.lower[j])
-                )
-                axis.plot(
-                    t_s[: len(rmse)], np.maximum(rmse, 1e-4), color=colour, lw=1.8, label=name
-                )
-        axis.set_xscale("log")
-        axis.set_yscale("log")
-        axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter(NullFormatter())
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
-        axis.set_xlim(t_s[0], t_s[-1])
-        axis.grid(alpha=0.3)
-        reading = READINGS[told[joint.name]["reading"]].split(":")[0]
-        axis.set_title(f"{joint.name}: {reading}", loc="left", fontsize=9)
-        remove_frame(axis)
-    figure.supxlabel("time of the free run [s]", fontsize=10)
-    figure.supylabel("RMSE [% of travel]", fontsize=10)
-    add_legend(figure, axes[0])
-    return figure
-
-
 def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
-    """Draw the gain of each rival, chosen ones in blue, and the gain by chance.
+    """Draw the gain of each rival, chosen ones in blue.
 
     Args:
         evidence: `rivals`: a list of `name`, `score`, `selected`; `threshold`: from which a rival
-            is believed; `null`: scores of simulated cases without a gap; `unit`: of the scores. All
-            but `rivals` may be missing.
+            is believed; `unit`: of the scores. All but `rivals` may be missing.
     """
     rows = sorted(evidence.get("rivals", []), key=lambda row: -row["score"])[:14]
     if not rows:
         return None
-    null, threshold = evidence.get("null") or [], evidence.get("threshold")
+    threshold = evidence.get("threshold")
     figure = make_figure(9.5, 1.2 + 0.3 * len(rows))
     axis = figure.add_subplot()
     for place, row in enumerate(rows):
@@ -274,11 +239,6 @@ def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
             va="center",
             fontsize=8,
         )
-    if len(null):
-        low, high = np.percentile(null, (2.5, 97.5))
-        axis.axvspan(
-            low, high, color="#999999", alpha=0.25, lw=0, label="chance: cases without a gap (95 %)"
-        )
     if threshold is not None:
         axis.axvline(threshold, color="black", ls="--", lw=1.0, label="to be believed")
     axis.set_yticks(range(len(rows)), [row["name"].replace("_", " ") for row in rows], fontsize=9)
@@ -286,66 +246,6 @@ def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
     axis.set_xlabel(evidence.get("unit", "what it earns on recordings that it was not fitted to"))
     if axis.get_legend_handles_labels()[0]:
         axis.legend(frameon=False, loc="lower right", fontsize=9)
-    remove_frame(axis)
-    return figure
-
-
-def draw_tip_budget(budget: Mapping[str, Any]) -> Figure:
-    """Draw how the joints' errors add up at the tip, and the tip error after the effects."""
-    before, after, floor = (budget[name] for name in ("before", "after", "floor"))
-    parts = sorted(before["joint_part"].items(), key=lambda pair: -pair[1])
-    whole = before["tip_rms_mm"]
-    figure = make_figure(9.5, 3.3)
-    axis = figure.add_subplot()
-    level, names = 0.0, []
-    for place, (joint, part) in enumerate(parts):
-        top = level + part
-        ends = [np.sqrt(max(value, 0.0)) * whole for value in (level, top)]
-        axis.bar(
-            place,
-            ends[1] - ends[0],
-            bottom=ends[0],
-            color=BEFORE,
-            alpha=0.35 + 0.65 * min(1.0, abs(part)),
-            width=0.62,
-        )
-        axis.annotate(
-            f"{round(100 * part)} %",
-            (place, max(ends)),
-            (0, 3),
-            textcoords="offset points",
-            ha="center",
-            fontsize=9,
-        )
-        axis.plot([place + 0.31, place + 0.69], [ends[1]] * 2, color="#777777", lw=0.8)
-        level = top
-        names.append(joint)
-    totals = [("before", before, BEFORE), ("after", after, AFTER), ("floor", floor, FLOOR)]
-    totals += [
-        (name, {"tip_rms_mm": value}, "#cc79a7") for name, value in budget["stages_mm"].items()
-    ]
-    for name, account, colour in totals:
-        if account is not None:
-            axis.bar(len(names), account["tip_rms_mm"], color=colour, width=0.62)
-            text = (
-                f"{account['tip_rms_mm']:.0f} mm"
-                if account["tip_rms_mm"] >= 10
-                else f"{account['tip_rms_mm']:.1f} mm"
-            )
-            axis.annotate(
-                text,
-                (len(names), account["tip_rms_mm"]),
-                (0, 3),
-                textcoords="offset points",
-                ha="center",
-                fontsize=9,
-            )
-            names.append(name)
-    axis.set_xticks(range(len(names)), names)
-    axis.set_ylabel("at the tool, RMS [mm]")
-    axis.set_ylim(
-        0.0, 1.15 * max(whole, *(one["tip_rms_mm"] for _, one, _ in totals if one is not None))
-    )
     remove_frame(axis)
     return figure
 

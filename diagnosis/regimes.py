@@ -1,4 +1,4 @@
-"""Regime, direction and load of each sample, so that every sample has one label of each kind.
+"""Regime of each sample.
 
 A joint answers its command a dead time later, so the label uses the command of that time.
 Axes: `T` rows, `J` joints.
@@ -6,14 +6,12 @@ Axes: `T` rows, `J` joints.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from actuators.recordings.split import COMMANDED
 from actuators.scales import scale_time
-from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -31,9 +29,6 @@ REGIMES = (
 near an end of its travel, else shortly after a change of direction (whatever time it rested in
 between), else shortly after rest, else by a small command, else together with other joints, else
 alone."""
-DIRECTIONS = ("not commanded", "extending", "retracting")
-LOADS = ("not commanded", "level", "lifting", "lowering")
-"""Against gravity, with it, or with less than `LEVEL` of the joint's largest load."""
 TRANSIENT_S = 0.6
 """Length of a transient on the reference of `actuators.scales`, s: lag, play and ringing are over after
 it; chosen by hand."""
@@ -41,58 +36,22 @@ NEAR_STOP = 0.05
 """Share of the travel near an end stop; chosen by hand."""
 CREEP_COMMAND = 0.3
 """Largest command of a creeping joint; chosen by hand: a usual dead band takes half of it."""
-LEVEL_LOAD = 0.1
-"""Share of the largest load below which a joint counts as level; chosen by hand."""
 
 
-@dataclass(frozen=True)
-class SampleGrouping:
-    """Labels of all samples by one criterion.
-
-    Attributes:
-        name: The criterion.
-        categories: Their names.
-        label: Number of the category of each sample, for each recording `(T, J)`.
-    """
-
-    name: str
-    categories: tuple[str, ...]
-    label: list[np.ndarray]
-
-
-def group_samples(
-    recordings: list[Recording], machine: Machine, dead_time_s: np.ndarray
-) -> list[SampleGrouping]:
-    """Return regime, direction and, where the masses are known, load of all samples.
+def label_recordings(
+    recordings: Sequence[Recording], machine: Machine, dead_time_s: np.ndarray
+) -> list[np.ndarray]:
+    """Return the number of the regime of each sample, for each recording `(T, J)`.
 
     Args:
         recordings: The recordings.
-        machine: Gives limits, period and masses.
+        machine: Gives limits and period.
         dead_time_s: Time from command to motion of each joint, `(J,)`.
     """
-    acting = [
-        shift_by_dead_time(recording.u, dead_time_s, 1.0 / recording.rate_hz)
-        for recording in recordings
-    ]
-    found = [
-        SampleGrouping(
-            "regime",
-            REGIMES,
-            [
-                label_regimes(u, r.q, machine, r.rate_hz)
-                for u, r in zip(acting, recordings, strict=True)
-            ],
-        ),
-        SampleGrouping("direction", DIRECTIONS, [label_directions(u) for u in acting]),
-    ]
-    if machine.has_bodies:
-        found.append(
-            SampleGrouping(
-                "load",
-                LOADS,
-                [label_loads(u, r.q, machine) for u, r in zip(acting, recordings, strict=True)],
-            )
-        )
+    found = []
+    for one in recordings:
+        acting = shift_by_dead_time(one.u, dead_time_s, 1.0 / one.rate_hz)
+        found.append(label_regimes(acting, one.q, machine, one.rate_hz))
     return found
 
 
@@ -131,24 +90,6 @@ def label_regimes(
         others,
     ]
     return np.select(conditions, range(len(conditions)), len(conditions))
-
-
-def label_directions(acting: np.ndarray) -> np.ndarray:
-    """Return the number of the direction of each sample, `(T, J)`."""
-    return np.where(np.abs(acting) <= COMMANDED, 0, np.where(acting > 0, 1, 2))
-
-
-def label_loads(acting: np.ndarray, q: np.ndarray, machine: Machine) -> np.ndarray:
-    """Return the number of the kind of load of each sample, `(T, J)`."""
-    load = (
-        Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
-    )
-    largest = np.maximum(np.abs(load).max(0), 1e-9)
-    pushed = load * np.sign(acting)
-    kind = np.where(np.abs(load) < LEVEL_LOAD * largest, 1, np.where(pushed < 0, 2, 3))
-    # a joint about the vertical carries nothing: its tiny load is rounding
-    kind = np.where(largest < 1e-3 * largest.max(), 1, kind)
-    return np.where(np.abs(acting) <= COMMANDED, 0, kind)
 
 
 def _hold_last_sign(sign: np.ndarray) -> np.ndarray:

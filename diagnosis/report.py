@@ -11,8 +11,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.report import Cell, Report, Tone
 from diagnosis import plots, report_checks
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
-from diagnosis.error_growth import READINGS
-from diagnosis.probes import CLEAR_Z
 
 GOOD_CLOSED = 0.5
 """Closed share of the gap from which the headline is good news; chosen by hand."""
@@ -186,6 +184,7 @@ def _format_share(value: Estimate, of: str = "") -> str:
 
 REPORT_FILE = "report.html"
 SEVERITIES = {"bad": "severe", "warn": "check it", "note": "good to know"}
+BEYOND_CHANCE = "beyond chance"
 MAX_LISTED = 8
 """Most rows of a list; the rest is folded. Chosen by hand: a screen."""
 
@@ -230,12 +229,10 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         f"starts anew every {choose_horizon_s(machine):g} s (thin lines). Black: measured; red: simulated as it was; blue: "
         "simulated with the effects.",
     )
-    _add_growth(page, outcome, machine, units)
     _add_evidence(page, more)
     _add_stages(page, more)
     _add_next_experiment(page, answer)
     _add_sanity(page, more)
-    _add_all_parts(page, more)
     page.write(folder / REPORT_FILE)
 
 
@@ -340,78 +337,60 @@ def _add_where(page: Report, outcome: Outcome, machine: Machine, units: Mapping[
     )
     rows = []
     for name, joint in location["joints"].items():
-        sure = "beyond chance" if joint["is_sure"] else ""
+        sure = BEYOND_CHANCE if joint["is_sure"] else ""
         row = [f"{name} [m{units[name]}]", _scale(joint["rmse"]), _scale(joint["floor"])]
         rows.append([*row, f"{100 * joint['error']:.0f}", Cell(f"{100 * joint['gap']:.0f}", sure)])
     columns = ["joint", "error", "floor", "% of the error", "% of the gap"]
     page.add_table(columns, rows, "Root mean square error of free runs")
     if not location["has_gap"]:
         page.add_text("No joint exceeds its floor beyond chance; the shares are noise.", "warn")
-    if location["blocks"]:
-        page.add_text(
-            f"Permutation test: {location['blocks']} change sides between field and reference; "
-            "false discovery rate of 5 %."
+    with page.add_details("All parts of the gap"):
+        page.add_table(
+            ["joint", "regime", "% of the time", "% of the error", "% of the gap", "p"],
+            _list_parts(location["parts"]),
+            "Error and gap add up to 100; p: probability of so large an error by chance, by a permutation "
+            "test over parts of 30 s of the recordings; false discovery rate of 5 %.",
         )
 
 
-def _add_growth(page: Report, outcome: Outcome, machine: Machine, units: Mapping[str, str]) -> None:
-    location = outcome.answer.more.get("location")
-    if not location:
-        return
-    page.add_heading("Growth of the error")
-    page.add_picture(
-        plots.draw_growth(outcome, machine),
-        "Error over the time of a free run; its slope beyond the floor suggests the kind of cause.",
-    )
-    rows = []
-    for name, growth in location["growth"].items():
-        errors = [f"{1e3 * value:.2f}" for value in growth["rmse"]]
-        whole = None if growth["whole_run"] is None else f"{1e3 * growth['whole_run']:.0f}"
-        rows.append([f"{name} [m{units[name]}]", *errors, whole, READINGS[growth["reading"]]])
-    horizons = [f"{value:g} s" for value in next(iter(location["growth"].values()))["horizon_s"]]
-    columns = ["joint", *horizons, "whole run", "kind"]
-    page.add_table(columns, rows, "Root mean square error at the end of free runs")
+def _list_parts(parts: Sequence[Mapping[str, Any]]) -> list[list[str | Cell | None]]:
+    rows: list[list[str | Cell | None]] = []
+    for part in parts:
+        if part["time"] <= 0:
+            continue
+        p = None
+        if part["p"] is not None:
+            p = Cell(f"{part['p']:.4f}", BEYOND_CHANCE if part["is_sure"] else "")
+        shares = [f"{100 * part[key]:.1f}" for key in ("time", "error", "gap")]
+        rows.append([part["joint"], part["category"], *shares, p])
+    return rows
 
 
 def _add_evidence(page: Report, more: Mapping[str, Any]) -> None:
-    evidence, probes = more.get("evidence"), more.get("probes", [])
+    evidence = more.get("evidence")
     figure = plots.draw_rivals(evidence) if isinstance(evidence, Mapping) else None
-    if figure or probes:
-        page.add_heading("Why these effects and not others")
     if figure:
+        page.add_heading("Why these effects and not others")
         page.add_picture(figure, "Gain of each rival on held-out recordings; blue: chosen.")
-    if not probes:
-        return
-    page.add_text(
-        "Traces in the residual, compared with the reference, and the effects behind them:"
-    )
-    texts = []
-    for probe in probes:
-        if abs(probe["z"]) > CLEAR_Z:
-            texts.append(f"{probe['text']} – as {name_effect(probe['effect'])} does")
-    page.add_list(texts[:MAX_LISTED] or ["no trace stands out"])
 
 
 def _add_stages(page: Report, more: Mapping[str, Any]) -> None:
-    stages, budget = more.get("stages", []), more.get("budget")
+    stages, tip = more.get("stages", []), more.get("tip")
     if not stages:
         return
     page.add_heading("At the tool, and by stage")
-    if budget:
-        page.add_picture(
-            plots.draw_tip_budget(budget),
-            "Red steps: how the errors of the joints add up to the error of the tip over free runs "
-            "of 5 s (as squares; one against the others goes down). Then the error of the tip "
-            "before, after, the floor, and other stages.",
-        )
-        names = [name for name in ("before", "after", "floor") if budget[name]]
+    if tip:
         rows = []
-        for joint, part in budget["before"]["joint_part"].items():
-            alone = [f"{budget[name]['joint_rms_mm'][joint]:.1f}" for name in names]
-            rows.append([joint, *alone, f"{100 * part:.0f}"])
-        rows.append(["tip", *(f"{budget[name]['tip_rms_mm']:.1f}" for name in names), "100"])
-        columns = ["", *(f"{name}, mm" for name in names), "% before"]
-        page.add_table(columns, rows, "Displacement of the tool by the error of each joint, RMS")
+        for joint in tip["before"]["joint_part"]:
+            parts = [f"{100 * one['joint_part'][joint]:.0f}" for one in tip.values()]
+            rows.append([f"% by {joint}", *parts])
+        rows.append(["RMS, mm", *(_scale(one["tip_rms_m"]) for one in tip.values())])
+        page.add_table(
+            ["", *tip],
+            rows,
+            "Distance of the simulated from the measured tool over free runs, and the parts of the "
+            "joints in its square; one that cancels others is below 0",
+        )
     rows = []
     for stage in stages:
         part = None if stage["part"] is None else f"{100 * stage['part']:.0f}"
@@ -458,29 +437,6 @@ def _add_sanity(page: Report, more: Mapping[str, Any]) -> None:
     if len(rows) > MAX_LISTED:
         with page.add_details(f"{len(rows) - MAX_LISTED} more"):
             page.add_table(columns, rows[MAX_LISTED:])
-
-
-def _add_all_parts(page: Report, more: Mapping[str, Any]) -> None:
-    location = more.get("location")
-    if not location:
-        return
-    page.add_heading("All parts of the gap")
-    for name, parts in location["parts"].items():
-        rows = []
-        for part in parts:
-            if part["time"] <= 0:
-                continue
-            p = None
-            if part["p"] is not None:
-                p = Cell(f"{part['p']:.4f}", "beyond chance" if part["is_sure"] else "")
-            shares = [f"{100 * part[key]:.1f}" for key in ("time", "error", "gap")]
-            rows.append([part["joint"], part["category"], *shares, p])
-        with page.add_details(f"by {name}"):
-            page.add_table(
-                ["joint", name, "% of the time", "% of the error", "% of the gap", "p"],
-                rows,
-                "Error and gap add up to 100; p: probability of so large an error by chance.",
-            )
 
 
 def _scale(value: float | None) -> str | None:

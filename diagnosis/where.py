@@ -1,67 +1,125 @@
-"""Location of the gap by joint, regime, direction, load, frequency and running time.
+"""Location of the gap: one table of joints and regimes.
 
 The floor is the error of the same simulator on reference recordings that it was not fitted to. The
-gap is the error beyond the floor and beyond one standard error. Each grouping splits error and gap
-completely: parts add up to 1 over joints and categories.
+gap is the error beyond the floor and beyond one standard error. The table splits error and gap
+completely: its cells add up to 1 over joints and regimes.
 
 An error of position stays after its cause is over, so it is traced to its origin: the error of a
-window is the sum of its increments, `e = Σ_c e_c` with `e_c` those of the samples in category `c`,
-and `Σ_t e_c(t) e(t)` is the part of the squared error of category `c`. The parts add up exactly; a
-negative part works against the others. Frequency bands add up by Parseval's theorem, recordings and
-running time by windows.
-Axes: `W` windows, `K` steps, `J` joints, `C` categories.
+window is the sum of its increments, `e = Σ_c e_c` with `e_c` those of the samples in regime `c`,
+and `Σ_t e_c(t) e(t)` is the part of the squared error of regime `c`. The parts add up exactly; a
+negative part works against the others.
+
+Samples of one recording are dependent, so parts of `PART_S` of a recording change sides in the
+permutation test, never samples.
+Axes: `W` windows, `K` steps, `J` joints, `C` regimes, `B` parts.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import false_discovery_control
 
 from actuators.scales import scale_time
 from brokk_rl.machine import Machine
-from diagnosis.error_growth import ErrorGrowth, measure_growth
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.permutation_test import (
-    FALSE_DISCOVERY_RATE,
-    adjust_p_values,
-    assign_blocks,
-    compute_excess_p,
-    estimate_standard_error,
-    sum_by_block,
-)
-from diagnosis.regimes import SampleGrouping, group_samples
-from diagnosis.sanity import name_recording
+from diagnosis.regimes import REGIMES, label_recordings
 
-BANDS_HZ = (0.3, 1.0, 3.0)
-"""Bounds of the frequency bands, Hz; chosen by hand: drift, motion, valve, vibration."""
-NUM_AGES = 4
-"""Number of parts of the running time; chosen by hand."""
 INCREMENT_S = 0.25
 """Time of the increments that the tests compare on the reference of `actuators.scales`, s; chosen by
 hand: increments are less dependent than the error, which stays."""
+PART_S = 30.0
+"""Length of the parts of recordings, s; chosen by hand: six windows of 5 s."""
+NUM_PERMUTATIONS = 2000
+"""Random permutations; the smallest p is 1 / 2001."""
+FALSE_DISCOVERY_RATE = 0.05
+"""The usual level."""
+TINY = np.finfo(float).tiny
+"""Smallest divisor: a sum of squares may be 0."""
 
 
 @dataclass(frozen=True)
-class GroupSums:
-    """Sums of each window by joint and category, all `(W, J, C)`.
+class GapPart:
+    """Share of one joint in one regime in error and gap.
 
     Attributes:
-        categories: Their names.
+        joint: The joint.
+        category: The regime, one of `regimes.REGIMES`.
+        time: Part of the joint's time that it takes.
+        error: Its part of the whole squared error of all joints; all add up to 1.
+        gap: Its part of the excess over the floor; these add up to 1 as well, none is negative.
+        p: How probable so large an excess would be by chance; `None` without a floor, or where the
+            reference never was.
+        is_sure: It holds with at most 5 % false discoveries among all that are sure.
+    """
+
+    joint: str
+    category: str
+    time: float
+    error: float
+    gap: float
+    p: float | None
+    is_sure: bool
+
+
+@dataclass(frozen=True)
+class JointError:
+    """Error of one joint over the horizon of the free runs.
+
+    Attributes:
+        rmse: Root mean square error, rad or m.
+        floor: The same on the reference; 0 without one.
+        error: Its part of the squared error of all joints (of travel, where units differ).
+        gap: Its part of the excess over the floor; of the squared error where nothing exceeds it.
+        is_sure: It exceeds the floor in one of its regimes for sure.
+    """
+
+    rmse: float
+    floor: float
+    error: float
+    gap: float
+    is_sure: bool
+
+
+@dataclass(frozen=True)
+class GapLocation:
+    """Location of the gap.
+
+    Attributes:
+        joints: By joint.
+        parts: Of each joint and regime.
+        has_gap: A joint exceeds its floor for sure; without a reference there is no telling, and
+            this is true.
+    """
+
+    joints: dict[str, JointError]
+    parts: list[GapPart]
+    has_gap: bool
+
+    def largest(self) -> list[GapPart]:
+        """Return the parts, the largest of the gap first."""
+        return sorted(self.parts, key=lambda part: -part.gap)
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as plain JSON data."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class _PartSums:
+    """Sums over the windows of each part of a recording, all `(B, J, C)`.
+
+    Attributes:
         square: Part of the squared error.
-        tested: Quantity that the tests compare: of a band, its part of the squared error; else the
-            increment of the error
-            within `INCREMENT_S`: within a category its size (a few windows would decide its square), of
-                a joint as a whole its square
-            (in the mean size a short regime would drown).
+        added: Absolute increments of the error within `INCREMENT_S`, which the test compares: a few
+            windows would decide their squares.
         count: Samples.
     """
 
-    categories: tuple[str, ...]
     square: np.ndarray
-    tested: np.ndarray
+    added: np.ndarray
     count: np.ndarray
 
 
@@ -78,182 +136,14 @@ def trace_to_origin(error: np.ndarray, label: np.ndarray, num_categories: int) -
     return np.stack([np.cumsum(added * (label == c), 1) for c in range(num_categories)]) * given
 
 
-def sum_by_joint(runs: WindowedRuns, machine: Machine) -> GroupSums:
-    """Return the sums of each joint as a single category."""
-    count = np.isfinite(runs.error).sum(1)[..., None].astype(float)
-    return GroupSums(
-        ("",),
-        np.nansum(runs.error**2, 1)[..., None],
-        (_measure_increments(runs, machine) ** 2).sum(1)[..., None],
-        count,
-    )
-
-
-def sum_by_condition(
-    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
-) -> dict[str, GroupSums]:
-    """Return the sums by regime, direction, load (where masses are known) and frequency."""
-    found = {}
-    for dimension in group_samples(list(runs.recordings), machine, dead_time_s):
-        found[dimension.name] = _sum_by_origin(runs, dimension, machine)
-    return found | {"frequency": _sum_by_band(runs, machine)}
-
-
-def sum_by_time(runs: WindowedRuns, machine: Machine) -> dict[str, GroupSums]:
-    """Return the sums by recording and by running time, which are those of whole windows."""
-    edges = np.linspace(runs.elapsed_s.min(), runs.elapsed_s.max(), NUM_AGES + 1)
-    age = np.clip(np.searchsorted(edges, runs.elapsed_s, "right") - 1, 0, NUM_AGES - 1)
-    whole = sum_by_joint(runs, machine)
-
-    def sums(names: tuple[str, ...], label: np.ndarray) -> GroupSums:
-        belongs = label[:, None, None] == np.arange(len(names))
-        return GroupSums(
-            names, whole.square * belongs, whole.tested * belongs, whole.count * belongs
-        )
-
-    ages = tuple(f"{low:.0f} to {high:.0f} s" for low, high in pairwise(edges))
-    return {
-        "running time": sums(ages, age),
-        "recording": sums(tuple(map(name_recording, runs.recordings)), runs.source),
-    }
-
-
-def _measure_increments(runs: WindowedRuns, machine: Machine) -> np.ndarray:
-    """Return the absolute increment of the error within `INCREMENT_S`, `(W, K, J)`."""
-    span = max(1, round(scale_time(machine, INCREMENT_S) / machine.period_s))
-    before = np.pad(runs.error, ((0, 0), (span, 0), (0, 0)))[:, : runs.error.shape[1]]
-    return np.nan_to_num(np.abs(runs.error - before))
-
-
-def _sum_by_origin(runs: WindowedRuns, dimension: SampleGrouping, machine: Machine) -> GroupSums:
-    label, names = runs.cut(dimension.label), dimension.categories
-    error, added = np.nan_to_num(runs.error), _measure_increments(runs, machine)
-    square = (trace_to_origin(runs.error, label, len(names)) * error).sum(2)
-    belongs = np.stack([label == c for c in range(len(names))])
-    return GroupSums(
-        names,
-        np.moveaxis(square, 0, 2),
-        np.moveaxis((added * belongs).sum(2), 0, 2),
-        np.moveaxis(belongs.sum(2).astype(float), 0, 2),
-    )
-
-
-def _sum_by_band(runs: WindowedRuns, machine: Machine) -> GroupSums:
-    """Split by Parseval's theorem; the error after the end of a recording counts as 0."""
-    error = np.nan_to_num(runs.error)
-    power = np.abs(np.fft.rfft(error, axis=1)) ** 2 / error.shape[1]
-    hertz = np.fft.rfftfreq(error.shape[1], machine.period_s)
-    power[:, (hertz > 0) & (hertz < 0.5 / machine.period_s - 1e-9)] *= 2.0  # the mirrored half
-    bands = []
-    for low, high in pairwise((0.0, *BANDS_HZ, np.inf)):
-        bands.append(power[:, (hertz >= low) & (hertz < high)].sum(1))
-    square = np.stack(bands, 2)
-    names = (
-        f"below {BANDS_HZ[0]:g} Hz",
-        *(f"{a:g} to {b:g} Hz" for a, b in pairwise(BANDS_HZ)),
-        f"above {BANDS_HZ[-1]:g} Hz",
-    )
-    count = np.repeat(np.isfinite(runs.error).sum(1)[..., None].astype(float), len(names), 2)
-    return GroupSums(names, square, square, count)
-
-
-TINY = np.finfo(float).tiny
-"""Smallest divisor: a sum of squares may be 0."""
-
-
-@dataclass(frozen=True)
-class GapPart:
-    """Share of one category of one joint in error and gap.
-
-    Attributes:
-        joint: The joint.
-        category: The category.
-        time: Part of the joint's time that it takes.
-        error: Its part of the whole squared error of all joints; those of one dimension add up to
-            1.
-        gap: Its part of the excess over the floor; these add up to 1 as well, none is negative.
-        p: How probable so large an excess would be by chance; `None` without a floor, or where the
-            reference never was.
-        is_sure: It holds with at most 5 % false discoveries among all that are sure.
-    """
-
-    joint: str
-    category: str
-    time: float
-    error: float
-    gap: float
-    p: float | None
-    is_sure: bool
-
-    def plain(self) -> dict[str, Any]:
-        """Return it as plain JSON data."""
-        found = {}
-        for name, value in self.__dict__.items():
-            found[name] = round(value, 6) if isinstance(value, float) else value
-        return found
-
-
-@dataclass(frozen=True)
-class JointError:
-    """Error of one joint over the horizon of the free runs.
-
-    Attributes:
-        rmse: Root mean square error, rad or m.
-        floor: The same on the reference; 0 without one.
-        error: Its part of the squared error of all joints (of travel, where units differ).
-        gap: Its part of the excess over the floor; of the squared error where nothing exceeds it.
-        p: How probable so large an excess would be by chance.
-        is_sure: It exceeds the floor, with at most 5 % false discoveries among the joints.
-    """
-
-    rmse: float
-    floor: float
-    error: float
-    gap: float
-    p: float | None
-    is_sure: bool
-
-
-@dataclass(frozen=True)
-class GapLocation:
-    """Location of the gap.
-
-    Attributes:
-        joints: By joint.
-        parts: By dimension (`regime`, `direction`, `load`, `frequency`, `running time`,
-            `recording`).
-        growth: By joint.
-        blocks: Unit that changed sides in the tests; empty without a reference.
-        has_gap: A joint exceeds its floor for sure; without a reference there is no telling, and
-            this is true.
-    """
-
-    joints: dict[str, JointError]
-    parts: dict[str, list[GapPart]]
-    growth: dict[str, ErrorGrowth]
-    blocks: str
-    has_gap: bool
-
-    def totals(self, dimension: str) -> dict[str, float]:
-        """Return the part of the gap of each category, all joints together."""
-        found: dict[str, float] = {}
-        for part in self.parts[dimension]:
-            found[part.category] = found.get(part.category, 0.0) + part.gap
-        return found
-
-    def largest(self, dimension: str = "regime") -> list[GapPart]:
-        """Return the parts of one dimension, the largest of the gap first."""
-        return sorted(self.parts[dimension], key=lambda part: -part.gap)
-
-    def plain(self) -> dict[str, Any]:
-        """Return it as plain JSON data."""
-        return {
-            "joints": {name: joint.__dict__ for name, joint in self.joints.items()},
-            "parts": {name: [part.plain() for part in parts] for name, parts in self.parts.items()},
-            "growth": {name: growth.plain() for name, growth in self.growth.items()},
-            "blocks": self.blocks,
-            "has_gap": self.has_gap,
-        }
+def number_parts(runs: WindowedRuns) -> np.ndarray:
+    """Return the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
+    begin_s = []
+    for source, row in zip(runs.source, runs.row, strict=True):
+        t_s = runs.recordings[source].t_s
+        begin_s.append(t_s[row] - t_s[0])
+    place = np.stack([runs.source, np.array(begin_s) // PART_S], 1)
+    return np.unique(place, axis=0, return_inverse=True)[1].ravel()
 
 
 def locate_gap(
@@ -262,7 +152,6 @@ def locate_gap(
     machine: Machine,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
-    whole: WindowedRuns | None = None,
 ) -> GapLocation:
     """Return where the gap lies.
 
@@ -273,120 +162,115 @@ def locate_gap(
         machine: Gives joints, limits, period and masses.
         dead_time_s: Time from command to motion of each joint, `(J,)`.
         generator: Draws the permutations.
-        whole: Free runs through whole field recordings, for the growth beyond the windows.
     """
-    judge = _GapTest(runs, reference, machine, generator)
-    joints = judge.joints()
-    own = {**sum_by_condition(runs, machine, dead_time_s), **sum_by_time(runs, machine)}
-    floor = sum_by_condition(reference, machine, dead_time_s) if reference else {}
-    parts = {name: judge.parts(sums, floor.get(name), joints) for name, sums in own.items()}
-    has_gap = reference is None or any(joint.is_sure for joint in joints.values())
-    return GapLocation(
-        joints, parts, measure_growth(runs, reference, machine, whole), judge.unit, has_gap
-    )
-
-
-class _GapTest:
-    """Comparison of field and reference: the excess over the floor and its p-values."""
-
-    def __init__(
-        self,
-        runs: WindowedRuns,
-        reference: WindowedRuns | None,
-        machine: Machine,
-        generator: np.random.Generator,
-    ) -> None:
-        self._machine, self._generator = machine, generator
-        # Metres and radians do not add up, so mixed joints count by their travel.
-        alike = len({joint.unit for joint in machine.joints}) == 1
-        self._weight = (
-            np.ones(machine.num_joints) if alike else (machine.upper - machine.lower) ** -2.0
-        )
-        self._mine = sum_by_joint(runs, machine)
-        self._floor = sum_by_joint(reference, machine) if reference else None
-        self._blocks = assign_blocks(runs, reference) if reference else None
-        self.unit = self._blocks.unit if self._blocks else ""
-
-    def joints(self) -> dict[str, JointError]:
-        """Return the error of each joint."""
-        mean, base = _average_square(self._mine), self._floor_mean()
-        rmse, floor = np.sqrt(mean).tolist(), np.sqrt(base).tolist()
-        count = self._mine.count.sum(0)[:, 0]
-        error = mean * count * self._weight
-        error = error / max(error.sum(), TINY)
-        chance = self._chance(self._mine, self._floor)[:, 0]
-        excess = (
-            _take_first_positive(mean - base - chance, mean - base, mean) * count * self._weight
-        )
-        gap = excess / max(excess.sum(), TINY)
-        p = self._p(self._mine, self._floor)[:, 0]
-        sure = adjust_p_values(p) <= FALSE_DISCOVERY_RATE
-        found = {}
-        for j, name in enumerate(self._machine.joint_names):
-            found[name] = JointError(
-                rmse[j], floor[j], float(error[j]), float(gap[j]), _drop_nan(p[j]), bool(sure[j])
-            )
-        return found
-
-    def parts(
-        self, sums: GroupSums, floor: GroupSums | None, joints: dict[str, JointError]
-    ) -> list[GapPart]:
-        """Return the parts of one grouping; without reference samples the joint's floor counts."""
-        square, count = sums.square.sum(0), sums.count.sum(0)
-        expected = self._floor_mean()[:, None] * count
-        if floor is not None:
-            seen = floor.count.sum(0)
-            expected = np.where(
-                seen > 0, floor.square.sum(0) / np.maximum(seen, 1.0) * count, expected
-            )
-        chance = self._chance(sums, floor) * count
+    field = _sum_parts(runs, machine, dead_time_s)
+    floor = _sum_parts(reference, machine, dead_time_s) if reference else None
+    square, count = field.square.sum(0), field.count.sum(0)
+    whole, time = square.sum(1), np.maximum(count.sum(1), 1.0)
+    base = np.zeros(len(whole))
+    expected, p = np.zeros_like(square), np.full(square.shape, np.nan)
+    chance, joint_chance = np.zeros_like(square), np.zeros(len(whole))
+    if floor is not None:
+        seen = floor.count.sum(0)
+        base = floor.square.sum((0, 2)) / np.maximum(seen.sum(1), 1.0)
+        own = floor.square.sum(0) / np.maximum(seen, 1.0)
+        # Where the reference never was in a regime, the floor of the joint counts.
+        expected = np.where(seen > 0, own, base[:, None]) * count
+        chance = _estimate_chance(field, floor) * count
+        joint_chance = _estimate_chance(_sum_regimes(field), _sum_regimes(floor))[:, 0] * time
+        p = _test_excess(field, floor, generator)
+    # Metres and radians do not add up, so mixed joints count by their travel.
+    is_alike = len({joint.unit for joint in machine.joints}) == 1
+    travel = np.ones(len(whole)) if is_alike else machine.upper - machine.lower
+    weight = travel**-2.0
+    beyond = _take_first_positive(whole - base * time - joint_chance, whole - base * time, whole)
+    joint_gap = _normalise(beyond * weight)
+    error = _normalise(whole * weight)
+    is_sure = _adjust_p_values(p) <= FALSE_DISCOVERY_RATE
+    joints, parts = {}, []
+    for j, name in enumerate(machine.joint_names):
         # A joint keeps parts that add up to 1 even where nothing exceeds the floor for sure.
-        rows = zip(square - expected - chance, square - expected, square, strict=True)
-        excess = np.stack([_take_first_positive(*row) for row in rows])
-        within = excess / np.maximum(excess.sum(1, keepdims=True), TINY)
-        gap = within * np.array([joint.gap for joint in joints.values()])[:, None]
-        error = square * self._weight[:, None]
-        error = error / max(self._mine.square.sum((0, 2)) @ self._weight, TINY)
-        time = count / np.maximum(self._mine.count.sum(0), 1.0)
-        p = self._p(sums, floor)
-        sure = adjust_p_values(p) <= FALSE_DISCOVERY_RATE
-        found = []
-        for j, name in enumerate(self._machine.joint_names):
-            for c, category in enumerate(sums.categories):
-                shares = (float(time[j, c]), float(error[j, c]), float(gap[j, c]))
-                found.append(GapPart(name, category, *shares, _drop_nan(p[j, c]), bool(sure[j, c])))
-        return found
-
-    def _floor_mean(self) -> np.ndarray:
-        return _average_square(self._floor) if self._floor else np.zeros(self._machine.num_joints)
-
-    def _chance(self, mine: GroupSums, floor: GroupSums | None) -> np.ndarray:
-        """Return the standard error of the excess over the floor, per sample, `(J, C)`."""
-        shape = mine.square.shape[1:]
-        if floor is None or self._blocks is None:
-            return np.zeros(shape)
-        square = np.zeros(shape)
-        # Field and reference are independent, so their variances add up.
-        for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference)):
-            error = estimate_standard_error(
-                _sum_blocks(sums.square, block), _sum_blocks(sums.count, block)
+        more = square[j] - expected[j]
+        within = _normalise(_take_first_positive(more - chance[j], more, square[j]))
+        joints[name] = JointError(
+            float(np.sqrt(whole[j] / time[j])),
+            float(np.sqrt(base[j])),
+            float(error[j]),
+            float(joint_gap[j]),
+            bool(is_sure[j].any()),
+        )
+        for c, regime in enumerate(REGIMES):
+            part = GapPart(
+                name,
+                regime,
+                float(count[j, c] / time[j]),
+                float(error[j] * square[j, c] / max(whole[j], TINY)),
+                float(joint_gap[j] * within[c]),
+                float(p[j, c]) if np.isfinite(p[j, c]) else None,
+                bool(is_sure[j, c]),
             )
-            square += np.nan_to_num(error.reshape(shape)) ** 2
-        return np.sqrt(square)
-
-    def _p(self, mine: GroupSums, floor: GroupSums | None) -> np.ndarray:
-        """Return p of each joint and category, `(J, C)`; NaN without a floor."""
-        shape = mine.square.shape[1:]
-        if floor is None or self._blocks is None:
-            return np.full(shape, np.nan)
-        own, other = self._blocks.field, self._blocks.reference
-        field = (_sum_blocks(mine.tested, own), _sum_blocks(mine.count, own))
-        reference = (_sum_blocks(floor.tested, other), _sum_blocks(floor.count, other))
-        return compute_excess_p(field, reference, self._generator).reshape(shape)
+            parts.append(part)
+    return GapLocation(joints, parts, floor is None or bool(is_sure.any()))
 
 
-def _sum_blocks(values: np.ndarray, block: np.ndarray) -> np.ndarray:
-    return sum_by_block(values.reshape(len(block), -1), block)
+def _sum_parts(runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray) -> _PartSums:
+    label = runs.cut(label_recordings(runs.recordings, machine, dead_time_s))
+    traced = trace_to_origin(runs.error, label, len(REGIMES))
+    belongs = np.stack([label == c for c in range(len(REGIMES))])
+    span = max(1, round(scale_time(machine, INCREMENT_S) / machine.period_s))
+    before = np.pad(runs.error, ((0, 0), (span, 0), (0, 0)))[:, : runs.error.shape[1]]
+    added = np.nan_to_num(np.abs(runs.error - before))
+    number = number_parts(runs)
+    sums = []
+    for values in (traced * np.nan_to_num(runs.error), added * belongs, belongs):
+        by_window = np.moveaxis(values.sum(2).astype(float), 0, 2)
+        by_part = np.zeros((number.max() + 1, *by_window.shape[1:]))
+        np.add.at(by_part, number, by_window)
+        sums.append(by_part)
+    return _PartSums(*sums)
+
+
+def _sum_regimes(sums: _PartSums) -> _PartSums:
+    """Return the sums of each joint as a single regime."""
+    every = (sums.square, sums.added, sums.count)
+    return _PartSums(*(values.sum(2, keepdims=True) for values in every))
+
+
+def _estimate_chance(field: _PartSums, floor: _PartSums) -> np.ndarray:
+    """Return the standard error of the excess over the floor, per sample, `(J, C)`.
+
+    Source: the ratio estimator's, Cochran 1977, section 2.11; both sides are independent.
+    """
+    variance = np.zeros(field.square.shape[1:])
+    for side in (field, floor):
+        num_parts = len(side.square)
+        if num_parts < 2:
+            continue
+        total = np.maximum(side.count.sum(0), 1.0)
+        off = side.square - side.square.sum(0) / total * side.count
+        variance += num_parts / (num_parts - 1) * (off**2).sum(0) / total**2
+    return np.sqrt(variance)
+
+
+def _test_excess(field: _PartSums, floor: _PartSums, generator: np.random.Generator) -> np.ndarray:
+    """Return how probable so large a mean increment would be by chance, `(J, C)`.
+
+    NaN where one side never visited the regime.
+    """
+    added = np.concatenate([field.added, floor.added])
+    count = np.concatenate([field.count, floor.count])
+    is_field = np.arange(len(count)) < len(field.count)
+    drawn = generator.permuted(np.tile(is_field, (NUM_PERMUTATIONS, 1)), axis=1)
+    sides = np.concatenate([is_field[None], drawn]).astype(float)  # the first is the observation
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mine = np.tensordot(sides, added, 1) / np.tensordot(sides, count, 1)
+        others = np.tensordot(1.0 - sides, added, 1) / np.tensordot(1.0 - sides, count, 1)
+        difference = mine - others
+        seen = difference[0]
+        # A draw in which one side never visits the regime says nothing against chance; rounding
+        # must not tell equals apart.
+        is_larger = ~(difference < seen - 1e-12 * np.abs(seen))
+    return np.where(np.isfinite(seen), is_larger.mean(0), np.nan)
 
 
 def _take_first_positive(*choices: np.ndarray) -> np.ndarray:
@@ -397,10 +281,14 @@ def _take_first_positive(*choices: np.ndarray) -> np.ndarray:
     return np.zeros_like(choices[-1])
 
 
-def _average_square(sums: GroupSums) -> np.ndarray:
-    """Return the mean squared error of each joint, `(J,)`."""
-    return sums.square.sum(0)[:, 0] / np.maximum(sums.count.sum(0)[:, 0], 1.0)
+def _normalise(values: np.ndarray) -> np.ndarray:
+    return values / max(float(values.sum()), TINY)
 
 
-def _drop_nan(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+def _adjust_p_values(p: np.ndarray) -> np.ndarray:
+    """Return p adjusted for the false discovery rate (Benjamini and Hochberg 1995); NaN stays NaN."""
+    found = np.full(p.shape, np.nan)
+    given = np.isfinite(p)
+    if given.any():
+        found[given] = false_discovery_control(p[given])
+    return found
