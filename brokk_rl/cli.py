@@ -22,13 +22,13 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 import brokk_rl
-from brokk_rl import distributed, extensions, gpu_pool
+from brokk_rl import distributed, extensions
 from brokk_rl.arguments import read_arguments
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.explain import compose_choices, explain, list_sources
 from brokk_rl.help import add_comments, collect_comments, describe_command, describe_mode
 from brokk_rl.sim import probe
-from brokk_rl.sweep import SweepFolder
+from brokk_rl.sweep import SweepFolder, take_place
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ def run_job(cfg: DictConfig) -> float | None:
     """Run one composed configuration: the whole command, or one job of a sweep."""
     set_up_logging()  # A launcher may run the job in a process of its own.
     try:
-        with gpu_pool.take_place():
+        with take_place():
             from brokk_rl.job import run
 
             return run(cfg)

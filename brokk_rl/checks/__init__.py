@@ -8,11 +8,14 @@ option of each config group; an extension over its own:
         check_actuator(MyActuator(gain=1.0), machine)
 """
 
-from brokk_rl.checks.actuator import check_actuator, check_actuator_model, check_effect
-from brokk_rl.checks.excitation import check_excitation
+from brokk_rl.checks.actuator import (
+    check_actuator,
+    check_actuator_model,
+    check_effect,
+    check_follower,
+)
 from brokk_rl.checks.exercise import NUM_ENVS
-from brokk_rl.checks.follower import check_follower
-from brokk_rl.checks.link import check_link
+from brokk_rl.checks.link import check_excitation, check_link
 from brokk_rl.checks.perception import check_finder
 from brokk_rl.checks.task import check_task
 from brokk_rl.checks.world import check_world

@@ -303,7 +303,7 @@ def _embed_meshes(spec: mujoco.MjSpec, source: ModelSource, packages: Sequence[s
             mesh.file = str(file.resolve())
             continue
         data = _load_mesh(file) if file else None
-        if data is None:
+        if file is None or data is None:
             missing.append(mesh.file)
             for geom in [one for one in spec.geoms if one.meshname == mesh.name]:
                 spec.delete(geom)
@@ -433,7 +433,8 @@ def _read_limits(source: ModelSource) -> None:
         if kind is None:
             continue
         if model.jnt_limited[joint]:
-            _read_travel(found, *map(float, model.jnt_range[joint]), kind, name, source)
+            lower, upper = model.jnt_range[joint].tolist()
+            _read_travel(found, lower, upper, kind, name, source)
         if model.jnt_actfrclimited[joint]:
             found.effort = float(model.jnt_actfrcrange[joint, 1])
         if found.speed and found.is_doubted:
