@@ -135,7 +135,7 @@ def test_actuator_and_effects_are_chosen_as_everywhere(
         "collect.num_runs=1",
         "collect.run_minutes=0.4",
         "collect.file_minutes=0.4",
-        "~preview",
+        "preview=null",
     )
     chosen = (
         "actuator=hydraulic",

@@ -252,7 +252,7 @@ def test_parts_of_a_run_that_overlap_in_time_are_told(
         "inspect.recordings=*.parquet",
         "session.out=out",
         "inspect.pictures=0",
-        "~preview",
+        "preview=null",
     )
     assert done.code == 0, done.err
     # 19.95 s - 15 s.

@@ -308,7 +308,7 @@ def test_collect_says_it_before_anything_moves(brokk: Callable[..., Any]) -> Non
     assert "these motions would tell" in done.out and "link_length: only measured tool" in done.out
     plain = brokk(
         "mode=collect", "collect.only_plan=true", "collect.num_runs=1", "collect.run_minutes=2",
-        "collect.file_minutes=2", "excitation=levels", "session.out=plain", "~preview",
+        "collect.file_minutes=2", "excitation=levels", "session.out=plain", "preview=null",
     )  # fmt: skip
     assert plain.code == 0, plain.err
     assert "preview" not in json.loads(Path("plain/plan.json").read_text())
