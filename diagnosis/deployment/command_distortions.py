@@ -16,9 +16,9 @@ from diagnosis.deployment.distortions import (
     keep_fixed,
     list_factors,
     list_groups,
-    list_permutations,
     make_fixed,
 )
+from diagnosis.deployment.orders import Order, list_orders
 from diagnosis.deployment.replay import Change, Transform
 from diagnosis.deployment.transforms import (
     arrange_columns,
@@ -30,6 +30,12 @@ from diagnosis.deployment.transforms import (
 )
 
 
+def make_command_order(names: list[str], order: Order) -> Distortion:
+    """Return the mistake that commands reach the joints in another order."""
+    text = "commands reach the joints in another order: " + describe_order(names, order)
+    return Distortion("order", "command", text, make_fixed(Change(command=arrange_columns(order))))
+
+
 def list_command_distortions(policy: LoadedPolicy) -> list[Distortion]:
     """Return mistakes between network and valve."""
     names, found = list(policy.contract.joints), list[Distortion]()
@@ -37,9 +43,8 @@ def list_command_distortions(policy: LoadedPolicy) -> list[Distortion]:
     def make(transform: Callable[[float], Transform]) -> Build:
         return lambda value: Change(command=transform(value))
 
-    for order in list_permutations(len(names)):
-        text = "commands reach the joints in another order: " + describe_order(names, order)
-        found.append(Distortion("order", "command", text, make(keep_fixed(arrange_columns(order)))))
+    for order in list_orders(names):
+        found.append(make_command_order(names, order))
     for columns, label in list_groups(names):
         place = "command" + label
         found += list_factors(place, columns, make)

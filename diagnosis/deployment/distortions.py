@@ -8,15 +8,17 @@ Axes: `T` rows, `R` rows that are asked for, `H` samples (oldest first), `C` col
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm
+from diagnosis.deployment.orders import Order, list_orders, match_order
 from diagnosis.deployment.replay import Change, Transform
 from diagnosis.deployment.transforms import (
     arrange_columns,
+    arrange_scaled,
     delay_rows,
     freeze_columns,
     hold_rows,
@@ -45,8 +47,6 @@ MAX_DELAY = 12
 """Longest delay that is tried, rows; half a second at 20 Hz is more than a history's dead time."""
 MAX_HOLD = 5
 """Largest number of rows for which a value is held that is tried."""
-MAX_JOINTS_PERMUTED = 5
-"""Up to so many joints all orders are tried, with more of them swaps, shifts and the reverse."""
 
 Build = Callable[[float], Change]
 
@@ -100,7 +100,7 @@ def list_input_distortions(
         found += _list_scalings(term, names)
         found += _list_timings(term, names, signals[term.name], rows)
         if term.name != "target" and len(names) > 1:
-            found += _list_orders(term.name, names)
+            found += _list_orders((term,), names)
         if term.samples > 1:
             found += _list_history_mistakes(term)
     found += _list_joint_mistakes(policy)
@@ -274,12 +274,60 @@ def _list_timings(
     return found
 
 
-def _list_orders(term: str, names: list[str]) -> list[Distortion]:
+def _list_orders(terms: Sequence[ObservationTerm], names: list[str]) -> list[Distortion]:
     found = []
-    for order in list_permutations(len(names)):
-        change = Change(signals={term: arrange_columns(order)})
-        text = f"{term} is in another order: {describe_order(names, order)}"
-        found.append(Distortion("order", term, text, make_fixed(change)))
+    for order in list_orders(names):
+        found += make_orders(terms, names, order)
+    return found
+
+
+def make_orders(
+    terms: Sequence[ObservationTerm], names: list[str], order: Order
+) -> list[Distortion]:
+    """Return the mistake that terms of the observation are in another order.
+
+    The mean that is subtracted may be in that order too, or in the one of the contract.
+    """
+    listed = " and ".join(
+        filter(None, (", ".join(term.name for term in terms[:-1]), terms[-1].name))
+    )
+    verb, place = ("is", terms[0].name) if len(terms) == 1 else ("are", "joints")
+    text = f"{listed} {verb} in another order: {describe_order(names, order)}"
+    raw = Change(signals={term.name: arrange_columns(order) for term in terms})
+    found = [Distortion("order", place, text, make_fixed(raw))]
+    if any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms):
+        scaled = Change(windows={term.name: arrange_scaled(term, order) for term in terms})
+        found.append(Distortion("order", place, text, make_fixed(scaled)))
+    return found
+
+
+def list_matched_orders(
+    policy: LoadedPolicy, signals: Mapping[str, np.ndarray], observed: np.ndarray
+) -> list[Distortion]:
+    """Return the orders of terms that a logged observation vector shows, whatever they are.
+
+    Args:
+        policy: The policy.
+        signals: The log's values by term, `(T, C)`.
+        observed: The vector as the network got it, `(T, O)`.
+    """
+    contract, shared = policy.contract, dict[Order, list[ObservationTerm]]()
+    found = list[Distortion]()
+    for term in contract.terms:
+        if len(term.columns) < 2:
+            continue
+        block = observed[:, contract.term_slices[term.name]]
+        seen = block.reshape(len(observed), term.samples, -1)[:, -1]
+        known = signals[term.name][np.clip(np.arange(len(observed)) + term.newest, 0, None)]
+        names = [_shorten(term, column) for column in term.columns]
+        by_scaled = match_order((known - term.mean) / term.std, seen)
+        for order in {by_scaled, match_order(known, seen * term.std + term.mean)} - {None}:
+            found += make_orders((term,), names, order)
+            if names == list(contract.joints):
+                shared.setdefault(order, []).append(term)
+    for order, terms in shared.items():
+        if len(terms) > 1:
+            found += make_orders(terms, list(contract.joints), order)
     return found
 
 
@@ -317,14 +365,13 @@ def _list_history_mistakes(term: ObservationTerm) -> list[Distortion]:
 def _list_joint_mistakes(policy: LoadedPolicy) -> list[Distortion]:
     """Return mistakes that positions and commands share, and those of the start."""
     contract, found = policy.contract, list[Distortion]()
-    terms = {term.name for term in contract.terms}
-    shared = [name for name in ("q", "u", "proposals") if name in terms]
+    names, by_joint = list(contract.joints), list[ObservationTerm]()
+    for term in contract.terms:
+        if [_shorten(term, column) for column in term.columns] == names:
+            by_joint.append(term)
+    shared = [term.name for term in by_joint]
     if len(shared) > 1:
-        names = list(contract.joints)
-        for order in list_permutations(len(names)):
-            change = Change(signals={name: arrange_columns(order) for name in shared})
-            text = f"all joints are observed in another order: {describe_order(names, order)}"
-            found.append(Distortion("order", "joints", text, make_fixed(change)))
+        found += _list_orders(by_joint, names)
         for columns, label in list_groups(names):
             change = Change(signals={name: scale_columns(columns, -1.0) for name in shared})
             found.append(
@@ -412,23 +459,6 @@ def list_groups(names: list[str]) -> Iterator[tuple[list[int], str]]:
             yield [column], f".{name}"
 
 
-def list_permutations(num: int) -> Iterator[tuple[int, ...]]:
-    """Yield all orders of a few columns but their own, or the likely ones of many."""
-    same = tuple(range(num))
-    if num <= MAX_JOINTS_PERMUTED:
-        for order in itertools.permutations(same):
-            if order != same:
-                yield order
-        return
-    yield same[::-1]
-    for shift in range(1, num):
-        yield same[shift:] + same[:shift]
-    for one, other in itertools.combinations(same, 2):
-        swapped = list(same)
-        swapped[one], swapped[other] = other, one
-        yield tuple(swapped)
-
-
 def describe_order(names: list[str], order: tuple[int, ...]) -> str:
     """Return an order in words."""
     return ", ".join(names[column] for column in order)
@@ -438,7 +468,7 @@ def _shorten(term: ObservationTerm, column: str) -> str:
     """Return the name of a column within its term: `q3` for `q_q3_rad`."""
     if term.name == "target":
         return column.split("_")[1]
-    for prefix in ("q_", "u_", "advice_"):
+    for prefix in (f"{term.name}_", "q_", "u_", "advice_"):
         column = column.removeprefix(prefix)
     for unit in ("_rad", "_m"):
         column = column.removesuffix(unit)

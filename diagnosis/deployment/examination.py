@@ -17,7 +17,8 @@ import numpy as np
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.deployment import command_distortions, distortions, frame_distortions
-from diagnosis.deployment.contract import LoadedPolicy
+from diagnosis.deployment.contract import LoadedPolicy, PolicyContract
+from diagnosis.deployment.distortions import Distortion
 from diagnosis.deployment.fault_search import (
     FittedDistortion,
     ReplayStage,
@@ -25,6 +26,7 @@ from diagnosis.deployment.fault_search import (
     judge_stage,
 )
 from diagnosis.deployment.motion_check import MotionEvidence
+from diagnosis.deployment.orders import match_order
 from diagnosis.deployment.replay import SPREAD_FACTOR, TOLERANCE, VECTOR_TOLERANCE, PolicyReplay
 from diagnosis.deployment.run_log import RunLog, read_run_log
 from diagnosis.deployment.training_range import RangeEvidence, compare_with_training
@@ -215,6 +217,7 @@ def _list_stages(
         inputs = [
             *frame_distortions.list_frame_distortions(policy),
             *distortions.list_input_distortions(policy, log.signals, rows),
+            *distortions.list_matched_orders(policy, log.signals, log.observed),
         ]
         stages.append(
             ReplayStage("observation", known.encode, log.observed, floor, tuple(labels), tuple(inputs), start)
@@ -222,6 +225,7 @@ def _list_stages(
     if commanded is not None and log.observed is not None:
         answer = _Answered(policy, log.observed)
         floor = np.full(commanded.shape, TOLERANCE)
+        after += _match_commands(contract, answer.command((), np.arange(len(commanded))), commanded)
         stages.append(
             ReplayStage("network", answer.command, commanded, floor, contract.joints, (*networks, *after), 0)
         )  # fmt: skip
@@ -233,11 +237,13 @@ def _list_stages(
             *distortions.list_input_distortions(policy, log.signals, rows),
         ]
         known = _Known(None, replay)
+        after += _match_commands(contract, replay.nominal, commanded)
         stages.append(
             ReplayStage("policy", known.command, commanded, floor, contract.joints, (*inputs, *after, *networks), start)
         )  # fmt: skip
     if log.commanded is not None and log.in_force is not None and is_sent:
         sent = _Delivered(log.commanded)
+        after += _match_commands(contract, log.commanded, log.in_force)
         floor = np.full(log.in_force.shape, TOLERANCE)
         stages.append(
             ReplayStage(
@@ -245,6 +251,15 @@ def _list_stages(
             )
         )
     return stages
+
+
+def _match_commands(
+    contract: PolicyContract, known: np.ndarray, seen: np.ndarray
+) -> list[Distortion]:
+    """Return the order of the joints, whatever it is, in which commands come out as they were logged."""
+    order = match_order(known, seen)
+    names = list(contract.joints)
+    return [] if order is None else [command_distortions.make_command_order(names, order)]
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,16 @@ def arrange_columns(order: tuple[int, ...]) -> Transform:
     return lambda values: values[:, list(order)]
 
 
+def arrange_scaled(term: ObservationTerm, order: tuple[int, ...]) -> Transform:
+    """Return the change that puts columns of a history, `(R, H, C)`, into another order after scaling."""
+
+    def transform(window: np.ndarray) -> np.ndarray:
+        scaled = (window - term.mean) / term.std
+        return scaled[..., list(order)] * term.std + term.mean
+
+    return transform
+
+
 def delay_rows(periods: float) -> Transform:
     """Return the change that delays all columns by whole rows; the first row stands before."""
     count = int(periods)
