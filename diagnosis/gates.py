@@ -29,6 +29,8 @@ MAX_REMARK_SHARES = {
     "interlock": 0.02,
     "frozen sensor": 0.05,
     "exclusive joint": 0.01,
+    "does not obey": 0.05,
+    "jumps": 0.05,
 }
 """Largest share of the field's time with a finding about one joint. Beyond it the recordings do not
 tell what the machine was told: radio frames lost by nuisances freeze a sensor for 0.3 % of the time,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import lfilter
 
 from actuators.recordings.split import group_by_run
 from brokk_rl.commands import read_targets
@@ -36,10 +36,14 @@ RESAMPLED = 200
 MIN_MOVING = 100
 """Samples with a command, in all recordings together, below which no delay is estimated."""
 
+MIN_CHANGES = 5
+"""Changes of a target, in all recordings together, below which no delay is estimated."""
 FREQUENCIES_RAD_S = np.geomspace(1.0, 300.0, 20)
 """Natural frequencies of a position loop that are tried first: from 0.16 Hz to a loop that is at its target at once."""
 DAMPINGS = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
 """Damping ratios that are tried first."""
+LOOP_BOUNDS = np.log([[0.3, 0.05], [400.0, 5.0]])
+"""Logarithms of the bounds of frequency and damping."""
 MOST_ROWS = 3000
 """Rows of a recording that are simulated: a minute at 50 Hz fixes a delay to a hundredth of a period."""
 NUM_REFINED = 3
@@ -105,7 +109,7 @@ def _estimate_servo_delay(
             if np.ptp(target) > 0:
                 pairs.append((target[:MOST_ROWS], one.q[:MOST_ROWS, joint].astype(float)))
                 runs.append(name)
-    if sum(int((np.diff(target) != 0).sum()) for target, _ in pairs) < MIN_MOVING:
+    if sum(int((np.diff(target) != 0).sum()) for target, _ in pairs) < MIN_CHANGES:
         return None
     loops = _ServoLoops(pairs, machine.period_s, grid_s)
     left = loops.search()
@@ -161,9 +165,8 @@ class _ServoLoops:
 
     def _simulate(self, loop: Sequence[float], delays: np.ndarray) -> np.ndarray:
         """Return what a loop, logarithms of frequency and damping, leaves at some delays, `(R, D)`."""
-        w, damping = np.exp(np.clip(loop, -5.0, 7.0))
-        system = cont2discrete(([w * w], [1.0, 2.0 * damping * w, w * w]), self.step_s)
-        numerator, denominator = np.ravel(system[0]), system[1]
+        w, damping = np.exp(np.clip(loop, *LOOP_BOUNDS))
+        numerator, denominator = discretise_loop(w, damping, self.step_s)
         left = np.empty((len(self._pairs), len(delays)))
         longest = int(self._shifts.max())
         for row, (target, q) in enumerate(self._pairs):
@@ -176,6 +179,22 @@ class _ServoLoops:
             gained = (late @ y) ** 2 / np.maximum((late**2).sum(1), 1e-12)
             left[row] = np.maximum(y @ y - gained, 0.0)
         return left
+
+
+def discretise_loop(w: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return numerator and denominator of a second-order loop under targets that are held for a step.
+
+    Its response to a unit step at one and two steps fixes the numerator; scipy's `cont2discrete` gives the
+    same, by a matrix exponential.
+    """
+    root = w * np.sqrt(complex(1.0 - damping**2) + 1e-12)
+    t_s = step_s * np.arange(1, 3)
+    phase = root * t_s
+    falling = np.exp(-damping * w * t_s) * (np.cos(phase) + damping * w / root * np.sin(phase))
+    first, second = 1.0 - falling.real
+    poles = np.exp((-damping * w + 1j * root * np.array([1, -1])) * step_s)
+    denominator = np.real(np.poly(poles))
+    return np.array([0.0, first, second + denominator[1] * first - first]), denominator
 
 
 def _estimate_dead_time(

@@ -9,12 +9,15 @@ from pathlib import Path
 from actuators.recordings import conversion, log_draft
 from actuators.recordings.column_names import UNITS, read_unit
 from actuators.recordings.guess import CommandKind, GivenColumns, Guess
+from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.log_draft import Draft
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
+from actuators.recordings.recording_checks import examine_recordings
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
 from brokk_rl.report import Report
 from brokk_rl.session import Session, read_record, write_json, write_text
 from brokk_rl.spec import Positive, spec
@@ -90,12 +93,14 @@ class ImportLogs:
         session: Folder.
         machine: The machine; `null` to draft one.
         reader: Reads the logs; `null` to draft a column map.
+        thresholds: From which on a stretch of a recording is remarked.
         log: Logs to import.
     """
 
     session: Session
     machine: Machine | None
     reader: LogReader | None
+    thresholds: InspectionThresholds
     log: LogSelection
 
     def check(self) -> None:
@@ -116,6 +121,9 @@ class ImportLogs:
             pieces = conversion.read_logs(self.log.input, self.reader, self.machine)
             place = self.session.folder / conversion.FOLDER
             conversion.write_recordings(pieces, place)
+            self._show_remarks(
+                [one for several in pieces.values() for one in several], self.machine
+            )
             simulator = SIMULATORS[self.machine.interface]
             choices = (read_record(self.session.folder) or {}).get("choices", {})
             machine = choices.get("machine", "…")
@@ -143,6 +151,16 @@ class ImportLogs:
         log_draft.draw_draft(draft).savefig(picture, dpi=110)
         log.info("picture: %s", picture)
         self._write(draft, paths)
+
+    def _show_remarks(self, recordings: list[Recording], machine: Machine) -> None:
+        """Print what limits the conclusions from the recordings, joint by joint."""
+        rows = []
+        for one in examine_recordings(recordings, machine, self.thresholds):
+            if one.severity != "note":
+                span = f"{one.from_s:.2f} to {one.to_s:.2f} s"
+                rows.append([one.recording, one.joint or "all", one.name, span, one.amount])
+        if rows:
+            print_table(["run", "joint", "remark", "when", "what"], rows, "look at these first")
 
     def _write(self, draft: Draft, paths: list[Path]) -> None:
         folder, guesses = self.session.folder, draft.list_guesses()

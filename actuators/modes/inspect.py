@@ -20,6 +20,7 @@ from actuators.recordings.inspection import (
     inspect_recording,
 )
 from actuators.recordings.preview import EffectPreview, PreviewResult
+from actuators.recordings.recording_checks import find_targets
 from brokk_rl import record
 from brokk_rl.commands import view_recordings
 from brokk_rl.console_table import print_table, print_text
@@ -145,7 +146,12 @@ class Inspect:
             return InspectedFile(path, None, breaches, None)
         (viewed,) = view_recordings([recording], self.machine)
         return InspectedFile(
-            path, recording, breaches, inspect_recording(viewed, self.machine, self.thresholds)
+            path,
+            recording,
+            breaches,
+            inspect_recording(
+                viewed, self.machine, self.thresholds, find_targets(recording, self.machine)
+            ),
         )
 
     def _preview(self, recordings: Sequence[Recording]) -> PreviewResult | None:

@@ -10,14 +10,19 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from annotated_types import Ge
 
+from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
 from brokk_rl.spec import Share, spec
 
-Kind = Literal["no motion", "no command", "frozen", "repeated rows", "beyond limit", "exclusive"]
+Kind = Literal[
+    "no motion", "not obeyed", "no command", "jump", "frozen", "repeated rows", "beyond limit", "exclusive"
+]  # fmt: skip
 KINDS: dict[Kind, str] = {
     "no motion": "command without motion: interlock, dead-man, dead band, or a load too heavy",
+    "not obeyed": "stays away from its target: the drive is off, blocked or too weak",
+    "jump": "steps by more than a machine moves: a wrap, a sign bit, a reset or another source",
     "no command": "motion without command: sinking, or moved by something that is not logged",
     "frozen": "equal samples, then a jump, or equal samples of a sensor with noise: it did not measure",
     "repeated rows": "all joints repeat the row before while one of them moves: lost frames",
@@ -35,6 +40,13 @@ HELD_TARGET = 1e-4
 servo follows a slow target, where a valve stays closed under a small command."""
 JUMP = 1.5
 """A sensor that has missed a sample jumps by two periods' worth of motion."""
+
+FAR_SHARE = 0.1
+"""Part of the travel from which on a joint stays away from its target; sag and play are below 0.05."""
+JUMP_TRAVEL = 0.01
+"""Part of the travel from which on a step is told; smaller ones hide in noise and coarse sensors."""
+LONGEST_LAG_S = 1.5
+"""Time within which a joint answers its target: more than twice the 0.55 s of the slowest machine known."""
 
 
 @spec
@@ -110,14 +122,26 @@ class Inspection:
 
 
 def inspect_recording(
-    recording: Recording, machine: Machine, thresholds: InspectionThresholds
+    recording: Recording,
+    machine: Machine,
+    thresholds: InspectionThresholds,
+    targets: np.ndarray | None = None,
 ) -> Inspection:
-    """Return the contents of a recording of `machine`."""
+    """Return the contents of a recording of `machine`.
+
+    Args:
+        recording: The recording, its commands as speeds.
+        machine: The machine.
+        thresholds: From which on a stretch is reported.
+        targets: Targets of joints that are commanded by position, `(T, J)`, rad or m; `None` for others.
+    """
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
-        look = _RecordingScan(recording, machine, thresholds)
+        look = _RecordingScan(recording, machine, thresholds, targets)
         findings = [
             *look.no_motion(),
+            *look.not_obeyed(),
+            *look.jumps(),
             *look.no_command(),
             *look.frozen(),
             *look.repeated(),
@@ -133,9 +157,13 @@ class _RecordingScan:
     """Scan of one recording: the quantities that all findings use."""
 
     def __init__(
-        self, recording: Recording, machine: Machine, thresholds: InspectionThresholds
+        self,
+        recording: Recording,
+        machine: Machine,
+        thresholds: InspectionThresholds,
+        targets: np.ndarray | None,
     ) -> None:
-        self._machine, self._limits = machine, thresholds
+        self._machine, self._limits, self._targets = machine, thresholds, targets
         self._t_s, self._u, self._q = (
             recording.t_s,
             recording.u.astype(np.float64),
@@ -223,6 +251,47 @@ class _RecordingScan:
                                 f"commanded {mean:+.2f}, does not move",
                             )
                         )
+        return found
+
+    def not_obeyed(self) -> list[RecordingFinding]:
+        """Find joints that stay away from where their target has been, or go further away."""
+        if self._targets is None:
+            return []
+        found, window = [], max(1, round(LONGEST_LAG_S / self._period_s))
+        for j, (name, unit) in enumerate(self._units()):
+            # the range of the targets that the joint may still be on its way to
+            past = np.concatenate([np.repeat(self._targets[:1, j], window), self._targets[:, j]])
+            recent = np.lib.stride_tricks.sliding_window_view(past, window + 1)
+            above, below = self._q[:, j] - recent.max(1), recent.min(1) - self._q[:, j]
+            away = np.fmax(np.fmax(above, below), 0.0)
+            coming = np.where(above > below, self._v[:, j] < 0, self._v[:, j] > 0)
+            is_coming = coming & self._is_moving[:, j]
+            far = (away > FAR_SHARE * self._travel[j]) & ~is_coming
+            for row, count in find_stretches(far):
+                if count * self._period_s >= self._limits.unanswered_s:
+                    most = away[row : row + count].max()
+                    text = f"stays up to {most:.2g} {unit} away from its target"
+                    found.append(self._finding("not obeyed", name, row, count, text))
+        return found
+
+    def jumps(self) -> list[RecordingFinding]:
+        """Find steps of a position that no command causes."""
+        found = []
+        for j, (name, unit) in enumerate(self._units()):
+            q = self._q[:, j]
+            if not np.isfinite(q).all():
+                continue
+            cause = np.zeros(len(q)) if self._targets is None else self._targets[:, j]
+            wrap = find_wrap(q)
+            rows = find_jumps(self._t_s, q, cause, LONGEST_LAG_S) if wrap is None else wrap.rows
+            if wrap is None:
+                rows = np.union1d(rows, find_spikes(q) - 1)
+            for row in rows.astype(int).tolist():
+                size = q[row + 1] - q[row]
+                if abs(size) <= max(self._visible[j], JUMP_TRAVEL * self._travel[j]):
+                    continue
+                text = f"steps by {size:+.4g} {unit}" if wrap is None else wrap.explain()
+                found.append(self._finding("jump", name, row, 2, text))
         return found
 
     def no_command(self) -> list[RecordingFinding]:

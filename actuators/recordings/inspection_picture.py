@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # distinguishable by those who see no red or green (Okabe and Ito)
-COLOURS = dict(
-    zip(KINDS, ("#e69f00", "#cc79a7", "#56b4e9", "#0072b2", "#d55e00", "#009e73"), strict=True)
-)
+HUES = ("#e69f00", "#f0e442", "#000000", "#cc79a7", "#56b4e9", "#0072b2", "#d55e00", "#009e73")
+COLOURS = dict(zip(KINDS, HUES, strict=True))
 BREACH = "#b00020"
 THINNEST = 0.002
 """A finding is drawn at least this wide, as a part of the picture, so that a single row can be

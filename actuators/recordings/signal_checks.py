@@ -28,6 +28,8 @@ FIT_SHARE = 0.04
 """A step is a wrap where it differs by at most this part of the modulus from going on at the speed beside it."""
 SPIKE_SHARE = 0.05
 """Least size of a spike, as a part of the range of a signal: above the noise of a working sensor."""
+SPIKE_RATIO = 8.0
+"""A spike is so many times the usual change over two samples, which noise and motion have too."""
 JUMP_SHARE = 0.1
 """Least size of a jump, as a part of the range."""
 JUMP_RATIO = 10.0
@@ -108,7 +110,8 @@ def find_spikes(values: np.ndarray) -> np.ndarray:
     back, on = values[1:-1] - values[:-2], values[1:-1] - values[2:]
     size = np.minimum(np.abs(back), np.abs(on))
     apart = np.abs(values[2:] - values[:-2])
-    is_spike = (back * on > 0) & (size > SPIKE_SHARE * span) & (apart < 0.3 * size)
+    least = max(SPIKE_SHARE * span, SPIKE_RATIO * float(np.median(apart)))
+    is_spike = (back * on > 0) & (size > least) & (apart < 0.3 * size)
     return np.flatnonzero(is_spike) + 1
 
 

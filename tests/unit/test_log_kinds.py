@@ -427,3 +427,24 @@ def test_the_next_log_of_a_kind_fits_into_the_draft(brokk: Callable[..., Done]) 
     options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml")
     done = brokk("mode=import", "log.input=b.csv", *options, "session.out=next")
     assert done.code == 0, done.err
+
+
+def test_a_joint_that_hangs_is_remarked_by_import_and_inspect(brokk: Callable[..., Done]) -> None:
+    rows = make_rows(1500)
+    rows[300:700, 4] = 1.5  # it hangs, while its target goes on
+    write_text("a.csv", rows)
+    pairs = ", ".join(f'{one}: ["{one}_target_rad", "{one}_pos_rad"]' for one in ("knee", "hip"))
+    given = f"log.joints={{{pairs}}}"
+    brokk("mode=import", "log.input=a.csv", "log.name=leg", "session.out=draft", given)
+    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml")
+    done = brokk("mode=import", "log.input=a.csv", *options, "session.out=read")
+    assert done.code == 0, done.err
+    (line,) = [line for line in done.out.splitlines() if "does not obey" in line]
+    assert "knee" in line and "6.0" in line and "13.8" in line
+    assert "jumps" in done.out
+    inspected = ("inspect.recordings=read/recordings/*", "preview=null", "session.out=seen")
+    done = brokk("mode=inspect", options[0], *inspected)
+    assert done.code == 0, done.err
+    found = json.loads(Path("seen/inspection.json").read_text())["recordings"][0]["findings"]
+    assert {one["kind"] for one in found if one["joint"] == "knee"} >= {"not obeyed", "jump"}
+    assert not [one for one in found if one["joint"] == "hip"]
