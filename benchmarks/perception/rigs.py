@@ -25,10 +25,10 @@ import cv2
 import hydra
 import numpy as np
 from hydra.utils import instantiate
+from scoring import FinderScore, score_frame
 
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.benchmark.scoring import FinderScore, score_frame
 from perception.calibrate.disparity_error import (
     correct_depth,
     estimate_disparity_error,

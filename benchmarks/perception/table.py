@@ -39,11 +39,11 @@ from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
+from scoring import FinderScore, score_frame
 
 from brokk_rl.contracts.vision import FrameDetections
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.benchmark.scoring import FinderScore, score_frame
 from perception.contracts import Overlay
 from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer

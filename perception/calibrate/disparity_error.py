@@ -16,6 +16,7 @@ import numpy as np
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from perception.label.camera_pose import BoardTracker
+from perception.robust_fit import TUKEY, compute_biweight, estimate_spread
 
 MIN_VIEWS = 8
 """Views from which four numbers are estimated; chosen by hand."""
@@ -25,8 +26,8 @@ SLOPE_STD_PX = 0.25
 """Prior of the slopes, px for a unit of x/z and y/z: that of `perception.pose.rig_px`."""
 SCALE_STD = 0.002
 """Prior of the part that grows with the disparity: 0.2 mm of 10 cm on paper; chosen by hand."""
-ROUNDS, TUKEY = 5, 4.685
-"""Rounds of reweighting, and Tukey's biweight, 95 % efficient with Gaussian noise."""
+ROUNDS = 5
+"""Rounds of reweighting."""
 PLACE = 0.02
 """Views that differ by less, in x/z, y/z and relative distance, are of one rest; by hand."""
 FLOOR_PX = 0.02
@@ -139,8 +140,8 @@ def estimate_disparity_error(views: list[BoardDisparity]) -> DisparityError | No
         away = excess - design @ solution
         # Four numbers are spent on the fit.
         spent = len(views) / (len(views) - 4)
-        scale_px = max(1.4826 * float(np.median(np.abs(away))) * spent**0.5, FLOOR_PX)
-        weight = np.maximum(1.0 - (away / (TUKEY * scale_px)) ** 2, 0.0) ** 2
+        scale_px = max(estimate_spread(away) * spent**0.5, FLOOR_PX)
+        weight = compute_biweight(away, TUKEY * scale_px)
     std_px = float(np.sqrt(np.diag(np.linalg.inv(information))[:3].max()))
     constant, across, down, scale = (float(one) for one in solution)
     return DisparityError((constant, across, down), std_px, scale, len(views))

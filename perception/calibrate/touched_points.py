@@ -20,6 +20,7 @@ from brokk_rl.spec import Positive, spec
 from perception.calibrate import arm, transforms, verdict
 from perception.calibrate.extrinsics import PoseResidual, build_calibration
 from perception.calibrate.hand_eye import STUDENT_T_FREEDOM
+from perception.robust_fit import fit_linear
 
 EXAMPLE = """expected YAML such as
   points:
@@ -41,10 +42,6 @@ MAX_STEPS = 60
 """Gauss-Newton steps; a bound, chosen by hand (Student's weights converge linearly)."""
 MIN_PIXELS = 12
 """Pixels with depth that a plane needs; chosen by hand."""
-NUM_TRIMS = 4
-"""Rounds of fitting and trimming; chosen by hand."""
-TRIM_SIGMAS = 2.5 * 1.4826
-"""Pixels farther off than 2.5 robust standard deviations are trimmed (1.4826 x the median)."""
 PIXELS_PER_SAMPLE = 10.0
 """Neighbours share a matcher's window: some ten pixels are as good as one; chosen by hand."""
 ASSUMED_FOCAL_PX = 1000.0
@@ -374,15 +371,9 @@ def fit_point_depth(
     # a plane is linear in inverse depth
     inverse = 1.0 / frame.depth_m[rows, columns].astype(float)
     table = np.stack([columns - pixel[0], rows - pixel[1], np.ones(len(rows))], 1)
-    away = np.abs(inverse - np.median(inverse))
-    plane = np.zeros(3)
-    for _ in range(NUM_TRIMS):
-        kept = away <= TRIM_SIGMAS * np.median(away) + 1e-6
-        plane = np.linalg.lstsq(table[kept], inverse[kept], rcond=None)[0]
-        away = np.abs(table @ plane - inverse)
-    kept = away <= TRIM_SIGMAS * np.median(away) + 1e-6
+    plane, _ = fit_linear(table, inverse, 1e-6)
     z = 1.0 / plane[2]
-    variance = np.linalg.pinv(table[kept].T @ table[kept])[2, 2]
+    variance = np.linalg.pinv(table.T @ table)[2, 2]
     flat = cv2.undistortPoints(
         pixel.reshape(1, 1, 2).astype(float),
         np.asarray(frame.camera_matrix, float),

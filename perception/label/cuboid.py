@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
+from perception.robust_fit import fit_linear, guess_plane
 
 FACES = ((2, 1), (2, -1), (0, 1), (0, -1), (1, 1), (1, -1))
 """Axis and side of each face; the first is the drilled one, at z = 0, whose normal is +z."""
@@ -221,14 +222,6 @@ EXAMPLE = """expected YAML such as
   thickness_m: 0.6 # of the block behind the face
   mouths: [{center_px: [660, 420], radius_m: 0.05}]  # or center_m"""
 # Robust fit of the face's plane; all chosen by hand.
-NUM_TRIALS = 400
-"""Planes through three random pixels; with half of the pixels wrong, all fail once in 10^23."""
-NUM_JUDGES = 800
-"""Random pixels whose median residual scores a trial."""
-NUM_TRIMS = 3
-"""Rounds of fitting and trimming after that."""
-TRIM_SIGMAS = 2.5 * 1.4826
-"""Pixels farther off than 2.5 robust standard deviations are trimmed (1.4826 x the median)."""
 MIN_FACE_PIXELS = 50
 """Pixels with depth that the plane needs."""
 FACE_SHARE = 0.9
@@ -347,17 +340,7 @@ def _fit_face_plane(frame: Frame, corners_px: np.ndarray) -> np.ndarray:
         )
     rays = compute_rays(frame, np.stack([columns, rows], axis=1).astype(float))
     inverse = 1.0 / frame.depth_m[rows, columns].astype(float)
-    generator = np.random.default_rng(0)
-    triples = generator.integers(len(rows), size=(NUM_TRIALS, 3))
-    triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-7]
-    trials = np.linalg.solve(rays[triples], inverse[triples][..., None])[..., 0]
-    judges = generator.integers(len(rows), size=NUM_JUDGES)
-    # least median of squares (Rousseeuw, 1984): up to half of the pixels between the corners may
-    # show an arm, a mouth or a wrong match
-    residuals = np.abs(trials @ rays[judges].T - inverse[judges])
-    plane = trials[np.median(residuals, axis=1).argmin()]
-    for _ in range(NUM_TRIMS):
-        away = np.abs(rays @ plane - inverse)
-        kept = away <= TRIM_SIGMAS * np.median(away) + 1e-9
-        plane = np.linalg.lstsq(rays[kept], inverse[kept], rcond=None)[0]
-    return plane
+    # Up to half of the pixels between the corners may show an arm, a mouth or a wrong match.
+    start = guess_plane(rays, inverse, np.random.default_rng(0))
+    # The residuals of a matcher that smooths can be 0.
+    return fit_linear(rays, inverse, 1e-6, start)[0]

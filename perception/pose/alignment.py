@@ -22,6 +22,7 @@ from perception.pose.plane import (
     estimate_sandwich_covariance,
     number_cells,
 )
+from perception.robust_fit import TUKEY, compute_biweight
 
 SMOOTH_PX = 1.0
 """Blur of both pictures, px: noise would bias the gradient."""
@@ -34,7 +35,6 @@ WIDE_PX = 1000
 ROUNDS, SETTLED_PX = 3, 0.004
 """Largest number of steps, and length of a last one, px: each is about a fifth of the one
 before."""
-TUKEY = 4.685
 MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
 """Margin around occluders, where a matcher bleeds, px; margin within the border, where blur mixes
 the face with the background, px; grey level of saturation. Chosen by hand."""
@@ -291,7 +291,7 @@ def _register_pictures(
         # picture.
         scale = 1.4826 * compute_upper_median(np.abs(off)) + 1e-6
         # Tukey's weights (95 % efficiency for normal errors) leave gross errors out altogether.
-        heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
+        heavy *= compute_biweight(off, TUKEY * scale)
         # The last unknown is the gain, which only has to be estimated along.
         step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
         m = m - step

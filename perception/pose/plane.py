@@ -13,13 +13,10 @@ import numpy as np
 
 from brokk_rl.signals import Frame
 from perception.ellipse import conic
-
-TUKEY = 4.685
-"""Tukey's biweight: residual in standard deviations from which a point counts nothing; 95 %
-efficient with Gaussian noise (Holland and Welsch 1977)."""
+from perception.robust_fit import TUKEY, compute_biweight, guess_plane
 
 GROWING = 3.0
-"""The same while the plane is grown. Chosen by hand: beyond an edge of the block another face
+"""Limit of the biweight, standard deviations, while the plane is grown. Chosen by hand: beyond an edge of the block another face
 begins at the same depth, and a wider limit would follow it."""
 NEARNESS, LEAN = 0.3, 0.4
 """Allowed relative error of inverse depth beside that of a circle of the ellipse's size, and
@@ -29,11 +26,6 @@ DEGENERATE = 1e12
 LEAST, FEWEST = 60, 8
 """Least number of points of a plane; cells from which its covariance is estimated, below which
 bands of rows take their place. Chosen by hand."""
-NUM_TRIALS, NUM_JUDGES = 40, 400
-"""Planes through three random points that are tried for a first guess, and points that judge them:
-as many judge as well as all points do."""
-
-
 USUAL_PULL_PX_M = 126.72
 """Focal length times baseline of the pair for which noise is configured: a ZED 2i at 1080p, 1056 px
 and 0.12 m."""
@@ -205,7 +197,7 @@ def fit_plane(
         return None
     number = int(np.searchsorted(points.radii, rings[0]))
     # A robust start: least squares would follow an occluder.
-    m = _guess_plane(points.rays[:number], points.inverse[:number], generator)
+    m = guess_plane(points.rays[:number], points.inverse[:number], generator)
     extent = rings[0]
     first = sigma = reach = floor
     rays = weight = points.rays[:0]
@@ -228,7 +220,7 @@ def fit_plane(
             # Other faces that come into reach are no noise.
             sigma = scale if ring == rings[0] else min(scale, 1.2 * first)
             reach = (TUKEY if ring == rings[0] else GROWING) * sigma
-            weight = np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2
+            weight = compute_biweight(residual, reach)
             # Half of the least number: with fewer the plane rests on an accident.
             if np.count_nonzero(weight) < LEAST // 2:
                 return None
@@ -243,7 +235,7 @@ def fit_plane(
     # Residuals of the last plane, and their own weights: with those of the step before, points that
     # left the reach would count.
     residual = points.inverse[:number] - rays @ m
-    weight = np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2
+    weight = compute_biweight(residual, reach)
     cov = estimate_sandwich_covariance(
         rays * compute_psi_slope(residual / reach)[:, None],
         rays * weight[:, None],
@@ -259,23 +251,6 @@ def compute_upper_median(values: np.ndarray) -> float:
     """Return the median of values `(P,)`, the upper one of an even number; faster than `np.median`."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
-
-
-def _guess_plane(
-    rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator
-) -> np.ndarray:
-    """Return the plane through three points with the least median residual (Rousseeuw 1984)."""
-    judge = generator.integers(len(rays), size=min(len(rays), NUM_JUDGES))
-    triples = generator.integers(len(rays), size=(NUM_TRIALS, 3))
-    # Points nearly on a line determine no plane.
-    triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-9]
-    if not len(triples):
-        return np.linalg.lstsq(rays, inverse, rcond=None)[0]
-    planes = np.linalg.solve(rays[triples], inverse[triples][..., None])[..., 0]
-    off = np.abs(inverse[judge, None] - rays[judge] @ planes.T)
-    middle = len(judge) // 2
-    # The least median tolerates half of the points being wrong.
-    return planes[np.argmin(np.partition(off, middle, axis=0)[middle])]
 
 
 def number_cells(cell: np.ndarray) -> np.ndarray:

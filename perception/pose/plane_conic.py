@@ -172,6 +172,7 @@ class PlaneConicEstimator:
         shape = self._check_shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
+        from_depth = face
         # The right picture gives the plane again, without the bias of the matcher.
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
@@ -192,7 +193,7 @@ class PlaneConicEstimator:
             if isinstance(shape, Rejection):
                 return shape
         aside = consistency.check_ring(
-            points, face, (s.rings[0], s.on_face), both is not None, ellipse
+            points, from_depth, (s.rings[0], s.on_face), both is not None, ellipse
         )
         if aside is not None:
             return aside

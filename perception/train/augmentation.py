@@ -3,65 +3,34 @@
 The paper's five are blur, crop, contrast, gamma and noise; crop changes the geometry and is
 `samples.Crop`. All take and return a batch of RGB pictures in [0, 1], `(B, 3, h, w)` float32 on any
 device. Each picture is changed by its own draw from the given generator, of the same device.
-
-JPEG is computed in torch for a whole batch, without files (ITU-T T.81; colours at full resolution).
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from typing import Protocol
 
+import cv2
+import numpy as np
 import torch
 from torch.nn import functional
 
 from brokk_rl.spec import NonNegativeRange, Share, spec
 
-LUMINANCE_STEPS = (
-    (16, 11, 10, 16, 24, 40, 51, 61), (12, 12, 14, 19, 26, 58, 60, 55), (14, 13, 16, 24, 40, 57, 69, 56),
-    (14, 17, 22, 29, 51, 87, 80, 62), (18, 22, 37, 56, 68, 109, 103, 77), (24, 35, 55, 64, 81, 104, 113, 92),
-    (49, 64, 78, 87, 103, 121, 120, 101), (72, 92, 95, 98, 112, 100, 103, 99),
-)  # fmt: skip
-COLOUR_STEPS = (
-    (17, 18, 24, 47, 99, 99, 99, 99), (18, 21, 26, 66, 99, 99, 99, 99), (24, 26, 56, 99, 99, 99, 99, 99),
-    (47, 66, 99, 99, 99, 99, 99, 99), *((99,) * 8,) * 4,
-)  # fmt: skip
-"""Steps of quantisation at quality 50 (annex K)."""
-YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
-"""Luminance and two colour differences of RGB (JFIF)."""
-
 
 def recompress_jpeg(pictures: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
     """Return RGB pictures, `(B, 3, h, w)` in [0, 1], as JPEG of a quality, `(B, 1, 1, 1)`, leaves them."""
-    height, width = pictures.shape[2:]
-    percent = torch.where(quality < 50.0, 5000.0 / quality, 200.0 - 2.0 * quality) / 100.0
-    tables, matrix, inverse, middle, wave = _build_jpeg_constants(pictures.device)
-    steps = (tables * percent).round().clamp(1.0, 255.0)[:, :, None, None]  # (B, 3, 1, 1, 8, 8)
-    ycc = torch.einsum("ij,bjhw->bihw", matrix, pictures.clamp(0.0, 1.0) * 255.0)
-    ycc = functional.pad(ycc, (0, -width % 8, 0, -height % 8), mode="replicate")
-    # (B, 3, rows, columns, 8, 8)
-    blocks = ycc.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)
-    kept = (wave @ (blocks - middle) @ wave.T / steps).round() * steps
-    back = (
-        (wave.T @ kept @ wave + middle)
-        .transpose(3, 4)
-        .flatten(4, 5)
-        .flatten(2, 3)[..., :height, :width]
-    )
-    return torch.einsum("ij,bjhw->bihw", inverse, back) / 255.0
-
-
-@functools.cache
-def _build_jpeg_constants(device: torch.device) -> tuple[torch.Tensor, ...]:
-    """Return steps at quality 50, YCC of RGB and its inverse, channel middles and cosines."""
-    number = torch.arange(8.0)
-    wave = ((number + 0.5) * number[:, None] * (math.pi / 8.0)).cos()
-    wave = wave * torch.where(number > 0, 0.5, 0.125**0.5)[:, None]  # orthonormal
-    matrix, middle = torch.tensor(YCC), torch.tensor([128.0, 0.0, 0.0]).reshape(3, 1, 1, 1, 1)
-    tables = torch.tensor([LUMINANCE_STEPS, COLOUR_STEPS, COLOUR_STEPS], dtype=torch.float32)
-    return tuple(one.to(device) for one in (tables, matrix, torch.linalg.inv(matrix), middle, wave))
+    pixels = (pictures.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+    results = []
+    for picture, percent in zip(
+        pixels.permute(0, 2, 3, 1).cpu().numpy(), quality.ravel(), strict=True
+    ):
+        options = [cv2.IMWRITE_JPEG_QUALITY, round(float(percent))]
+        data = cv2.imencode(".jpg", picture[..., ::-1], options)[1]
+        results.append(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1].copy())
+    stacked = torch.from_numpy(np.stack(results)).to(pictures.device)
+    return stacked.permute(0, 3, 1, 2).to(pictures.dtype) / 255.0
 
 
 Range = tuple[float, float]

@@ -12,8 +12,7 @@ from composed import option
 from drawn import AXIS, CENTER, K, both_views, drawn
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks
-from perception import dataset, rim_scale, search
-from perception.benchmark.scoring import FinderScore, match_holes, score_frame
+from perception import rim_scale, search
 from perception.contracts import SizePrior
 from perception.finder import StagedFinder, rectify
 
@@ -120,54 +119,6 @@ def test_lens_distortion_is_taken_out() -> None:
     known = straight.depth_m[np.isfinite(straight.depth_m)]
     assert np.isin(known, frame.depth_m).all()
     assert rectify(replace(frame, distortion=np.zeros(5))).color is frame.color
-
-
-def test_figures_are_counted_as_by_hand() -> None:
-    def circle(x: float, depth_m: float) -> dataset.TrueCircle:
-        return dataset.TrueCircle(
-            (x, 0, 2), (0, 0, -1), (x, 0, 2), (0, 0, -1), 0.05, depth_m, 0.0, True
-        )
-
-    def pose(x: float, z: float = 2.0) -> HolePose:
-        axis_cov = np.diag([1e-6, 1e-6, 0])
-        return HolePose(
-            np.array([x, 0, z]),
-            np.array([0, 0, -1.0]),
-            0.05,
-            np.eye(3) * 1e-6,
-            axis_cov,
-            "camera",
-            1.0,
-            0.0,
-        )
-
-    truth = dataset.SceneTruth(
-        "test", {}, (circle(0.0, 0.3), circle(0.5, 0.3)), (circle(1.0, 0.0),), {}
-    )
-    tally = FinderScore()
-    match_holes([pose(0.0, 2.003), pose(1.01), pose(3.0)], truth, drawn()[0], tally)
-    assert (tally.true, tally.found, tally.decoys, tally.fooled, tally.false) == (2, 1, 1, 1, 1)
-    assert tally.position_m == pytest.approx([0.003])
-    assert tally.along_sigmas == pytest.approx([3.0])
-    assert tally.row()["precision"] == pytest.approx(1 / 3)
-    assert (tally + tally).row() == {**tally.row(), "false": 2}
-
-
-def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> None:
-    frame, masks, _ = drawn()
-    hole = dataset.TrueCircle(
-        tuple(CENTER), tuple(AXIS), tuple(CENTER), tuple(AXIS), 0.05, 0.3, 0.0, True
-    )
-    truth = dataset.SceneTruth("test", {}, (hole,), (), {})
-    seen, _ = score_frame(finder_with(masks), frame, truth)
-    error_mm = seen.row()["position_mm_median"]
-    assert seen.is_perfect and error_mm is not None and error_mm < 2.0
-    blind = option("perception", "plane_conic").build()
-    missed, found = score_frame(
-        blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth
-    )
-    assert (missed.refused, missed.true, missed.found, missed.is_perfect) == (1, 1, 0, False)
-    assert not found.holes
 
 
 def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None:
