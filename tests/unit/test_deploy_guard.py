@@ -167,6 +167,9 @@ WRONG = [
     ({"trusted": False}, GuardTrip.CHANNEL_INVALID),
     ({"described": False}, GuardTrip.DESCRIPTION),
     ({"observed": GuardTrip.JOINT_TURNED}, GuardTrip.JOINT_TURNED),
+    ({"observed": GuardTrip.FLOW_UNASKED}, GuardTrip.FLOW_UNASKED),
+    ({"observed": GuardTrip.FLOW_TURNED}, GuardTrip.FLOW_TURNED),
+    ({"observed": GuardTrip.FLOW_SCALED}, GuardTrip.FLOW_SCALED),
     ({"observed": GuardTrip.JOINT_STILL}, GuardTrip.JOINT_STILL),
     ({"observed": GuardTrip.JOINT_WEAK}, GuardTrip.JOINT_WEAK),
     ({"observed": GuardTrip.JOINT_DRIFTS}, GuardTrip.JOINT_DRIFTS),
@@ -371,9 +374,10 @@ def test_old_switches_and_feedback_and_an_unknown_way_latch_but_matter_only_wher
     assert hand.decide(estop=True, **change).trip is GuardTrip.ESTOP, "what is worse is said"
 
 
-def test_a_borehole_beyond_its_limits_latches() -> None:
+@pytest.mark.parametrize("name", ["INVALID", "OLD", "REACH", "GROUND", "FACE", "JUMPS"])
+def test_a_borehole_beyond_its_limits_latches(name: str) -> None:
     hand = Hand().active()
-    for trip in (GuardTrip.NONE, GuardTrip.TARGET_REACH):
+    for trip in (GuardTrip.NONE, GuardTrip[f"TARGET_{name}"]):
         request = CommandRequest((0.1, 0.0, 0.1), 0.0, trip)
         hand.now_s += DT
         decision = hand.guard.decide(hand.now_s, True, WELL, request)

@@ -309,6 +309,7 @@ def test_one_stamp_of_the_future_teaches_nothing_and_a_clock_that_was_set_ahead_
     now_s = hear(clock, [5.0 + 0.003 * k for k in range(100)], 100.0)
     clock.learn(15.3, CLOCK_WRAP_S, now_s + 0.001)
     assert clock.newest_s < 6.0 and clock.is_early(15.3, CLOCK_WRAP_S, now_s)
+    assert not clock.is_early(5.297, CLOCK_WRAP_S, now_s)
     now_s = hear(clock, [5.3], now_s)
     assert clock.find_sent_s(5.3, CLOCK_WRAP_S, now_s) == pytest.approx(now_s, abs=0.01)
     now_s = hear(clock, [15.3 + 0.003 * k for k in range(NUM_AGREEING - 1)], now_s)
@@ -342,6 +343,31 @@ def test_a_clock_that_was_set_back_is_learned_when_a_person_says_so(
     late_s = now_s - clock.find_sent_s(stamps[-1], CLOCK_WRAP_S, now_s)
     assert late_s == pytest.approx(0.0 if accepted else back_s, abs=2e-3)
     assert clock.newest_s == stamps[-1]
+
+
+@pytest.mark.parametrize("least_s", [0.135, 0.28, 0.32])
+def test_of_delays_that_agree_the_least_becomes_none(least_s: float) -> None:
+    clock = GatewayClock()
+    now_s = hear(clock, [5.0 + 0.003 * k for k in range(100)], 100.0)
+    stamps = [5.3 + 0.003 * k - (0.3 if k % 2 else 0.34) for k in range(100)]
+    now_s = hear(clock, stamps, now_s)
+    clock.accept_delay(stamps[-1], least_s)
+    expected = (0.0, 0.04) if least_s < 0.3 else (0.3, 0.34)
+    for late_s, delay_s in zip((0.3, 0.34), expected, strict=True):
+        sent_s = clock.find_sent_s(5.297 + 0.3 - late_s, CLOCK_WRAP_S, now_s)
+        assert now_s - sent_s == pytest.approx(delay_s, abs=2e-3)
+
+
+def test_a_clock_set_ahead_is_learned_by_the_message_that_came_fastest() -> None:
+    clock = GatewayClock()
+    now_s = hear(clock, [5.0 + 0.003 * k for k in range(100)], 100.0)
+    stamps = [15.3 + 0.003 * k - 0.04 * (k % 2) for k in range(NUM_AGREEING)]
+    now_s = hear(clock, stamps, now_s)
+    assert now_s - clock.find_sent_s(stamps[-1], CLOCK_WRAP_S, now_s) == pytest.approx(
+        0.0, abs=2e-3
+    )
+    late = clock.find_sent_s(stamps[-1] - 0.04, CLOCK_WRAP_S, now_s)
+    assert now_s - late == pytest.approx(0.04, abs=2e-3)
 
 
 def test_delays_that_differ_are_no_clock_that_was_set_back() -> None:

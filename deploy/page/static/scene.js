@@ -1,5 +1,4 @@
 // The 3D scene, in a worker with a canvas and a WebSocket of its own: machine, block, boreholes, path, and the point cloud.
-import { decompress } from "./fzstd.js";
 import { add, lookAlong, lookAt, multiply, perspective } from "./matrices.js";
 import { Painter } from "./painter.js";
 import { Shapes, block, boreholes, camera, ground, machine, path, tip } from "./shapes.js";
@@ -36,7 +35,8 @@ async function take(data, socket) {
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
   const { width, height, depth_bytes } = header;
   const count = width * height, depth = new Uint16Array(count);
-  const bytes = decompress(new Uint8Array(data, 4 + length, depth_bytes), new Uint8Array(2 * count));
+  const deflated = new Blob([new Uint8Array(data, 4 + length, depth_bytes)]).stream();
+  const bytes = new Uint8Array(await new Response(deflated.pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
   for (let row = 0; row < count; row += width) for (let i = row, unit = 0; i < row + width; i++) {
     const outwards = bytes[i] | bytes[count + i] << 8;
     depth[i] = unit += (outwards >> 1) ^ -(outwards & 1);  // modulo 2^16
