@@ -56,7 +56,7 @@ class TargetCheck:
             first = machine.joints[0]
             if first.kind == "hinge" and tuple(machine.bodies[0].axis) == (0.0, 0.0, 1.0):
                 self._slew = float(machine.lower[0]), float(machine.upper[0])
-        self._anchor_m, self._since_s = np.full(3, math.nan), -math.inf
+        self._anchor_m, self._since_s = np.full(3, math.nan), math.inf
 
     def check(self, now_s: float, target: SeenTarget) -> GuardTrip:
         """Return the fault of a borehole, `GuardTrip.NONE` for none."""

@@ -35,6 +35,7 @@ from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
+from deploy.shapes import MachineShapes, read_machine_shapes
 
 if TYPE_CHECKING:
     from deploy.recorder.scene_topics import SceneTopics
@@ -64,6 +65,7 @@ class CaptureConfig:
         machine: The machine.
         facts: Further metadata: `source`, `policy`, …
         pictures_hz: Pictures of the camera a second; 0: none.
+        shapes: File with the machine's shapes (`deploy.shapes`); `None`: none are drawn.
     """
 
     folder: Path
@@ -71,6 +73,7 @@ class CaptureConfig:
     machine: Machine
     facts: dict[str, str]
     pictures_hz: float
+    shapes: str | None = None
 
 
 def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
@@ -143,7 +146,10 @@ class CaptureWriter:
         self._schemas: dict[str, TopicSchema] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
-        self._scene = open_scene(machine, self._write_message, self._offset_ns)
+        shapes = None
+        if capture.shapes is not None:
+            shapes = read_machine_shapes(resolve_package_path(capture.shapes), machine)
+        self._scene = open_scene(machine, shapes, self._write_message, self._offset_ns)
         self._flushed_s = time.monotonic()
 
     def add(self, data: bytes) -> None:
@@ -240,7 +246,9 @@ class CaptureWriter:
         self._mcap.add_message(self._channels[topic], wall_ns, data, wall_ns, self._sequence[topic])
 
 
-def open_scene(machine: Machine, write: WriteMessage, offset_ns: int) -> SceneTopics | None:
+def open_scene(
+    machine: Machine, shapes: MachineShapes | None, write: WriteMessage, offset_ns: int
+) -> SceneTopics | None:
     """Return what writes the scene for viewers; `None` where Foxglove's schemas are missing.
 
     A recording is worth more than its pictures: it goes on without them.
@@ -252,7 +260,7 @@ def open_scene(machine: Machine, write: WriteMessage, offset_ns: int) -> SceneTo
             "no scene and no pictures in the recording: %s; install brokk-rl[deploy]", error
         )
         return None
-    return SceneTopics(machine, write, offset_ns)
+    return SceneTopics(machine, shapes, write, offset_ns)
 
 
 class PictureSampler:

@@ -37,13 +37,13 @@ from google.protobuf.message import Message
 from brokk_rl.kinematics import compute_tool_kinematics, rotate_about_axis
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from deploy.bus.shapes import BASE, MachineShapes, read_machine_shapes
 from deploy.kernel.guard import GuardState
 from deploy.page.scene import plan_approach
 from deploy.picture import decode_jpeg, encode_jpeg
 from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import AdviceStatus
 from deploy.runtime.target import NEAR_M
+from deploy.shapes import BASE, MachineShapes
 
 SHAPES, SHAPE_POINTS = "scene/machine", "scene/machine_points"
 TASK, TASK_POINTS = "scene/task", "scene/task_points"
@@ -81,18 +81,21 @@ class SceneTopics:
 
     Args:
         machine: The machine.
+        shapes: Of the machine; `None`: none are drawn.
         write: Takes topic, monotonic time, name and data of the schema, and the message.
         offset_ns: Wall-clock time minus monotonic time.
     """
 
-    def __init__(self, machine: Machine, write: WriteMessage, offset_ns: int) -> None:
+    def __init__(
+        self, machine: Machine, shapes: MachineShapes | None, write: WriteMessage, offset_ns: int
+    ) -> None:
         self._machine, self._write_message, self._offset_ns = machine, write, offset_ns
         self._q = np.full(machine.num_joints, np.nan)
         self._index = {f"Position_{name}": j for j, name in enumerate(machine.joint_names)}
         self._links_s = self._task_s = -math.inf
         self._holes: list[dict[str, Any]] = []
         self._target_m: np.ndarray | None = None
-        self._shapes = read_machine_shapes(machine)
+        self._shapes = shapes
         self._schemas: dict[str, bytes] = {}
 
     def add(self, topic: str, t_s: float, values: dict[str, Any]) -> None:

@@ -39,6 +39,7 @@ def test_a_flow_at_rest_is_unasked_from_its_second_message_on(source: int) -> No
     valves = Valves()
     assert (valves.check.fault, valves.check.joint) == (GuardTrip.NONE, -1)
     assert (NOBODY, LEVERS, FROM_PC) == (0, 1, 2), "as the DBC numbers them"
+    assert Valves().report((0.0, 0.0, 0.3), source, 1) == (GuardTrip.NONE, -1)
     assert valves.report(STILL, source, 10) == (GuardTrip.NONE, -1)
     assert valves.report((0.0, 0.02, -0.02), source, 5) == (GuardTrip.NONE, -1), "the tolerance"
     assert valves.report((0.0, 0.0, 0.021), source, 1) == (GuardTrip.NONE, -1)

@@ -29,6 +29,7 @@ from deploy.recorder.capture import BLF, MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.conversion import CaptureLogReader
 
 READER = CaptureLogReader(longest_gap_s=0.15, shortest_s=1.0)
+SHAPES = "deploy:machine_shapes/brokk170.json"
 
 
 def write(
@@ -42,7 +43,7 @@ def write(
     """Writes a capture of a machine whose first joint follows a known path: q1 = 0.1 t, flow a step of 0.5 at 1.025 s."""
     bus, log = (
         BusDescription(DBC, machine),
-        CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 0.0)),
+        CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 0.0, SHAPES)),
     )
     begun_s, counter = time.monotonic(), 0
     for k in range(round(seconds * 100)):

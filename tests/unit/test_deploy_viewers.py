@@ -57,6 +57,7 @@ HOLES = [
     }
     for hole in TARGETS
 ]  # fmt: skip
+SHAPES = "deploy:machine_shapes/brokk170.json"
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of one second with every topic, and two pictures where viewers' messages are written."""
     folder, bus = tmp_path_factory.mktemp("capture"), BusDescription(DBC, machine)
     camera = BlockCamera(160, 90, BLOCK_M, TARGETS)
-    with CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 1.0)) as log:
+    with CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 1.0, SHAPES)) as log:
 
         def say(topic: str, t_s: float, values: dict[str, Any]) -> None:
             log.add(TEXT + json.dumps({"topic": topic, "t_s": t_s, **values}).encode())
