@@ -29,8 +29,8 @@ from brokk_rl.policy_folder import (
     TaskDescription,
     drop_targets,
     find_policy,
+    find_resumed,
     format_value,
-    list_checkpoints,
     list_differences,
     name_target,
 )
@@ -209,8 +209,10 @@ def _take_over(cfg: DictConfig) -> DictConfig:
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
         return cfg
-    if cfg.get(RUN) == TRAIN and _is_resumed(cfg):
-        _refuse_late_values(cfg, stored)
+    if cfg.get(RUN) == TRAIN:
+        out = OmegaConf.select(cfg, "session.out", default=None)
+        if find_resumed(str(cfg.policy.path), Path(out or "runs")):  # else a new folder there
+            _refuse_late_values(cfg, stored)
     given = _list_given()
     brought = []
     if "task" in cfg:
@@ -222,13 +224,6 @@ def _take_over(cfg: DictConfig) -> DictConfig:
     if brought:
         log.info("the policy in %s brings %s", stored.name, " and ".join(brought))
     return cfg
-
-
-def _is_resumed(cfg: DictConfig) -> bool:
-    """Return whether a training goes on from a checkpoint."""
-    path, out = str(cfg.policy.path), OmegaConf.select(cfg, "session.out", default=None) or "."
-    has_begun = bool(list_checkpoints(_find_run(path)))
-    return path.endswith(".pt") or (has_begun and is_going_on(cfg, Path(out)))
 
 
 def _choose_option(

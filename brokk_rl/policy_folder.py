@@ -418,6 +418,20 @@ def list_checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob("model_*.pt"), key=lambda path: int(path.stem.removeprefix("model_")))
 
 
+def find_resumed(policy: str | None, folder: Path) -> Path | None:
+    """Return the checkpoint with which a training in `folder` goes on; `None` where it begins.
+
+    It is the newest one there, or the one that was given as `policy` where that is of this run, or
+    where the run has none yet.
+    """
+    here = list_checkpoints(folder)
+    if policy is not None and policy.endswith(".pt"):
+        given = Path(policy)
+        if not here or given.resolve().parent == folder.resolve():
+            return given
+    return here[-1] if here else None
+
+
 def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
     """Read a checkpoint without running code from it.
 

@@ -19,6 +19,7 @@ from brokk_rl.policy_folder import (
     CONTRACT,
     describe_policy,
     describe_spec,
+    find_resumed,
     list_checkpoints,
     read_contract,
     write_policy,
@@ -122,7 +123,7 @@ class Train(SimulatedPlant):
 
     def _begin(self, runner: TrainingRunner) -> None:
         """Load the checkpoint from which training goes on, or the network with which it begins."""
-        checkpoint = self._find_checkpoint()
+        checkpoint = find_resumed(self.policy and self.policy.path, self.session.folder)
         if checkpoint is not None:
             runner.load(str(checkpoint))
             book = runner.logger
@@ -143,16 +144,6 @@ class Train(SimulatedPlant):
             return self.policy.path
         earlier = read_contract(folder, self.policy.path)  # it was stopped before a checkpoint
         return earlier.get("trained", {}).get("began_with")
-
-    def _find_checkpoint(self) -> Path | None:
-        """Return the checkpoint to go on from: the one that was given, else the newest here."""
-        folder = self.session.folder
-        here = list_checkpoints(folder)
-        if self.policy is not None and self.policy.path.endswith(".pt"):
-            given = Path(self.policy.path)
-            if not here or given.resolve().parent == folder.resolve():
-                return given
-        return here[-1] if here else None
 
     @contextlib.contextmanager
     def _explain_interruption(self) -> Iterator[None]:
