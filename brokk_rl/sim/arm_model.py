@@ -154,12 +154,9 @@ class ArmModel:
         """
         model, data = self.model, self.data
         joint = self.chain[row]
-        shared = [
-            other
-            for other in range(row, len(self.chain))
-            if model.jnt_bodyid[self.chain[other]] == model.jnt_bodyid[joint]
-        ]
-        bodies = self._links[shared[-1] + 1]
+        owners = model.jnt_bodyid[self.chain]
+        (alike,) = np.nonzero(owners == owners[row])
+        bodies = self._links[alike[-1] + 1]
         masses = model.body_mass[bodies]
         mass_kg = float(masses.sum())
         if mass_kg < 1e-4:
@@ -173,39 +170,27 @@ class ArmModel:
             turn, away = data.ximat[body].reshape(3, 3), data.xipos[body] - centre
             inertia += turn @ np.diag(model.body_inertia[body]) @ turn.T
             inertia += mass * (away @ away * np.eye(3) - np.outer(away, away))
-        alike = [
-            i
-            for i, one in enumerate(self.chain)
-            if model.jnt_bodyid[one] == model.jnt_bodyid[joint]
-        ]
-        share = 0.1 if len(shared) > 1 else 1.0 - 0.1 * (len(alike) - 1)
+        share = 1.0 - 0.1 * (len(alike) - 1) if row == alike[-1] else 0.1
         return share * mass_kg, centre - self.anchors[row], share * inertia
 
     def find_tool(self) -> np.ndarray:
         """Return the tool point from the last joint: as asked, a named frame, else the far end."""
         model, data, bodies, last = self.model, self.data, self._links[-1], self.anchors[-1]
         fingers = {int(model.jnt_bodyid[joint]) for joint in self._arm.gripper}
-        sites, frames = self._list_frames(bodies)
-        if (tip := self._choices.tip) is not None:
-            kind, _ = self.tree.find_frame(tip)
-            choices = sites if kind == "site" else frames
-            if tip not in choices:
-                raise ConfigError(
-                    f"subject.tip={tip}: it does not move with {self.names[-1]}, the last joint; choose one of "
-                    f"{', '.join([*sites, *frames])}, or another subject.chain"
-                )
-            return choices[tip] - last
-        if TIP in sites:
-            return sites[TIP] - last
+        frames, tip = self._list_frames(bodies), self._choices.tip
+        if tip is not None and tip not in frames:
+            raise ConfigError(
+                f"subject.tip={tip}: it does not move with {self.names[-1]}, the last joint; choose one of "
+                f"{', '.join(frames)}, or another subject.chain"
+            )
+        if (wanted := tip or TIP) in frames:
+            return frames[wanted] - last
         gripper = set(self._arm.gripper)
         palm = [body for body in bodies if gripper.isdisjoint(self.tree.list_above(body, False))]
-        choices: dict[str, np.ndarray] = {}
-        for places in reversed(self._list_frames(palm)):
-            choices |= {
-                name: at_m
-                for name, at_m in places.items()
-                if np.linalg.norm(at_m - last) > NEAREST_TIP_M
-            }
+        choices = {}
+        for name, at_m in self._list_frames(palm).items():
+            if np.linalg.norm(at_m - last) > NEAREST_TIP_M:
+                choices[name] = at_m
         if named := [name for name in choices if TIP_NAMES.search(name)]:
             chosen = named[-1]
         elif fingers:
@@ -227,17 +212,14 @@ class ArmModel:
         )
         return choices[chosen] - last
 
-    def _list_frames(
-        self, bodies: Sequence[int]
-    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Return the places of the sites and of the frames of bodies, by name."""
+    def _list_frames(self, bodies: Sequence[int]) -> dict[str, np.ndarray]:
+        """Return the places of bodies and of the sites on them, by name."""
         model, data = self.model, self.data
-        sites = {
-            model.site(site).name: data.site_xpos[site]
-            for site in range(model.nsite)
-            if model.site_bodyid[site] in bodies
-        }
-        return sites, {model.body(body).name: data.xpos[body] for body in bodies}
+        frames = {model.body(body).name: data.xpos[body] for body in bodies}
+        for site in range(model.nsite):
+            if model.site_bodyid[site] in bodies:
+                frames[model.site(site).name] = data.site_xpos[site]
+        return frames
 
     def write(self, name: str, tool_m: np.ndarray) -> tuple[mujoco.MjModel, str, dict[str, bytes]]:
         """Return model, text and meshes of an MJCF whose link frames lie in the joints, parallel to the base at zero."""

@@ -79,7 +79,7 @@ class KinematicTree:
             joints = self._choose_named(chain)
         else:
             joints, gripper = self._choose_longest()
-            beyond = self.list_above(self.find_frame(tip)[1]) if tip else []
+            beyond = self.list_above(self._find_frame(tip)) if tip else []
             if tip and not set(beyond) <= {*joints, *gripper}:
                 joints, gripper = beyond, []
         if with_gripper and gripper:
@@ -112,23 +112,18 @@ class KinematicTree:
             body = int(self.model.body_parentid[body])
         return found
 
-    def find_frame(self, name: str) -> tuple[str, int]:
-        """Return `site` or `body` and the body of a frame.
-
-        Raises:
-            ConfigError: There is none of this name.
-        """
-        for site in range(self.model.nsite):
-            if self.model.site(site).name == name:
-                return "site", int(self.model.site_bodyid[site])
-        for body in range(1, self.model.nbody):
-            if self.model.body(body).name == name:
-                return "body", body
-        names = [self.model.site(i).name for i in range(self.model.nsite)]
-        names += [self.model.body(i).name for i in range(1, self.model.nbody)]
-        raise ConfigError(
-            f"subject.tip={name}: {self._source.path.name} has no such site or link; {list_choices(name, names)}"
-        )
+    def _find_frame(self, name: str) -> int:
+        """Return the body of a site or body of this name."""
+        model = self.model
+        bodies = {model.body(body).name: body for body in range(1, model.nbody)}
+        for site in range(model.nsite):
+            bodies[model.site(site).name] = int(model.site_bodyid[site])
+        if name not in bodies:
+            raise ConfigError(
+                f"subject.tip={name}: {self._source.path.name} has no such site or link; "
+                f"{list_choices(name, bodies)}"
+            )
+        return bodies[name]
 
     def describe_held(self, chain: ArmChain) -> list[str]:
         """Return sentences about all joints that the machine does not have."""
