@@ -1,4 +1,4 @@
-"""Diagnosis in five functions for a Python program or a notebook, without the command line.
+"""Diagnosis in six functions for a Python program or a notebook, without the command line.
 
     from diagnosis import api
 
@@ -7,8 +7,9 @@
     print(outcome.answer.verdict, [one.effect for one in outcome.answer.selected])
     api.report(outcome, field, "runs/diagnosis")
 
-Options are named as on the command line (`servo`, or the path of a YAML file), or given as specs. The
-extra `diagnose` is enough: neither simulator nor training is imported.
+`from_arrays` takes arrays in the place of recordings. Options are named as on the command line
+(`servo`, or the path of a YAML file), or given as specs. The extra `diagnose` is enough: neither
+simulator nor training is imported.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FunctionType
 from typing import Any
 
@@ -24,9 +26,12 @@ import torch
 
 from actuators import open_loop
 from actuators.contracts import ActuatorFit
+from actuators.recordings import log_draft
+from actuators.recordings.column_names import UNITS, read_unit
+from actuators.recordings.guess import CommandKind, GivenColumns
 from brokk_rl import extensions, record
 from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
@@ -69,6 +74,61 @@ def load(pattern: str | Sequence[str], machine: str | Path | Machine) -> Recordi
     chosen: Machine = _load_option("machine", machine)
     patterns = pattern if isinstance(pattern, str) else tuple(pattern)
     return RecordingSet(tuple(record.read_recordings(patterns, chosen)), chosen)
+
+
+def from_arrays(
+    t_s: np.ndarray,
+    u: np.ndarray,
+    q: np.ndarray,
+    command: CommandKind,
+    joints: Sequence[str] | None = None,
+    unit: str = "rad",
+    max_force: float | None = None,
+) -> RecordingSet:
+    """Return recordings of arrays, with a machine that is drafted from them.
+
+    Args:
+        t_s: Times, `(T,)` s; a gap splits the recording.
+        u: Commands, `(T,)` or `(T, J)`: targets in `unit`, speeds or forces.
+        q: Positions in `unit`, of the same shape.
+        command: `position`, `velocity` or `torque`, the quantity that commands set.
+        joints: Names of the joints; `None`: `joint_1`, `joint_2`, …
+        unit: Unit of the positions, as `log.position_unit`.
+        max_force: Force or torque at the largest command, N or Nm; needed for `torque`.
+
+    Raises:
+        RecordingError: The shapes differ, or the times cannot be used.
+        ConfigError: A force is commanded without `max_force`, or the unit is unknown.
+    """
+    commands, positions = (np.asarray(one, dtype=float).reshape(len(t_s), -1) for one in (u, q))
+    names = list(joints or [f"joint_{number + 1}" for number in range(positions.shape[1])])
+    if commands.shape != positions.shape or len(names) != positions.shape[1]:
+        raise RecordingError(
+            f"from_arrays: expected commands, positions and names of as many joints, got {commands.shape}, "
+            f"{positions.shape} and {len(names)}"
+        )
+    if command == "torque" and max_force is None:
+        raise ConfigError(
+            "from_arrays: command 'torque' needs max_force, the force at the largest command"
+        )
+    if read_unit(unit) is None:
+        raise ConfigError(f"from_arrays: unknown unit '{unit}'; {list_choices(unit, UNITS)}")
+    columns = {"t_s": np.asarray(t_s, dtype=float)}
+    pairs = {}
+    for number, name in enumerate(names):
+        pairs[name] = (f"command {name}", f"measured {name}")
+        columns |= {pairs[name][0]: commands[:, number], pairs[name][1]: positions[:, number]}
+    given = GivenColumns(pairs, command, unit, time=("t_s",))
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / "arrays.npz"
+        np.savez(log, **columns)  # pyright: ignore[reportArgumentType]
+        draft = log_draft.make_draft([log], "arrays", given, None)
+        texts = {"machine": log_draft.format_machine(draft), "import": log_draft.format_map(draft)}
+        texts["machine"] = texts["machine"].replace(log_draft.QUOTED_MISSING, str(max_force))
+        for name, text in texts.items():
+            (Path(folder) / f"{name}.yaml").write_text(text)
+        machine, reader = (_load_option(name, Path(folder) / f"{name}.yaml") for name in texts)
+        return RecordingSet(tuple(reader.read(log, machine)), machine)
 
 
 def identify(

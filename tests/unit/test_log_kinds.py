@@ -18,6 +18,8 @@ from conftest import Done
 from mcap.writer import Writer
 
 from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
+from brokk_rl.errors import RecordingError
+from diagnosis import api
 
 RATE_HZ = 50.0
 LAG = 5
@@ -448,3 +450,15 @@ def test_a_joint_that_hangs_is_remarked_by_import_and_inspect(brokk: Callable[..
     found = json.loads(Path("seen/inspection.json").read_text())["recordings"][0]["findings"]
     assert {one["kind"] for one in found if one["joint"] == "knee"} >= {"not obeyed", "jump"}
     assert not [one for one in found if one["joint"] == "hip"]
+
+
+@pytest.mark.parametrize("command", ["position", "velocity", "torque"])
+def test_arrays_become_recordings_of_a_drafted_machine(command: Any) -> None:
+    rows = make_rows()
+    force = 3.0 if command == "torque" else None
+    found = api.from_arrays(rows[:, 0], rows[:, 1::2], rows[:, 2::2], command, ("hip", "knee"), max_force=force)  # fmt: skip
+    assert {joint.command for joint in found.machine.joints} == {"valve" if command == "velocity" else command}  # fmt: skip
+    (recording,) = found.recordings
+    np.testing.assert_allclose(recording.q[:, 1], rows[: recording.num_samples, 4], atol=2e-3)
+    with pytest.raises(RecordingError, match="as many joints"):
+        api.from_arrays(rows[:, 0], rows[:, 1], rows[:, 2::2], command)
