@@ -272,6 +272,12 @@ class _RecordingScan:
                     most = away[row : row + count].max()
                     text = f"stays up to {most:.2g} {unit} away from its target"
                     found.append(self._finding("not obeyed", name, row, count, text))
+            for row, count in find_stretches(~self._is_moving[:, j] & ~far):
+                moved = np.ptp(self._targets[row : row + max(1, count - self._lead), j])
+                is_long = count * self._period_s >= self._limits.unanswered_s
+                if is_long and moved > FAR_SHARE * self._travel[j]:
+                    text = f"stands while its target moves by {moved:.2g} {unit}"
+                    found.append(self._finding("not obeyed", name, row, count, text))
         return found
 
     def jumps(self) -> list[RecordingFinding]:

@@ -237,12 +237,13 @@ def format_map(draft: Draft) -> str:
     for joint in draft.joints:
         lines += _format_joint(joint, draft.survey.joints[joint.name], draft.has_targets)
     period_s = draft.survey.slowest_period_s
-    shortest_s = max(SHORTEST_S, 20.0 * draft.survey.period_s)
+    # a log of seconds is one piece, and a slow one has some rows in each
+    shortest_s = max(min(SHORTEST_S, 0.5 * draft.survey.longest_s), 20.0 * draft.survey.period_s)
     lines += [
         "optional: {}",
         "overrun: 0.001        # of full command; rounding",
         f"longest_gap_s: {_round_up(GAP_PERIODS * period_s):g}   # s; {GAP_PERIODS} periods of {period_s:.4g} s",
-        f"shortest_s: {shortest_s:g}         # s; shorter ones hold no free run worth judging",
+        f"shortest_s: {shortest_s:.4g}         # s; shorter ones hold no free run worth judging",
         f"damaged: {draft.damaged}       # skip: leave damaged rows, messages, chunks and frames out",
     ]
     if draft.dbc is not None:

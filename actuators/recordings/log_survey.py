@@ -84,6 +84,7 @@ class LogSurvey:
         slowest_period_s: Median period of the slowest signal.
         num_runs: Number of runs.
         minutes: Length of all runs without their gaps.
+        longest_s: Length of the longest piece without a gap.
         gaps: Gaps that split the logs, as text.
     """
 
@@ -92,6 +93,7 @@ class LogSurvey:
     slowest_period_s: float = 0.0
     num_runs: int = 0
     minutes: float = 0.0
+    longest_s: float = 0.0
     gaps: list[str] = field(default_factory=list)
 
     @property
@@ -116,6 +118,8 @@ class LogSurvey:
                 f"from {t_s[longest] - t_s[0]:.2f} s on: lost rows, or a clock that was set; the log is split there"
             )
         self.minutes += float(t_s[-1] - t_s[0] - periods_s[gaps].sum()) / 60.0
+        edges_s = np.concatenate([t_s[:1], t_s[gaps], t_s[-1:]])
+        self.longest_s = max(self.longest_s, float(np.diff(edges_s).max()))
         self.num_runs += 1
 
 

@@ -32,6 +32,8 @@ SPIKE_RATIO = 8.0
 """A spike is so many times the usual change over two samples, which noise and motion have too."""
 JUMP_SHARE = 0.1
 """Least size of a jump, as a part of the range."""
+CAUSE_SHARE = 0.3
+"""Least step of a target that causes a step of the position, as a part of the latter."""
 JUMP_RATIO = 10.0
 """A jump is so many times the 95 % quantile of the steps of its signal; a joint gains speed over samples."""
 
@@ -137,6 +139,8 @@ def find_jumps(
     found = []
     for row in np.flatnonzero(size > least):
         begin = int(np.searchsorted(t_s, t_s[row] - longest_lag_s))
-        if np.ptp(cause[begin : row + 2]) < 0.5 * size[row]:
+        # only a step causes a step; a target that moves slowly does not
+        largest = np.abs(np.diff(cause[begin : row + 2])).max(initial=0.0)
+        if largest < CAUSE_SHARE * size[row]:
             found.append(row)
     return np.array(found, dtype=int)

@@ -247,6 +247,8 @@ def test_steps_that_no_machine_makes_are_found() -> None:
     reset = q.copy()
     reset[500:] += 200.0
     assert find_jumps(t_s, reset, np.zeros(1000), 1.5).tolist() == [499]
+    moving = 300.0 * np.sin(0.5 * t_s + 0.1)
+    assert find_jumps(t_s, reset, moving, 1.5).tolist() == [499]
     step = np.where(t_s > 5.0, 1.0, 0.0)
     assert not len(find_jumps(t_s, delay(step), step, 1.5))
 
