@@ -5,13 +5,13 @@ by the error that a simulator and the machine's sensors have anyway. Its squared
 information about the size of the effect. An effect is told where the expected gain in log likelihood
 exceeds the penalty that the search puts on it. What small faults of the simulator explain is removed
 first.
-Axes: `J` joints, `W` windows, `E` entries (whitened increments), `M` rows of responses.
+Axes: `J` joints, `E` entries (whitened increments), `S` sizes, `R` responses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -21,41 +21,35 @@ from actuators.open_loop import FreeRunWindows
 from actuators.recordings.inspection import estimate_step
 from actuators.recordings.preview import EffectLimit, LookalikePair, PreviewCallback, PreviewResult
 from actuators.scales import choose_horizon_s
-from brokk_rl.contracts.actuator import Actuator, Excitation
-from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording, make_motion
-from brokk_rl.spec import Count, Positive, name_spec, spec
+from brokk_rl.record import Recording
+from brokk_rl.spec import Count, name_spec, spec
 from diagnosis import effect_library
 from diagnosis.case import estimate_running_s
+from diagnosis.decision import SAME_NATS, SAME_SHARE
 from diagnosis.effect_library import EffectSimulator, EffectType
-from diagnosis.error_covariance import ErrorCovariance
-from diagnosis.late_frames import find_smallest_lateness
+from diagnosis.error_covariance import T_FREEDOM, ErrorCovariance
 from diagnosis.request import Penalties
-from diagnosis.residuals import INCREMENT_SAMPLES, Residuals
-from diagnosis.response_table import (
-    ResponseTable,
-    compare_pair,
-    find_needed_minutes,
-    find_separating_minutes,
-    find_smallest_size,
-    find_soonest,
-    multiply_rows,
-    simulate_responses,
-)
+from diagnosis.residuals import INCREMENT_SAMPLES, Residuals, build_rays
+from diagnosis.responses import SIZE_PRIOR
 from diagnosis.search import MIN_SIZE
 from diagnosis.sensors import MIN_ADDED_SCATTER, estimate_sensor_noise
 
-SIZES, COMPARED_SIZES = (0.25, 0.5, 1.0, 2.0), (0.5, 1.0, 2.0)
-"""Sizes over the typical one that are simulated along the motions and along each excitation; in
-between the information is interpolated. Powers of two: typical sizes of effects with the same form
-differ by such (a delay of commands, an offset of clocks). Chosen by hand for 20 s on one core."""
+SIZES = (0.25, 0.5, 1.0, 2.0)
+"""Sizes over the typical one that are simulated; in between the information is interpolated. Powers of
+two: typical sizes of effects with the same form differ by such (a delay of commands, an offset of
+clocks). Chosen by hand for ten seconds on one core."""
+TRIED_SIZES = np.geomspace(0.02, 4.0, 240)
+"""Sizes over the typical one among which the smallest is sought; steps of 2 %."""
 QUANTISATION_FACTOR = 12.0**-0.5
 """Root mean square of a rounding error, over the step."""
-
-MIN_STOP_MARGIN = 0.05
-"""Least distance from a stop that programs keep, over the travel: effects at the stops themselves are
-no purpose of an excitation. Chosen by hand."""
+INFORMATION_SHARE = (T_FREEDOM + 1.0) / (T_FREEDOM + 3.0)
+"""Fisher information of the t distribution about its place, over that of a normal one: 3/4."""
+RIVAL_SIGMA = 4.0
+"""Prior standard deviation of the size of an effect in the place of another, over the typical one: all
+that the search tries."""
 
 
 @spec
@@ -113,27 +107,20 @@ class TellableEffects:
         effects: Names of effects; `null`: all that are registered.
         prices: Penalties of the search.
         error: Expected error of the simulator and the sensors.
-        excitations: Excitations that are compared, by name.
         num_windows: Free runs that are simulated of the motions, evenly spread; more motions of the
             same making hold as much information each.
-        num_compared: The same of each excitation.
-        compared_s: Length of the programs of each excitation from which these are taken.
     """
 
     actuator: Actuator
     effects: tuple[str, ...] | None
     prices: Penalties
     error: ExpectedError
-    excitations: dict[str, Excitation]
     num_windows: Count
-    num_compared: Count
-    compared_s: Positive
 
     def assess(
         self,
         motions: Sequence[Recording],
         machine: Machine,
-        generator: np.random.Generator,
         tell: PreviewCallback,
         are_measured: bool,
     ) -> PreviewResult:
@@ -144,24 +131,21 @@ class TellableEffects:
         noise = self.error.expect_noise(machine, reading)
         cut, running_s, seconds = cut_motions(motions, machine, self.num_windows)
         residuals = self._hold(machine, cut, running_s, noise)
-        moving = [kind for kind in kinds if _is_seen_in_motion(kind)]
-        columns, rows, sizes = simulate_responses(
-            residuals, moving, SIZES, lambda doing, done: tell(doing, 0.05 + 0.5 * done)
-        )
-        used_s = len(cut.q) * choose_horizon_s(machine)
-        table = ResponseTable(
-            multiply_rows(columns), residuals.faults.shape[1], rows, sizes, used_s
-        ).scale_to(seconds)
-        compared = self._compare_excitations(machine, moving, noise, generator, tell)
-        tell("effects and pairs", 0.95)
-        limits = list(self._list_limits(machine, moving, table, compared))
+        times = seconds / (len(cut.q) * choose_horizon_s(machine))
+        shown = []
+        for number, kind in enumerate(kinds):
+            tell(f"simulating {kind.name}", number / len(kinds))
+            if _is_seen_in_motion(kind):
+                shown += simulate_responses(residuals, kind)
+        known = ResponseInformation(residuals.faults, times)
+        limits = list(self._list_limits(machine, shown, known))
         for kind in kinds:
             if not _is_seen_in_motion(kind):
-                limits += self._list_other_limits(machine, kind, residuals, noise, seconds / used_s)
+                limits += _list_other_limits(machine, kind, noise)
         return PreviewResult(
             minutes=seconds / 60.0,
             limits=tuple(limits),
-            pairs=tuple(list_lookalikes(machine, table, compared, limits)),
+            pairs=tuple(list_lookalikes(machine, shown, known, limits)),
             assumed={
                 "simulator": name_spec(self.actuator),
                 "price": {"joint": self.prices.joint, "name": self.prices.name},
@@ -182,92 +166,140 @@ class TellableEffects:
         simulator = EffectSimulator(self.actuator, machine, cut, running_s, 0)
         return Residuals(simulator, noise, np.ones((len(cut.q), machine.num_joints), dtype=bool))
 
-    def _compare_excitations(
-        self,
-        machine: Machine,
-        kinds: Sequence[EffectType],
-        noise: Sequence[ErrorCovariance],
-        generator: np.random.Generator,
-        tell: PreviewCallback,
-    ) -> dict[str, ResponseTable]:
-        """Return the responses at typical sizes along each excitation."""
-        cuts = {}
-        for name, excitation in self.excitations.items():
-            if motions := simulate_programs(excitation, machine, self.compared_s, generator):
-                cut, _, _ = cut_motions(motions, machine, self.num_compared)
-                cuts[name] = replace(cut, run=np.full(len(cut.q), name))
-        if not cuts:
-            return {}
-        joined = open_loop.join_windows(list(cuts.values()))
-        residuals = self._hold(machine, joined, np.zeros(len(joined.q)), noise)
-        columns, rows, sizes = simulate_responses(
-            residuals,
-            kinds,
-            COMPARED_SIZES,
-            lambda doing, done: tell(f"{doing}, excitations", 0.55 + 0.4 * done),
-        )
-        found, steps = {}, residuals.increments.shape[1]
-        for name in cuts:
-            entries = np.repeat(joined.run == name, steps)
-            seconds = entries.sum() / steps * choose_horizon_s(machine)
-            found[name] = ResponseTable(
-                multiply_rows(columns[..., entries]),
-                residuals.faults.shape[1],
-                rows,
-                sizes,
-                seconds,
-            )
-        return found
-
     def _list_limits(
-        self,
-        machine: Machine,
-        kinds: Sequence[EffectType],
-        table: ResponseTable,
-        compared: Mapping[str, ResponseTable],
+        self, machine: Machine, shown: Sequence[NumberResponse], known: ResponseInformation
     ) -> Iterator[EffectLimit]:
         """Yield the limits of effects that free runs show."""
-        for kind in kinds:
-            is_shared = bool(effect_library.list_shared_effects([kind]))
+        for one in shown:
+            is_shared = bool(effect_library.list_shared_effects([one.kind]))
             price = self.prices.name + (0.0 if is_shared else self.prices.joint)
-            groups = [list(range(machine.num_joints))] if is_shared else []
-            groups = groups or [[j] for j in range(machine.num_joints)]
-            for key in table.list_keys(kind.name):
-                for group in groups:
-                    gains = sum(table.expect_gains(j, key) for j in group)
-                    size = find_smallest_size(np.asarray(gains), price, table.sizes[key][-1])
-                    if size is not None and not is_shared:
-                        size = max(size, MIN_SIZE)
-                    best = find_soonest(
-                        {
-                            name: find_needed_minutes(one, group, key, price)
-                            for name, one in compared.items()
-                        }
-                    )
-                    yield _describe_limit(machine, kind, key[1], group, size, "motion", *best)
+            every = list(range(machine.num_joints))
+            alike = [other for other in shown if other.kind is one.kind]
+            for group in [every] if is_shared else [[j] for j in every]:
+                gains = sum(known.expect_gains(j, one, alike) for j in group)
+                size = find_smallest_size(np.asarray(gains), price, one.sizes[-1])
+                if size is not None and not is_shared:
+                    size = max(size, MIN_SIZE)
+                yield _describe_limit(machine, one.kind, one.number, group, size, "motion")
 
-    def _list_other_limits(
-        self,
-        machine: Machine,
-        kind: EffectType,
-        residuals: Residuals,
-        noise: Sequence[ErrorCovariance],
-        times: float,
-    ) -> Iterator[EffectLimit]:
-        """Yield the limits of effects that sensors, frames or tool points show."""
-        every, price = list(range(machine.num_joints)), self.prices.joint + self.prices.name
-        for name in kind.fitted:
-            if kind.target.side == "measurement":
-                factor = QUANTISATION_FACTOR if not kind.target.stochastic else 1.0
-                for j in every:
-                    least = MIN_ADDED_SCATTER * noise[j].reading / factor
-                    size = least / abs(kind.size_on(name, j))
-                    yield _describe_limit(machine, kind, name, [j], size, "scatter")
-            elif kind.target.side == "command":
-                size = find_smallest_lateness(residuals, kind, name, price, times)
-                yield _describe_limit(machine, kind, name, every, size, "frames")
-            else:
-                yield _describe_limit(machine, kind, name, every, None, "tool points")
+
+@dataclass(frozen=True, eq=False)
+class NumberResponse:
+    """Response of the joints to one number of an effect.
+
+    Attributes:
+        kind: The effect.
+        number: Its number; empty where one size stands for all numbers.
+        sizes: Sizes over the typical one, `(S,)`.
+        rows: Whitened responses, `(J, S, E)`.
+    """
+
+    kind: EffectType
+    number: str
+    sizes: np.ndarray
+    rows: np.ndarray
+
+    def at_typical(self, joint: int) -> np.ndarray:
+        """Return the response at the size nearest to the typical one, `(E,)`."""
+        return self.rows[joint, int(np.argmin(np.abs(self.sizes - 1.0)))]
+
+
+def simulate_responses(residuals: Residuals, kind: EffectType) -> list[NumberResponse]:
+    """Return the whitened responses to each number of an effect."""
+    found = []
+    for ray in build_rays(kind, SIZES):
+        tried = ray.sizes[ray.sizes > 0.0]
+        one = replace(ray, sizes=np.concatenate([[0.0], tried]))
+        found.append(NumberResponse(kind, ray.name, tried, residuals.response(one)[:, 1:]))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseInformation:
+    """Information about sizes beside the faults of the simulator.
+
+    Attributes:
+        faults: Responses to the faults of each joint at one prior sigma, `(J, R, E)`.
+        times: Length of the motions over that of the simulated free runs.
+    """
+
+    faults: np.ndarray
+    times: float
+
+    def measure(
+        self, joint: int, rows: np.ndarray, beside: Sequence[np.ndarray] = ()
+    ) -> np.ndarray:
+        """Return the information about the lengths of responses `(R, E)`, `(R,)`.
+
+        Faults have a prior of one standard deviation each, the responses `beside` one of
+        `RIVAL_SIGMA`.
+        """
+        share = INFORMATION_SHARE * self.times
+        known = np.concatenate([self.faults[joint], *beside])
+        precision = np.ones(len(known))
+        precision[self.faults.shape[1] :] = RIVAL_SIGMA**-2.0
+        cross = share * known @ rows.T
+        inner = share * known @ known.T + np.diag(precision)
+        explained = (cross * np.linalg.solve(inner, cross)).sum(0)
+        return np.maximum(share * (rows**2).sum(1) - explained, 0.0)
+
+    def expect_gains(
+        self, joint: int, one: NumberResponse, alike: Sequence[NumberResponse]
+    ) -> np.ndarray:
+        """Return the expected gain of each of `TRIED_SIZES` before penalties, nats.
+
+        It is the logarithm of a Bayes factor by Laplace's approximation: half the squared length of
+        the response, less the prior of the size and Occam's factor of all numbers `alike`.
+        """
+        unit = self._interpolate(joint, one)
+        occam = sum(np.log1p(self._interpolate(joint, other)) for other in alike)
+        return 0.5 * (unit - SIZE_PRIOR**-2.0) * TRIED_SIZES**2 - 0.5 * occam
+
+    def _interpolate(self, joint: int, one: NumberResponse) -> np.ndarray:
+        """Return the information over the squared size at each of `TRIED_SIZES`."""
+        known = self.measure(joint, one.rows[joint]) / one.sizes**2
+        return np.interp(np.log(TRIED_SIZES), np.log(one.sizes), known)
+
+    def is_explained(
+        self, joint: int, numbers: Sequence[NumberResponse], others: Sequence[NumberResponse]
+    ) -> bool:
+        """Return whether another effect explains all numbers of an effect at their typical sizes.
+
+        The same limits make two effects equivalent in the answer of a diagnosis. Numbers that show
+        nothing are not explained.
+        """
+        beside = [other.rows[joint] for other in others]
+        for one in numbers:
+            row = one.at_typical(joint)[None]
+            own = float(self.measure(joint, row)[0])
+            left = float(self.measure(joint, row, beside)[0])
+            is_alike = left < (1.0 - SAME_SHARE) * own or 0.5 * left < SAME_NATS
+            if 0.5 * own < SAME_NATS or not is_alike:
+                return False
+        return True
+
+
+def find_smallest_size(gains: np.ndarray, price: float, largest: float) -> float | None:
+    """Return the smallest of `TRIED_SIZES` from which the gain exceeds the price; `None` for none up to `largest`."""
+    told = (gains > price) & (largest + 1e-9 >= TRIED_SIZES)
+    return float(TRIED_SIZES[int(np.argmax(told))]) if told.any() else None
+
+
+def _list_other_limits(
+    machine: Machine, kind: EffectType, noise: Sequence[ErrorCovariance]
+) -> Iterator[EffectLimit]:
+    """Yield the limits of effects that the scatter of sensors shows, and effects that no motion shows."""
+    every = list(range(machine.num_joints))
+    for name in kind.fitted:
+        if kind.target.side == "measurement":
+            factor = 1.0 if kind.target.stochastic else QUANTISATION_FACTOR
+            for j in every:
+                least = MIN_ADDED_SCATTER * noise[j].reading / factor
+                size = least / abs(kind.size_on(name, j))
+                yield _describe_limit(machine, kind, name, [j], size, "scatter")
+        else:
+            place = "frames" if kind.target.side == "command" else "tool points"
+            yield _describe_limit(machine, kind, name, every, None, place)
 
 
 def cut_motions(
@@ -297,58 +329,30 @@ def cut_motions(
     return some, running_s[kept], seconds
 
 
-def simulate_programs(
-    excitation: Excitation, machine: Machine, seconds: float, generator: np.random.Generator
-) -> list[Recording]:
-    """Return the programs of an excitation as a nominal machine would follow them; none where none fits."""
-    try:
-        segments = excitation.segments(machine, seconds, generator, [])
-    except ConfigError:  # not a single segment fits
-        return []
-    before, late = (
-        open_loop.count_samples_before(machine),
-        round(machine.dead_time_s / machine.period_s),
-    )
-    found = []
-    for number, segment in enumerate(segments):
-        u, full = np.pad(segment.u, ((before, 0), (0, 0))), machine.max_speed * machine.period_s
-        margin = max(segment.stop_margin, MIN_STOP_MARGIN) * (machine.upper - machine.lower)
-        low, high = machine.lower + margin, machine.upper - margin
-        # A joint that comes near its stop waits there until its program turns around.
-        heading = segment.start.astype(float)
-        for k in range(len(u)):
-            ahead = heading + u[k] * full
-            u[k] *= ~((ahead > high) & (u[k] > 0.0) | (ahead < low) & (u[k] < 0.0))
-            heading = heading + u[k] * full
-        moved = np.pad(u, ((late + 1, 0), (0, 0)))[: len(u)] * full
-        q = segment.start + np.cumsum(moved, 0)
-        t_s = np.arange(len(u)) * machine.period_s
-        found.append(make_motion(machine, f"{number}", t_s, u, q))
-    return found
-
-
 def list_lookalikes(
     machine: Machine,
-    table: ResponseTable,
-    compared: Mapping[str, ResponseTable],
+    shown: Sequence[NumberResponse],
+    known: ResponseInformation,
     limits: Sequence[EffectLimit],
 ) -> Iterator[LookalikePair]:
     """Yield pairs of effects that are told, and of which each explains the other on some joints."""
+    numbers: dict[str, list[NumberResponse]] = {}
+    for one in shown:
+        numbers.setdefault(one.kind.name, []).append(one)
     told: list[set[str]] = []
     for name in machine.joint_names:
         mine = [one for one in limits if name in one.joints and one.shows_in == "motion"]
         told.append({one.effect for one in mine} - {one.effect for one in mine if not one.is_told})
-    for pair in combinations(sorted(set().union(*told)), 2):
+    for first, second in combinations(sorted(set().union(*told)), 2):
+        one, other = numbers[first], numbers[second]
         joints = []
         for j, names in enumerate(told):
-            if names.issuperset(pair) and compare_pair(table, j, pair) == "alike":
-                joints.append(j)
+            if not names.issuperset((first, second)):
+                continue
+            if known.is_explained(j, one, other) and known.is_explained(j, other, one):
+                joints.append(machine.joint_names[j])
         if joints:
-            needed = {
-                name: find_separating_minutes(one, joints, pair) for name, one in compared.items()
-            }
-            names = tuple(machine.joint_names[j] for j in joints)
-            yield LookalikePair((pair[0], pair[1]), names, *find_soonest(needed))
+            yield LookalikePair((first, second), tuple(joints))
 
 
 def _describe_limit(
@@ -358,8 +362,6 @@ def _describe_limit(
     joints: Sequence[int],
     size: float | None,
     shows_in: str,
-    excitation: str | None = None,
-    minutes: float | None = None,
 ) -> EffectLimit:
     """Return a limit with its sizes in SI units; those of several joints are their mean."""
     number = number or kind.fitted[0]
@@ -372,8 +374,6 @@ def _describe_limit(
         typical=typical,
         smallest=None if size is None else size * typical,
         shows_in=shows_in,
-        excitation=excitation,
-        minutes=minutes,
     )
 
 

@@ -151,8 +151,7 @@ class Collect:
             motions.append(
                 record.make_motion(self.machine, f"{n}", track.t_s, track.u[:, n], track.q[:, n])
             )
-        generator = self.session.generator("preview")
-        return preview_report.run_preview(self.preview, motions, self.machine, generator, False)
+        return preview_report.run_preview(self.preview, motions, self.machine, False)
 
     def _metadata(self, plan: ExcitationPlan) -> dict[str, str]:
         return {

@@ -158,8 +158,7 @@ class Inspect:
         """Return which effects these recordings could tell; `None` without a preview, or where none is long enough."""
         if self.preview is None or not recordings:
             return None
-        generator = self.session.generator("preview")
-        return preview_report.run_preview(self.preview, recordings, self.machine, generator, True)
+        return preview_report.run_preview(self.preview, recordings, self.machine, True)
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
         """Return each joint's dead time from all sound recordings, `None` where unknown."""

@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from brokk_rl.machine import Machine
     from brokk_rl.record import Recording
 
@@ -30,8 +28,6 @@ class EffectLimit:
         typical: Typical size there.
         smallest: Smallest size that would be told; `None`: none of those that were tried.
         shows_in: Part of the recordings that shows it: `motion`, `scatter`, `frames`, `tool points`.
-        excitation: Registered excitation that tells the typical size soonest; `None`: none does.
-        minutes: Time that this excitation takes.
     """
 
     effect: str
@@ -41,8 +37,6 @@ class EffectLimit:
     typical: float
     smallest: float | None
     shows_in: str
-    excitation: str | None = None
-    minutes: float | None = None
 
     @property
     def is_told(self) -> bool:
@@ -57,14 +51,10 @@ class LookalikePair:
     Attributes:
         effects: Their names.
         joints: Joints on which they look alike.
-        excitation: Registered excitation that separates them soonest; `None`: none does.
-        minutes: Time that this excitation takes.
     """
 
     effects: tuple[str, str]
     joints: tuple[str, ...]
-    excitation: str | None
-    minutes: float | None
 
 
 @dataclass(frozen=True)
@@ -102,7 +92,6 @@ class EffectPreview(Protocol):
         self,
         motions: Sequence[Recording],
         machine: Machine,
-        generator: np.random.Generator,
         tell: PreviewCallback,
         are_measured: bool,
     ) -> PreviewResult:
@@ -111,7 +100,6 @@ class EffectPreview(Protocol):
         Args:
             motions: Recordings, or motions that are planned.
             machine: The machine.
-            generator: Draws excitations.
             tell: Receives the progress.
             are_measured: The positions are readings of the machine's sensors, so that their noise
                 is that of the recordings.

@@ -26,6 +26,11 @@ EXPLANATION = (
     "Smallest size that would be told, as a distance from the value without the effect. In brackets: "
     "larger than the typical size. – : none of the sizes that were tried."
 )
+UNTOLD = {
+    "tool points": "only measured tool points (ee_x_m, ee_y_m, ee_z_m) show them",
+    "frames": "the more often commands change, the smaller ones show",
+}
+"""What is said of effects whose smallest size is not foretold."""
 COLOURS = ("#009e73", "#f0e442", "#d55e00")
 """Told with ease, just told, not told: distinguishable by those who see no red or green (Okabe and
 Ito)."""
@@ -36,11 +41,7 @@ CELL_INCHES = 0.34
 
 
 def run_preview(
-    preview: EffectPreview,
-    motions: Sequence[Recording],
-    machine: Machine,
-    generator: np.random.Generator,
-    are_measured: bool,
+    preview: EffectPreview, motions: Sequence[Recording], machine: Machine, are_measured: bool
 ) -> PreviewResult | None:
     """Return the preview of some motions, with a bar of progress.
 
@@ -53,11 +54,7 @@ def run_preview(
     try:
         with ItemProgress("preview", SHARE) as progress:
             return preview.assess(
-                motions,
-                machine,
-                generator,
-                lambda doing, done: progress.reach(done, doing),
-                are_measured,
+                motions, machine, lambda doing, done: progress.reach(done, doing), are_measured
             )
     except RecordingError as error:
         log.warning("no preview of the effects that these motions could tell: %s", error)
@@ -66,7 +63,7 @@ def run_preview(
 
 def describe_effects(result: PreviewResult, machine: Machine) -> Rows:
     """Return the table of effects: a row a number, a column a joint."""
-    head = ["effect", *machine.joint_names, "unit", "typical", "told soonest by"]
+    head = ["effect", *machine.joint_names, "unit", "typical"]
     rows, names = [], _name_numbers(result)
     for limits in _group_limits(result):
         first = limits[0]
@@ -81,7 +78,6 @@ def describe_effects(result: PreviewResult, machine: Machine) -> Rows:
                 *sizes.values(),
                 " or ".join(sorted({one.unit.replace("1", "–") for one in limits})),
                 " to ".join([typical[0], typical[-1]] if len(typical) > 1 else typical),
-                _format_soonest(limits),
             ]
         )
     return head, rows
@@ -89,21 +85,18 @@ def describe_effects(result: PreviewResult, machine: Machine) -> Rows:
 
 def describe_pairs(result: PreviewResult) -> Rows:
     """Return the table of effects that look alike."""
-    head, rows = ["look alike", "joints", "told apart soonest by"], []
+    head, rows = ["look alike", "joints"], []
     for pair in result.pairs:
-        soonest = _format_excitation(pair.excitation, pair.minutes)
-        rows.append([" and ".join(pair.effects), ", ".join(pair.joints), soonest])
+        rows.append([" and ".join(pair.effects), ", ".join(pair.joints)])
     return head, rows
 
 
 def list_remarks(result: PreviewResult) -> list[str]:
     """Return what the tables leave out, and what they rest on."""
-    hidden = sorted({one.effect for one in result.limits if one.shows_in == "tool points"})
     found = []
-    if hidden:
-        found.append(
-            f"{', '.join(hidden)}: only measured tool points (ee_x_m, ee_y_m, ee_z_m) show them"
-        )
+    for place, text in UNTOLD.items():
+        if hidden := sorted({one.effect for one in result.limits if one.shows_in == place}):
+            found.append(f"{', '.join(hidden)}: {text}")
     source = "of these recordings" if result.assumed["noise_is_measured"] else "expected"
     price = sum(result.assumed["price"].values())
     found.append(
@@ -116,7 +109,7 @@ def list_remarks(result: PreviewResult) -> list[str]:
 
 def show_preview(result: PreviewResult, machine: Machine) -> None:
     """Print the tables."""
-    untold = [one for one in result.limits if not one.is_told and one.shows_in != "tool points"]
+    untold = [one for one in result.limits if not one.is_told and one.shows_in not in UNTOLD]
     title = (
         f"effects that {result.minutes:.1f} minutes of these motions would tell "
         f"({len(untold)} of {len(result.limits)} numbers not at their typical size)"
@@ -172,7 +165,7 @@ def _group_limits(result: PreviewResult) -> list[list[EffectLimit]]:
     """Return the limits of each number that commands and positions show."""
     found: dict[tuple[str, str], list[EffectLimit]] = {}
     for one in result.limits:
-        if one.shows_in != "tool points":
+        if one.shows_in not in UNTOLD:
             found.setdefault((one.effect, one.number), []).append(one)
     return list(found.values())
 
@@ -193,24 +186,3 @@ def _format_size(one: EffectLimit) -> str:
     if one.smallest is None:
         return "–"
     return f"{one.smallest:.2g}" if one.is_told else f"({one.smallest:.2g})"
-
-
-def _format_soonest(limits: Sequence[EffectLimit]) -> str:
-    """Return the excitation of the joint that needs the longest time, of those that any tells."""
-    if limits[0].shows_in == "scatter":
-        return "any rest or motion"
-    if limits[0].shows_in == "frames":
-        return "more changes of commands"
-    known = [one for one in limits if one.minutes is not None]
-    if not known:
-        return "none"
-    slowest = max(known, key=lambda one: one.minutes or 0.0)
-    text = _format_excitation(slowest.excitation, slowest.minutes)
-    without = [one.joints[0] for one in limits if one.minutes is None]
-    return f"{text}; none on {', '.join(without)}" if without else text
-
-
-def _format_excitation(name: str | None, minutes: float | None) -> str:
-    if name is None or minutes is None:
-        return "none"
-    return f"{name}, {minutes:.2g} min"

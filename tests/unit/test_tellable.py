@@ -15,6 +15,7 @@ from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
+from actuators import open_loop
 from actuators.models.lag import FirstOrderLag
 from actuators.recordings.preview import EffectLimit, PreviewResult
 from actuators.recordings.preview_report import run_preview
@@ -26,12 +27,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library, tellable
 from diagnosis.detection import choose_by_penalties
-from diagnosis.late_frames import compute_divergence
 from diagnosis.residuals import Residuals, build_rays, to_increments
-from diagnosis.response_table import ResponseTable
 from diagnosis.responses import Response, add_responses, choose_rays, fit_joint_faults
 from diagnosis.search import SubsetTable
-from diagnosis.tellable import ExpectedError, TellableEffects
+from diagnosis.tellable import ExpectedError, ResponseInformation, TellableEffects
 
 torch.set_num_threads(1)
 PLANT = FirstOrderLag(
@@ -61,25 +60,38 @@ def preview(effects: Sequence[str] | None = EFFECTS, **changes: Any) -> Tellable
         "effects": None if effects is None else tuple(effects),
         "prices": load_part("prices"),
         "error": NOISY,
-        "excitations": {},
         "num_windows": 400,
-        "num_compared": 8,
-        "compared_s": 120.0,
     }
     return TellableEffects(**fields | changes)
 
 
 def motions(machine: Machine, seconds: float, seed: int, name: str = "levels") -> list[Recording]:
-    return tellable.simulate_programs(
-        option("excitation", name), machine, seconds, np.random.default_rng(seed)
-    )
+    """Returns the programs of an excitation as a machine with the nominal speed follows them."""
+    excitation, generator = option("excitation", name), np.random.default_rng(seed)
+    before = open_loop.count_samples_before(machine)
+    late = round(machine.dead_time_s / machine.period_s) + 1
+    full = machine.max_speed * machine.period_s
+    found = []
+    for number, segment in enumerate(excitation.segments(machine, seconds, generator, [])):
+        u = np.pad(segment.u, ((before, 0), (0, 0)))
+        margin = max(segment.stop_margin, 0.05) * (machine.upper - machine.lower)
+        heading = segment.start.astype(float)
+        for row in u:  # a joint that comes near its stop waits until its program turns around
+            ahead = heading + row * full
+            is_over = (ahead > machine.upper - margin) & (row > 0.0)
+            is_under = (ahead < machine.lower + margin) & (row < 0.0)
+            row *= ~(is_over | is_under)
+            heading = heading + row * full
+        q = segment.start + np.cumsum(np.pad(u, ((late, 0), (0, 0)))[: len(u)] * full, 0)
+        t_s = np.arange(len(u)) * machine.period_s
+        found.append(record.make_motion(machine, f"{number}", t_s, u, q))
+    return found
 
 
 def assess(
     one: TellableEffects, machine: Machine, some: Sequence[Recording], are_measured: bool = False
 ) -> PreviewResult:
-    generator = np.random.default_rng(0)
-    return one.assess(some, machine, generator, lambda doing, done: None, are_measured)
+    return one.assess(some, machine, lambda doing, done: None, are_measured)
 
 
 def limit(result: PreviewResult, effect: str, joint: str, number: str = "") -> EffectLimit:
@@ -184,31 +196,24 @@ def test_some_free_runs_stand_for_all(axis: Machine) -> None:
     assert part.smallest == pytest.approx(whole.smallest, rel=0.25)
 
 
-def test_a_joint_that_stands_still_tells_nothing_and_an_excitation_would(machine: Machine) -> None:
+def test_a_joint_that_stands_still_tells_nothing(machine: Machine) -> None:
     steps = 1200
     u = np.zeros((steps, 5))
     u[:, 2] = np.repeat([0.0, 0.5, 0.0, -0.5], 60)[np.arange(steps) % 240]
     q = machine.home + np.cumsum(u * machine.max_speed * machine.period_s, 0)
     still = record.make_motion(machine, "still", np.arange(steps) * machine.period_s, u, q)
-    excitations = {"levels": option("excitation", "levels")}
-    result = assess(preview(("lag", "load_dependence"), excitations=excitations), machine, [still])
+    result = assess(preview(("lag", "load_dependence")), machine, [still])
     for one in result.limits:
         assert (one.smallest is None) == (one.joints != ("q3",)), one
-    assert limit(result, "lag", "q4").excitation == "levels"
-    assert limit(result, "load_dependence", "q1").excitation is None, (
-        "a slewing joint lifts nothing"
-    )
 
 
 def test_a_delay_and_an_offset_of_clocks_look_alike_in_any_motion(machine: Machine) -> None:
-    excitations = {name: option("excitation", name) for name in ("levels", "ramps")}
-    one = preview(("clock_offset", "dead_time", "dead_band"), excitations=excitations)
+    one = preview(("clock_offset", "dead_time", "dead_band"))
     result = assess(
         replace(one, error=load_part("preview").error), machine, motions(machine, 300.0, 3)
     )
     (pair,) = result.pairs
     assert pair.effects == ("clock_offset", "dead_time") and pair.joints == machine.joint_names
-    assert pair.excitation is None and pair.minutes is None
 
 
 def test_noise_that_is_measured_hides_small_effects(axis: Machine) -> None:
@@ -239,21 +244,12 @@ def test_a_coarse_sensor_has_the_noise_of_rounding(axis: Machine) -> None:
 
 def test_information_is_what_faults_leave() -> None:
     """One fault of length 2 at 60 degrees to a response of length 3: worked by hand."""
-    products = np.array([[[4.0, 3.0], [3.0, 9.0]]])
-    table = ResponseTable(products, 1, {("lag", "t"): [1]}, {("lag", "t"): np.ones(1)}, 60.0)
+    faults, row = np.array([[[2.0, 0.0]]]), np.array([[1.5, np.sqrt(6.75)]])
     # 3/4 of all products; the prior of the fault adds 1
-    assert table.measure_information(0, 1) == pytest.approx(0.75 * 9.0 - (0.75 * 3.0) ** 2 / 4.0)
-    twice = table.scale_to(120.0)
-    assert twice.measure_information(0, 1) == pytest.approx(1.5 * 9.0 - (1.5 * 3.0) ** 2 / 7.0)
-
-
-def test_late_frames_are_told_by_the_divergence_of_their_times() -> None:
-    """Where no change is late nothing is gained; where half are late by far more than the error, log 2 is, or the square of it."""
-    width, chances = np.full(10, 0.1), np.array([0.5, 0.5])
-    assert compute_divergence(width, np.zeros(2), chances) == pytest.approx(0.0, abs=1e-9)
-    far = compute_divergence(width, np.array([-0.5, 0.5]), chances)
-    # the density of either place is half as high, and the place is 5 standard errors from 0
-    assert far / 10 == pytest.approx(0.5 * 25.0 - np.log(2.0), rel=0.02)
+    once = ResponseInformation(faults, 1.0).measure(0, row)
+    assert once == pytest.approx([0.75 * 9.0 - (0.75 * 3.0) ** 2 / 4.0])
+    twice = ResponseInformation(faults, 2.0).measure(0, row)
+    assert twice == pytest.approx([1.5 * 9.0 - (1.5 * 3.0) ** 2 / 7.0])
 
 
 def test_too_short_motions_are_refused(axis: Machine) -> None:
@@ -267,7 +263,7 @@ def test_too_short_motions_are_refused(axis: Machine) -> None:
 def test_machines_without_masses_have_a_preview() -> None:
     machine = option("machine", "mini_excavator")
     some = motions(machine, 120.0, 1, "reversals")
-    result = assess(replace(load_part("preview"), excitations={}), machine, some)
+    result = assess(load_part("preview"), machine, some)
     joint = machine.joint_names[0]
     assert limit(result, "creep", joint).number == "drift_rad_s"
     assert limit(result, "backlash", joint).unit == "m" and limit(result, "backlash", joint).is_told
@@ -281,15 +277,12 @@ def test_joints_commanded_by_targets_or_torques_have_no_preview(
     some = motions(machine, 120.0, 1, "reversals")
     assert some, "there is motion: the interface alone is the reason"
     caplog.set_level("INFO")
-    generator = np.random.default_rng(0)
-    assert run_preview(load_part("preview"), some, machine, generator, True) is None
+    assert run_preview(load_part("preview"), some, machine, True) is None
     assert "known for joints commanded by speed only" in caplog.text
 
 
 FAST = (
     "preview.num_windows=6",
-    "preview.num_compared=2",
-    "preview.compared_s=120",
     "preview.effects=[lag,dead_time,clock_offset,link_length,sensor_noise]",
 )
 
@@ -333,11 +326,3 @@ def test_the_shipped_preview_is_that_of_the_search() -> None:
         cfg = compose("config", overrides=["mode=collect"])
     shipped = instantiate(cfg.preview, _convert_="all")
     assert shipped.prices == load_part("prices")
-    assert list(shipped.excitations) == [
-        "levels",
-        "sine",
-        "ramps",
-        "holds",
-        "reversals",
-        "staircase",
-    ]
