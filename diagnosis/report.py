@@ -4,16 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
-from brokk_rl.report import Cell, Report, Tone
+from brokk_rl.report import Tone, embed_picture, render_page, write_page
 from diagnosis import plots, report_checks
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 
+REPORT_FILE = "report.html"
+TEMPLATE = Path(__file__).with_name("diagnosis.html.jinja")
 GOOD_CLOSED = 0.5
 """Closed share of the gap from which the headline is good news; chosen by hand."""
+SEVERITIES = {"bad": "severe", "warn": "check it", "note": "good to know"}
+MAX_LISTED = 8
+"""Most remarks in sight; the rest is folded. Chosen by hand: a screen."""
+RIVALS = {
+    "hold": "standing still",
+    "arx": "ARX with dead-band hinges, fitted to other parts of the field",
+    "flexible": "flexible model, fitted to other parts of the field",
+}
+"""Rivals in words."""
 
 
 def write_headline(answer: Answer) -> tuple[str, Tone]:
@@ -182,13 +192,6 @@ def _format_share(value: Estimate, of: str = "") -> str:
     return f"{100 * value.mean:.0f} %{of}{interval}"
 
 
-REPORT_FILE = "report.html"
-SEVERITIES = {"bad": "severe", "warn": "check it", "note": "good to know"}
-BEYOND_CHANCE = "beyond chance"
-MAX_LISTED = 8
-"""Most rows of a list; the rest is folded. Chosen by hand: a screen."""
-
-
 def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
     """Write `report.html` into `folder`; parts that the answer lacks are left out.
 
@@ -196,255 +199,43 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         StorageError: it could not be written.
     """
     answer, more = outcome.answer, outcome.answer.more
-    text, tone = write_headline(answer)
-    page = Report(f"Missing effects in the simulator of {machine.name}", text, tone)
-    if machine.interface == "speed" and (curves := more.get("curves")):
-        page.add_picture(
-            plots.draw_speed_curves(curves, machine),
-            "Speed over command, positive and negative side. Black: the machine; red: the simulator "
-            "under the same commands, fitted in the same way. Bands: 95 % by a bootstrap over blocks "
-            "of 30 s. Titles: what changes the red curve into the black one.",
-        )
-    if figure := plots.draw_gap_bars(answer):
-        page.add_picture(
-            figure,
-            f"Error of free runs of {choose_horizon_s(machine):g} s on recordings that no effect was "
-            "fitted to: before, after, and the floor.",
-        )
-    report_checks.add_rivals(page, answer)
-    for remark in more.get("sanity", []):
-        if remark["severity"] == "bad":
-            page.add_text(_describe_remark(remark), "bad")
-    units = {joint.name: joint.unit for joint in machine.joints}
-    _add_effects(page, answer)
-    report_checks.add_gates(page, answer)
-    _add_errors_by_joint(page, answer, units)
-    report_checks.add_motion_delays(page, answer)
-    _add_residual_model(page, more)
-    _add_where(page, outcome, machine, units)
-    page.add_heading("Measured and simulated")
-    page.add_picture(
-        plots.draw_paths(outcome, machine),
-        "Joints with the largest gaps. The simulator gets the recorded commands (grey, below) and "
-        f"starts anew every {choose_horizon_s(machine):g} s (thin lines). Black: measured; red: simulated as it was; blue: "
-        "simulated with the effects.",
-    )
-    _add_evidence(page, more)
-    _add_stages(page, more)
-    _add_next_experiment(page, answer)
-    _add_sanity(page, more)
-    page.write(folder / REPORT_FILE)
+    headline, tone = write_headline(answer)
+    values = {
+        "title": f"Missing effects in the simulator of {machine.name}",
+        "headline": headline,
+        "tone": tone,
+        "said": answer,
+        "more": more,
+        "pictures": _draw_pictures(outcome, machine),
+        "horizon_s": choose_horizon_s(machine),
+        "units": {joint.name: joint.unit for joint in machine.joints},
+        "rivals": RIVALS,
+        "severities": SEVERITIES,
+        "max_listed": MAX_LISTED,
+        "remainder": describe_remainder(answer),
+        "describe_class": describe_class,
+        "describe_bounds": report_checks.describe_bounds,
+        "describe_edit": report_checks.describe_edit,
+        "name_effect": name_effect,
+        "join_words": join_words,
+        "format_error": format_error,
+        "format_estimate": format_estimate,
+    }
+    write_page(folder / REPORT_FILE, render_page(TEMPLATE, values))
 
 
-def _add_effects(page: Report, answer: Answer) -> None:
-    page.add_heading("Effects")
-    if answer.verdict == "none":
-        page.add_text("No effect that exceeds chance.")
-    elif answer.verdict == "unknown":
-        page.add_text("No effect of the library explains the gap.")
-    rows = []
-    for one in answer.selected:
-        rows += _list_effect_rows(one)
-    if rows:
-        page.add_table(
-            ["effect", "joints", "probability", "closes, %", "parameter", "value"],
-            rows,
-            "With 95 % intervals. 'Closes' is the effect's part of the gap (Shapley value).",
-        )
-    for one in answer.selected:
-        page.add_text(describe_class(one), "warn")
-        page.add_text(report_checks.describe_bounds(one), "warn")
-        page.add_text(report_checks.describe_edit(one), "warn")
-    page.add_text(describe_remainder(answer))
-    if answer.reason and answer.verdict == "none":
-        page.add_text(f"{answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}.")
-    predicted = answer.more.get("predicted_closed")
-    if predicted and answer.gap and answer.gap.closed:
-        page.add_text(
-            f"Predicted on the parts of the recordings that sizes were fitted to: "
-            f"{100 * predicted['mean']:.0f} % closed. Achieved on the other parts: "
-            f"{100 * answer.gap.closed.mean:.0f} %."
-        )
-
-
-def _list_effect_rows(one: Selected) -> list[list[str | Cell | None]]:
-    """Return a row for each parameter of an effect; only the first names the effect."""
-    others = f"or {', '.join(name_effect(name) for name in one.same_as)}" if one.same_as else ""
-    head: list[str | Cell | None] = [
-        Cell(name_effect(one.effect), others),
-        ", ".join(one.joints) or "machine",
-        f"{one.probability:.2f}",
-        Cell(*format_estimate(one.gap_closed, 100.0, ".0f")),
-    ]
-    rows: list[list[str | Cell | None]] = []
-    for parameter, by_joint in one.parameters.items():
-        for joint, value in by_joint.items():
-            rows.append([*head, f"{parameter} {joint}", Cell(*format_estimate(value))])
-            head = [""] * len(head)
-    return rows or [[*head, "", None]]
-
-
-def _add_errors_by_joint(page: Report, answer: Answer, units: Mapping[str, str]) -> None:
-    """Add errors before and after the effects by joint, on unseen recordings too."""
-    gap, unseen = answer.gap, answer.more.get("unseen")
-    if not answer.selected or gap is None or not gap.joints:
-        return
-    rows = []
-    for name, one in gap.joints.items():
-        row = [f"{name} [m{units[name]}]", _scale(one.before), _scale(one.after)]
-        row += [_scale(one.floor), f"{100 * one.share:.0f}"]
-        if unseen:
-            other = unseen["joints"][name]
-            row += [_scale(other["before"]), _scale(other["after"]), f"{100 * other['share']:.0f}"]
-        rows.append(row)
-    columns = ["joint", "before", "after", "floor", "% less"]
-    caption = "Root mean square error of free runs, on parts that sizes were not fitted to"
-    if unseen:
-        columns += ["unseen: before", "after", "% less"]
-        caption += f"; unseen: {unseen['recordings']} further recordings"
-        caption += f" ({unseen['seconds']:.0f} s)"
-    page.add_table(columns, rows, caption)
-
-
-def _add_residual_model(page: Report, more: Mapping[str, Any]) -> None:
-    """Add how well a flexible model predicts the remaining error."""
-    left = more.get("remainder")
-    for key, label in (("undecided", "Undecided"), ("remainder", "Remainder")):
-        if isinstance(found := more.get(key), str):
-            page.add_text(f"{label}: {found}")
-    if not isinstance(left, Mapping) or not left:
-        return
-    rows = []
-    for joint, one in left.items():
-        gains = [None if one.get(key) is None else f"{one[key]:.1f}" for key in ("earned", "null")]
-        rows.append([joint, one.get("clue"), *gains])
-    page.add_table(
-        ["joint", "best input", "gain", "gain by chance"],
-        rows,
-        "Gain of a flexible model on the remaining error, log likelihood",
-    )
-
-
-def _add_where(page: Report, outcome: Outcome, machine: Machine, units: Mapping[str, str]) -> None:
-    location = outcome.answer.more.get("location")
-    if not location:
-        return
-    page.add_heading("Location of the gap")
-    page.add_picture(
-        plots.draw_gap_map(outcome.answer, outcome.before, machine),
-        "Left: share of the gap, all cells together are 100 %; an error counts at its origin. "
-        "Right: error of free runs along the recordings.",
-    )
-    rows = []
-    for name, joint in location["joints"].items():
-        sure = BEYOND_CHANCE if joint["is_sure"] else ""
-        row = [f"{name} [m{units[name]}]", _scale(joint["rmse"]), _scale(joint["floor"])]
-        rows.append([*row, f"{100 * joint['error']:.0f}", Cell(f"{100 * joint['gap']:.0f}", sure)])
-    columns = ["joint", "error", "floor", "% of the error", "% of the gap"]
-    page.add_table(columns, rows, "Root mean square error of free runs")
-    if not location["has_gap"]:
-        page.add_text("No joint exceeds its floor beyond chance; the shares are noise.", "warn")
-    with page.add_details("All parts of the gap"):
-        page.add_table(
-            ["joint", "regime", "% of the time", "% of the error", "% of the gap", "p"],
-            _list_parts(location["parts"]),
-            "Error and gap add up to 100; p: probability of so large an error by chance, by a permutation "
-            "test over parts of 30 s of the recordings; false discovery rate of 5 %.",
-        )
-
-
-def _list_parts(parts: Sequence[Mapping[str, Any]]) -> list[list[str | Cell | None]]:
-    rows: list[list[str | Cell | None]] = []
-    for part in parts:
-        if part["time"] <= 0:
-            continue
-        p = None
-        if part["p"] is not None:
-            p = Cell(f"{part['p']:.4f}", BEYOND_CHANCE if part["is_sure"] else "")
-        shares = [f"{100 * part[key]:.1f}" for key in ("time", "error", "gap")]
-        rows.append([part["joint"], part["category"], *shares, p])
-    return rows
-
-
-def _add_evidence(page: Report, more: Mapping[str, Any]) -> None:
-    evidence = more.get("evidence")
-    figure = plots.draw_rivals(evidence) if isinstance(evidence, Mapping) else None
-    if figure:
-        page.add_heading("Why these effects and not others")
-        page.add_picture(figure, "Gain of each rival on held-out recordings; blue: chosen.")
-
-
-def _add_stages(page: Report, more: Mapping[str, Any]) -> None:
-    stages, tip = more.get("stages", []), more.get("tip")
-    if not stages:
-        return
-    page.add_heading("At the tool, and by stage")
-    if tip:
-        rows = []
-        for joint in tip["before"]["joint_part"]:
-            parts = [f"{100 * one['joint_part'][joint]:.0f}" for one in tip.values()]
-            rows.append([f"% by {joint}", *parts])
-        rows.append(["RMS, mm", *(_scale(one["tip_rms_m"]) for one in tip.values())])
-        page.add_table(
-            ["", *tip],
-            rows,
-            "Distance of the simulated from the measured tool over free runs, and the parts of the "
-            "joints in its square; one that cancels others is below 0",
-        )
-    rows = []
-    for stage in stages:
-        part = None if stage["part"] is None else f"{100 * stage['part']:.0f}"
-        rows.append([stage["stage"], part, _scale(stage["rms_m"]), stage["text"]])
-    page.add_table(["stage", "% of the joints' gap", "at the tool, mm", "why"], rows)
-
-
-def _add_next_experiment(page: Report, answer: Answer) -> None:
-    following = answer.next_experiment
-    if following is None:
-        return
-    page.add_heading("Next experiment")
-    text = following.why
-    if following.separates:
-        names = join_words([name_effect(name) for name in following.separates])
-        text += f" It separates {names}."
-    page.add_text(text.strip())
-    page.add_code(following.excitation)
-
-
-def _add_sanity(page: Report, more: Mapping[str, Any]) -> None:
-    remarks = more.get("sanity")
-    if remarks is None:
-        return
-    page.add_heading("Can the recordings be trusted?")
-    if not remarks:
-        page.add_text(
-            "No finding about clocks, lost frames, interlocks, sensors or exclusive joints.", "good"
-        )
-        return
-    columns, rows = ["finding", "joint", "place", "amount and meaning"], []
-    for remark in remarks:
-        place = f"{remark['from_s']:.1f} to {remark['to_s']:.1f} s, {remark['count']} ×"
-        meaning = f"{remark['meaning']}. To do: {remark['advice']}"
-        rows.append(
-            [
-                Cell(remark["name"], SEVERITIES[remark["severity"]]),
-                remark["joint"] or "all",
-                Cell(remark["recording"], place),
-                Cell(remark["amount"], meaning),
-            ]
-        )
-    page.add_table(columns, rows[:MAX_LISTED])
-    if len(rows) > MAX_LISTED:
-        with page.add_details(f"{len(rows) - MAX_LISTED} more"):
-            page.add_table(columns, rows[MAX_LISTED:])
-
-
-def _scale(value: float | None) -> str | None:
-    """Return an error in rad or m as text in mrad or mm."""
-    return None if value is None else f"{1e3 * value:.1f}"
-
-
-def _describe_remark(remark: Mapping[str, Any]) -> str:
-    joint = f" ({remark['joint']})" if remark["joint"] else ""
-    place = f"{remark['name']}{joint} in {remark['recording']}"
-    return f"{place}: {remark['amount']}. {remark['meaning']}; {remark['advice']}."
+def _draw_pictures(outcome: Outcome, machine: Machine) -> dict[str, str | None]:
+    """Return the pictures as addresses that hold their data; `None` for those without content."""
+    answer, more = outcome.answer, outcome.answer.more
+    curves, evidence = more.get("curves"), more.get("evidence")
+    has_curves = machine.interface == "speed" and curves
+    figures = {
+        "curves": plots.draw_speed_curves(curves, machine) if has_curves else None,
+        "gap": plots.draw_gap_bars(answer),
+        "map": plots.draw_gap_map(answer, outcome.before, machine)
+        if more.get("location")
+        else None,
+        "paths": plots.draw_paths(outcome, machine),
+        "rivals": plots.draw_rivals(evidence) if isinstance(evidence, Mapping) else None,
+    }
+    return {name: None if one is None else embed_picture(one) for name, one in figures.items()}
