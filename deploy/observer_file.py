@@ -26,9 +26,6 @@ from deploy.kernel.observer import Observer
 from deploy.kernel.valve_model import SCHEMA, describe_sources, load_observer_file
 
 FILE, COUNTS = "observer.json", "observed.json"
-FAR = 0.3
-"""Part of full speed above which a window counts for the sensitivity. Chosen by hand: slower motion
-is judged by a longer way."""
 SHIFT_S = 8 * 3600.0
 """A shift, to which alarms are extrapolated."""
 
@@ -46,50 +43,21 @@ class AlarmCounts:
     """Alarms of an observer in recordings.
 
     Attributes:
-        num_joints: Number of joints, `J`.
         seconds: Length of all recordings.
         faults: Alarms by joint and fault.
         num_runs: Number of runs.
-        num_moving: Windows in which a joint should move far, `(J,)`; see `FAR`.
-        num_found: Of these, those in which a joint that stands still would be found, and one that
-            moves the wrong way, `(2, J)`.
     """
 
-    num_joints: int
     seconds: float = 0.0
     num_runs: int = 0
     faults: Counter[str] = field(default_factory=Counter)
-    num_moving: np.ndarray = field(init=False)
-    num_found: np.ndarray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.num_moving = np.zeros(self.num_joints, int)
-        self.num_found = np.zeros((2, self.num_joints), int)
 
     def note(self, observer: Observer, machine: Machine) -> None:
         """Take in what an observer found in one period, and clear its fault."""
-        seen = observer.window
-        is_far = np.abs(seen.wanted) > FAR * machine.max_speed * observer.window_s
-        self.num_moving += is_far
-        # The difference is once the predicted motion, or twice.
-        for times in (1, 2):
-            self.num_found[times - 1] += is_far & (times * np.abs(seen.wanted) > seen.limit)
         found = observer.observation
         if found.joint >= 0:
             self.faults[f"{machine.joint_names[found.joint]} {found.fault.value}"] += 1
             observer.clear()
-
-    def describe_sensitivity(self, machine: Machine) -> list[str]:
-        """Return a line for each joint: how much of its motion would show a fault."""
-        lines = []
-        for joint, name in enumerate(machine.joint_names):
-            if number := int(self.num_moving[joint]):
-                still, turned = (f"{found / number:.0%}" for found in self.num_found[:, joint])
-                lines.append(
-                    f"  {name}: of its windows above {FAR:.0%} of full speed {still} would show that it stands still, "
-                    f"{turned} that it moves the wrong way"
-                )
-        return lines
 
     @property
     def faults_a_shift(self) -> float:
@@ -164,14 +132,12 @@ class ObserverCalibration:
             f"{minutes}: {counts.faults.total()} false alarms, {counts.faults_a_shift:.1f} a shift of 8 h"
         ]
         lines += [f"  {name}: {number}" for name, number in counts.faults.most_common()]
-        lines += counts.describe_sensitivity(machine)
         found = {
             "minutes": counts.seconds / 60,
             "runs": counts.num_runs,
             "faults": dict(counts.faults),
         }
         found["faults_a_shift"] = counts.faults_a_shift
-        found |= {"moving": counts.num_moving.tolist(), "found": counts.num_found.tolist()}
         write_json(session.folder / COUNTS, found)
         return lines
 
@@ -208,7 +174,7 @@ def count_alarms(
 
     A named fault is cleared at once, as an operator would by letting go of the dead-man.
     """
-    counts = AlarmCounts(machine.num_joints)
+    counts = AlarmCounts()
     runs: dict[str, list[Recording]] = {}
     for recording in recordings:
         runs.setdefault(recording.run, []).append(recording)

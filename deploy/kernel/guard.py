@@ -209,7 +209,7 @@ class Guard:
         # Direction in which each joint is withheld at its stop, 0 for none.
         self._held = [0.0] * len(self._still)
         # Since when the dead-man is held without a sign of the operator.
-        self._awake_s, self._prompt = -math.inf, False
+        self._awake_s, self._prompt = math.inf, False
 
     def decide(
         self, now_s: float, armed: bool, seen: GuardInput, request: CommandRequest | None

@@ -410,6 +410,25 @@ def test_a_joint_ends_its_way_outward_so_early_that_it_rests_before_its_stop() -
     assert hand.decide(u=(-0.05, 0.0, 0.0), q=(q, 0.0, 1.0)).u[0] == -0.05
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_joint_that_is_withheld_at_its_stop_needs_more_room_to_go_on(side: float) -> None:
+    limits = replace(LIMITS, max_command=1.0, max_rate_1_s=1000.0, speed_margin=1.3)
+    hand, u = Hand(limits).active(), (side, 0.0, 0.0)
+    for _ in range(20):
+        assert hand.decide(u=u).u == u
+
+    def passes(under_way_s: float, off: float) -> bool:
+        """Whether the command passes so far before the place from which it is withheld."""
+        edge = 0.9 - 0.5 * 1.3 * (under_way_s + limits.reaction_s) - off
+        return hand.decide(u=u, q=(side * edge, 0.0, 1.0)).u == u
+
+    # Dead time and coasting are 0.3 s; while nothing is sent less and less is under way.
+    assert passes(0.30, 0.01)
+    assert not passes(0.30, -0.01)
+    assert not passes(0.28, 0.01) and not passes(0.26, limits.stop_release - 0.01)
+    assert passes(0.24, limits.stop_release + 0.01)
+
+
 def test_who_holds_the_dead_man_for_long_is_asked_and_has_to_answer() -> None:
     hand = Hand().active()
     prompts: list[float] = []

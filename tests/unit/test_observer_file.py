@@ -81,20 +81,6 @@ def test_the_command_writes_a_file_that_names_its_recordings_and_counts_others(
     assert any(name.startswith("q2 ") for name in counted["faults"])
 
 
-def test_the_counts_say_what_these_thresholds_would_find() -> None:
-    content = build_content()
-    for slack_s, still, turned in ((0.06, 1.0, 1.0), (0.31, 0.0, 1.0), (0.71, 0.0, 0.0)):
-        content["thresholds"] = {"window_s": 1.0, "share": 0.25, "slack_s": [slack_s] * 5}
-        counts = count_alarms(content, MACHINE, [record(0.0)])
-        # A second at 0.4 of full speed: 0.4 s of way, of which 0.1 s are borne.
-        moving = counts.num_moving
-        assert (moving[[0, 2, 3, 4]] > 50).all() and moving[1] == 0
-        shares = counts.num_found[:, 0] / moving[0]
-        assert shares == pytest.approx([still, turned], abs=0.3), slack_s
-        lines = counts.describe_sensitivity(MACHINE)
-        assert len(lines) == 4 and lines[0].startswith("  q1: ")
-
-
 @pytest.mark.parametrize(
     ("source", "is_real"),
     [
