@@ -43,6 +43,8 @@ JUMP = 1.5
 
 FAR_SHARE = 0.1
 """Part of the travel from which on a joint stays away from its target; sag and play are below 0.05."""
+STILL_TRAVEL = 0.01
+"""Parts of the travel per s below which a joint stands, whatever the machine's top speed is said to be."""
 JUMP_TRAVEL = 0.01
 """Part of the travel from which on a step is told; smaller ones hide in noise and coarse sensors."""
 LONGEST_LAG_S = 1.5
@@ -272,7 +274,8 @@ class _RecordingScan:
                     most = away[row : row + count].max()
                     text = f"stays up to {most:.2g} {unit} away from its target"
                     found.append(self._finding("not obeyed", name, row, count, text))
-            for row, count in find_stretches(~self._is_moving[:, j] & ~far):
+            is_still = np.abs(self._v[:, j]) < STILL_TRAVEL * self._travel[j]
+            for row, count in find_stretches(is_still & ~far):
                 moved = np.ptp(self._targets[row : row + max(1, count - self._lead), j])
                 is_long = count * self._period_s >= self._limits.unanswered_s
                 if is_long and moved > FAR_SHARE * self._travel[j]:
