@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: size of the gap, speed curves, location, paths and rivals.
+"""Figures of a diagnosis: speed curves and paths.
 
 Black is the measurement, red the simulator as it was, blue the simulator with the effects, grey the
 floor.
@@ -11,59 +11,18 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, make_joint_panels, remove_frame
-from diagnosis.answer import Answer, Outcome, format_error
-from diagnosis.free_runs import WindowedRuns
+from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_joint_panels, remove_frame
+from diagnosis.answer import Outcome
 from diagnosis.sanity import name_recording
 
 BEFORE, AFTER, FLOOR = RED, BLUE, GREY
-HEAT = LinearSegmentedColormap.from_list("heat", ["#ffffff", "#fde3c8", "#f4a36b", RED, "#7a2e00"])
 IDLE = "#c3cbd3"
 MAX_JOINTS = 3
 """Joints whose paths are drawn."""
-NUM_AGES = 16
-"""Columns of the picture over time."""
-
-
-def draw_gap_bars(answer: Answer) -> Figure | None:
-    """Draw the error before and after over the floor; `None` where there is none to draw."""
-    gap = answer.gap
-    if gap is None or not max(gap.before, gap.floor or 0.0):
-        return None
-    figure = make_figure(9.5, 2.0)
-    axis = figure.add_subplot()
-    rows = [("before", gap.before, BEFORE)]
-    rows += [("after", gap.after, AFTER)] if answer.selected else []
-    rows += (
-        []
-        if gap.floor is None
-        else [
-            (
-                "floor" if gap.floor_of == "reference" else f"{gap.floor_of}\n(floor)",
-                gap.floor,
-                FLOOR,
-            )
-        ]
-    )
-    scale = 100.0 if gap.unit == "travel" else 1e3
-    for place, (_, width, colour) in enumerate(rows):
-        axis.barh(place, scale * width, color=colour, height=0.62)
-        told = format_error(width, gap.unit)
-        axis.annotate(told, (scale * width, place), (6, 0), textcoords="offset points", va="center")
-    axis.set_yticks(range(len(rows)), [row[0] for row in rows])
-    axis.invert_yaxis()
-    if gap.floor is not None:
-        axis.axvline(scale * gap.floor, color=FLOOR, lw=1.0, ls=":")
-    axis.set_xlim(0.0, scale * max(width for _, width, _ in rows) * 1.16)
-    unit = "% of travel" if gap.unit == "travel" else f"m{gap.unit}"
-    axis.set_xlabel(f"error over free runs, all joints, RMS [{unit}]")
-    remove_frame(axis)
-    return figure
 
 
 def draw_speed_curves(curves: Mapping[str, Any], machine: Machine) -> Figure:
@@ -124,53 +83,6 @@ CURVE_WORDS = {
 """Words for the numbers of a curve's change; two numbers: positive and negative side."""
 
 
-def draw_gap_map(answer: Answer, before: WindowedRuns, machine: Machine) -> Figure:
-    """Draw the gap by joint and regime, and the error of each joint over the running time."""
-    location = answer.more["location"]
-    parts = location["parts"]
-    joints, regimes = (
-        list(machine.joint_names),
-        list(dict.fromkeys(part["category"] for part in parts)),
-    )
-    share = np.array(
-        [[_find_part(parts, joint, regime)["gap"] for regime in regimes] for joint in joints]
-    )
-    figure = make_figure(12.0, 1.5 + 0.52 * len(joints))
-    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
-    left.imshow(
-        100.0 * share, cmap=HEAT, vmin=0.0, vmax=max(30.0, 100.0 * share.max()), aspect="auto"
-    )
-    for y, joint in enumerate(joints):
-        for x, regime in enumerate(regimes):
-            part = _find_part(parts, joint, regime)
-            if share[y, x] >= 0.005 or part["is_sure"]:
-                text = f"{100 * share[y, x]:.0f} %" + (" ●" if part["is_sure"] else "")
-                dark = share[y, x] > 0.6 * max(0.3, share.max())
-                left.text(
-                    x,
-                    y,
-                    text,
-                    ha="center",
-                    va="center",
-                    fontsize=8.5,
-                    color="white" if dark else "black",
-                )
-    left.set_xticks(np.arange(len(regimes) - 1) + 0.5, minor=True)
-    left.set_yticks(np.arange(len(joints) - 1) + 0.5, minor=True)
-    left.grid(which="minor", color="#d7dce1", lw=0.8)
-    left.set_xticks(
-        range(len(regimes)), [regime.replace(" ", "\n", 1) for regime in regimes], fontsize=8
-    )
-    left.set_yticks(range(len(joints)), joints)
-    left.set_title("part of the gap by joint and regime (● beyond chance)", loc="left", fontsize=10)
-    _draw_error_over_time(right, before, machine)
-    for axis in (left, right):
-        axis.tick_params(length=0)
-        axis.tick_params(which="minor", length=0)
-        axis.spines[:].set_visible(False)
-    return figure
-
-
 def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
     """Draw measured and simulated positions of the joints with the largest gaps."""
     before = outcome.before
@@ -214,66 +126,6 @@ def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
                 below.set_xlabel("time [s]")
     add_legend(figure, figure.axes[0])
     return figure
-
-
-def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
-    """Draw the gain of each rival, chosen ones in blue.
-
-    Args:
-        evidence: `rivals`: a list of `name`, `score`, `selected`; `threshold`: from which a rival
-            is believed; `unit`: of the scores. All but `rivals` may be missing.
-    """
-    rows = sorted(evidence.get("rivals", []), key=lambda row: -row["score"])[:14]
-    if not rows:
-        return None
-    threshold = evidence.get("threshold")
-    figure = make_figure(9.5, 1.2 + 0.3 * len(rows))
-    axis = figure.add_subplot()
-    for place, row in enumerate(rows):
-        axis.barh(place, row["score"], color=BLUE if row.get("selected") else IDLE, height=0.7)
-        axis.annotate(
-            f"{row['score']:.{0 if abs(row['score']) >= 100 else 1}f}",
-            (max(row["score"], 0.0), place),
-            (5, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
-    if threshold is not None:
-        axis.axvline(threshold, color="black", ls="--", lw=1.0, label="to be believed")
-    axis.set_yticks(range(len(rows)), [row["name"].replace("_", " ") for row in rows], fontsize=9)
-    axis.invert_yaxis()
-    axis.set_xlabel(evidence.get("unit", "what it earns on recordings that it was not fitted to"))
-    if axis.get_legend_handles_labels()[0]:
-        axis.legend(frameon=False, loc="lower right", fontsize=9)
-    remove_frame(axis)
-    return figure
-
-
-def _draw_error_over_time(axis: Axes, before: WindowedRuns, machine: Machine) -> None:
-    """Fill the axis with the error of each joint over running time, in parts of its travel."""
-    square = np.nanmean(before.error**2, 1) / (machine.upper - machine.lower) ** 2
-    order = np.lexsort((before.row, before.source))
-    groups = np.array_split(order, min(NUM_AGES * 2, len(order)))
-    shade = 100.0 * np.sqrt(np.array([square[group].mean(0) for group in groups]).T)
-    image = axis.imshow(shade, cmap=HEAT, vmin=0.0, aspect="auto")
-    cuts = [
-        i
-        for i in range(1, len(groups))
-        if before.source[groups[i][0]] != before.source[groups[i - 1][0]]
-    ]
-    for place in cuts:
-        axis.axvline(place - 0.5, color="black", lw=0.8)
-    starts = [0, *cuts]
-    labels = [name_recording(before.recordings[int(before.source[groups[i][0]])]) for i in starts]
-    axis.set_xticks(
-        starts, labels if len(labels) <= 6 else [""] * len(labels), fontsize=8, ha="left"
-    )
-    axis.set_yticks(range(machine.num_joints), machine.joint_names)
-    axis.set_title(
-        "error over the running time, by recording [% of travel]", loc="left", fontsize=10
-    )
-    axis.figure.colorbar(image, ax=axis, pad=0.01, fraction=0.04).outline.set_visible(False)  # type: ignore[union-attr]
 
 
 def _draw_path(
@@ -332,7 +184,3 @@ def _draw_path(
         above.set_ylim((low + high - 0.02 * span) / 2.0, (low + high + 0.02 * span) / 2.0)
     for axis in (above, below):
         remove_frame(axis)
-
-
-def _find_part(parts: Sequence[Mapping[str, Any]], joint: str, category: str) -> Mapping[str, Any]:
-    return next(part for part in parts if part["joint"] == joint and part["category"] == category)

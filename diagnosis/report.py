@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
@@ -16,6 +17,8 @@ TEMPLATE = Path(__file__).with_name("diagnosis.html.jinja")
 GOOD_CLOSED = 0.5
 """Closed share of the gap from which the headline is good news; chosen by hand."""
 SEVERITIES = {"bad": "severe", "warn": "check it", "note": "good to know"}
+MAX_RIVALS = 14
+"""Most rivals of the table. Chosen by hand: a screen."""
 MAX_LISTED = 8
 """Most remarks in sight; the rest is folded. Chosen by hand: a screen."""
 RIVALS = {
@@ -212,6 +215,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "rivals": RIVALS,
         "severities": SEVERITIES,
         "max_listed": MAX_LISTED,
+        "earned": _rank_rivals(more.get("evidence")),
         "remainder": describe_remainder(answer),
         "describe_class": describe_class,
         "describe_bounds": report_checks.describe_bounds,
@@ -224,18 +228,16 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
     write_page(folder / REPORT_FILE, render_page(TEMPLATE, values))
 
 
+def _rank_rivals(evidence: Any) -> list[Mapping[str, Any]]:
+    """Return the rivals with the largest gains; `undecided` answers hold a sentence instead."""
+    rows = evidence.get("rivals", []) if isinstance(evidence, Mapping) else []
+    return sorted(rows, key=lambda row: -row["score"])[:MAX_RIVALS]
+
+
 def _draw_pictures(outcome: Outcome, machine: Machine) -> dict[str, str | None]:
     """Return the pictures as addresses that hold their data; `None` for those without content."""
-    answer, more = outcome.answer, outcome.answer.more
-    curves, evidence = more.get("curves"), more.get("evidence")
-    has_curves = machine.interface == "speed" and curves
-    figures = {
-        "curves": plots.draw_speed_curves(curves, machine) if has_curves else None,
-        "gap": plots.draw_gap_bars(answer),
-        "map": plots.draw_gap_map(answer, outcome.before, machine)
-        if more.get("location")
-        else None,
-        "paths": plots.draw_paths(outcome, machine),
-        "rivals": plots.draw_rivals(evidence) if isinstance(evidence, Mapping) else None,
-    }
+    more = outcome.answer.more
+    figures = {"paths": plots.draw_paths(outcome, machine), "curves": None}
+    if machine.interface == "speed" and more.get("curves"):
+        figures["curves"] = plots.draw_speed_curves(more["curves"], machine)
     return {name: None if one is None else embed_picture(one) for name, one in figures.items()}

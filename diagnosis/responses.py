@@ -205,20 +205,6 @@ def _compute_penalty(
     return 0.5 * float(precision @ np.square(size)) + 0.5 * float(np.linalg.slogdet(told)[1])
 
 
-def cross_validate_change(
-    z: np.ndarray, shapes: Sequence[Response], fold: np.ndarray
-) -> np.ndarray:
-    """Return the sum of responses, `(E,)`, on each half `fold` with sizes fitted to the other."""
-    change = np.zeros(len(z))
-    for half in (0, 1):
-        other = fold == half
-        if shapes and other.any() and not other.all():
-            change[other] = sum_responses(
-                shapes, fit_sizes(z, shapes, used=np.where(other, 0.0, 1.0))
-            )[other]
-    return change
-
-
 # Chosen by hand. SHAPE_FACTORS was (0.4, 2.0) before; no comparison is recorded.
 SHAPE_FACTORS = (0.35, 0.5, 0.7, 1.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""

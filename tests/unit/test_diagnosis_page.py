@@ -82,7 +82,7 @@ def test_the_report_says_verdict_gap_cause_place_and_what_to_do(
     ):  # fmt: skip
         assert part in text, part
     assert "https:" not in text and "<run>" not in text and "nan" not in text.split("base64")[0]
-    assert text.count("data:image/png;base64,") == 4
+    assert text.count("data:image/png;base64,") == 1
 
 
 def test_the_survey_finds_the_joint_and_the_stage(seen: tuple[Outcome, Survey]) -> None:

@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
-from diagnosis.answer import Answer, Selected, Where
+from brokk_rl.machine import Machine
+from diagnosis import why_report
+from diagnosis.answer import Answer, Estimate, Selected, Where
 from diagnosis.why_answer import (
     ALL_EFFECTS,
     BEFORE,
@@ -123,3 +125,19 @@ def test_inputs_are_refused_before_the_first_stage(
     assert done.code == 2
     assert expected in done.err
     assert not Path("out/doctor").exists()
+
+
+def test_the_page_says_effect_cost_and_what_was_not_measured(
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = replace(make_result(tmp_path, 0.5), unmeasured=("link_length",))
+    assert result.diagnosis is not None
+    number = {"time_constant_s": {"q3": Estimate(0.2, (0.1, 0.3))}}
+    lag = replace(result.diagnosis.selected[0], parameters=number, same_as=("dead_time",))
+    result = replace(result, diagnosis=replace(result.diagnosis, selected=(lag,)))
+    monkeypatch.setattr(why_report, "read_result", lambda *_: result)
+    titles = {BEFORE: "As trained", ALL_EFFECTS: "With lag"}
+    why_report.write_why_page(tmp_path, titles, machine)
+    text = (tmp_path / why_report.WHY_PAGE).read_text()
+    for part in ("0.1 to 0.3", "that, or dead time", "-50", "the cost of link length", "cleared"):
+        assert part in text, part
