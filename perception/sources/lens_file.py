@@ -59,7 +59,9 @@ class PairLens:
             return pictures
         straight = []
         for picture, maps in zip(pictures, self.maps, strict=False):
-            straight.append(np.asarray(cv2.remap(picture, *maps, cv2.INTER_CUBIC), np.uint8))
+            straight.append(
+                np.asarray(cv2.remap(picture, maps[0], maps[1], cv2.INTER_CUBIC), np.uint8)
+            )
         return straight
 
 
