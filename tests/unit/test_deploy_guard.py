@@ -336,7 +336,8 @@ def test_nothing_moves_further_out_at_a_stop_but_everything_back() -> None:
     hand = Hand().active()
     q = (0.9, 0.0, 0.1)
     assert hand.decide(u=(0.05, 0.0, -0.05), q=q).u == STILL
-    assert hand.decide(u=(-0.05, 0.0, 0.05), q=q).u == (-0.05, 0.0, 0.05)
+    for back in (q, (0.95, 0.0, 0.05)):
+        assert hand.decide(u=(-0.05, 0.0, 0.05), q=back).u == (-0.05, 0.0, 0.05)
     assert hand.decide(u=(0.05, 0.0, -0.05), q=(0.899, 0.0, 0.101)).u == (0.05, 0.0, -0.05)
 
 
