@@ -219,8 +219,15 @@ class GreyBoxFit:
         sure = estimate_uncertainty(runs, x, self.robust)
         found = self._rounded(machine, runs, x)
         fitted: Any = dataclasses.replace(self.actuator, **found)  # pyright: ignore[reportArgumentType, reportCallIssue]
-        facts = self._describe(machine, train, runs, held, x)
-        facts |= {
+        facts = {
+            "schema": 1,
+            "machine": machine.name,
+            "recordings": len(train),
+            "runs": len({recording.run for recording in train}),
+            "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
+            "windows": len(runs.active),
+            "horizon_s": self.horizon_s,
+            "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
             "seconds": round(search.before_s + time.monotonic() - began, 1),
             "created": record.format_now(),
             "parameters": tabulate_parameters(found, runs, x, sure),
@@ -246,26 +253,6 @@ class GreyBoxFit:
             if gain < self.tolerance:
                 break
         return dataclasses.replace(fitted, **self._rounded(machine, runs, x))  # pyright: ignore[reportArgumentType, reportCallIssue]
-
-    def _describe(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        runs: CandidateRuns,
-        held: CandidateRuns,
-        x: np.ndarray,
-    ) -> dict[str, Any]:
-        """Return the facts on the data of a fit, and its error on the validation runs `held`."""
-        return {
-            "schema": 1,
-            "machine": machine.name,
-            "recordings": len(train),
-            "runs": len({recording.run for recording in train}),
-            "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
-            "windows": len(runs.active),
-            "horizon_s": self.horizon_s,
-            "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
-        }
 
     def _nominal(self, machine: Machine, device: torch.device) -> np.ndarray:
         """Return the actuator's own parameters in units of their ranges, `(P, J)`.
