@@ -120,7 +120,6 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
         "closed_examined": bootstrap_over_cases(known, compute_examined_share),
         "closed_differs": _rate_items(_select_examined(known), attrgetter("differs")),
         "closed_missing": _rate_items(_select_named(scores), _is_without_share),
-        "predicted_off": bootstrap_over_cases(known, compute_prediction_error),
         "seconds": {"median": _take_median(seconds), "most": max(seconds, default=None)},
         "by_effect": summarize_effects(scores),
         "confusion": count_confusions(one),
@@ -347,15 +346,6 @@ def _is_without_share(score: CaseScore) -> bool:
 def compute_examined_share(scores: Sequence[CaseScore]) -> float | None:
     """Return the median closed share of the gap by the examiner's own simulation."""
     return _take_median(score.examined for score in scores if score.examined is not None)
-
-
-def compute_prediction_error(scores: Sequence[CaseScore]) -> float | None:
-    """Return the median distance of the predicted and the achieved share of the gap."""
-    distances = []
-    for score in scores:
-        if score.predicted is not None and score.closed is not None:
-            distances.append(abs(score.predicted - score.closed))
-    return _take_median(distances)
 
 
 def _take_median(values: Iterable[float]) -> float | None:

@@ -11,10 +11,13 @@ from matplotlib.figure import Figure
 
 from brokk_rl.console_table import MISSING
 from brokk_rl.plot import BLUE, GREY, ORANGE, add_legend, make_figure, save_figure
-from brokk_rl.report import Cell, Report
+from brokk_rl.report import Cell, embed_picture, render_page, write_page
 from brokk_rl.session import write_text
 
 REPORT_FILE = "exam.html"
+TEMPLATE = Path(__file__).with_name("exam.html.jinja")
+COLUMNS = ["right", "wrong", "missed", "precision", "recall", "f1", "parameter_error"]
+"""Figures of each effect."""
 TABLE_FILE = "exam.md"
 ROWS = {
     "top1": ("one effect: named first, over classes", True),
@@ -37,7 +40,6 @@ ROWS = {
     "closed_examined": ("gap closed on withheld parts, by the examiner, median", True),
     "closed_differs": ("stated closing disagrees with the examiner's", False),
     "closed_missing": ("effects named without a share", False),
-    "predicted_off": ("predicted closing off by, median", False),
 }
 """Label of each metric, and whether more of it is better."""
 CAPTIONS = {
@@ -108,35 +110,21 @@ def write_report(
     The pictures are `confusion_<name>.png`, `reliability_<name>.png` and `size_<name>.png`.
     """
     cases = next(iter(tables.values()))["cases"]
-    kinds = _join_counts({kind: count for kind, count in cases.items() if count})
-    page = Report(
-        f"Exam of {', '.join(tables)}",
-        f"{exam['num_cases']} cases ({kinds}), roughness {exam['roughness']}, seed {exam['seed']}.",
-    )
-    for name, table in tables.items():
-        sat = table["sat"]
-        if sat["value"] < sat["of"]:
-            page.add_text(
-                f"{name} sat {sat['value']} of {sat['of']} cases; the others are left out.", "warn"
-            )
-    if not exam["sealed"]:
-        page.add_text(
-            "A development seed: the authors of the candidates may have looked at its cases.",
-            "warn",
-        )
-    page.add_heading("Metrics")
-    page.add_table(
-        ["", *tables],
-        build_rows(tables),
-        "Rates with 95 % Wilson intervals, other metrics with bootstrap intervals over cases",
-    )
-    for name, table in tables.items():
-        _add_candidate(page, folder, name, table)
-    facts = {"labels, SHA-256": exam["labels_sha256"]}
-    for name, table in tables.items():
-        facts[f"commit of {name}"] = table["commit"] or MISSING
-    page.add_facts(facts)
-    page.write(folder / REPORT_FILE)
+    metrics = []
+    for label, *cells in build_rows(tables):
+        metrics.append((label, cells))
+    values = {
+        "title": f"Exam of {', '.join(tables)}",
+        "exam": exam,
+        "cases": _join_counts({kind: count for kind, count in cases.items() if count}),
+        "tables": tables,
+        "metrics": metrics,
+        "pictures": {name: _save_pictures(folder, name, one) for name, one in tables.items()},
+        "captions": CAPTIONS,
+        "columns": COLUMNS,
+        "join_counts": _join_counts,
+    }
+    write_page(folder / REPORT_FILE, render_page(TEMPLATE, values))
     write_text(folder / TABLE_FILE, format_markdown(tables))
 
 
@@ -144,29 +132,16 @@ def _join_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
-def _add_candidate(page: Report, folder: Path, name: str, table: Mapping[str, Any]) -> None:
-    page.add_heading(name)
-    drawings = {
-        "confusion": draw_confusion(table),
-        "reliability": draw_reliability(table),
-        "size": draw_detection(table),
-    }
-    for stem, figure in drawings.items():
+def _save_pictures(folder: Path, name: str, table: Mapping[str, Any]) -> dict[str, str]:
+    """Write the pictures of a candidate, and return them as addresses that hold their data."""
+    found = {}
+    for stem, draw in DRAWINGS.items():
+        figure = draw(table)
         if figure is not None:
             path = folder / f"{stem}_{name}.png"
             save_figure(figure, path)
-            page.add_picture(path, CAPTIONS[stem])
-    columns = ["right", "wrong", "missed", "precision", "recall", "f1", "parameter_error"]
-    rows = []
-    for effect, row in table["by_effect"].items():
-        rows.append([effect, *map(row.__getitem__, columns)])
-    with page.add_details("By effect, all cases"):
-        page.add_table(["effect", *(column.replace("_", " ") for column in columns)], rows)
-    answers = []
-    for kind, row in table["outside"].items():
-        answers.append([kind, _join_counts(row)])
-    with page.add_details("Faults outside the library, and the answers"):
-        page.add_table(["outside", "said"], answers)
+            found[stem] = embed_picture(path)
+    return found
 
 
 def draw_confusion(table: Mapping[str, Any]) -> Figure | None:
@@ -241,3 +216,6 @@ def draw_detection(table: Mapping[str, Any]) -> Figure | None:
         axis.set(xlabel=label, ylim=(-0.03, 1.03))
     add_legend(figure, figure.axes[0])
     return figure
+
+
+DRAWINGS = {"confusion": draw_confusion, "reliability": draw_reliability, "size": draw_detection}

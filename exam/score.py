@@ -75,7 +75,6 @@ class CaseScore:
         size: Largest size of an effect or outside fault, of typical.
         moved_rad: Change of the motion by the cause over 5 s, on the joint with the largest.
         closed: Share of the gap closed, by the answer's own account.
-        predicted: Share of the gap that the answer said would be closed, before it looked.
         examined: Share of the gap closed on withheld recordings, by the examiner's simulation of
             `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
         was_examined: Whether the examiner simulated the answer.
@@ -99,7 +98,6 @@ class CaseScore:
     size: float
     moved_rad: float
     closed: float | None
-    predicted: float | None
     examined: float | None
     was_examined: bool
     differs: bool
@@ -157,7 +155,6 @@ def score_answer(
         if effect == one.effect:
             numbers.extend(_score_parameters(true[effect], one))
     gap = answer.gap if answer else None
-    predicted = answer.more.get("predicted_closed") if answer else None
     return CaseScore(
         case=label["case"],
         kind=kind,
@@ -174,7 +171,6 @@ def score_answer(
         size=max(sizes, default=0.0),
         moved_rad=max(label["moved_rad"].values()),
         closed=gap.closed.mean if gap and gap.closed else None,
-        predicted=predicted["mean"] if isinstance(predicted, Mapping) else predicted,
         examined=examination["closed"] if examination else None,
         was_examined=examination is not None,
         differs=bool(examination and examination["differs"]),

@@ -66,7 +66,6 @@ def answered(
         where=Where({}, (), None),
         gap=Gap(0.03, 0.01, 0.008, Estimate(0.9, (0.8, 0.95))),
         next_experiment=None,
-        more={"predicted_closed": {"mean": 0.8}},
     )
 
 
@@ -164,7 +163,6 @@ def test_the_figures_of_a_table_are_those_worked_by_hand() -> None:
         "right": 4, "wrong": 1, "missed": 0, "precision": 0.8, "recall": 1.0, "f1": pytest.approx(8 / 9), "parameter_error": 0.0,
     }  # fmt: skip
     assert found["confusion"] == {"lag": {"lag": 2}, "creep": {"backlash": 1}}
-    assert found["predicted_off"]["value"] == pytest.approx(0.1)
     assert found["seconds"] == {"median": 10.0, "most": 10.0}
 
 

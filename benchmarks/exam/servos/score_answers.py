@@ -19,7 +19,7 @@ from diagnosis import answer
 from exam import score
 from exam.metrics import compute_metrics
 
-NEEDS_EXAMINER = ("closed_examined", "closed_differs", "seconds", "predicted_off")
+NEEDS_EXAMINER = ("closed_examined", "closed_differs", "seconds")
 """Rates that rest on runs on withheld recordings, or on times, which are not read here."""
 
 
