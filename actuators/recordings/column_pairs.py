@@ -168,7 +168,9 @@ class PairFinder:
                         "its table only increases"
                     )
                 entries.append(entry)
-            pairs[joint] = ColumnPair(*entries, Evidence("as given by log.joints", 5.0), True)
+            command, position = entries
+            evidence = Evidence("as given by log.joints", 5.0)
+            pairs[joint] = ColumnPair(command, position, evidence, True)
         return pairs
 
     def _pair_by_names(self, entries: list[ColumnEntry]) -> dict[str, ColumnPair]:

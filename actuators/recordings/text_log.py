@@ -84,7 +84,7 @@ class TextLayout:
 
     def tell_kind(self, at: int) -> CellKind:
         """Return the kind of column `at`: that of most of its cells."""
-        kinds = Counter(
+        kinds: Counter[CellKind] = Counter(
             tell_kind(row[at], self.decimal) for row in self.samples if row[at] not in MISSING
         )
         return kinds.most_common(1)[0][0] if kinds else "number"
@@ -173,7 +173,7 @@ class TextLog(LogFile):
         ordered = {name: columns[name] for name in places}
         yield LogRun(self.path.stem, str(self.path), {"": TextTable(ordered, source=self)})
 
-    def _read_cells(self, places: list[int], max_rows: int | None) -> dict[int, pd.Series]:
+    def _read_cells(self, places: list[int], max_rows: int | None) -> dict[int, Any]:
         """Return the cells of some columns; numbers are numbers already where all of them are."""
         layout, width = self.layout, len(self.layout.samples[0])
         texts = {at: str for at in places if layout.tell_kind(at) != "number"}
@@ -193,6 +193,7 @@ class TextLog(LogFile):
             "nrows": max_rows,
             "index_col": False,
         }
+        frame: Any
         try:
             frame = pd.read_csv(self.path, on_bad_lines="error", **options)
         except pd.errors.ParserError as error:
@@ -272,13 +273,14 @@ class TextLog(LogFile):
         return [*self._labels] if len(self._labels) == length else [str(i) for i in range(length)]
 
 
-def convert_cells(cells: pd.Series, kind: CellKind, length: int, decimal: str) -> np.ndarray:
+def convert_cells(cells: Any, kind: CellKind, length: int, decimal: str) -> np.ndarray:
     """Return cells as numbers, `(T,)`, or `(T, K)` for lists; NaN for what is none."""
     if kind == "number":
         if cells.dtype.kind in "fiu":
             return cells.to_numpy(dtype=float)
         texts = cells.astype(str).str.strip().str.replace(decimal, ".", regex=False)
-        return pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
+        numbers: Any = pd.to_numeric(texts, errors="coerce")
+        return numbers.to_numpy(dtype=float)
     texts = cells.fillna("").str.strip()
     if kind == "flag":
         return texts.str.lower().map(FLAGS).to_numpy(dtype=float)
@@ -292,15 +294,17 @@ def convert_cells(cells: pd.Series, kind: CellKind, length: int, decimal: str) -
     return found
 
 
-def convert_times(texts: pd.Series) -> np.ndarray:
+def convert_times(texts: Any) -> np.ndarray:
     """Return times as seconds since 1970, without a zone as if it were UTC, or as seconds of the day, `(T,)`."""
     first = next((text for text in texts if text), "")
     texts = texts.str.replace(",", ".", regex=False)
     if CLOCK_TIME.fullmatch(first):
-        elapsed = pd.to_timedelta(texts, errors="coerce")
+        elapsed: Any = pd.to_timedelta(texts, errors="coerce")
         return elapsed.dt.total_seconds().to_numpy(dtype=float)
     is_iso = ISO_TIME.fullmatch(first) is not None
-    form = {"format": "ISO8601"} if is_iso else {"dayfirst": "/" not in first, "format": "mixed"}
+    form: Any = (
+        {"format": "ISO8601"} if is_iso else {"dayfirst": "/" not in first, "format": "mixed"}
+    )
     stamps: Any = pd.to_datetime(texts, utc=True, errors="coerce", **form)
     elapsed = stamps - pd.Timestamp(0, tz="UTC")
     return (elapsed / pd.Timedelta(seconds=1)).to_numpy(dtype=float)

@@ -321,7 +321,8 @@ def list_matched_orders(
         known = signals[term.name][np.clip(np.arange(len(observed)) + term.newest, 0, None)]
         names = [_shorten(term, column) for column in term.columns]
         by_scaled = match_order((known - term.mean) / term.std, seen)
-        for order in {by_scaled, match_order(known, seen * term.std + term.mean)} - {None}:
+        by_raw = match_order(known, seen * term.std + term.mean)
+        for order in dict.fromkeys(one for one in (by_scaled, by_raw) if one is not None):
             found += make_orders((term,), names, order)
             if names == list(contract.joints):
                 shared.setdefault(order, []).append(term)
