@@ -13,11 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy import stats
 
-from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, remove_frame, save_figure
-from brokk_rl.report import Cell, Report, Tone
+from brokk_rl.report import Tone, render_page, write_page
 from brokk_rl.statistics import compute_wilson_interval
 
 COMPARISON_FILE = "close_gap.json"
@@ -150,144 +148,28 @@ def format_rate(share: SuccessRate) -> str:
 
 
 REPORT_FILE = "close_gap.html"
-PICTURE_FILE = "close_gap.png"
+TEMPLATE = Path(__file__).with_name("close_gap.html.jinja")
 PLANT_NAMES = {
     "simulator": "simulator as it was",
     "repaired": "repaired simulator",
     "machine": "machine",
 }
 POLICY_NAMES = {BEFORE: "policy as it was", AFTER: "retrained"}
-COLOURS = {BEFORE: RED, AFTER: BLUE}
 
 
 def write_report(found: Mapping[str, Any], folder: Path) -> None:
-    """Write `close_gap.html` and `close_gap.png` into `folder`.
+    """Write `close_gap.html` into `folder`.
 
     Raises:
-        StorageError: something could not be written.
+        StorageError: it could not be written.
     """
-    text, tone = write_headline(found)
-    page = Report("Success of the policy before and after retraining", text, tone)
-    figure = draw_success(found)
-    save_figure(figure, folder / PICTURE_FILE)
-    page.add_picture(
-        figure,
-        "Share of episodes that end in strict success, with Wilson's 95 % intervals; all meet the same starts.",
-    )
-    add_success_table(page, found)
-    page.add_heading("Predicted and achieved")
-    fall, back = found["fall"], found["return"]
-    page.add_table(
-        ["", "success", "95 %"],
-        [
-            ["lost between simulator and machine", *_format_points(fall)],
-            ["regained on the machine by retraining", *_format_points(back)],
-            ["still missing", *_format_points(found["left"])],
-            ["predicted: retrained, repaired simulator", *_format_percent(found["predicted"])],
-            ["achieved: retrained, machine", *_format_percent(found["achieved"])],
-        ],
-        "Percentage points and per cent",
-    )
-    _add_agreement_table(page, found)
-    if "retraining" in found:
-        page.add_heading("How it was made")
-        plants = {PLANT_NAMES[name]: text for name, text in found["plants"].items()}
-        page.add_facts(plants | found["retraining"])
-    page.write(folder / REPORT_FILE)
-
-
-def _add_agreement_table(page: Report, found: Mapping[str, Any]) -> None:
-    """Add the agreement of each simulator with the machine about the order of policies."""
-    page.add_heading("Does the simulator know which policy is better?")
-    rows = []
-    for plant, one in found["agreement"].items():
-        tau = None if one["kendall"] is None else f"{one['kendall']:.2f}"
-        rows.append(
-            [PLANT_NAMES[plant], tau, f"{one['rank_violation']:.3f}", f"{one['error']:.3f}"]
-        )
-    names = ", ".join(map(_name_policy, found["success"]))
-    page.add_table(
-        ["", "Kendall's tau", "cost of wrong orders", "mean error of success"],
-        rows,
-        f"Over {len(found['success'])} policies: {names}",
-    )
-
-
-def add_success_table(page: Report, found: Mapping[str, Any]) -> None:
-    """Add success and time to insert of each policy on each plant."""
-    best = max(found["success"].values(), key=lambda shares: shares["machine"]["mean"])
-    rows = []
-    for policy, shares in found["success"].items():
-        times = found["time_to_insert_s"][policy]
-        row: list[Any] = [_name_policy(policy)]
-        for plant in PLANTS:
-            text = f"{100 * shares[plant]['mean']:.1f}"
-            # Only the machine decides which policy is the best.
-            is_best = shares is best and plant == "machine"
-            row.append(Cell(text, _note_interval(shares[plant], times[plant]), best=is_best))
-        rows.append(row)
-    page.add_table(
-        ["", *(PLANT_NAMES[plant] for plant in PLANTS)],
-        rows,
-        f"Strict success, %, of {found['episodes']} episodes",
-    )
-
-
-def draw_success(found: Mapping[str, Any]) -> Figure:
-    """Draw success of each policy on each plant."""
-    figure = make_figure(9.5, 3.8)
-    axis = figure.add_subplot()
-    policies = list(found["success"])
-    width = 0.8 / len(policies)
-    for number, policy in enumerate(policies):
-        shares = [found["success"][policy][plant] for plant in PLANTS]
-        mean = np.array([share["mean"] for share in shares])
-        low, high = np.array([share["ci95"] for share in shares]).T
-        place = np.arange(len(PLANTS)) + (number - (len(policies) - 1) / 2) * width
-        # Rounding must not make it negative.
-        error = 100 * np.maximum(0.0, [mean - low, high - mean])
-        axis.bar(
-            place,
-            100 * mean,
-            0.92 * width,
-            color=COLOURS.get(policy, GREY),
-            label=_name_policy(policy),
-        )
-        axis.errorbar(
-            place, 100 * mean, yerr=error, fmt="none", ecolor="black", elinewidth=1.0, capsize=2.5
-        )
-        for x, share in zip(place, shares, strict=True):
-            axis.annotate(
-                f"{100 * share['mean']:.0f}",
-                (x, 100 * share["ci95"][1]),
-                (0, 3),
-                textcoords="offset points",
-                ha="center",
-            )
-    axis.set_xticks(range(len(PLANTS)), [PLANT_NAMES[plant] for plant in PLANTS])
-    axis.set_ylabel("strict success [%]")
-    axis.set_ylim(0.0, 112.0)
-    axis.set_yticks(range(0, 101, 20))
-    axis.tick_params(axis="x", length=0)
-    remove_frame(axis)
-    add_legend(figure, axis)
-    return figure
-
-
-def _name_policy(policy: str) -> str:
-    return POLICY_NAMES.get(policy, policy)
-
-
-def _note_interval(share: Mapping[str, Any], time_s: float | None) -> str:
-    text = format_rate(dict(share)).partition("(")[2].rstrip(")")
-    return text if time_s is None else f"{text}; {time_s:.1f} s"
-
-
-def _format_percent(share: Mapping[str, Any]) -> tuple[str, str]:
-    low, high = share["ci95"]
-    return f"{100 * share['mean']:.1f} %", f"{100 * low:.1f} to {100 * high:.1f} %"
-
-
-def _format_points(share: Mapping[str, Any]) -> tuple[str, str]:
-    low, high = share["ci95"]
-    return f"{100 * share['mean']:+.1f}", f"{100 * low:+.1f} to {100 * high:+.1f}"
+    headline, tone = write_headline(found)
+    values = {
+        "title": "Success of the policy before and after retraining",
+        "headline": headline,
+        "tone": tone,
+        "found": found,
+        "plants": PLANT_NAMES,
+        "policies": POLICY_NAMES,
+    }
+    write_page(folder / REPORT_FILE, render_page(TEMPLATE, values))
