@@ -232,7 +232,7 @@ class GapClosure:
             for paths in (self.base.field.residuals.base, self.after)
         )
         floor = None if self.joint_floor is None else np.sqrt(self.joint_floor[0])
-        return _describe_joints(self.machine, before, after, floor)
+        return describe_joints(self.machine, before, after, floor)
 
 
 def evaluate_unseen(
@@ -261,7 +261,7 @@ def evaluate_unseen(
     paths = simulate_sizes(simulator, result.fitted.rays, result.fitted.sizes[None])[0]
     before, after = (_compute_joint_rmse([one], [cut.measured]) for one in (none, paths))
     joints = {
-        name: vars(one) for name, one in _describe_joints(machine, before, after, None).items()
+        name: vars(one) for name, one in describe_joints(machine, before, after, None).items()
     }
     return {"seconds": horizon_s * len(cut.q), "recordings": len(cuts), "joints": joints}
 
@@ -278,9 +278,10 @@ def _compute_joint_rmse(paths: Sequence[np.ndarray], measured: Sequence[np.ndarr
     return np.sqrt(np.concatenate(squares).mean(0))
 
 
-def _describe_joints(
+def describe_joints(
     machine: Machine, before: np.ndarray, after: np.ndarray, floor: np.ndarray | None
 ) -> dict[str, JointClosed]:
+    """Return errors `(J,)` before, after and at the floor, joint by joint."""
     found = {}
     for j, name in enumerate(machine.joint_names):
         least = None if floor is None else float(floor[j])

@@ -38,6 +38,7 @@ from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import EffectType
 from diagnosis.own_simulator import OwnSimulator
 from diagnosis.pipeline import DiagnosisPipeline
+from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from diagnosis.request import DiagnosisSubject
 
 log = logging.getLogger(__name__)
@@ -121,8 +122,11 @@ class Diagnose:
             def tell(doing: str, done: float) -> None:
                 progress.reach(done, doing)
 
-            base = self._base(given, self._kinds, tell)
             generator = self.session.generator("diagnosis")
+            if given.reference and self.machine.interface == "speed" and not given.doubts():
+                work = ReferenceDiagnosis(given, self._kinds, self.thresholds, generator)
+                return work.run(tell)
+            base = self._base(given, self._kinds, tell)
             prices, certainty = (
                 self.diagnosis.prices,
                 self.diagnosis.choose_certainty(self.machine, bool(given.reference)),

@@ -1,0 +1,1 @@
+"""The diagnosis by simulating every hypothesis, one module a step; see `docs/diagnosis.md`."""

@@ -1,0 +1,318 @@
+"""The decision: which effects are named, none, or unknown.
+
+The best effect is simulated, and the table made again beside it; a second one is named if it earns
+enough there. The cause is unknown where a row outside the library or a flexible column explains much
+more than the effects. Every constant has its comparison in `benchmarks/diagnosis`.
+Axes: `J` joints, `P` numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from diagnosis.engine.direct import find_step, weigh_stalls
+from diagnosis.engine.evidence import Evidence, FieldJoint, JointRow
+from diagnosis.engine.generic import GenericCauses
+from diagnosis.engine.holds import HeldCommands, Hold, hold_commands
+from diagnosis.engine.rows import OUTSIDE, SHARED, Row, change_numbers
+from diagnosis.engine.side import Side
+
+LEAST_NATS = 22.0
+"""An effect that earns less is not named."""
+JOINT_NATS = 6.0
+"""What each joint of an effect costs, for its size and its form."""
+JOINT_SHARE = 0.1
+"""A joint that earns less, of what the best joint earns, does not have the effect."""
+LOAD_NATS = 12.0
+"""What load dependence costs besides: pose explains nearly the same."""
+SECOND_SHARE = 0.03
+"""A second effect earns so much of the first at least: a first one is never quite of the right form."""
+SAME_JOINT_SHARE = 0.5
+"""So much where it shares a joint with the first."""
+HELD_SECOND_NATS = 60.0
+"""So much if it is held commands, which follow whatever is left."""
+BESIDE_STALLS_NATS = 60.0
+COARSE_NATS = 30.0
+"""Evidence of a coarse sensor beyond twice that of the reference."""
+STALL_NATS = 20.0
+MAX_STALLED = 3
+"""More joints that stall have a common cause, such as a pump."""
+JITTER_FACTOR = 2.0
+"""Jitter can copy lost frames, so it earns so much more, unless it delays most of the time."""
+MOSTLY = 0.8
+STARTS_LIMIT = 1.15
+"""Held commands delay starts and stops alike; what helps starts so much more is no held command."""
+STOPS_FACTOR = 4.0
+SLOW_RATE = 3.5
+"""A rate of the command above this, full strokes a second, is ageing of the pilot stage."""
+OUTSIDE_NATS = 18.0
+GENERIC_NATS = 45.0
+"""A row outside the library, or a flexible column, that earns so much more than the best effect."""
+LEFT_SHARE = 0.6
+LEFT_NATS = 40.0
+"""What may remain beside the named effects, of what they earn, and beyond."""
+HUNTING_NATS = 150.0
+HUNTING_FACTOR = 1.5
+
+HELD = frozenset({"frame_loss", "delay_jitter"})
+WHOLE = SHARED | HELD | {"thermal_all"}
+"""Effects of the whole machine."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect with what it earns.
+
+    Attributes:
+        effect: Its name.
+        joints: Places of its joints.
+        nats: Gain less all prices.
+        rows: Its row on each of them; empty for held commands and direct findings.
+        hold: The course of held commands.
+    """
+
+    effect: str
+    joints: tuple[int, ...]
+    nats: float
+    rows: Mapping[int, Row] = field(default_factory=dict)
+    hold: Hold | None = None
+
+    @property
+    def name(self) -> str:
+        """Name in the registry."""
+        return "thermal_drift" if self.effect == "thermal_all" else self.effect
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What the engine says.
+
+    Attributes:
+        verdict: `effects`, `none` or `unknown`.
+        named: The named effects, the best first.
+        rivals: All effects in the first table, the best first.
+        seconds: The same beside the first named effect.
+        outside: Best row outside the library.
+        generic: Best group of flexible columns, and what it earns, nats.
+        left: What remains beside the named effects, nats.
+    """
+
+    verdict: Literal["effects", "none", "unknown"]
+    named: tuple[Finding, ...]
+    rivals: tuple[Finding, ...]
+    seconds: tuple[Finding, ...]
+    outside: Finding | None
+    generic: tuple[str, float]
+    left: float
+
+
+class Decider:
+    """The decision on one case.
+
+    Args:
+        reference: The machine as it was.
+        field: The machine as it is.
+        noises: Standard deviation of the noise that sensors of the field add, `(J,)`, units.
+    """
+
+    def __init__(self, reference: Side, field: Side, noises: np.ndarray | None = None) -> None:
+        self.evidence = Evidence(reference, field)
+        if noises is not None:
+            self.evidence.noises = noises
+        self.generic = GenericCauses(self.evidence)
+        self.holds = HeldCommands(self.evidence)
+        self.num_joints = reference.num_joints
+
+    def decide(self) -> Decision:
+        """Return the decision."""
+        evidence = self.evidence
+        coarse = self._find_coarse()
+        healthy = [base.numbers for base in evidence.bases]
+        joints = evidence.view_field(healthy)
+        table = evidence.weigh_rows(joints)
+        stalled = self._find_stalled(table, coarse)
+        skip = frozenset(stalled)
+        rivals = self._list_findings(joints, table, skip)
+        outside = [one for one in rivals if one.effect in OUTSIDE]
+        library = [one for one in rivals if one.effect not in OUTSIDE]
+        groups = self._weigh_generic(joints, skip)
+        direct = []
+        if coarse:
+            direct.append(Finding("quantisation", tuple(coarse), 1e3))
+        if stalled:
+            direct.append(Finding("stiction", tuple(stalled), 500.0))
+        named = list(direct)
+        best = library[0]
+        needed = LEAST_NATS
+        if coarse:
+            needed = max(needed, COARSE_NATS)
+        if stalled:
+            needed = max(needed, BESIDE_STALLS_NATS)
+        seconds: list[Finding] = []
+        left = 0.0
+        is_new = best.effect not in [one.effect for one in direct]
+        if best.nats >= needed and len(named) < 2 and is_new:
+            named.append(best)
+            joints = self._apply(healthy, best)
+            table = evidence.weigh_rows(joints)
+            seconds = [
+                one
+                for one in self._list_findings(joints, table, skip)
+                if one.effect != best.effect and {one.name, best.name} != {"thermal_drift"}
+            ]
+            left = self._weigh_generic(joints, skip)[1]
+            left = max([left, *(one.nats for one in seconds if one.effect in OUTSIDE)])
+            seconds = [one for one in seconds if one.effect not in OUTSIDE]
+            if len(named) < 2 and seconds and self._is_second(best, seconds[0], named):
+                named.append(seconds[0])
+                numbers = [joint.numbers for joint in joints]
+                field = joints[0].side
+                after = self._apply(numbers, seconds[0], field)
+                left = self._weigh_generic(after, skip)[1]
+        verdict = "none"
+        earned = sum(one.nats for one in named if one not in direct)
+        hunting = self._weigh_generic(evidence.view_field(healthy), skip, "hunting")[1]
+        most = max(best.nats, 0.0)
+        pump = max([one.nats for one in outside if one.effect == "pump_lag"], default=0.0)
+        is_odd = outside[0].nats > most + OUTSIDE_NATS
+        is_odd |= groups[1] > most + GENERIC_NATS
+        is_odd |= left > LEFT_SHARE * earned + LEFT_NATS
+        is_odd |= best.effect in HELD and pump > 0.5 * most
+        if (is_odd and not direct) or hunting > HUNTING_FACTOR * most + HUNTING_NATS:
+            verdict = "unknown"
+            named = []
+        elif named:
+            verdict = "effects"
+        return Decision(
+            verdict,
+            tuple(named),
+            tuple(library),
+            tuple(seconds),
+            outside[0] if outside else None,
+            groups,
+            left,
+        )
+
+    def _find_coarse(self) -> list[int]:
+        """Return the joints with a coarse sensor on the field; their steps enter the scale."""
+        found, evidence = [], self.evidence
+        for j in np.flatnonzero(evidence.noises == 0.0):
+            nats, step = find_step(evidence.field, j)
+            known, _ = find_step(evidence.reference, j)
+            if nats > 2.0 * known + COARSE_NATS:
+                evidence.steps[j] = step
+                found.append(int(j))
+        return found
+
+    def _find_stalled(
+        self, table: Mapping[str, Mapping[int, JointRow]], coarse: Sequence[int]
+    ) -> list[int]:
+        """Return the joints that stick and slip; one that rings as well is compliant."""
+        found = []
+        ringing = table["compliance"]
+        for j in range(self.num_joints):
+            is_rough = j in coarse or self.evidence.noises[j] > 0.0
+            nats = 0.0 if is_rough else weigh_stalls(self.evidence, j)
+            rings = ringing[j].gain if j in ringing else 0.0
+            if nats >= STALL_NATS and rings < nats:
+                found.append(j)
+        return found if len(found) <= MAX_STALLED else []
+
+    def _list_findings(
+        self,
+        joints: Sequence[FieldJoint],
+        table: Mapping[str, Mapping[int, JointRow]],
+        skip: frozenset[int],
+    ) -> list[Finding]:
+        """Return all effects with what they earn, the best first."""
+        found = [_add_up(effect, rows, skip) for effect, rows in table.items()]
+        common = self.evidence.weigh_common("thermal_drift", joints)
+        found.append(_add_up("thermal_all", common, skip))
+        if not any(joint.side is not self.evidence.field for joint in joints):
+            holds = self.holds.find(joints)
+            found += [_weigh_hold(hold, self.num_joints) for hold in _choose_hold(holds)]
+        return sorted(found, key=lambda one: -one.nats)
+
+    def _apply(
+        self, numbers: Sequence[np.ndarray], finding: Finding, field: Side | None = None
+    ) -> list[FieldJoint]:
+        """Return the joints of the field with an effect."""
+        changed = []
+        for j, values in enumerate(numbers):
+            row = finding.rows.get(j)
+            changed.append(values if row is None else change_numbers(values, [row])[0])
+        side = self.evidence.field if field is None else field
+        if finding.hold is not None:
+            side = hold_commands(side, finding.hold.delays)
+        return self.evidence.view_field(changed, side)
+
+    def _is_second(self, first: Finding, second: Finding, named: Sequence[Finding]) -> bool:
+        """Return whether a second effect earns enough."""
+        is_whole = first.effect in WHOLE or second.effect in WHOLE
+        shares = bool(set(first.joints) & set(second.joints)) and not is_whole
+        needed = (SAME_JOINT_SHARE if shares else SECOND_SHARE) * first.nats
+        if second.effect in HELD:
+            needed = max(needed, HELD_SECOND_NATS)
+        is_new = second.effect not in [one.effect for one in named]
+        return is_new and second.nats >= max(needed, LEAST_NATS)
+
+    def _weigh_generic(
+        self, joints: Sequence[FieldJoint], skip: frozenset[int], only: str = ""
+    ) -> tuple[str, float]:
+        """Return the group that earns most on all joints, and how much, nats."""
+        total: dict[str, float] = {}
+        for joint in joints:
+            if joint.joint in skip:
+                continue
+            for name, nats in self.generic.weigh(joint).items():
+                total[name] = total.get(name, 0.0) + max(nats - JOINT_NATS, 0.0)
+        some = {name: nats for name, nats in total.items() if only in ("", name)}
+        best = max(some, key=some.__getitem__)
+        return best, some[best]
+
+
+def _add_up(effect: str, rows: Mapping[int, JointRow], skip: frozenset[int]) -> Finding:
+    """Return an effect with the joints that it pays on."""
+    if effect in SHARED or effect == "thermal_all":
+        nats = sum(row.gain - row.price for row in rows.values()) - JOINT_NATS
+        own = {j: row.row for j, row in rows.items()}
+        return Finding(effect, tuple(rows), nats, own)
+    nets = {}
+    for j, row in rows.items():
+        net = row.gain - row.price - JOINT_NATS
+        if net > 0.0 and j not in skip:
+            nets[j] = net
+    total = sum(nets.values())
+    if effect == "load_dependence":
+        total -= LOAD_NATS
+    if effect == "rate_limit" and nets:
+        fastest = min(1.0 / rows[j].row.size for j in nets)
+        if fastest > SLOW_RATE:
+            total = 0.0
+    most = max(nets.values(), default=0.0)
+    joints = tuple(j for j, net in nets.items() if net >= JOINT_SHARE * most)
+    return Finding(effect, joints, total, {j: rows[j].row for j in joints})
+
+
+def _weigh_hold(hold: Hold, num_joints: int) -> Finding:
+    nats = min(hold.gain, STOPS_FACTOR * max(min(hold.starts, hold.stops), 0.0))
+    if hold.starts > STARTS_LIMIT * hold.stops:
+        nats = min(nats, max(hold.stops, 0.0))
+    joints = tuple(range(num_joints))
+    return Finding(hold.course.effect, joints, nats - hold.price - JOINT_NATS, {}, hold)
+
+
+def _choose_hold(holds: Mapping[str, Hold]) -> list[Hold]:
+    """Return the likelier of lost frames and jitter."""
+    if len(holds) < 2:
+        return list(holds.values())
+    jitter, loss = holds["delay_jitter"], holds["frame_loss"]
+    earned = jitter.gain - jitter.price
+    other = max(loss.gain - loss.price, 1.0)
+    is_jitter = earned > JITTER_FACTOR * other
+    is_jitter |= jitter.share > MOSTLY and earned > 1.05 * other
+    return [jitter if is_jitter else loss]

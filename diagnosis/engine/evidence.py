@@ -1,0 +1,259 @@
+"""The table of evidence: how much each row earns on each joint of the field, less what it earns on the reference.
+
+Axes: `C` rows, `J` joints, `N` increments, `P` numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from diagnosis.engine import rows as row_tables
+from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, fit_reference, linearise
+from diagnosis.engine.measure import Measure, Scale, measure_motion
+from diagnosis.engine.nuisance import JointNuisance, compute_gain, count_part, estimate_nuisance
+from diagnosis.engine.rows import SHARED, Row, change_numbers
+from diagnosis.engine.side import Side
+
+FIRST_FACTORS = (0.78, 0.86, 0.93, 1.0, 1.08, 1.17, 1.28)
+SECOND_FACTORS = (0.955, 0.98, 1.0, 1.02, 1.045)
+SHAPE_FACTORS = (0.6, 0.8, 1.25, 1.6)
+WORTH_REFINING = 3.0
+"""Nats of the best row of an effect from which its size is searched."""
+SHARED_SPREAD = 0.08
+"""Standard deviation of the logarithm of a common size between joints."""
+LOSS_LIMIT = -20.0
+"""A joint takes at most so many nats from a common effect."""
+
+
+@dataclass(frozen=True)
+class JointRow:
+    """The best row of an effect on one joint.
+
+    Attributes:
+        row: The row, its size searched.
+        gain: Its gain on the field, nats.
+        price: Mean over the parts of the reference of the most that any row of the effect gains
+            there, at the length of the field, nats.
+    """
+
+    row: Row
+    gain: float
+    price: float
+
+
+class FieldJoint:
+    """One joint of the field, its numbers those of the reference with effects that are there already.
+
+    Args:
+        side: The field.
+        joint: Place of the joint.
+        base: Its baseline.
+        nuisance: Its ageing and wander.
+        numbers: Its numbers, `(P,)`.
+        step: Step of a coarse sensor, units; 0: none.
+        noise: Standard deviation of noise that its sensor adds, units.
+        used: Samples that count, `(T,)` bool; `None`: all.
+    """
+
+    def __init__(
+        self,
+        side: Side,
+        joint: int,
+        base: JointBaseline,
+        nuisance: JointNuisance,
+        numbers: np.ndarray,
+        step: float = 0.0,
+        noise: float = 0.0,
+        used: np.ndarray | None = None,
+    ) -> None:
+        self.side = side
+        self.joint = joint
+        self.numbers = numbers
+        healthy = side.simulate(joint, base.numbers)[0].astype(float)
+        scale = base.scale
+        if step or noise:
+            scale = Scale(scale.coefficients, () if step else scale.memory, step, noise)
+        self.measure = Measure(side, scale, measure_motion(side, healthy), used)
+        self.increments, slopes = linearise(side, joint, numbers, self.measure)
+        self.path = side.simulate(joint, numbers)[0].astype(float)
+        self.projection = nuisance.project(side, self.path, slopes, self.measure, base.spread)
+        self.residual = self.measure(side.q[:, joint]).astype(float) - self.increments
+        self.squares = float(self.projection.measure_squares(self.residual)[0])
+        self.count = self.measure.count
+
+    @property
+    def scatter(self) -> float:
+        """Mean square of the remaining increments over that of the reference."""
+        return self.squares / self.count
+
+    def simulate(self, tried: Sequence[Row]) -> np.ndarray:
+        """Return the increments that rows add to the simulated joint, `(C, N)`."""
+        paths = self.side.simulate(self.joint, change_numbers(self.numbers, tried))
+        return self.measure(paths) - self.increments.astype(np.float32)
+
+    def score(self, tried: Sequence[Row]) -> np.ndarray:
+        """Return the gains of rows, nats, `(C,)`."""
+        left = self.residual.astype(np.float32) - self.simulate(tried)
+        squares = self.projection.measure_squares(left)
+        return compute_gain(squares, self.squares, self.count)
+
+    def refine(self, row: Row) -> tuple[float, Row]:
+        """Return gain and row where the size and the shape of a row fit best."""
+        best = (-np.inf, row)
+        for factors, shapes in ((FIRST_FACTORS, SHAPE_FACTORS), (SECOND_FACTORS, SHAPE_FACTORS)):
+            tried = [best[1].resize(factor) for factor in factors]
+            if len(row.sizes) < len(row.changes):
+                tried += [best[1].resize(1.0, shape) for shape in shapes]
+            gains = self.score(tried)
+            top = int(np.argmax(gains))
+            if gains[top] > best[0]:
+                best = (float(gains[top]), tried[top])
+        return best
+
+
+class Evidence:
+    """All that reference and field say about the rows.
+
+    Args:
+        reference: The machine as it was.
+        field: The machine as it is.
+    """
+
+    def __init__(self, reference: Side, field: Side) -> None:
+        self.reference = reference
+        self.field = field
+        self.bases = fit_reference(reference)
+        field.ask_others([base.numbers for base in self.bases])
+        self.rows = row_tables.list_effect_rows()
+        self.outside = row_tables.list_outside_rows(reference.num_joints)
+        self.every = [*self.rows, *self.outside]
+        self.names = np.array([row.effect for row in self.every])
+        joints = range(reference.num_joints)
+        self.nuisances = [estimate_nuisance(reference, j, self.bases[j]) for j in joints]
+        self.steps = np.zeros(reference.num_joints)
+        self.noises = np.zeros(reference.num_joints)
+
+    @cached_property
+    def is_loaded(self) -> np.ndarray:
+        """Which joints carry weight, `(J,)` bool."""
+        return np.abs(self.reference.loads).max((1, 2)) > 1e-3
+
+    @cached_property
+    def parts(self) -> list[np.ndarray]:
+        """Gain of each row on each part of the reference, nats a second, of each joint `(parts, C)`."""
+        return [self._price_joint(j) for j in range(self.reference.num_joints)]
+
+    def can_have(self, joint: int) -> np.ndarray:
+        """Return which rows a joint can have, `(C,)` bool."""
+        weighs = self.names == "load_dependence"
+        return np.logical_not(weighs) | self.is_loaded[joint]
+
+    def _price_joint(self, joint: int) -> np.ndarray:
+        base, side = self.bases[joint], self.reference
+        tried = self.can_have(joint)
+        for name in np.unique(self.names):
+            # Every second size is enough for the largest gain.
+            if name not in SHARED:
+                tried[np.flatnonzero(self.names == name)[1::2]] = False
+        places = np.flatnonzero(tried)
+        some = [self.every[place] for place in places]
+        paths = side.simulate(joint, change_numbers(base.numbers, some))
+        healthy = side.simulate(joint, base.numbers)
+        added = base.measure(paths) - base.measure(healthy)
+        found = np.full((NUM_PARTS, len(self.every)), -9.0)
+        for k in range(NUM_PARTS):
+            own = base.part == k
+            part, count = self.nuisances[joint].parts[k], count_part(base, k)
+            residual = base.left_out[own].astype(np.float32)
+            before = float(part.measure_squares(residual)[0])
+            gains = compute_gain(part.measure_squares(residual - added[:, own]), before, count)
+            seconds = count * base.measure.interval * side.period_s
+            found[k, places] = gains / seconds
+        return found
+
+    def view_field(
+        self,
+        numbers: Sequence[np.ndarray],
+        field: Side | None = None,
+        used: np.ndarray | None = None,
+    ) -> list[FieldJoint]:
+        """Return the joints of the field with these numbers `(P,)` each, seen in the samples `used` `(T,)`."""
+        side = self.field if field is None else field
+        found = []
+        for j, row in enumerate(numbers):
+            base, nuisance = self.bases[j], self.nuisances[j]
+            found.append(
+                FieldJoint(side, j, base, nuisance, row, self.steps[j], self.noises[j], used)
+            )
+        return found
+
+    def weigh_rows(self, joints: Sequence[FieldJoint]) -> dict[str, dict[int, JointRow]]:
+        """Return the best row of each effect on each joint, by effect and joint."""
+        tables = []
+        for joint in joints:
+            gains = np.full(len(self.every), -99.0)
+            some = np.flatnonzero(self.can_have(joint.joint))
+            gains[some] = joint.score([self.every[place] for place in some])
+            tables.append(gains)
+        found: dict[str, dict[int, JointRow]] = {}
+        for name in dict.fromkeys(self.names.tolist()):
+            places = np.flatnonzero(self.names == name)
+            if name in SHARED:
+                found[name] = self._weigh_shared(places, joints, tables)
+                continue
+            found[name] = {}
+            for joint, gains in zip(joints, tables, strict=True):
+                best = places[np.argmax(gains[places])]
+                if gains[best] < LOSS_LIMIT:
+                    continue
+                gain, row = float(gains[best]), self.every[best]
+                if gain > WORTH_REFINING:
+                    gain, row = joint.refine(row)
+                seconds = joint.count * joint.measure.interval * self.field.period_s
+                most = np.maximum(self.parts[joint.joint][:, places].max(1) * seconds, 0.0)
+                found[name][joint.joint] = JointRow(row, gain, float(most.mean()))
+        return found
+
+    def weigh_common(self, name: str, joints: Sequence[FieldJoint]) -> dict[int, JointRow]:
+        """Return the rows of an effect with the same size on all joints."""
+        places = np.flatnonzero(self.names == name)
+        tables = []
+        for joint in joints:
+            gains = np.full(len(self.every), -99.0)
+            gains[places] = joint.score([self.every[place] for place in places])
+            tables.append(gains)
+        return self._weigh_shared(places, joints, tables, np.array(0.0))
+
+    def _weigh_shared(
+        self,
+        places: np.ndarray,
+        joints: Sequence[FieldJoint],
+        tables: Sequence[np.ndarray],
+        least: np.ndarray | None = None,
+    ) -> dict[int, JointRow]:
+        """Return the rows of an effect that has about one size on all joints; its price is on the first."""
+        total = np.sum([np.maximum(gains[places], LOSS_LIMIT) for gains in tables], 0)
+        seconds = joints[0].count * joints[0].measure.interval * self.field.period_s
+        floor = -5.0 / seconds if least is None else least
+        parts = [np.maximum(self.parts[j.joint][:, places], floor) for j in joints]
+        prices = np.maximum(np.sum(parts, 0).max(0) * seconds, 0.0)
+        best = int(np.argmax(total - prices))
+        row = self.every[places[best]]
+        tried = [row.resize(factor) for factor in (0.88, 0.92, 0.96, 1.0, 1.04, 1.08, 1.13)]
+        scores = np.stack([joint.score(tried) for joint in joints])
+        logs = np.log(np.abs([one.size for one in tried]))
+        off = 0.5 * np.square(logs[None] - logs[:, None]) / SHARED_SPREAD**2
+        around = scores[:, None, :] - off[None]
+        totals = np.maximum(around.max(2), LOSS_LIMIT).sum(0)
+        centre = int(np.argmax(totals))
+        found = {}
+        for joint, own in zip(joints, around[:, centre], strict=True):
+            size = int(np.argmax(own))
+            gain = max(float(own[size]), LOSS_LIMIT)
+            price = float(prices[best]) if joint is joints[0] else 0.0
+            found[joint.joint] = JointRow(tried[size], gain, price)
+        return found

@@ -1,0 +1,140 @@
+"""Flexible columns: what one quantity alone could explain, whatever the law.
+
+A group of columns lets the simulated speed follow any function of one quantity: place, level of the
+command, the other joints, what happened before, or a slow oscillation. Their marginal likelihood
+pays for their number. Where a group earns much more than any effect, the cause is unknown.
+Axes: `T` samples, `K` columns, `N` increments.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
+from diagnosis.engine.evidence import Evidence, FieldJoint
+from diagnosis.engine.joint_model import PLACE
+from diagnosis.engine.nuisance import (
+    Projection,
+    compute_gain,
+    count_part,
+    draw_hats,
+    simulate_speed,
+)
+from diagnosis.engine.side import MAX_DEMAND, Side
+
+NUM_POSES = 8
+LEVELS = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
+"""Knots of the place and of the speed over the top speed."""
+HUNTING_HZ = np.arange(0.1, 0.62, 0.03)
+"""Slow oscillations of a pump controller."""
+HISTORY_S = (-0.3, -0.15, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2)
+RISING_S = (-0.15, 0.15, 0.35, 0.7)
+"""Shifts of the simulated speed: at any time, and while it rises."""
+SMOOTHING_S = 0.25
+
+
+def list_groups(
+    side: Side, joint: int, base: JointBaseline, path: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the columns of each group as paths `(K, T)`, from the simulated path `(T,)`."""
+    speed = simulate_speed(side, path)
+    numbers = base.numbers
+    top = 0.5 * (numbers[PLACE["speed_out"]] + numbers[PLACE["speed_in"]]) * side.period_s
+    forward, backward = np.maximum(speed, 0.0), np.minimum(speed, 0.0)
+    place = side.poses[joint][:, 0]
+    by_pose = draw_hats(place, np.linspace(-1.0, 1.0, NUM_POSES))
+    groups = {"place": 0.15 * np.concatenate([forward * by_pose, backward * by_pose])}
+    up, down = draw_hats(speed / top, LEVELS), draw_hats(-speed / top, LEVELS)
+    groups["level"] = 0.2 * np.concatenate([forward * up, backward * down])
+    groups["other joints"] = 0.1 * _view_others(side, joint, base, speed, top)
+    waves = 2.0 * np.pi * HUNTING_HZ[:, None] * side.time_s
+    groups["hunting"] = 0.2 * speed * np.concatenate([np.sin(waves), np.cos(waves)])
+    rising = np.abs(_shift(speed, -1)) > np.abs(speed)
+    before = [_shift(speed, _count(side, s)) - speed for s in HISTORY_S]
+    before += [(_shift(speed, _count(side, s)) - speed) * rising for s in RISING_S]
+    groups["history"] = 0.2 * np.stack(before)
+    return {name: np.cumsum(columns, -1) - columns for name, columns in groups.items()}
+
+
+def _count(side: Side, seconds: float) -> int:
+    return round(seconds / side.period_s)
+
+
+def _view_others(
+    side: Side, joint: int, base: JointBaseline, speed: np.ndarray, top: float
+) -> np.ndarray:
+    """Return the measured speeds and the delayed commands of the other joints, and their demand."""
+    width = side.count(SMOOTHING_S)
+    kernel = np.ones(width) / width
+    delay = _count(side, base.numbers[PLACE["delay_s"]])
+    moving, asked = [], []
+    for other in range(side.num_joints):
+        if other != joint:
+            own = simulate_speed(side, side.q[:, other])
+            moving.append(np.convolve(own, kernel, "same"))
+            asked.append(_shift(side.u[:, other], delay) * top)
+    demand = speed * np.minimum(side.demand[joint], 2.0 * MAX_DEMAND)
+    return np.stack([*moving, *asked, demand])
+
+
+def _shift(values: np.ndarray, by: int) -> np.ndarray:
+    """Return `values` `(T,)` later by some samples, 0 where none are known."""
+    found = np.zeros_like(values)
+    if by > 0:
+        found[by:] = values[:-by]
+    elif by < 0:
+        found[:by] = values[-by:]
+    else:
+        found[:] = values
+    return found
+
+
+def compute_evidence(
+    projection: Projection, residual: np.ndarray, columns: np.ndarray, count: float
+) -> float:
+    """Return the log evidence of columns of prior deviation 1 beside the nuisance, nats."""
+    columns = columns[np.square(columns).sum(1) > 1e-9]
+    wide = projection.add(columns)
+    before = float(projection.measure_squares(residual)[0])
+    gain = float(compute_gain(wide.measure_squares(residual), before, count)[0])
+    return gain - 0.5 * (wide.log_determinant - projection.log_determinant)
+
+
+class GenericCauses:
+    """Evidence of the groups, with its price on the reference.
+
+    Args:
+        evidence: The table.
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        self._evidence = evidence
+        self._prices = [self._price(j) for j in range(evidence.reference.num_joints)]
+
+    def _price(self, joint: int) -> dict[str, float]:
+        """Return the most that each group earns on a left-out part, nats a second."""
+        side, base = self._evidence.reference, self._evidence.bases[joint]
+        path = side.simulate(joint, base.numbers)[0].astype(float)
+        parts = self._evidence.nuisances[joint].parts
+        found = {}
+        for name, columns in list_groups(side, joint, base, path).items():
+            increments = base.measure(columns)
+            gains = []
+            for k in range(NUM_PARTS):
+                own, count = base.part == k, count_part(base, k)
+                residual = base.left_out[own]
+                gain = compute_evidence(parts[k], residual, increments[:, own], count)
+                gains.append(gain / (count * base.measure.interval * side.period_s))
+            found[name] = max(*gains, 0.0)
+        return found
+
+    def weigh(self, joint: FieldJoint) -> dict[str, float]:
+        """Return what each group earns on a joint of the field, less its price, nats."""
+        base = self._evidence.bases[joint.joint]
+        seconds = joint.count * joint.measure.interval * joint.side.period_s
+        prices, found = self._prices[joint.joint], {}
+        for name, columns in list_groups(joint.side, joint.joint, base, joint.path).items():
+            increments = joint.measure(columns).astype(float)
+            gain = compute_evidence(joint.projection, joint.residual, increments, joint.count)
+            found[name] = gain - prices[name] * seconds
+        return found

@@ -1,0 +1,402 @@
+"""Commands that were held: lost frames and jitter, as a hidden delay common to all joints.
+
+Viterbi's algorithm finds the likeliest course of the delay. The commands are replaced by those that
+were in force, and judged by the same measure as every other row, less the prior of the course.
+Axes: `T` samples, `K` delays, `M` models of the course.
+"""
+
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# The kernel is compiled by Warp; a type checker reads it as ordinary Python.
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from diagnosis.engine.baseline import JointBaseline
+from diagnosis.engine.evidence import Evidence, FieldJoint
+from diagnosis.engine.joint_model import PLACE
+from diagnosis.engine.measure import Scale, measure_motion
+from diagnosis.engine.nuisance import Projection, compute_gain
+from diagnosis.engine.side import Side
+
+LONGEST_S = 0.9
+"""Longest delay that a course reaches."""
+MAX_SQUARE = 16.0
+LATENT_UNITS_S = 0.004
+"""Speed that no joint shows: its step is below the noise of the encoder."""
+TEMPERS = (1.0, 0.5)
+"""Powers of the likelihood under which a course is sought; the samples depend on each other."""
+NEIGHBOUR = 0.45
+"""Chance that a jumping delay changes by one sample only, up and down each."""
+LEAST_NATS = 5.0
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a delay comes and goes.
+
+    Attributes:
+        effect: `frame_loss`: it grows with each lost frame and ends at once; `delay_jitter`: it
+            jumps.
+        begins: Chance a sample that a delay begins.
+        lasts: Chance a sample that it goes on.
+    """
+
+    effect: str
+    begins: float
+    lasts: float
+
+    @property
+    def is_loss(self) -> bool:
+        """True for frames that are lost."""
+        return self.effect == "frame_loss"
+
+
+COURSES = (
+    Course("frame_loss", 0.01, 0.6),
+    Course("frame_loss", 0.04, 0.85),
+    Course("frame_loss", 0.02, 0.94),
+    Course("delay_jitter", 0.02, 0.9),
+    Course("delay_jitter", 0.1, 0.9),
+    Course("delay_jitter", 0.3, 0.6),
+)
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A found course.
+
+    Attributes:
+        course: Its model.
+        delays: Additional delay of each sample of the field, in samples, `(T,)`.
+        gain: What it earns on the field less its prior, nats.
+        price: The same on the reference, at the length of the field, nats.
+        starts: Gain while the arm speeds up, nats.
+        stops: Gain while it slows down, nats.
+    """
+
+    course: Course
+    delays: np.ndarray
+    gain: float
+    price: float
+    starts: float
+    stops: float
+
+    @property
+    def share(self) -> float:
+        """Share of the samples that are delayed."""
+        return float((self.delays > 0).mean())
+
+
+@wp.kernel(enable_backward=False)
+def find_courses(
+    likelihood: wp.array2d[wp.float64],
+    is_first: wp.array[wp.int32],
+    is_loss: wp.array[wp.int32],
+    begins: wp.array[wp.float64],
+    lasts: wp.array[wp.float64],
+    temper: wp.array[wp.float64],
+    score: wp.array3d[wp.float64],
+    back: wp.array3d[wp.int32],
+    course: wp.array2d[wp.int32],
+):
+    """Find the likeliest course of each model by Viterbi's algorithm, `(M, T)`."""
+    m = wp.tid()
+    samples = likelihood.shape[0]
+    delays = likelihood.shape[1]
+    one = wp.float64(1.0)
+    stay_off = wp.log(one - begins[m])
+    begin = wp.log(begins[m])
+    last = wp.log(lasts[m])
+    end = wp.log(one - lasts[m])
+    jump = wp.log((one - lasts[m]) / wp.float64(delays))
+    near = wp.log((one - lasts[m]) * wp.float64(NEIGHBOUR))
+    for d in range(delays):
+        score[m, 0, d] = wp.float64(-1e9)
+    score[m, 0, 0] = wp.float64(0.0)
+    for k in range(samples):
+        top = score[m, 0, 0]
+        place = wp.int32(0)
+        for d in range(1, delays):
+            if score[m, 0, d] > top:
+                top = score[m, 0, d]
+                place = d
+        for d in range(delays):
+            best = wp.float64(-1e9)
+            source = place
+            if is_first[k] == 1:
+                if d == 0:
+                    best = top
+            elif is_loss[m] == 1:
+                if d == 0:
+                    best = score[m, 0, 0] + stay_off
+                    source = wp.int32(0)
+                    if top + end > best and place > 0:
+                        best = top + end
+                        source = place
+                    for other in range(1, delays):
+                        if score[m, 0, other] + end > best:
+                            best = score[m, 0, other] + end
+                            source = other
+                elif d == 1:
+                    best = score[m, 0, 0] + begin
+                    source = wp.int32(0)
+                else:
+                    best = score[m, 0, d - 1] + last
+                    source = d - 1
+            else:
+                best = top + jump
+                stay = last
+                if d == 0:
+                    stay = stay_off
+                if score[m, 0, d] + stay > best:
+                    best = score[m, 0, d] + stay
+                    source = d
+                if d > 0:
+                    rise = near
+                    if d == 1:
+                        rise = begin
+                    if score[m, 0, d - 1] + rise > best:
+                        best = score[m, 0, d - 1] + rise
+                        source = d - 1
+                # Warp evaluates both sides of `and`: the index stays within the row.
+                above = wp.min(d + 1, delays - 1)
+                if d < above and score[m, 0, above] + near > best:
+                    best = score[m, 0, above] + near
+                    source = above
+            score[m, 1, d] = best
+            back[m, k, d] = source
+        for d in range(delays):
+            score[m, 0, d] = score[m, 1, d] + temper[m] * likelihood[k, d]
+    state = wp.int32(0)
+    for d in range(1, delays):
+        if score[m, 0, d] > score[m, 0, state]:
+            state = d
+    for i in range(samples):
+        k = samples - 1 - i
+        course[m, k] = state
+        state = back[m, k, state]
+
+
+def _search_courses(bank: np.ndarray, side: Side) -> list[tuple[Course, np.ndarray]]:
+    """Return the likeliest course under each model and temper from log likelihoods `(T, K)`."""
+    models = [(course, temper) for course in COURSES for temper in TEMPERS]
+    num_samples, num_delays = bank.shape
+    is_first = np.zeros(num_samples, dtype=np.int32)
+    is_first[side.starts] = 1
+    found = wp.zeros((len(models), num_samples), dtype=wp.int32)
+    inputs = [
+        wp.array(bank, dtype=wp.float64),
+        wp.array(is_first, dtype=wp.int32),
+        wp.array([int(course.is_loss) for course, _ in models], dtype=wp.int32),
+        wp.array([course.begins for course, _ in models], dtype=wp.float64),
+        wp.array([course.lasts for course, _ in models], dtype=wp.float64),
+        wp.array([temper for _, temper in models], dtype=wp.float64),
+        wp.empty((len(models), 2, num_delays), dtype=wp.float64),
+        wp.empty((len(models), num_samples, num_delays), dtype=wp.int32),
+    ]
+    wp.launch(find_courses, dim=len(models), inputs=inputs, outputs=[found])
+    return [(course, row) for (course, _), row in zip(models, found.numpy(), strict=True)]
+
+
+def _build_bank(
+    side: Side, bases: Sequence[JointBaseline], numbers: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return the log likelihood of each additional delay at each sample of the command, `(T, K)`."""
+    num_delays = side.count(LONGEST_S)
+    bank = np.zeros((side.num_samples, num_delays))
+    for j, (base, row) in enumerate(zip(bases, numbers, strict=True)):
+        tried = np.repeat(row[None], num_delays, 0)
+        tried[:, PLACE["delay_s"]] += np.arange(num_delays) * side.period_s
+        paths = side.simulate(j, tried).astype(float)
+        motion = measure_motion(side, paths[0])
+        variance = Scale(base.frame_variance).variance(motion)
+        variance = variance + (LATENT_UNITS_S * side.period_s) ** 2
+        steps = np.diff(paths, axis=1, append=paths[:, -1:])
+        error = np.diff(side.q[:, j], append=side.q[-1, j]) - steps
+        error[:, side.ends - 1] = 0.0
+        likelihood = -0.5 * np.minimum(error**2 / variance, MAX_SQUARE)
+        lags = ("delay_s", "pilot_lag_s", "spool_lag_s", "motion_lag_s")
+        late_s = sum(row[PLACE[name]] for name in (*lags, "command_lag_s", "speed_lag_s"))
+        late = int(late_s / side.period_s)
+        share = late_s / side.period_s - late
+        mixed = (1.0 - share) * likelihood[:, late:-1] + share * likelihood[:, late + 1 :]
+        bank[: side.num_samples - late - 1] += mixed.T
+    for begin in side.starts:
+        bank[begin : begin + num_delays] = 0.0
+    return bank
+
+
+def hold_commands(side: Side, delays: np.ndarray) -> Side:
+    """Return the side under the commands that were in force, each later by `delays` samples `(T,)`."""
+    rows = np.arange(side.num_samples) - delays
+    return side.with_commands(side.u[np.maximum(rows, 0)])
+
+
+def _price_course(delays: np.ndarray, course: Course, num_delays: int) -> np.ndarray:
+    """Return the log prior of each step of a course, against no delay at all, `(T,)`."""
+    now, then = delays[:-1], delays[1:]
+    is_off, is_same = now == 0, now == then
+    off = np.log(1.0 - course.begins)
+    begin, last = np.log(course.begins), np.log(course.lasts)
+    end = np.log(1.0 - course.lasts)
+    if course.is_loss:
+        on = np.where(then == now + 1, last, end)
+        price = np.where(is_off, np.where(is_same, off, begin), on)
+    else:
+        step = np.where(np.abs(now - then) == 1, NEIGHBOUR, 1.0 / num_delays)
+        stay = np.where(is_off, off, last)
+        leave = np.where(is_off, begin, end) + np.log(step)
+        price = np.where(is_same, stay, leave)
+    return np.append(price - off, 0.0)
+
+
+class HeldCommands:
+    """The search for held commands on the field, priced by the same on the reference.
+
+    Args:
+        evidence: The table.
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        self._evidence = evidence
+        self._on_reference: dict[Course, float] = {}
+
+    def find(self, joints: Sequence[FieldJoint]) -> dict[str, Hold]:
+        """Return the best course of each effect beside the numbers of the joints, where one earns anything."""
+        side, evidence = joints[0].side, self._evidence
+        numbers = [joint.numbers for joint in joints]
+        bank = _build_bank(side, evidence.bases, numbers)
+        rising = _find_rising(side, joints)
+        price_prior = bank.shape[1]
+
+        def judge(delays: np.ndarray) -> np.ndarray:
+            held = hold_commands(side, delays)
+            total = np.zeros(side.num_samples)
+            for joint in joints:
+                path = held.simulate(joint.joint, joint.numbers)[0]
+                left = joint.residual - (joint.measure(path).astype(float) - joint.increments)
+                gains = _share_gain(joint.projection, joint.residual, left, joint.count)
+                total[: len(gains)] += gains
+            return total
+
+        found: dict[str, Hold] = {}
+        for course, delays in _search_courses(bank, side):
+            if not delays.any():
+                continue
+            gain, delays, gains = _drop_worthless(side, delays, course, price_prior, judge)
+            if gain < LEAST_NATS:
+                continue
+            price = max(self._price(course), 0.0) * side.num_samples
+            price /= evidence.reference.num_samples
+            best = found.get(course.effect)
+            if best is None or gain - price > best.gain - best.price:
+                starts, stops = float(gains[rising].sum()), float(gains[~rising].sum())
+                found[course.effect] = Hold(course, delays, gain, price, starts, stops)
+        return found
+
+    def _price(self, course: Course) -> float:
+        """Return what a model of the course earns on the left-out parts of the reference, nats."""
+        if not self._on_reference:
+            self._search_reference()
+        return self._on_reference[course]
+
+    def _search_reference(self) -> None:
+        evidence, side = self._evidence, self._evidence.reference
+        bases, nuisances = evidence.bases, evidence.nuisances
+        self._on_reference = dict.fromkeys(COURSES, 0.0)
+        numbers = [base.numbers for base in bases]
+        bank = _build_bank(side, bases, numbers)
+        healthy = [side.simulate(j, row)[0] for j, row in enumerate(numbers)]
+
+        def judge(delays: np.ndarray) -> np.ndarray:
+            held = hold_commands(side, delays)
+            total = np.zeros(side.num_samples)
+            for j, base in enumerate(bases):
+                path = held.simulate(j, base.numbers)[0]
+                added = base.measure(path).astype(float) - base.measure(healthy[j])
+                for k, part in enumerate(nuisances[j].parts):
+                    own = np.flatnonzero(base.part == k)
+                    before = base.left_out[own]
+                    left = before - added[own]
+                    first, second = part.clean(before), part.clean(left)
+                    root = np.sqrt(part.spread)
+                    total[own] += 0.5 * (before / root * first - left / root * second)
+            return total
+
+        for course, delays in _search_courses(bank, side):
+            if delays.any():
+                gain = _drop_worthless(side, delays, course, bank.shape[1], judge)[0]
+                self._on_reference[course] = max(self._on_reference[course], gain)
+
+
+def _share_gain(
+    projection: Projection, before: np.ndarray, after: np.ndarray, count: float
+) -> np.ndarray:
+    """Return the gain of a change of residuals, shared among the increments, `(N,)`."""
+    root = np.sqrt(projection.spread)
+    first = before / root * projection.clean(before)
+    second = after / root * projection.clean(after)
+    squares, changed = float(first.sum()), float(second.sum())
+    weight = 0.5
+    if changed < squares:
+        gain = float(compute_gain(np.array(changed), squares, count))
+        weight = gain / (squares - changed)
+    return weight * (first - second)
+
+
+def _find_rising(side: Side, joints: Sequence[FieldJoint]) -> np.ndarray:
+    """Return at which samples the arm speeds up, `(T,)` bool."""
+    speed = np.zeros(side.num_samples)
+    for joint in joints:
+        top = joint.numbers[PLACE["speed_out"]]
+        speed += np.abs(np.gradient(joint.path)) / top
+    ahead, behind = side.count(0.5), side.count(0.2)
+    later = np.concatenate([speed[ahead:], np.zeros(ahead)])
+    earlier = np.concatenate([np.zeros(behind), speed[:-behind]])
+    return later > earlier
+
+
+def _drop_worthless(
+    side: Side,
+    delays: np.ndarray,
+    course: Course,
+    num_delays: int,
+    judge: Callable[[np.ndarray], np.ndarray],
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return gain, course and gain of each sample without the episodes that do not earn their prior."""
+
+    def add_up(tried: np.ndarray, gains: np.ndarray) -> float:
+        return float(gains.sum() + _price_course(tried, course, num_delays).sum())
+
+    gains = judge(delays)
+    best = (add_up(delays, gains), delays, gains)
+    for _ in range(3):
+        prior = _price_course(delays, course, num_delays)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], delays > 0, [0]]).astype(int)))
+        begin, end = edges[::2], edges[1::2]
+        if not len(begin):
+            break
+        last = side.num_samples
+        earned = np.concatenate([[0.0], np.cumsum(gains)])
+        priced = np.concatenate([[0.0], np.cumsum(prior)])
+        following = np.append(begin[1:] + side.count(0.4), last)
+        until = np.minimum(end + side.count(1.75), following)
+        until = np.maximum(until, np.minimum(end, last))
+        since = np.minimum(begin + side.count(0.2), last)
+        net = earned[until] - earned[since]
+        net += priced[np.minimum(end + 1, last)] - priced[np.maximum(begin - 1, 0)]
+        if (net >= 0.0).all():
+            break
+        delays = delays.copy()
+        for first, behind in zip(begin[net < 0.0], end[net < 0.0], strict=True):
+            delays[first:behind] = 0
+        gains = judge(delays)
+        total = add_up(delays, gains)
+        if total > best[0]:
+            best = (total, delays, gains)
+    return best

@@ -1,0 +1,384 @@
+"""The compiled simulation of one joint: command to spool, spool to path, for many candidates at once.
+
+Warp compiles both kernels once for the processor or the GPU. Candidates that differ only behind the
+spool share the path of the command, which takes half of the time.
+Axes: `C` candidates, `D` distinct command paths, `T` samples, `S` sub-steps, `P` numbers.
+"""
+
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# Kernels are compiled by Warp; a type checker reads them as ordinary Python.
+
+from __future__ import annotations
+
+import warp as wp
+
+from diagnosis.engine.joint_model import PLACE
+
+NUM_POSE = 4
+NUM_LOAD = 4
+
+DELAY_S = wp.constant(PLACE["delay_s"])
+PILOT_LAG_S = wp.constant(PLACE["pilot_lag_s"])
+SPOOL_LAG_S = wp.constant(PLACE["spool_lag_s"])
+BAND_OUT = wp.constant(PLACE["band_out"])
+BAND_IN = wp.constant(PLACE["band_in"])
+SPEED_OUT = wp.constant(PLACE["speed_out"])
+SPEED_IN = wp.constant(PLACE["speed_in"])
+CURVE_OUT = wp.constant(PLACE["curve_out"])
+BEND_OUT = wp.constant(PLACE["bend_out"])
+CURVE_IN = wp.constant(PLACE["curve_in"])
+BEND_IN = wp.constant(PLACE["bend_in"])
+POSE = wp.constant(PLACE["pose_1"])
+LOAD_OUT = wp.constant(PLACE["load_out_1"])
+LOAD_IN = wp.constant(PLACE["load_in_1"])
+MOTION_LAG_S = wp.constant(PLACE["motion_lag_s"])
+DROOP = wp.constant(PLACE["droop"])
+PUMP_LOAD = wp.constant(PLACE["pump_load"])
+HYSTERESIS = wp.constant(PLACE["hysteresis"])
+PLAY = wp.constant(PLACE["play"])
+DRIFT = wp.constant(PLACE["drift"])
+CREEP = wp.constant(PLACE["creep"])
+LOG_CLOSING_RATIO = wp.constant(PLACE["log_closing_ratio"])
+SLOPE_TIME_S = wp.constant(PLACE["slope_time_s"])
+COMMAND_LAG_S = wp.constant(PLACE["command_lag_s"])
+SPEED_LAG_S = wp.constant(PLACE["speed_lag_s"])
+STROKE = wp.constant(PLACE["stroke"])
+TOP_SHARE = wp.constant(PLACE["top_share"])
+START_COMMAND = wp.constant(PLACE["start_command"])
+STOP_RATIO = wp.constant(PLACE["stop_ratio"])
+BREAK_AWAY = wp.constant(PLACE["break_away"])
+CATCH_UP = wp.constant(PLACE["catch_up"])
+SAME_WAY_SHARE = wp.constant(PLACE["same_way_share"])
+LOAD_OPPOSING = wp.constant(PLACE["load_opposing"])
+LOAD_BOTH = wp.constant(PLACE["load_both"])
+LOAD_ALONE = wp.constant(PLACE["load_alone"])
+LOAD_ROOT = wp.constant(PLACE["load_root"])
+LOAD_CONSTANT = wp.constant(PLACE["load_constant"])
+CREEP_BY_LOAD = wp.constant(PLACE["creep_by_load"])
+OMEGA_RAD_S = wp.constant(PLACE["omega_rad_s"])
+DAMPING = wp.constant(PLACE["damping"])
+SAG = wp.constant(PLACE["sag"])
+THERMAL_SHARE = wp.constant(PLACE["thermal_share"])
+THERMAL_S = wp.constant(PLACE["thermal_s"])
+THERMAL_GROWS = wp.constant(PLACE["thermal_grows"])
+DEMAND_LIMIT = wp.constant(PLACE["demand_limit"])
+POSE_PULL = wp.constant(PLACE["pose_pull"])
+CROSSTALK = wp.constant(PLACE["crosstalk"])
+CROSSTALK_JOINT = wp.constant(PLACE["crosstalk_joint"])
+CLOSING_LAG_S = wp.constant(PLACE["closing_lag_s"])
+SLIP = wp.constant(PLACE["slip"])
+SLIP_ABOVE = wp.constant(PLACE["slip_above"])
+PUMP_LAG_S = wp.constant(PLACE["pump_lag_s"])
+PLAY_SLIP = wp.constant(PLACE["play_slip"])
+
+DRIFT_SPAN_S = wp.constant(wp.float64(600.0))
+"""The drift is the change of speed over ten minutes, so that its prior is that of a working day."""
+
+COMMAND_NUMBERS = (
+    "delay_s",
+    "slope_time_s",
+    "command_lag_s",
+    "pilot_lag_s",
+    "log_closing_ratio",
+    "closing_lag_s",
+    "spool_lag_s",
+    "hysteresis",
+    "crosstalk",
+    "crosstalk_joint",
+)
+"""Numbers between the command and the spool."""
+
+
+@wp.func
+def _approach(step_s: wp.float64, time_s: wp.float64) -> wp.float64:
+    """Return the share of a first-order lag that one step covers; all of it without a lag."""
+    if time_s < wp.float64(1e-4):
+        return wp.float64(1.0)
+    return wp.float64(1.0) - wp.exp(-step_s / time_s)
+
+
+@wp.func
+def _read_command(
+    commands: wp.array2d[wp.float64], joint: int, begin: int, at: wp.float64, step: wp.float64
+) -> wp.float64:
+    """Return the mean command from time `at` on over one sub-step, in samples; 0 before the recording."""
+    first = int(wp.floor(at))
+    second = int(wp.floor(at + step))
+    a = wp.float64(0.0)
+    b = wp.float64(0.0)
+    if first >= begin:
+        a = commands[first, joint]
+    if second >= begin:
+        b = commands[second, joint]
+    share = wp.float64(0.0)
+    if second > first:
+        share = (at + step - wp.float64(second)) / step
+    return a + share * (b - a)
+
+
+@wp.kernel(enable_backward=False)
+def simulate_spool(
+    commands: wp.array2d[wp.float64],
+    begins: wp.array[wp.int32],
+    joint: int,
+    period_s: wp.float64,
+    substeps: int,
+    numbers: wp.array2d[wp.float64],
+    spool: wp.array2d[wp.float32],
+):
+    """Simulate the spool of each command path, `(D, T S)`."""
+    d = wp.tid()
+    one = wp.float64(1.0)
+    zero = wp.float64(0.0)
+    step = one / wp.float64(substeps)
+    step_s = period_s * step
+    delay = numbers[d, DELAY_S] / period_s
+    opening = _approach(step_s, numbers[d, PILOT_LAG_S])
+    closing_s = (
+        numbers[d, PILOT_LAG_S] * wp.exp(numbers[d, LOG_CLOSING_RATIO]) + numbers[d, CLOSING_LAG_S]
+    )
+    closing = _approach(step_s, closing_s)
+    second = _approach(step_s, numbers[d, SPOOL_LAG_S])
+    lagging = _approach(step_s, numbers[d, COMMAND_LAG_S])
+    slope = wp.float64(1e9)
+    if numbers[d, SLOPE_TIME_S] > zero:
+        slope = step_s / numbers[d, SLOPE_TIME_S]
+    width = wp.max(numbers[d, HYSTERESIS], zero)
+    crosstalk = numbers[d, CROSSTALK]
+    other = int(numbers[d, CROSSTALK_JOINT])
+    limited = zero
+    lagged = zero
+    pilot = zero
+    follower = zero
+    held = zero
+    begin = wp.int32(0)
+    for k in range(commands.shape[0]):
+        if begins[k] != begin or k == 0:
+            begin = begins[k]
+            limited = zero
+            lagged = zero
+            pilot = zero
+            follower = zero
+            held = zero
+        for i in range(substeps):
+            at = wp.float64(k) + wp.float64(i) * step - delay
+            command = _read_command(commands, joint, begin, at, step)
+            if crosstalk != zero:
+                command += crosstalk * _read_command(commands, other, begin, at, step)
+            limited += wp.clamp(command - limited, -slope, slope)
+            lagged += lagging * (limited - lagged)
+            rate = opening
+            if wp.abs(lagged) < wp.abs(pilot):
+                rate = closing
+            pilot += rate * (lagged - pilot)
+            follower += second * (pilot - follower)
+            held = wp.clamp(held, follower - width, follower + width)
+            spool[d, k * substeps + i] = wp.float32(held)
+
+
+@wp.kernel(enable_backward=False)
+def simulate_path(
+    spool: wp.array2d[wp.float32],
+    which: wp.array[wp.int32],
+    begins: wp.array[wp.int32],
+    poses: wp.array2d[wp.float64],
+    loads: wp.array2d[wp.float64],
+    load: wp.array[wp.float64],
+    stops: wp.array[wp.int32],
+    demand: wp.array[wp.float64],
+    time_s: wp.array[wp.float64],
+    period_s: wp.float64,
+    substeps: int,
+    numbers: wp.array2d[wp.float64],
+    path: wp.array2d[wp.float32],
+    flow: wp.array2d[wp.float32],
+):
+    """Integrate the speed behind the spool `which` of each candidate to a path, `(C, T)`; keep its demand of flow."""
+    c = wp.tid()
+    one = wp.float64(1.0)
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    step = one / wp.float64(substeps)
+    step_s = period_s * step
+    source = which[c]
+    mean_speed = half * (numbers[c, SPEED_OUT] + numbers[c, SPEED_IN])
+    band_out = wp.max(numbers[c, BAND_OUT], zero)
+    band_in = wp.max(numbers[c, BAND_IN], zero)
+    motion = _approach(step_s, numbers[c, MOTION_LAG_S])
+    late = _approach(step_s, numbers[c, SPEED_LAG_S])
+    pumping = _approach(step_s, numbers[c, PUMP_LAG_S])
+    play = wp.max(numbers[c, PLAY], zero)
+    omega = numbers[c, OMEGA_RAD_S]
+    ringing_s = half * step_s
+    rounds = wp.int32(2)
+    if omega > zero:
+        # Twelve steps a radian keep the explicit ringing stable and within one per cent.
+        rounds = wp.max(wp.int32(2), int(wp.ceil(step_s * omega * wp.float64(6.0))))
+        ringing_s = step_s / wp.float64(rounds)
+    smooth = zero
+    slow = zero
+    ring = zero
+    ring_rate = zero
+    driven = zero
+    out = zero
+    volume = zero
+    pump = zero
+    direction = zero
+    moving = wp.int32(0)
+    stuck = wp.int32(1)
+    begin = wp.int32(-1)
+    for k in range(load.shape[0]):
+        is_first = wp.int32(0)
+        if begins[k] != begin:
+            is_first = wp.int32(1)
+            begin = begins[k]
+            smooth = zero
+            slow = zero
+            ring = zero
+            ring_rate = zero
+            driven = zero
+            out = zero
+            volume = zero
+            pump = zero
+            moving = wp.int32(0)
+            stuck = wp.int32(1)
+        path[c, k] = wp.float32(out)
+        asked = zero
+        by_pose = one
+        load_out = one
+        load_in = one
+        for i in range(NUM_POSE):
+            by_pose += numbers[c, POSE + i] * poses[k, i]
+        for i in range(NUM_LOAD):
+            load_out += numbers[c, LOAD_OUT + i] * loads[k, i]
+            load_in += numbers[c, LOAD_IN + i] * loads[k, i]
+        warm = one + numbers[c, DRIFT] * (time_s[k] / DRIFT_SPAN_S - half)
+        if numbers[c, THERMAL_SHARE] != zero:
+            fading = wp.exp(-time_s[k] / numbers[c, THERMAL_S])
+            if numbers[c, THERMAL_GROWS] > zero:
+                fading = one - fading
+            warm *= one + numbers[c, THERMAL_SHARE] * fading
+        for i in range(substeps):
+            x = wp.float64(spool[source, k * substeps + i])
+            if numbers[c, POSE_PULL] != zero and wp.abs(x) > wp.float64(0.03):
+                x += numbers[c, POSE_PULL] * poses[k, 0]
+            if numbers[c, STROKE] > zero:
+                x = wp.clamp(x, -numbers[c, STROKE], numbers[c, STROKE])
+            if numbers[c, START_COMMAND] > zero:
+                least = numbers[c, START_COMMAND]
+                if moving == 1:
+                    least *= numbers[c, STOP_RATIO]
+                moving = wp.int32(0)
+                if wp.abs(x) > least:
+                    moving = wp.int32(1)
+                else:
+                    x = zero
+            opened = zero
+            speed = zero
+            if x > zero:
+                opened = wp.max(x - band_out, zero) / (one - band_out)
+                rest = one - opened
+                speed = (
+                    numbers[c, SPEED_OUT]
+                    * opened
+                    * (
+                        one
+                        + numbers[c, CURVE_OUT] * rest
+                        + numbers[c, BEND_OUT] * rest * (half - opened)
+                    )
+                )
+            else:
+                opened = wp.max(-x - band_in, zero) / (one - band_in)
+                rest = one - opened
+                speed = (
+                    -numbers[c, SPEED_IN]
+                    * opened
+                    * (
+                        one
+                        + numbers[c, CURVE_IN] * rest
+                        + numbers[c, BEND_IN] * rest * (half - opened)
+                    )
+                )
+            own = wp.abs(speed) / mean_speed
+            asked += own * step
+            total = own + demand[k]
+            cut = one - numbers[c, DROOP] * demand[k]
+            if numbers[c, PUMP_LOAD] * total > one:
+                cut /= numbers[c, PUMP_LOAD] * total
+            if numbers[c, DEMAND_LIMIT] > zero and total > numbers[c, DEMAND_LIMIT]:
+                cut *= numbers[c, DEMAND_LIMIT] / total
+            if numbers[c, PUMP_LAG_S] > zero:
+                wanted = zero
+                if total > wp.float64(0.02):
+                    wanted = one
+                pump += pumping * (wanted - pump)
+                cut *= wp.clamp((pump - wp.float64(0.3)) / half, zero, one)
+            by_load = load_in
+            helping = -load[k]
+            if speed > zero:
+                by_load = load_out
+                helping = load[k]
+            speed *= by_pose * by_load * warm * cut
+            alone = one
+            if numbers[c, LOAD_ALONE] > zero:
+                alone = one / (one + numbers[c, LOAD_ALONE] * demand[k])
+            speed *= one - alone * numbers[c, LOAD_OPPOSING] * wp.max(-helping, zero)
+            speed *= wp.max(one + alone * numbers[c, LOAD_BOTH] * helping, zero)
+            if numbers[c, LOAD_ROOT] != zero:
+                share = numbers[c, LOAD_CONSTANT]
+                pressure = wp.max(share - (one - share) * helping, zero)
+                speed *= wp.sqrt(
+                    wp.max(one - alone * numbers[c, LOAD_ROOT] * pressure, wp.float64(0.01))
+                )
+            if numbers[c, TOP_SHARE] > zero:
+                speed = wp.clamp(
+                    speed,
+                    -numbers[c, TOP_SHARE] * numbers[c, SPEED_IN],
+                    numbers[c, TOP_SHARE] * numbers[c, SPEED_OUT],
+                )
+            smooth += motion * (speed - smooth)
+            slow += late * (smooth - slow)
+            speed = slow
+            if numbers[c, SLIP] != zero and wp.abs(speed) > numbers[c, SLIP_ABOVE]:
+                speed *= one - numbers[c, SLIP]
+            is_shut = opened <= zero
+            if numbers[c, BREAK_AWAY] > zero:
+                if is_shut and wp.abs(speed) < wp.float64(0.004):
+                    stuck = wp.int32(1)
+                    volume = zero
+                    speed = zero
+                if stuck == 1 and not is_shut:
+                    volume += speed * step_s
+                    needed = numbers[c, BREAK_AWAY]
+                    if numbers[c, SAME_WAY_SHARE] > zero and speed * direction > zero:
+                        needed *= numbers[c, SAME_WAY_SHARE]
+                    if wp.abs(volume) > needed:
+                        stuck = wp.int32(0)
+                        direction = speed
+                        speed = numbers[c, CATCH_UP] * volume / step_s
+                    else:
+                        speed = zero
+            if is_shut:
+                speed += numbers[c, CREEP] + numbers[c, CREEP_BY_LOAD] * load[k]
+            if omega > zero:
+                if numbers[c, SAG] != zero and is_first == 0:
+                    speed += numbers[c, SAG] * (load[k] - load[k - 1]) / period_s
+                for _ in range(rounds):
+                    ring_rate += ringing_s * (
+                        omega * omega * (speed - ring)
+                        - wp.float64(2.0) * numbers[c, DAMPING] * omega * ring_rate
+                    )
+                    ring += ringing_s * ring_rate
+                speed = ring
+            if stops[k] > 0 and speed > zero:
+                speed = zero
+            if stops[k] < 0 and speed < zero:
+                speed = zero
+            driven += step_s * speed
+            if play > zero:
+                if numbers[c, PLAY_SLIP] > zero:
+                    out += step_s * numbers[c, PLAY_SLIP] * wp.sign(load[k])
+                out = wp.clamp(out, driven - half * play, driven + half * play)
+            else:
+                out = driven
+        flow[c, k] = wp.float32(asked)

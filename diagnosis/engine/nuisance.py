@@ -1,0 +1,142 @@
+"""What a machine does without any effect: its numbers age, and its speed wanders slowly.
+
+Both are columns with a prior in the covariance of the increments. What they explain costs nothing,
+and no hypothesis earns by it.
+Axes: `N` increments, `K` columns, `C` candidates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis.engine import joint_model
+from diagnosis.engine.baseline import FITTED, NUM_PARTS, JointBaseline, linearise
+from diagnosis.engine.measure import Measure
+from diagnosis.engine.side import Side
+
+AGEING = joint_model.list_values("ageing")[FITTED]
+SPEEDS = np.isin(np.array(joint_model.NAMES)[FITTED], ("speed_out", "speed_in"))
+SPEED_AGEING = 0.012
+"""Ageing of a top speed over its value; a part of the nominal speed would hide small effects."""
+WANDER_S = 12.0
+"""Distance of the knots between which the speed wanders."""
+WANDER_SIZES = (0.02, 0.04, 0.07, 0.12)
+"""Standard deviations of the wander that are tried on the reference, over the speed."""
+
+
+class Projection:
+    """Square sums of increments with the nuisance columns free within their prior.
+
+    Args:
+        columns: Columns of standard deviation 1, `(K, N)`.
+        spread: Variance of the increments.
+    """
+
+    def __init__(self, columns: np.ndarray, spread: float) -> None:
+        self.spread = spread
+        self.columns = columns / np.sqrt(spread)
+        self._narrow = self.columns.astype(np.float32)
+        normal = np.eye(len(columns)) + self.columns @ self.columns.T
+        self.inverse = np.linalg.inv(normal)
+        self.log_determinant = float(np.linalg.slogdet(normal)[1])
+
+    def measure_squares(self, increments: np.ndarray) -> np.ndarray:
+        """Return the square sum of each row of increments `(C, N)`, `(C,)`."""
+        increments = np.atleast_2d(increments)
+        scaled = increments.astype(np.float32) / np.float32(np.sqrt(self.spread))
+        shares = (scaled @ self._narrow.T).astype(float)
+        total = np.einsum("cn,cn->c", scaled, scaled, dtype=float)
+        return total - np.einsum("ck,kl,cl->c", shares, self.inverse, shares)
+
+    def clean(self, increments: np.ndarray) -> np.ndarray:
+        """Return increments `(N,)` over their deviation, less what the columns explain."""
+        scaled = increments / np.sqrt(self.spread)
+        return scaled - self.columns.T @ (self.inverse @ (self.columns @ scaled))
+
+    def add(self, columns: np.ndarray) -> Projection:
+        """Return the projection with more columns of standard deviation 1."""
+        own = self.columns * np.sqrt(self.spread)
+        return Projection(np.concatenate([own, columns]), self.spread)
+
+
+def compute_gain(squares: np.ndarray, before: float, count: float) -> np.ndarray:
+    """Return the gain of candidates in nats from their square sums.
+
+    The variance is estimated with them: a Student distribution with as many degrees of freedom as
+    there are increments.
+    """
+    return count * np.log((before + count) / (squares + count))
+
+
+def draw_hats(at: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Return the hat functions of `at` `(T,)` on the knots `(K,)`, `(K, T)`."""
+    return np.stack([np.interp(at, knots, row) for row in np.eye(len(knots))])
+
+
+def simulate_speed(side: Side, path: np.ndarray) -> np.ndarray:
+    """Return the step of a path `(T,)` from each sample to the next, 0 between recordings."""
+    step = np.diff(path, append=path[-1])
+    step[side.ends - 1] = 0.0
+    return step
+
+
+def list_wander(side: Side, path: np.ndarray, measure: Measure) -> np.ndarray:
+    """Return the columns of a slow wander of the speed, as large as the speed, `(K, N)`."""
+    at_s = np.arange(side.num_samples) * side.period_s
+    knots = np.arange(0.0, at_s[-1] + WANDER_S, WANDER_S)
+    step = simulate_speed(side, path)
+    columns = measure(np.cumsum(step * draw_hats(at_s, knots), -1)).astype(float)
+    return columns[np.square(columns).sum(1) > 1e-6]
+
+
+@dataclass
+class JointNuisance:
+    """Ageing and wander of one joint, as the reference shows them.
+
+    Attributes:
+        mix: Columns of ageing from the slopes of the fitted numbers, `(F, F)`.
+        wander: Standard deviation of the wander over the speed.
+        parts: Projection of each part of the reference.
+    """
+
+    mix: np.ndarray
+    wander: float
+    parts: list[Projection]
+
+    def project(
+        self, side: Side, path: np.ndarray, slopes: np.ndarray, measure: Measure, spread: float
+    ) -> Projection:
+        """Return the projection of a joint on a side, from its simulated path and slopes."""
+        columns = [self.mix @ slopes, self.wander * list_wander(side, path, measure)]
+        return Projection(np.concatenate(columns), spread)
+
+
+def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisance:
+    """Return ageing and wander of a joint; the wander is the one that makes the left-out parts likeliest."""
+    ageing = np.where(SPEEDS, SPEED_AGEING * base.numbers[FITTED], AGEING)
+    mix = np.linalg.cholesky(base.covariance + np.diag(ageing**2)).T
+    _, slopes = linearise(side, joint, base.numbers, base.measure)
+    aged = mix @ slopes
+    wander = list_wander(side, side.simulate(joint, base.numbers)[0].astype(float), base.measure)
+    best = None
+    for size in WANDER_SIZES:
+        columns = np.concatenate([aged, size * wander])
+        evidence, parts = 0.0, []
+        for k in range(NUM_PARTS):
+            own = base.part == k
+            count = count_part(base, k)
+            part = Projection(columns[:, own], base.spread)
+            squares = part.measure_squares(base.left_out[own])[0]
+            evidence -= count * np.log(squares + count) + 0.5 * part.log_determinant
+            parts.append(part)
+        if best is None or evidence > best[0]:
+            best = (evidence, size, parts)
+    assert best is not None, "there is at least one size"
+    return JointNuisance(mix, best[1], best[2])
+
+
+def count_part(base: JointBaseline, part: int) -> float:
+    """Return the number of independent increments in a part of the reference."""
+    return float(((base.part == part) & base.measure.valid).sum()) / base.measure.interval

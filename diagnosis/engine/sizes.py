@@ -1,0 +1,210 @@
+"""Sizes of the named effects, as numbers of the registry, with intervals.
+
+A row may have a form that the registry lacks, such as a volume before a joint breaks away. The size
+is then that of the registry's own form. Its proof shows how far that form goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.gravity import GRAVITY_M_S2
+from brokk_rl.machine import Machine
+from diagnosis.closure import Estimate
+from diagnosis.effect_library import EffectType
+from diagnosis.engine.decide import Finding
+from diagnosis.engine.evidence import FieldJoint
+from diagnosis.engine.holds import Hold
+from diagnosis.engine.joint_model import PLACE
+from diagnosis.engine.rows import Row, list_effect_rows
+from diagnosis.engine.side import UNIT_S, measure_full_loads, measure_units
+
+PLAIN_FORMS = frozenset(
+    {
+        ("delay_s",),
+        ("band_out", "band_in"),
+        ("speed_out", "speed_in"),
+        ("speed_out",),
+        ("speed_in",),
+        ("stroke",),
+        ("top_share",),
+        ("command_lag_s",),
+        ("speed_lag_s",),
+        ("play",),
+        ("slope_time_s",),
+        ("start_command", "stop_ratio"),
+        ("load_both",),
+        ("load_opposing",),
+        ("creep_by_load",),
+        ("creep",),
+        ("omega_rad_s", "damping"),
+        ("thermal_share", "thermal_s"),
+        ("thermal_share", "thermal_s", "thermal_grows"),
+        ("demand_limit",),
+    }
+)
+"""Numbers of the rows that are effects of the registry as they stand."""
+SIZE_STEPS = np.array([0.8, 0.88, 0.94, 1.0, 1.06, 1.14, 1.25])
+"""Multiples of a size at which its likelihood is read."""
+FORM_ERROR = 0.1
+"""Relative error of a size that its form makes, 1 sigma; see `benchmarks/diagnosis`."""
+SIGMAS = 1.96
+
+
+@dataclass(frozen=True)
+class SizedRow:
+    """An effect of the registry on one joint.
+
+    Attributes:
+        row: The row in the registry's form.
+        relative: Standard error of its size over the size.
+    """
+
+    row: Row
+    relative: float
+
+
+def size_finding(finding: Finding, joints: Sequence[FieldJoint]) -> dict[int, SizedRow]:
+    """Return the rows of an effect in the registry's form, by joint, from the joints without it."""
+    plain = [row for row in list_effect_rows() if row.effect == finding.name and is_plain(row)]
+    found = {}
+    for j in finding.joints:
+        some = [row for row in plain if suits(row, joints[j])]
+        if not some:
+            continue
+        best = some[int(np.argmax(joints[j].score(some)))]
+        _, row = joints[j].refine(best)
+        found[j] = SizedRow(row, _estimate_error(row, joints[j]))
+    return found
+
+
+def fit_rows(finding: Finding, joints: Sequence[FieldJoint]) -> dict[int, Row]:
+    """Return the rows of a finding with sizes fitted to these joints; for one without rows those of its effect."""
+    found = {}
+    for j in finding.joints:
+        row = finding.rows.get(j)
+        if row is None:
+            some = [one for one in list_effect_rows() if one.effect == finding.name]
+            if not some:
+                continue
+            row = some[int(np.argmax(joints[j].score(some)))]
+        found[j] = joints[j].refine(row)[1]
+    return found
+
+
+def is_plain(row: Row) -> bool:
+    """Return whether a row has a form of the registry."""
+    return tuple(name for name, _, _ in row.changes) in PLAIN_FORMS
+
+
+def suits(row: Row, joint: FieldJoint) -> bool:
+    """Return whether the registry has a row for a joint: creep follows the weight where that is known."""
+    names = {name for name, _, _ in row.changes}
+    is_loaded = bool(np.abs(joint.side.loads[joint.joint]).max() > 1e-3)
+    if "creep" in names:
+        return not is_loaded
+    if names & {"creep_by_load", "load_both", "load_opposing"}:
+        return is_loaded
+    return True
+
+
+def _estimate_error(row: Row, joint: FieldJoint) -> float:
+    """Return the standard error of a size over the size, from the curvature of its likelihood and its form."""
+    gains = joint.score([row.resize(float(factor)) for factor in SIZE_STEPS])
+    curve = np.polyfit(np.log(SIZE_STEPS), gains, 2)[0]
+    # A flat likelihood tells nothing: the interval then covers a factor of two.
+    variance = 0.5 / max(-curve, 1.0)
+    return float(np.sqrt(variance + FORM_ERROR**2))
+
+
+def describe_numbers(
+    kind: EffectType, rows: dict[int, SizedRow], hold: Hold | None, machine: Machine
+) -> dict[str, dict[str, Estimate]]:
+    """Return the numbers of an effect with intervals, by name and joint (or `machine`)."""
+    found: dict[str, dict[str, Estimate]] = {}
+    if hold is not None:
+        for name, value in _describe_hold(hold, machine).items():
+            for joint in machine.joint_names:
+                interval = (0.8 * value, 1.25 * value)
+                found.setdefault(name, {})[joint] = Estimate(value, interval)
+        return found
+    for j, sized in rows.items():
+        for name, value in translate(sized.row, j, machine).items():
+            none = kind.numbers[name].none
+            off = 0.0 if none is None else none
+            ends = off + (value - off) * np.exp(SIGMAS * sized.relative * np.array([-1.0, 1.0]))
+            least, most = (float(side[j if len(side) > 1 else 0]) for side in kind.limits(name))
+            low, mean, high = np.clip(np.sort([*ends, value]), least, most).tolist()
+            at_bound = bool(np.isclose(mean, least) or np.isclose(mean, most)) and mean != off
+            estimate = Estimate(mean, (low, high), at_bound)
+            found.setdefault(name, {})[machine.joint_names[j]] = estimate
+    return found
+
+
+def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
+    """Return a row as numbers of the registry's effect."""
+    values = {name: value for name, _, value in row.changes}
+    unit = float(measure_units(machine)[joint])
+    effect = row.effect
+    if effect == "dead_time":
+        return {"dead_time_s": values["delay_s"]}
+    if effect == "dead_band":
+        return {"extend": values["band_out"], "retract": values["band_in"]}
+    if effect == "flow_gain":
+        return {"gain": 1.0 + values["speed_out"]}
+    if effect == "asymmetry":
+        return {
+            "extend_gain": 1.0 + values.get("speed_out", 0.0),
+            "retract_gain": 1.0 + values.get("speed_in", 0.0),
+        }
+    if effect == "saturation":
+        return {"level": next(iter(values.values()))}
+    if effect == "lag":
+        return {"time_constant_s": next(iter(values.values()))}
+    if effect == "backlash":
+        return {"gap_rad": values["play"] * unit}
+    if effect == "rate_limit":
+        return {"stroke_s": values["slope_time_s"]}
+    if effect == "stiction":
+        start = values["start_command"]
+        return {"start": start, "stop": start * values["stop_ratio"]}
+    if effect == "compliance":
+        return {"ringing_s": 2.0 * np.pi / values["omega_rad_s"], "damping": values["damping"]}
+    if effect == "thermal_drift":
+        side = "change" if "thermal_grows" in values else "cold_change"
+        return {side: values["thermal_share"], "time_s": values["thermal_s"]}
+    if effect == "flow_sharing":
+        # The engine counts flow over that of the joint's own full speed, here 0.3 units a second.
+        return {"demand": 1.0 / values["demand_limit"]}
+    if effect == "creep" and "creep" in values:
+        return {"drift_rad_s": values["creep"] * unit}
+    # Weight over the yield force, at the stretched arm.
+    share = _measure_stretched_share(joint, machine)
+    if effect == "creep":
+        return {"sink_rad_s": abs(values["creep_by_load"]) * unit / share}
+    # To first order the square root of the registry halves the sensitivity.
+    lowering = 1.0 if "load_both" in values else 0.0
+    return {"sensitivity": 2.0 * next(iter(values.values())) / share, "lowering": lowering}
+
+
+def _measure_stretched_share(joint: int, machine: Machine) -> float:
+    force = machine.bodies[joint].yield_force.value
+    return float(measure_full_loads(machine)[joint]) * GRAVITY_M_S2 / force
+
+
+def _describe_hold(hold: Hold, machine: Machine) -> dict[str, float]:
+    """Return the numbers of held commands from their course."""
+    delays = hold.delays
+    if not hold.course.is_loss:
+        return {"jitter_s": 2.0 * float(delays.mean()) * machine.period_s}
+    share = max(hold.share, 1e-4)
+    begins = max(int(((delays[1:] > 0) & (delays[:-1] == 0)).sum()), 1)
+    mean_frames = (delays > 0).sum() / begins
+    persistence = 1.0 - 1.0 / (mean_frames * (1.0 - share))
+    return {"probability": share, "persistence": float(np.clip(persistence, 0.0, 0.95))}
+
+
+assert UNIT_S * 0.3 == 1.0 and "demand_limit" in PLACE

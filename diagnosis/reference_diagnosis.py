@@ -1,0 +1,562 @@
+"""The diagnosis of a case with a reference: what the recordings show directly, the engine, sizes and proof.
+
+Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+
+from actuators import open_loop
+from actuators.recordings.inspection import InspectionThresholds
+from actuators.scales import choose_horizon_s
+from brokk_rl.commands import view_recordings
+from brokk_rl.history import History
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis import gates, geometry, sanity, sensors
+from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected
+from diagnosis.attribution import judge_edit
+from diagnosis.bootstrap import draw_weights, summarise_draws
+from diagnosis.case import GapCase
+from diagnosis.closure import Gap, Gate, RivalError
+from diagnosis.detection import ProgressCallback
+from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
+from diagnosis.engine.decide import Decider, Decision, Finding
+from diagnosis.engine.holds import hold_commands
+from diagnosis.engine.proof import Floor, Windows, list_windows, run_free
+from diagnosis.engine.rows import Row, change_numbers
+from diagnosis.engine.side import Side, choose_stride, measure_units, stack_side
+from diagnosis.engine.sizes import SizedRow, describe_numbers, fit_rows, size_finding
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
+from diagnosis.rivals import measure_rivals
+from diagnosis.stages import Survey, examine_gap
+
+DIRECT_NATS = 4.0
+NAME_NATS = 12.0
+"""What a joint and a name cost where tool points or the scatter of samples show an effect."""
+BLOCK_WINDOWS = 4
+"""Windows in a row that belong to one half of the field."""
+LEAST_GAP = 0.02
+"""Least gap over the error, so that its share can be told where the floor nearly reaches it."""
+CLOCK_SHIFT_S = 0.01
+"""Least shift between encoders and tool tracker that is named; the trackers' own clock wanders less."""
+NATS_OF_HALF = 20.0
+NATS_OF_SURE = 15.0
+"""An effect of so many nats is there in half of the cases, and how fast that grows."""
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """A named effect, however it was found.
+
+    Attributes:
+        kind: The effect of the registry.
+        finding: What the engine found; `None` where it was found directly.
+        detected: What tool points or samples showed; `None` otherwise.
+    """
+
+    kind: EffectType
+    finding: Finding | None
+    detected: DetectedEffect | None
+
+
+@dataclass(frozen=True)
+class ReferenceDiagnosis:
+    """A diagnosis of a machine of which earlier recordings are known.
+
+    Attributes:
+        case: The recordings.
+        kinds: The library.
+        thresholds: When a stretch of a recording is worth telling.
+        generator: Draws bootstraps and permutations.
+    """
+
+    case: GapCase
+    kinds: Sequence[EffectType]
+    thresholds: InspectionThresholds
+    generator: np.random.Generator
+
+    def run(self, tell: ProgressCallback) -> Outcome:
+        """Return the outcome; `tell` receives the name and the progress of each step."""
+        case, machine = self.case, self.case.machine
+        tell("recordings", 0.05)
+        remarks = sanity.examine_recordings(case.field, machine, self.thresholds)
+        told = gates.judge_recordings(remarks, case.field, case.reference, machine)
+        tell("sensors and tool points", 0.1)
+        detected = self._detect()
+        tell("fitting the reference", 0.2)
+        reference = stack_side(case.reference, machine)
+        field = stack_side(correct_positions(case.field, detected, machine), machine)
+        decider = Decider(reference, field, self._measure_noise(detected))
+        tell("simulating every effect", 0.45)
+        decision = decider.decide()
+        if failed := gates.list_failures(told):
+            decision = replace(decision, verdict="unknown", named=())
+        tell("sizes and proof", 0.8)
+        named = [] if failed else self._list_named(decision, detected)
+        proof = _Proof(case, decider, [one for one in named if one.finding], self.generator)
+        return self._build_outcome(decision, named, proof, told, failed)
+
+    def _detect(self) -> list[DetectedEffect]:
+        """Return the effects that tool points and the scatter of samples show."""
+        on_tool = geometry.find_geometry_errors(self.case, self.kinds, DIRECT_NATS, NAME_NATS)
+        noisy = [kind for kind in self.kinds if kind.name in ("sensor_noise", "quantisation")]
+        rough = sensors.find_sensor_effects(self.case, noisy, DIRECT_NATS, NAME_NATS)
+        # Steps of a coarse sensor are found by the engine itself.
+        return [*on_tool.found, *(one for one in rough if one.kind.name == "sensor_noise")]
+
+    def _measure_noise(self, detected: Sequence[DetectedEffect]) -> np.ndarray:
+        """Return the noise that noisy sensors add, units, `(J,)`."""
+        machine = self.case.machine
+        noisy = np.zeros(machine.num_joints, dtype=bool)
+        for one in detected:
+            if one.kind.name == "sensor_noise":
+                noisy |= one.joints
+        if not noisy.any():
+            return np.zeros(machine.num_joints)
+        excess = sensors.measure_excess_scatter(self.case.field, self.case.reference, machine)
+        return excess * noisy / measure_units(machine)
+
+    def _list_named(
+        self, decision: Decision, detected: Sequence[DetectedEffect]
+    ) -> list[NamedEffect]:
+        kinds = {kind.name: kind for kind in self.kinds}
+        found = [NamedEffect(one.kind, None, one) for one in detected]
+        for finding in decision.named if decision.verdict == "effects" else ():
+            name = self._name_delay(finding)
+            if name in kinds and name not in [one.kind.name for one in found]:
+                found.append(NamedEffect(kinds[name], finding, None))
+        return found
+
+    def _name_delay(self, finding: Finding) -> str:
+        """Return the name of a finding; a delay of all joints that the tool tracker lacks is one of the clock."""
+        if finding.name != "dead_time" or len(finding.joints) < self.case.machine.num_joints:
+            return finding.name
+        field = measure_clock_shift(self.case.field, self.case.machine)
+        known = measure_clock_shift(self.case.reference, self.case.machine)
+        if field is None:
+            return finding.name
+        return "clock_offset" if abs(field - (known or 0.0)) > CLOCK_SHIFT_S else finding.name
+
+    def _build_outcome(
+        self,
+        decision: Decision,
+        named: Sequence[NamedEffect],
+        proof: _Proof,
+        told: Sequence[Gate],
+        failed: str,
+    ) -> Outcome:
+        machine = self.case.machine
+        before = proof.view(proof.before)
+        after = proof.view(proof.after) if named else None
+        floor = proof.view_floor()
+        survey = self._examine(before, floor, after)
+        selected = [self._describe(one, proof) for one in named]
+        selected.sort(key=lambda one: -one.probability)
+        verdict = "effects" if selected else decision.verdict
+        if verdict == "effects" and not selected:
+            verdict = "unknown"
+        answer = Answer(
+            verdict=verdict,
+            selected=tuple(selected),
+            ranking=tuple(_rank(selected, decision, verdict, machine)),
+            where=survey.where(),
+            gap=proof.measure_gap(),
+            rivals=proof.rivals,
+            gates=(*told, *(proof.judge() if named else ())),
+            next_experiment=_propose(selected),
+            reason=_explain(verdict, selected, decision, failed),
+            more=survey.more() | {"evidence": _describe_evidence(decision, machine)},
+        )
+        return Outcome(answer, before, after, floor)
+
+    def _examine(
+        self, before: WindowedRuns, floor: WindowedRuns | None, after: WindowedRuns | None
+    ) -> Survey:
+        machine = self.case.machine
+        dead_time_s = np.full(machine.num_joints, machine.dead_time_s)
+        return examine_gap(
+            before, floor, after, machine, self.thresholds, dead_time_s, self.generator
+        )
+
+    def _describe(self, one: NamedEffect, proof: _Proof) -> Selected:
+        machine = self.case.machine
+        if one.detected is not None:
+            joints = one.detected.joints
+            names = [n for n, has in zip(machine.joint_names, joints, strict=True) if has]
+            own = {"own_statistic_explained": one.detected.closed}
+            return Selected(
+                effect=one.kind.name,
+                joints=tuple(names),
+                probability=estimate_probability(one.detected.net_gain),
+                parameters=one.detected.parameters,
+                gap_closed=None,
+                edit=own,
+            )
+        finding = one.finding
+        assert finding is not None, "an effect was found one way or the other"
+        parameters = describe_numbers(one.kind, proof.sizes[finding.effect], finding.hold, machine)
+        if one.kind.name == "clock_offset":
+            parameters = {"offset_s": parameters.get("dead_time_s", {})}
+        part = proof.parts.get(finding.effect)
+        like, decided_by = self._list_alike(one.kind.name, finding)
+        return Selected(
+            effect=one.kind.name,
+            joints=tuple(machine.joint_names[j] for j in finding.joints),
+            probability=estimate_probability(finding.nats),
+            parameters=parameters,
+            gap_closed=None if part is None else part["closed"],
+            same_as=like,
+            decided_by=decided_by,
+            identified=None if part is None else part["identified"],
+            edit=None if part is None else part["edit"],
+        )
+
+    def _list_alike(self, name: str, finding: Finding) -> tuple[tuple[str, ...], str | None]:
+        """Return what these recordings cannot tell from an effect, and the measurement that would."""
+        if geometry.is_tracked(self.case.field, self.case.machine):
+            return (), None
+        known = {kind.name for kind in self.kinds}
+        is_whole = len(finding.joints) == self.case.machine.num_joints
+        if name == "flow_gain" and "encoder_scale" in known:
+            how = "an outside measurement of the angle (inclinometer, laser) at two positions"
+            return ("encoder_scale",), how
+        if name == "dead_time" and is_whole and "clock_offset" in known:
+            how = "one clock for commands and positions, or a pulse that both record"
+            return ("clock_offset",), how
+        return (), None
+
+
+def estimate_probability(nats: float) -> float:
+    """Return the probability that a named effect is there."""
+    odds = np.exp((min(nats, 300.0) - NATS_OF_HALF) / NATS_OF_SURE)
+    return float(np.clip(odds / (1.0 + odds), 0.5, 0.99))
+
+
+def correct_positions(
+    recordings: Sequence[Recording], detected: Sequence[DetectedEffect], machine: Machine
+) -> list[Recording]:
+    """Return the recordings without errors of the encoders that tool points showed."""
+    found = list(recordings)
+    for one in detected:
+        if one.kind.target.side != "measurement" or one.kind.target.stochastic:
+            continue
+        model = one.kind.wrap(StationaryModel(), machine, 2, torch.device("cpu"))
+        for name, value in one.values().items():
+            model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
+        ends = torch.tensor(np.stack([machine.lower, machine.upper]), dtype=torch.float32)
+        with torch.inference_mode():
+            model.step(History(q=ends[:, None], u=torch.zeros_like(ends[:, None])))
+            shown = model.measure(ends).numpy().astype(float)
+        slope = (shown[1] - shown[0]) / (machine.upper - machine.lower)
+        found = [replace(r, q=machine.lower + (r.q - shown[0]) / slope) for r in found]
+    return found
+
+
+def measure_clock_shift(recordings: Sequence[Recording], machine: Machine) -> float | None:
+    """Return by how much encoders lag behind measured tool points, s; `None` where none are measured."""
+    if not geometry.is_tracked(recordings, machine):
+        return None
+    kinematics = Kinematics(machine)
+    products, squares = 0.0, 0.0
+    for recording in recordings:
+        if not all(column in recording.extra for column in geometry.TOOL_COLUMNS):
+            continue
+        seen = np.stack([recording.extra[column] for column in geometry.TOOL_COLUMNS], 1)
+        pose, _ = kinematics.pose_and_jacobian(torch.as_tensor(recording.q, dtype=torch.float32))
+        tip = pose.tip_in_base_m.numpy().astype(float)
+        velocity = np.gradient(tip, machine.period_s, axis=0)
+        off = seen - tip
+        given = np.isfinite(off).all(1)
+        off = off[given] - off[given].mean(0)
+        products += float((off * velocity[given]).sum())
+        squares += float(np.square(velocity[given]).sum())
+    return products / max(squares, 1e-12)
+
+
+class _Proof:
+    """Free runs over the field, cross-fitted in two halves, and their errors."""
+
+    def __init__(
+        self,
+        case: GapCase,
+        decider: Decider,
+        named: Sequence[NamedEffect],
+        generator: np.random.Generator,
+    ) -> None:
+        self.machine = case.machine
+        self._case = case
+        self._decider = decider
+        self._findings = [one.finding for one in named if one.finding is not None]
+        self._generator = generator
+        evidence = decider.evidence
+        self._field = evidence.field
+        self._healthy = [base.numbers for base in evidence.bases]
+        horizon_s = choose_horizon_s(case.machine)
+        self.windows = list_windows(self._field, horizon_s)
+        self.half = np.arange(len(self.windows.first)) // BLOCK_WINDOWS % 2
+        self.floor = Floor(evidence.reference, evidence.bases, horizon_s)
+        self.weights = draw_weights(len(self.windows.first), generator)
+        self.sizes: dict[str, dict[int, SizedRow]] = {}
+        """Rows of each effect in the registry's form, by joint."""
+        self._rows = self._fit_rows(None)
+        self._halves = [self._fit_rows(self._list_used(half)) for half in (0, 1)]
+        self._runs: dict[frozenset[str], np.ndarray] = {}
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Measured positions, `(W, K, J)`, rad or m."""
+        return self._field.q[self.windows.rows] * measure_units(self.machine)
+
+    @property
+    def before(self) -> np.ndarray:
+        """Free runs of the machine as it was, `(W, K, J)`."""
+        return self.run(frozenset())
+
+    @property
+    def after(self) -> np.ndarray:
+        """Free runs with all named effects."""
+        return self.run(frozenset(one.effect for one in self._findings))
+
+    def _list_used(self, half: int) -> np.ndarray:
+        """Return the samples outside the windows of a half, `(T,)` bool."""
+        used = np.ones(self._field.num_samples, dtype=bool)
+        used[self.windows.rows[self.half == half]] = False
+        return used
+
+    def _fit_rows(self, used: np.ndarray | None) -> dict[str, dict[int, Row]]:
+        """Return the rows of each named effect, one fitted beside the others, to the samples `used`."""
+        numbers, side = list(self._healthy), self._field
+        found: dict[str, dict[int, Row]] = {}
+        for finding in self._findings:
+            found[finding.effect] = {}
+            if finding.hold is not None:
+                side = hold_commands(side, finding.hold.delays)
+                self.sizes[finding.effect] = {}
+                continue
+            joints = self._decider.evidence.view_field(numbers, side, used)
+            if used is None:
+                self.sizes[finding.effect] = size_finding(finding, joints)
+            found[finding.effect] = fit_rows(finding, joints)
+            numbers = _apply(numbers, found[finding.effect])
+        return found
+
+    def run(self, effects: frozenset[str]) -> np.ndarray:
+        """Return free runs with some of the named effects, each window with sizes of the other half."""
+        if effects not in self._runs:
+            side = self._field
+            for finding in self._findings:
+                if finding.effect in effects and finding.hold is not None:
+                    side = hold_commands(side, finding.hold.delays)
+            runs = []
+            for sizes in self._halves:
+                numbers = list(self._healthy)
+                for name in effects:
+                    numbers = _apply(numbers, sizes[name])
+                runs.append(run_free(side, self.windows, numbers))
+            chosen = self.half[:, None, None] == 0
+            self._runs[effects] = np.where(chosen, runs[0], runs[1])
+        return self._runs[effects]
+
+    def measure_squares(self, paths: np.ndarray) -> np.ndarray:
+        """Return mean squares of free runs in each draw, `(1 + B, J)`."""
+        return self.weights @ np.square(paths - self.measured).mean(1)
+
+    def measure_errors(self, paths: np.ndarray) -> np.ndarray:
+        """Return the error of free runs in each draw, all joints together, `(1 + B,)`."""
+        return combine_joints(self.measure_squares(paths), self.machine)
+
+    @cached_property
+    def floor_squares(self) -> np.ndarray:
+        """Mean squares at the floor in each draw, `(1 + B, J)`."""
+        numbers = list(self._healthy)
+        for rows in self._rows.values():
+            numbers = _apply(numbers, rows)
+        return self.weights @ self.floor.foresee(self._field, self.windows, numbers)
+
+    def measure_gap(self) -> Gap:
+        """Return the errors and the share that is closed."""
+        before, after = self.measure_errors(self.before), self.measure_errors(self.after)
+        floor = combine_joints(self.floor_squares, self.machine)
+        closed, reason = None, "no effect is named"
+        if self._findings:
+            closed = summarise_draws(self._share(before - after))
+            reason = ""
+        joints = describe_joints(
+            self.machine,
+            np.sqrt(self.measure_squares(self.before)[0]),
+            np.sqrt(self.measure_squares(self.after)[0]),
+            np.sqrt(self.floor_squares[0]),
+        )
+        return Gap(
+            before=float(before[0]),
+            after=float(after[0]),
+            floor=float(floor[0]),
+            closed=closed,
+            unit=choose_unit(self.machine),
+            floor_of="reference",
+            joints=joints,
+            reduced=summarise_draws((before - after) / np.maximum(before, 1e-12)),
+            closed_reason=reason,
+        )
+
+    def _share(self, fewer: np.ndarray) -> np.ndarray:
+        """Return differences of errors over the gap of the same draw, `(1 + B,)`."""
+        before = self.measure_errors(self.before)
+        floor = combine_joints(self.floor_squares, self.machine)
+        return fewer / np.maximum(before - floor, LEAST_GAP * before)
+
+    @cached_property
+    def parts(self) -> dict[str, dict[str, Any]]:
+        """Part of each effect: its Shapley value, and what its removal restores."""
+        names = [one.effect for one in self._findings]
+        every = frozenset(names)
+        before, after = self.measure_errors(self.before), self.measure_errors(self.after)
+        values = compute_shapley(names, lambda some: -self.measure_errors(self.run(some)))
+        found = {}
+        for name, fewer in values.items():
+            reduced = summarise_draws(fewer / np.maximum(before, 1e-12))
+            without = self.measure_errors(self.run(every - {name}))
+            rise = summarise_draws((without - after) / np.maximum(before, 1e-12))
+            restored, identified = judge_edit(reduced, rise)
+            edit = {"restored": restored, "reduced": reduced.mean, "rise_without": rise.mean}
+            closed = summarise_draws(self._share(fewer))
+            found[name] = {"closed": closed, "identified": identified, "edit": edit}
+        return found
+
+    @cached_property
+    def rivals(self) -> dict[str, RivalError]:
+        """Errors of standing still and of an ARX on the field."""
+        recordings = view_recordings(self._case.field, self.machine)
+        horizon_s = choose_horizon_s(self.machine)
+        cut = open_loop.cut_windows(recordings, self.machine, horizon_s, horizon_s)
+        found = {}
+        for name, one in measure_rivals(cut).items():
+            if one.squares is None:
+                found[name] = RivalError(None, {}, one.reason)
+                continue
+            squares = one.squares.mean(0)
+            joints = dict(zip(self.machine.joint_names, np.sqrt(squares).tolist(), strict=True))
+            found[name] = RivalError(float(combine_joints(squares, self.machine)), joints)
+        return found
+
+    def judge(self) -> list[Gate]:
+        """Return whether the repaired simulator beats standing still on every named joint."""
+        joints = sorted({j for one in self._findings for j in one.joints})
+        after = np.sqrt(self.measure_squares(self.after)[0])
+        still = self.rivals["hold"].joints
+        found = []
+        for j in joints:
+            name = self.machine.joint_names[j]
+            passed = bool(after[j] <= still[name])
+            text = f"{name}: {after[j]:.3g} with the effects, {still[name]:.3g} standing still"
+            found.append(Gate(f"beats_hold_{name}", passed, float(after[j]), still[name], text))
+        return found
+
+    def view(self, paths: np.ndarray) -> WindowedRuns:
+        """Return free runs beside the recordings of the field."""
+        return _view_runs(self._case.field, self._field, self.windows, paths)
+
+    def view_floor(self) -> WindowedRuns:
+        """Return the left-out runs beside the recordings of the reference."""
+        reference = self._decider.evidence.reference
+        windows = self.floor.windows
+        measured = reference.q[windows.rows]
+        paths = (measured - self.floor.errors) * measure_units(self.machine)
+        return _view_runs(self._case.reference, reference, windows, paths)
+
+
+def _apply(numbers: Sequence[np.ndarray], rows: Mapping[int, SizedRow]) -> list[np.ndarray]:
+    """Return the numbers of all joints with an effect."""
+    found = list(numbers)
+    for j, row in rows.items():
+        found[j] = change_numbers(found[j], [row])[0]
+    return found
+
+
+def _view_runs(
+    recordings: Sequence[Recording], side: Side, windows: Windows, paths: np.ndarray
+) -> WindowedRuns:
+    """Return paths `(W, K, J)` beside their recordings, thinned out as the engine read them."""
+    stride = choose_stride(side.machine)
+    thin = []
+    for one in recordings:
+        rows = slice(0, one.num_samples // stride * stride, stride)
+        extra = {name: values[rows] for name, values in one.extra.items()}
+        part = replace(one, t_s=one.t_s[rows], u=one.u[rows], q=one.q[rows], extra=extra)
+        thin.append(part)
+    source = np.searchsorted(side.starts, windows.first, "right") - 1
+    row = windows.first + 1 - side.starts[source]
+    return WindowedRuns(thin, source, row, paths)
+
+
+def _rank(
+    selected: Sequence[Selected], decision: Decision, verdict: str, machine: Machine
+) -> list[Ranked]:
+    """Return all that is worth naming, the most probable first."""
+    found = [Ranked(one.effect, one.joints, one.probability) for one in selected]
+    left = 1.0 - max([one.probability for one in selected], default=0.0)
+    if verdict != "effects":
+        found.append(Ranked(verdict, (), 0.8))
+        left = 0.2
+    names = {one.effect for one in selected}
+    for finding in decision.rivals[:4]:
+        if finding.name not in names and finding.nats > 0.0:
+            joints = tuple(machine.joint_names[j] for j in finding.joints)
+            chance = left * float(np.clip(finding.nats / 100.0, 0.01, 0.5))
+            found.append(Ranked(finding.name, joints, chance))
+            names.add(finding.name)
+    return sorted(found, key=lambda one: -one.probability)
+
+
+def _propose(selected: Sequence[Selected]) -> NextExperiment | None:
+    """Return the measurement that would tell apart what these recordings cannot."""
+    for one in selected:
+        if one.same_as and one.decided_by:
+            return NextExperiment(
+                "", (one.effect, *one.same_as), f"no excitation does; {one.decided_by} would"
+            )
+    return None
+
+
+def _explain(verdict: str, selected: Sequence[Selected], decision: Decision, failed: str) -> str:
+    if failed:
+        return f"cannot tell, because {failed}"
+    if verdict == "effects":
+        return "; ".join(f"{one.effect} on {', '.join(one.joints)}" for one in selected)
+    if verdict == "none":
+        return "no effect earns more on the field recordings than it would by chance"
+    group, nats = decision.generic
+    return (
+        "the gap is real, and no effect of the library explains it; "
+        f"the field follows a law of: {group} ({nats:.0f} nats)"
+    )
+
+
+def _describe_evidence(decision: Decision, machine: Machine) -> dict[str, Any]:
+    """Return what each effect earns, plain JSON data."""
+    rows = []
+    for finding in decision.rivals:
+        joints = [machine.joint_names[j] for j in finding.joints]
+        rows.append(
+            {"name": finding.name, "effect": finding.name, "joints": joints}
+            | {"score": finding.nats}
+        )
+    outside = decision.outside
+    return {
+        "rivals": rows,
+        "second": [{"effect": one.name, "score": one.nats} for one in decision.seconds[:5]],
+        "outside": None if outside is None else {"cause": outside.effect, "score": outside.nats},
+        "generic": {"group": decision.generic[0], "score": decision.generic[1]},
+        "left": decision.left,
+        "unit": "log likelihood",
+    }
