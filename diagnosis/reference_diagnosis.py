@@ -378,10 +378,13 @@ class _Proof:
     @cached_property
     def floor_squares(self) -> np.ndarray:
         """Mean squares at the floor in each draw, `(1 + B, J)`."""
-        numbers = list(self._healthy)
-        for rows in self._rows.values():
-            numbers = _apply(numbers, rows)
-        return self.weights @ self.floor.foresee(self._field, self.windows, numbers)
+        numbers, side = list(self._healthy), self._field
+        for finding in self._findings:
+            numbers = _apply(numbers, self._rows[finding.effect])
+            if finding.hold is not None:
+                side = hold_commands(side, finding.hold.delays)
+        joints = self._decider.evidence.view_field(numbers, side)
+        return self.weights @ self.floor.foresee(self.windows, joints)
 
     def measure_gap(self) -> Gap:
         """Return the errors and the share that is closed."""

@@ -73,6 +73,7 @@ class FieldJoint:
         self.side = side
         self.joint = joint
         self.numbers = numbers
+        self.nuisance = nuisance
         healthy = side.simulate(joint, base.numbers)[0].astype(float)
         scale = base.scale
         if step or noise:
@@ -89,6 +90,10 @@ class FieldJoint:
     def scatter(self) -> float:
         """Mean square of the remaining increments over that of the reference."""
         return self.squares / self.count
+
+    def explain_nuisance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the wander, `(T,)`."""
+        return self.nuisance.explain(self.side, self.path, self.projection, self.residual)
 
     def simulate(self, tried: Sequence[Row]) -> np.ndarray:
         """Return the increments that rows add to the simulated joint, `(C, N)`."""

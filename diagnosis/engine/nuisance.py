@@ -82,13 +82,12 @@ def simulate_speed(side: Side, path: np.ndarray) -> np.ndarray:
     return step
 
 
-def list_wander(side: Side, path: np.ndarray, measure: Measure) -> np.ndarray:
-    """Return the columns of a slow wander of the speed, as large as the speed, `(K, N)`."""
+def list_wander(side: Side, path: np.ndarray) -> np.ndarray:
+    """Return paths of a slow wander of the speed, as large as the speed, `(K, T)`."""
     at_s = np.arange(side.num_samples) * side.period_s
     knots = np.arange(0.0, at_s[-1] + WANDER_S, WANDER_S)
     step = simulate_speed(side, path)
-    columns = measure(np.cumsum(step * draw_hats(at_s, knots), -1)).astype(float)
-    return columns[np.square(columns).sum(1) > 1e-6]
+    return np.cumsum(step * draw_hats(at_s, knots), -1)
 
 
 @dataclass
@@ -109,8 +108,25 @@ class JointNuisance:
         self, side: Side, path: np.ndarray, slopes: np.ndarray, measure: Measure, spread: float
     ) -> Projection:
         """Return the projection of a joint on a side, from its simulated path and slopes."""
-        columns = [self.mix @ slopes, self.wander * list_wander(side, path, measure)]
-        return Projection(np.concatenate(columns), spread)
+        wander = measure(list_wander(side, path)).astype(float)
+        return Projection(np.concatenate([self.mix @ slopes, self.wander * wander]), spread)
+
+    def explain(
+        self, side: Side, path: np.ndarray, projection: Projection, residual: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the wander, `(T,)`.
+
+        Args:
+            side: The recordings.
+            path: Simulated path, `(T,)`.
+            projection: Made by `project` from the same path.
+            residual: Increments of the error, `(N,)`.
+        """
+        scaled = residual / np.sqrt(projection.spread)
+        shares = projection.inverse @ (projection.columns @ scaled)
+        size = len(self.mix)
+        wander = self.wander * (shares[size:] @ list_wander(side, path))
+        return shares[:size] @ self.mix, wander
 
 
 def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisance:
@@ -119,7 +135,8 @@ def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisa
     mix = np.linalg.cholesky(base.covariance + np.diag(ageing**2)).T
     _, slopes = linearise(side, joint, base.numbers, base.measure)
     aged = mix @ slopes
-    wander = list_wander(side, side.simulate(joint, base.numbers)[0].astype(float), base.measure)
+    path = side.simulate(joint, base.numbers)[0].astype(float)
+    wander = base.measure(list_wander(side, path)).astype(float)
     best = None
     for size in WANDER_SIZES:
         columns = np.concatenate([aged, size * wander])

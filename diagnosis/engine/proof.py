@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from diagnosis.engine.baseline import FITTED, STEP, JointBaseline
+from diagnosis.engine.baseline import FITTED, LOWER, UPPER, JointBaseline
+from diagnosis.engine.evidence import FieldJoint
 from diagnosis.engine.measure import SETTLING_S
-from diagnosis.engine.nuisance import AGEING, SPEED_AGEING, SPEEDS
 from diagnosis.engine.side import Side, measure_units
 
 POSE_ROUNDS = 2
@@ -74,7 +74,8 @@ class Floor:
     """Error of the unchanged machine under the motion of the field.
 
     On the reference the error of the left-out parts over a window is fitted as a function of how
-    far the joint goes. What the ageing of the numbers adds is simulated on the field itself.
+    far the joint goes. What the likeliest ageing of the numbers and the likeliest wander add is
+    simulated on the field itself.
 
     Args:
         reference: The machine as it was.
@@ -83,7 +84,6 @@ class Floor:
     """
 
     def __init__(self, reference: Side, bases: Sequence[JointBaseline], horizon_s: float) -> None:
-        self._bases = bases
         windows = list_windows(reference, horizon_s)
         self.errors = np.stack([windows.cut(base.error) for base in bases], 2)
         """Errors of the left-out parts, `(W, K, J)`, units."""
@@ -97,19 +97,23 @@ class Floor:
             law, _ = nnls(columns * weight[:, None], squares * weight)
             self._laws.append(law)
 
-    def foresee(self, side: Side, windows: Windows, numbers: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the mean squares that the unchanged machine would show, `(W, J)`, rad² or m²."""
+    def foresee(self, windows: Windows, joints: Sequence[FieldJoint]) -> np.ndarray:
+        """Return the mean squares that the unchanged machine would show, `(W, J)`, rad² or m².
+
+        Args:
+            windows: Windows of the field.
+            joints: Joints of the field with the named effects.
+        """
         found = []
-        for j, (base, row) in enumerate(zip(self._bases, numbers, strict=True)):
-            varied = np.repeat(row[None], 1 + len(FITTED), 0)
-            varied[1 + np.arange(len(FITTED)), FITTED] += STEP
-            paths = windows.cut(side.simulate(j, varied))
-            ageing = np.where(SPEEDS, SPEED_AGEING * base.numbers[FITTED], AGEING)
-            changes = (paths[1:] - paths[:1]) * (ageing / STEP)[:, None, None]
-            aged = np.square(changes).mean(2).sum(0)
-            motion = _describe_motion(side.simulate(j, row)[0], windows)
-            found.append(motion @ self._laws[j] + aged)
-        return np.stack(found, 1) * np.square(measure_units(side.machine))
+        for joint, law in zip(joints, self._laws, strict=True):
+            ageing, wander = joint.explain_nuisance()
+            aged = joint.numbers.copy()
+            aged[FITTED] += ageing
+            path = joint.side.simulate(joint.joint, np.clip(aged, LOWER, UPPER))[0]
+            moved = windows.cut(path - joint.path + wander)
+            motion = _describe_motion(joint.path, windows)
+            found.append(motion @ law + np.square(moved).mean(1))
+        return np.stack(found, 1) * np.square(measure_units(joints[0].side.machine))
 
 
 def _describe_motion(path: np.ndarray, windows: Windows) -> np.ndarray:
