@@ -9,6 +9,7 @@ Priors, steps and ageing come from the comparison in `benchmarks/diagnosis`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -103,6 +104,8 @@ NUMBERS = (
 NAMES = tuple(number.name for number in NUMBERS)
 PLACE = {name: place for place, name in enumerate(NAMES)}
 """Place of each number in a vector of all."""
+Place = IntEnum("Place", [(name.upper(), place) for name, place in PLACE.items()])
+"""The same as constants of the kernel."""
 FITTED = np.array([number.deviation > 0.0 for number in NUMBERS])
 NUM_FITTED = int(FITTED.sum())
 

@@ -12,64 +12,11 @@ from __future__ import annotations
 
 import warp as wp
 
-from diagnosis.engine.joint_model import PLACE
+from diagnosis.engine.joint_model import Place
 
 NUM_POSE = 4
 NUM_LOAD = 4
 
-DELAY_S = wp.constant(PLACE["delay_s"])
-PILOT_LAG_S = wp.constant(PLACE["pilot_lag_s"])
-SPOOL_LAG_S = wp.constant(PLACE["spool_lag_s"])
-BAND_OUT = wp.constant(PLACE["band_out"])
-BAND_IN = wp.constant(PLACE["band_in"])
-SPEED_OUT = wp.constant(PLACE["speed_out"])
-SPEED_IN = wp.constant(PLACE["speed_in"])
-CURVE_OUT = wp.constant(PLACE["curve_out"])
-BEND_OUT = wp.constant(PLACE["bend_out"])
-CURVE_IN = wp.constant(PLACE["curve_in"])
-BEND_IN = wp.constant(PLACE["bend_in"])
-POSE = wp.constant(PLACE["pose_1"])
-LOAD_OUT = wp.constant(PLACE["load_out_1"])
-LOAD_IN = wp.constant(PLACE["load_in_1"])
-MOTION_LAG_S = wp.constant(PLACE["motion_lag_s"])
-DROOP = wp.constant(PLACE["droop"])
-PUMP_LOAD = wp.constant(PLACE["pump_load"])
-HYSTERESIS = wp.constant(PLACE["hysteresis"])
-PLAY = wp.constant(PLACE["play"])
-DRIFT = wp.constant(PLACE["drift"])
-CREEP = wp.constant(PLACE["creep"])
-LOG_CLOSING_RATIO = wp.constant(PLACE["log_closing_ratio"])
-SLOPE_TIME_S = wp.constant(PLACE["slope_time_s"])
-COMMAND_LAG_S = wp.constant(PLACE["command_lag_s"])
-SPEED_LAG_S = wp.constant(PLACE["speed_lag_s"])
-STROKE = wp.constant(PLACE["stroke"])
-TOP_SHARE = wp.constant(PLACE["top_share"])
-START_COMMAND = wp.constant(PLACE["start_command"])
-STOP_RATIO = wp.constant(PLACE["stop_ratio"])
-BREAK_AWAY = wp.constant(PLACE["break_away"])
-CATCH_UP = wp.constant(PLACE["catch_up"])
-SAME_WAY_SHARE = wp.constant(PLACE["same_way_share"])
-LOAD_OPPOSING = wp.constant(PLACE["load_opposing"])
-LOAD_BOTH = wp.constant(PLACE["load_both"])
-LOAD_ALONE = wp.constant(PLACE["load_alone"])
-LOAD_ROOT = wp.constant(PLACE["load_root"])
-LOAD_CONSTANT = wp.constant(PLACE["load_constant"])
-CREEP_BY_LOAD = wp.constant(PLACE["creep_by_load"])
-OMEGA_RAD_S = wp.constant(PLACE["omega_rad_s"])
-DAMPING = wp.constant(PLACE["damping"])
-SAG = wp.constant(PLACE["sag"])
-THERMAL_SHARE = wp.constant(PLACE["thermal_share"])
-THERMAL_S = wp.constant(PLACE["thermal_s"])
-THERMAL_GROWS = wp.constant(PLACE["thermal_grows"])
-DEMAND_LIMIT = wp.constant(PLACE["demand_limit"])
-POSE_PULL = wp.constant(PLACE["pose_pull"])
-CROSSTALK = wp.constant(PLACE["crosstalk"])
-CROSSTALK_JOINT = wp.constant(PLACE["crosstalk_joint"])
-CLOSING_LAG_S = wp.constant(PLACE["closing_lag_s"])
-SLIP = wp.constant(PLACE["slip"])
-SLIP_ABOVE = wp.constant(PLACE["slip_above"])
-PUMP_LAG_S = wp.constant(PLACE["pump_lag_s"])
-PLAY_SLIP = wp.constant(PLACE["play_slip"])
 
 DRIFT_SPAN_S = wp.constant(wp.float64(600.0))
 """The drift is the change of speed over ten minutes, so that its prior is that of a working day."""
@@ -132,20 +79,21 @@ def simulate_spool(
     zero = wp.float64(0.0)
     step = one / wp.float64(substeps)
     step_s = period_s * step
-    delay = numbers[d, DELAY_S] / period_s
-    opening = _approach(step_s, numbers[d, PILOT_LAG_S])
+    delay = numbers[d, Place.DELAY_S] / period_s
+    opening = _approach(step_s, numbers[d, Place.PILOT_LAG_S])
     closing_s = (
-        numbers[d, PILOT_LAG_S] * wp.exp(numbers[d, LOG_CLOSING_RATIO]) + numbers[d, CLOSING_LAG_S]
+        numbers[d, Place.PILOT_LAG_S] * wp.exp(numbers[d, Place.LOG_CLOSING_RATIO])
+        + numbers[d, Place.CLOSING_LAG_S]
     )
     closing = _approach(step_s, closing_s)
-    second = _approach(step_s, numbers[d, SPOOL_LAG_S])
-    lagging = _approach(step_s, numbers[d, COMMAND_LAG_S])
+    second = _approach(step_s, numbers[d, Place.SPOOL_LAG_S])
+    lagging = _approach(step_s, numbers[d, Place.COMMAND_LAG_S])
     slope = wp.float64(1e9)
-    if numbers[d, SLOPE_TIME_S] > zero:
-        slope = step_s / numbers[d, SLOPE_TIME_S]
-    width = wp.max(numbers[d, HYSTERESIS], zero)
-    crosstalk = numbers[d, CROSSTALK]
-    other = int(numbers[d, CROSSTALK_JOINT])
+    if numbers[d, Place.SLOPE_TIME_S] > zero:
+        slope = step_s / numbers[d, Place.SLOPE_TIME_S]
+    width = wp.max(numbers[d, Place.HYSTERESIS], zero)
+    crosstalk = numbers[d, Place.CROSSTALK]
+    other = int(numbers[d, Place.CROSSTALK_JOINT])
     limited = zero
     lagged = zero
     pilot = zero
@@ -201,14 +149,14 @@ def simulate_path(
     step = one / wp.float64(substeps)
     step_s = period_s * step
     source = which[c]
-    mean_speed = half * (numbers[c, SPEED_OUT] + numbers[c, SPEED_IN])
-    band_out = wp.max(numbers[c, BAND_OUT], zero)
-    band_in = wp.max(numbers[c, BAND_IN], zero)
-    motion = _approach(step_s, numbers[c, MOTION_LAG_S])
-    late = _approach(step_s, numbers[c, SPEED_LAG_S])
-    pumping = _approach(step_s, numbers[c, PUMP_LAG_S])
-    play = wp.max(numbers[c, PLAY], zero)
-    omega = numbers[c, OMEGA_RAD_S]
+    mean_speed = half * (numbers[c, Place.SPEED_OUT] + numbers[c, Place.SPEED_IN])
+    band_out = wp.max(numbers[c, Place.BAND_OUT], zero)
+    band_in = wp.max(numbers[c, Place.BAND_IN], zero)
+    motion = _approach(step_s, numbers[c, Place.MOTION_LAG_S])
+    late = _approach(step_s, numbers[c, Place.SPEED_LAG_S])
+    pumping = _approach(step_s, numbers[c, Place.PUMP_LAG_S])
+    play = wp.max(numbers[c, Place.PLAY], zero)
+    omega = numbers[c, Place.OMEGA_RAD_S]
     ringing_s = half * step_s
     rounds = wp.int32(2)
     if omega > zero:
@@ -248,26 +196,26 @@ def simulate_path(
         load_out = one
         load_in = one
         for i in range(NUM_POSE):
-            by_pose += numbers[c, POSE + i] * poses[k, i]
+            by_pose += numbers[c, Place.POSE_1 + i] * poses[k, i]
         for i in range(NUM_LOAD):
-            load_out += numbers[c, LOAD_OUT + i] * loads[k, i]
-            load_in += numbers[c, LOAD_IN + i] * loads[k, i]
-        warm = one + numbers[c, DRIFT] * (time_s[k] / DRIFT_SPAN_S - half)
-        if numbers[c, THERMAL_SHARE] != zero:
-            fading = wp.exp(-time_s[k] / numbers[c, THERMAL_S])
-            if numbers[c, THERMAL_GROWS] > zero:
+            load_out += numbers[c, Place.LOAD_OUT_1 + i] * loads[k, i]
+            load_in += numbers[c, Place.LOAD_IN_1 + i] * loads[k, i]
+        warm = one + numbers[c, Place.DRIFT] * (time_s[k] / DRIFT_SPAN_S - half)
+        if numbers[c, Place.THERMAL_SHARE] != zero:
+            fading = wp.exp(-time_s[k] / numbers[c, Place.THERMAL_S])
+            if numbers[c, Place.THERMAL_GROWS] > zero:
                 fading = one - fading
-            warm *= one + numbers[c, THERMAL_SHARE] * fading
+            warm *= one + numbers[c, Place.THERMAL_SHARE] * fading
         for i in range(substeps):
             x = wp.float64(spool[source, k * substeps + i])
-            if numbers[c, POSE_PULL] != zero and wp.abs(x) > wp.float64(0.03):
-                x += numbers[c, POSE_PULL] * poses[k, 0]
-            if numbers[c, STROKE] > zero:
-                x = wp.clamp(x, -numbers[c, STROKE], numbers[c, STROKE])
-            if numbers[c, START_COMMAND] > zero:
-                least = numbers[c, START_COMMAND]
+            if numbers[c, Place.POSE_PULL] != zero and wp.abs(x) > wp.float64(0.03):
+                x += numbers[c, Place.POSE_PULL] * poses[k, 0]
+            if numbers[c, Place.STROKE] > zero:
+                x = wp.clamp(x, -numbers[c, Place.STROKE], numbers[c, Place.STROKE])
+            if numbers[c, Place.START_COMMAND] > zero:
+                least = numbers[c, Place.START_COMMAND]
                 if moving == 1:
-                    least *= numbers[c, STOP_RATIO]
+                    least *= numbers[c, Place.STOP_RATIO]
                 moving = wp.int32(0)
                 if wp.abs(x) > least:
                     moving = wp.int32(1)
@@ -279,35 +227,35 @@ def simulate_path(
                 opened = wp.max(x - band_out, zero) / (one - band_out)
                 rest = one - opened
                 speed = (
-                    numbers[c, SPEED_OUT]
+                    numbers[c, Place.SPEED_OUT]
                     * opened
                     * (
                         one
-                        + numbers[c, CURVE_OUT] * rest
-                        + numbers[c, BEND_OUT] * rest * (half - opened)
+                        + numbers[c, Place.CURVE_OUT] * rest
+                        + numbers[c, Place.BEND_OUT] * rest * (half - opened)
                     )
                 )
             else:
                 opened = wp.max(-x - band_in, zero) / (one - band_in)
                 rest = one - opened
                 speed = (
-                    -numbers[c, SPEED_IN]
+                    -numbers[c, Place.SPEED_IN]
                     * opened
                     * (
                         one
-                        + numbers[c, CURVE_IN] * rest
-                        + numbers[c, BEND_IN] * rest * (half - opened)
+                        + numbers[c, Place.CURVE_IN] * rest
+                        + numbers[c, Place.BEND_IN] * rest * (half - opened)
                     )
                 )
             own = wp.abs(speed) / mean_speed
             asked += own * step
             total = own + demand[k]
-            cut = one - numbers[c, DROOP] * demand[k]
-            if numbers[c, PUMP_LOAD] * total > one:
-                cut /= numbers[c, PUMP_LOAD] * total
-            if numbers[c, DEMAND_LIMIT] > zero and total > numbers[c, DEMAND_LIMIT]:
-                cut *= numbers[c, DEMAND_LIMIT] / total
-            if numbers[c, PUMP_LAG_S] > zero:
+            cut = one - numbers[c, Place.DROOP] * demand[k]
+            if numbers[c, Place.PUMP_LOAD] * total > one:
+                cut /= numbers[c, Place.PUMP_LOAD] * total
+            if numbers[c, Place.DEMAND_LIMIT] > zero and total > numbers[c, Place.DEMAND_LIMIT]:
+                cut *= numbers[c, Place.DEMAND_LIMIT] / total
+            if numbers[c, Place.PUMP_LAG_S] > zero:
                 wanted = zero
                 if total > wp.float64(0.02):
                     wanted = one
@@ -320,53 +268,53 @@ def simulate_path(
                 helping = load[k]
             speed *= by_pose * by_load * warm * cut
             alone = one
-            if numbers[c, LOAD_ALONE] > zero:
-                alone = one / (one + numbers[c, LOAD_ALONE] * demand[k])
-            speed *= one - alone * numbers[c, LOAD_OPPOSING] * wp.max(-helping, zero)
-            speed *= wp.max(one + alone * numbers[c, LOAD_BOTH] * helping, zero)
-            if numbers[c, LOAD_ROOT] != zero:
-                share = numbers[c, LOAD_CONSTANT]
+            if numbers[c, Place.LOAD_ALONE] > zero:
+                alone = one / (one + numbers[c, Place.LOAD_ALONE] * demand[k])
+            speed *= one - alone * numbers[c, Place.LOAD_OPPOSING] * wp.max(-helping, zero)
+            speed *= wp.max(one + alone * numbers[c, Place.LOAD_BOTH] * helping, zero)
+            if numbers[c, Place.LOAD_ROOT] != zero:
+                share = numbers[c, Place.LOAD_CONSTANT]
                 pressure = wp.max(share - (one - share) * helping, zero)
                 speed *= wp.sqrt(
-                    wp.max(one - alone * numbers[c, LOAD_ROOT] * pressure, wp.float64(0.01))
+                    wp.max(one - alone * numbers[c, Place.LOAD_ROOT] * pressure, wp.float64(0.01))
                 )
-            if numbers[c, TOP_SHARE] > zero:
+            if numbers[c, Place.TOP_SHARE] > zero:
                 speed = wp.clamp(
                     speed,
-                    -numbers[c, TOP_SHARE] * numbers[c, SPEED_IN],
-                    numbers[c, TOP_SHARE] * numbers[c, SPEED_OUT],
+                    -numbers[c, Place.TOP_SHARE] * numbers[c, Place.SPEED_IN],
+                    numbers[c, Place.TOP_SHARE] * numbers[c, Place.SPEED_OUT],
                 )
             smooth += motion * (speed - smooth)
             slow += late * (smooth - slow)
             speed = slow
-            if numbers[c, SLIP] != zero and wp.abs(speed) > numbers[c, SLIP_ABOVE]:
-                speed *= one - numbers[c, SLIP]
+            if numbers[c, Place.SLIP] != zero and wp.abs(speed) > numbers[c, Place.SLIP_ABOVE]:
+                speed *= one - numbers[c, Place.SLIP]
             is_shut = opened <= zero
-            if numbers[c, BREAK_AWAY] > zero:
+            if numbers[c, Place.BREAK_AWAY] > zero:
                 if is_shut and wp.abs(speed) < wp.float64(0.004):
                     stuck = wp.int32(1)
                     volume = zero
                     speed = zero
                 if stuck == 1 and not is_shut:
                     volume += speed * step_s
-                    needed = numbers[c, BREAK_AWAY]
-                    if numbers[c, SAME_WAY_SHARE] > zero and speed * direction > zero:
-                        needed *= numbers[c, SAME_WAY_SHARE]
+                    needed = numbers[c, Place.BREAK_AWAY]
+                    if numbers[c, Place.SAME_WAY_SHARE] > zero and speed * direction > zero:
+                        needed *= numbers[c, Place.SAME_WAY_SHARE]
                     if wp.abs(volume) > needed:
                         stuck = wp.int32(0)
                         direction = speed
-                        speed = numbers[c, CATCH_UP] * volume / step_s
+                        speed = numbers[c, Place.CATCH_UP] * volume / step_s
                     else:
                         speed = zero
             if is_shut:
-                speed += numbers[c, CREEP] + numbers[c, CREEP_BY_LOAD] * load[k]
+                speed += numbers[c, Place.CREEP] + numbers[c, Place.CREEP_BY_LOAD] * load[k]
             if omega > zero:
-                if numbers[c, SAG] != zero and is_first == 0:
-                    speed += numbers[c, SAG] * (load[k] - load[k - 1]) / period_s
+                if numbers[c, Place.SAG] != zero and is_first == 0:
+                    speed += numbers[c, Place.SAG] * (load[k] - load[k - 1]) / period_s
                 for _ in range(rounds):
                     ring_rate += ringing_s * (
                         omega * omega * (speed - ring)
-                        - wp.float64(2.0) * numbers[c, DAMPING] * omega * ring_rate
+                        - wp.float64(2.0) * numbers[c, Place.DAMPING] * omega * ring_rate
                     )
                     ring += ringing_s * ring_rate
                 speed = ring
@@ -376,8 +324,8 @@ def simulate_path(
                 speed = zero
             driven += step_s * speed
             if play > zero:
-                if numbers[c, PLAY_SLIP] > zero:
-                    out += step_s * numbers[c, PLAY_SLIP] * wp.sign(load[k])
+                if numbers[c, Place.PLAY_SLIP] > zero:
+                    out += step_s * numbers[c, Place.PLAY_SLIP] * wp.sign(load[k])
                 out = wp.clamp(out, driven - half * play, driven + half * play)
             else:
                 out = driven
