@@ -21,7 +21,7 @@ from diagnosis.engine.evidence import Evidence, FieldJoint
 from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.measure import Scale, measure_motion
 from diagnosis.engine.nuisance import Projection, compute_gain
-from diagnosis.engine.side import Side
+from diagnosis.engine.side import DEVICE, Side
 
 LONGEST_S = 0.9
 """Longest delay that a course reaches."""
@@ -188,18 +188,19 @@ def _search_courses(bank: np.ndarray, side: Side) -> list[tuple[Course, np.ndarr
     num_samples, num_delays = bank.shape
     is_first = np.zeros(num_samples, dtype=np.int32)
     is_first[side.starts] = 1
-    found = wp.zeros((len(models), num_samples), dtype=wp.int32)
-    inputs = [
-        wp.array(bank, dtype=wp.float64),
-        wp.array(is_first, dtype=wp.int32),
-        wp.array([int(course.is_loss) for course, _ in models], dtype=wp.int32),
-        wp.array([course.begins for course, _ in models], dtype=wp.float64),
-        wp.array([course.lasts for course, _ in models], dtype=wp.float64),
-        wp.array([temper for _, temper in models], dtype=wp.float64),
-        wp.empty((len(models), 2, num_delays), dtype=wp.float64),
-        wp.empty((len(models), num_samples, num_delays), dtype=wp.int32),
-    ]
-    wp.launch(find_courses, dim=len(models), inputs=inputs, outputs=[found])
+    with wp.ScopedDevice(DEVICE):
+        found = wp.zeros((len(models), num_samples), dtype=wp.int32)
+        inputs = [
+            wp.array(bank, dtype=wp.float64),
+            wp.array(is_first, dtype=wp.int32),
+            wp.array([int(course.is_loss) for course, _ in models], dtype=wp.int32),
+            wp.array([course.begins for course, _ in models], dtype=wp.float64),
+            wp.array([course.lasts for course, _ in models], dtype=wp.float64),
+            wp.array([temper for _, temper in models], dtype=wp.float64),
+            wp.empty((len(models), 2, num_delays), dtype=wp.float64),
+            wp.empty((len(models), num_samples, num_delays), dtype=wp.int32),
+        ]
+        wp.launch(find_courses, dim=len(models), inputs=inputs, outputs=[found])
     return [(course, row) for (course, _), row in zip(models, found.numpy(), strict=True)]
 
 

@@ -14,6 +14,8 @@ import warp as wp
 
 from diagnosis.engine.joint_model import Place
 
+wp.config.log_level = wp.LOG_ERROR  # that a kernel is compiled or read is no news to people
+
 NUM_POSE = 4
 NUM_LOAD = 4
 

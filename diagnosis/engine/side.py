@@ -29,6 +29,9 @@ FASTEST_HZ = 50.0
 """Recordings of a higher rate are thinned out: hydraulic joints do nothing faster."""
 STOP_UNITS = 0.006
 """Distance from the end of the travel at which a joint rests against it."""
+DEVICE = "cpu"
+"""A GPU does each of the many small calls in the time of its longest thread: 24,000 steps one after the
+other. On one H100 a case took several minutes, on one core of its host 15 s."""
 MAX_DEMAND = 1.5
 """A joint asks for at most so much flow, over that of its full speed."""
 
@@ -117,23 +120,24 @@ class Side:
         first = np.zeros(len(distinct), dtype=int)
         first[which] = np.arange(len(numbers))
         shape = (len(distinct), self.num_samples * self.substeps)
-        spool = wp.empty(shape, dtype=wp.float32)
+        spool = wp.empty(shape, dtype=wp.float32, device=DEVICE)
         commands, begins = self._shared
         wp.launch(
             kernel.simulate_spool,
             dim=len(distinct),
             inputs=[commands, begins, joint, self.period_s, self.substeps, _send(numbers[first])],
             outputs=[spool],
+            device=DEVICE,
         )
-        path = wp.empty((len(numbers), self.num_samples), dtype=wp.float32)
-        flow = wp.empty((len(numbers), self.num_samples), dtype=wp.float32)
+        path = wp.empty((len(numbers), self.num_samples), dtype=wp.float32, device=DEVICE)
+        flow = wp.empty((len(numbers), self.num_samples), dtype=wp.float32, device=DEVICE)
         poses, loads, load, stops, time_s = self._own[joint]
         wp.launch(
             kernel.simulate_path,
             dim=len(numbers),
             inputs=[
                 spool,
-                wp.array(which.astype(np.int32), dtype=wp.int32),
+                wp.array(which.astype(np.int32), dtype=wp.int32, device=DEVICE),
                 begins,
                 poses,
                 loads,
@@ -146,20 +150,21 @@ class Side:
                 _send(numbers),
             ],
             outputs=[path, flow],
+            device=DEVICE,
         )
         return path.numpy(), flow.numpy()
 
     @cached_property
     def _shared(self) -> tuple[wp.array, wp.array]:
         """Commands and beginnings where the kernel reads them."""
-        return _send(self.u), wp.array(self.begins.astype(np.int32), dtype=wp.int32)
+        return _send(self.u), wp.array(self.begins.astype(np.int32), dtype=wp.int32, device=DEVICE)
 
     @cached_property
     def _own(self) -> list[tuple[wp.array, ...]]:
         """Poses, loads and stops of each joint where the kernel reads them."""
         time_s, found = _send(self.time_s), []
         for j in range(self.num_joints):
-            stops = wp.array(self.stops[j].astype(np.int32), dtype=wp.int32)
+            stops = wp.array(self.stops[j].astype(np.int32), dtype=wp.int32, device=DEVICE)
             arrays = (_send(self.poses[j]), _send(self.loads[j]), _send(self.load[j]))
             found.append((*arrays, stops, time_s))
         return found
@@ -186,7 +191,7 @@ class Side:
 
 
 def _send(values: np.ndarray) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, dtype=np.float64), dtype=wp.float64)
+    return wp.array(np.ascontiguousarray(values, dtype=np.float64), dtype=wp.float64, device=DEVICE)
 
 
 def stack_side(recordings: Sequence[Recording], machine: Machine) -> Side:

@@ -53,7 +53,7 @@ DOORS = {
     "omegaconf": COMPOSERS,
     "mujoco": ("brokk_rl.sim", "diagnosis.mjcf"),
     "mujoco_warp": ("brokk_rl.sim",),
-    "warp": ("brokk_rl.sim",),
+    "warp": ("brokk_rl.sim", "diagnosis.engine"),
     "rsl_rl": ("brokk_rl.rl",),
     "tensordict": ("brokk_rl.rl",),
     "wandb": ("brokk_rl.rl",),

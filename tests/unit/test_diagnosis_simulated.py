@@ -1,0 +1,246 @@
+"""The engine that simulates every hypothesis, against SciPy, brute force and plants written apart from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.signal import lsim
+from scipy.stats import multivariate_normal
+
+from brokk_rl import extensions
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis import effect_library
+from diagnosis.case import GapCase
+from diagnosis.engine import holds
+from diagnosis.engine.joint_model import PLACE, list_values
+from diagnosis.engine.nuisance import Projection
+from diagnosis.engine.rows import Row, change_numbers
+from diagnosis.engine.side import Side, measure_units, stack_side
+from diagnosis.reference_diagnosis import ReferenceDiagnosis
+
+RATE_HZ = 20.0
+
+
+@pytest.fixture(scope="module")
+def two_joints(machine: Machine) -> Machine:
+    """A machine of two arms."""
+    return replace(machine, joints=machine.joints[2:4], exclusive=(), levers=(), name="two")
+
+
+def make_commands(seconds: float, seed: int) -> np.ndarray:
+    """Return levels that two joints hold for some seconds each, `(T, 2)`."""
+    generator = np.random.default_rng(seed)
+    rows = round(seconds * RATE_HZ)
+    u = np.zeros((rows, 2))
+    for j in range(2):
+        at, sign = 0, 1.0
+        while at < rows:
+            held = generator.integers(20, 60)
+            is_off = generator.random() < 0.3
+            u[at : at + held, j] = 0.0 if is_off else sign * generator.uniform(0.2, 1.0)
+            at, sign = at + held, -sign
+    return u
+
+
+def move(u: np.ndarray, delay_s: float, gain: float, seed: int) -> np.ndarray:
+    """Return positions of a plant of its own kind: delayed command, dead band, first-order speed, `(T, 2)`."""
+    generator = np.random.default_rng(seed)
+    late = round(delay_s * RATE_HZ)
+    command = np.concatenate([np.zeros((late, 2)), u[: len(u) - late]])
+    wanted = np.sign(command) * np.maximum(np.abs(command) - 0.08, 0.0) / 0.92
+    speed, q = np.zeros(2), np.zeros(2)
+    found = np.zeros_like(u)
+    for k, row in enumerate(wanted):
+        found[k] = q
+        speed = speed + (1.0 - np.exp(-1.0 / RATE_HZ / 0.12)) * (row * (0.25, 0.3) - speed)
+        q = q + gain * speed / RATE_HZ
+    return found + generator.normal(0.0, 5e-4, found.shape)
+
+
+def record(machine: Machine, u: np.ndarray, q: np.ndarray) -> Recording:
+    """Return commands and positions as a recording."""
+    middle = 0.5 * (machine.lower + machine.upper)
+    return Recording(
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=("rad", "rad"),
+        rate_hz=RATE_HZ,
+        t_s=np.arange(len(u)) / RATE_HZ,
+        u=u.astype(np.float32),
+        q=(middle + 0.5 * (q - q.mean(0))).astype(np.float32),
+    )
+
+
+def make_case(machine: Machine, delay_s: np.ndarray, gain: np.ndarray) -> GapCase:
+    """Return a case whose field has other delays and gains of each joint than 0.3 s and 1."""
+    reference, field = [], []
+    for seed in range(4):
+        u = make_commands(100.0, seed)
+        reference.append(record(machine, u, move(u, 0.3, 1.0, seed)))
+    for seed in (10, 11):
+        u = make_commands(90.0, seed)
+        every = [move(u, delay_s[j], gain[j], seed)[:, j] for j in range(2)]
+        field.append(record(machine, u, np.stack(every, 1)))
+    return GapCase(machine, reference, field)
+
+
+def diagnose(case: GapCase):
+    """Return the answer of the engine."""
+    thresholds = extensions.load_part("thresholds")
+    kinds = effect_library.load_effects(case.machine)
+    work = ReferenceDiagnosis(case, kinds, thresholds, np.random.default_rng(0))
+    return work.run(lambda *_: None).answer
+
+
+def make_side(machine: Machine, u: np.ndarray) -> Side:
+    """Return a side with these commands and no motion."""
+    return stack_side([record(machine, u, np.zeros_like(u))], machine)
+
+
+def pure_numbers(**values: float) -> np.ndarray:
+    """Return numbers of a joint that follows its command at once, but for `values`."""
+    numbers = np.zeros(len(PLACE))
+    numbers[[PLACE["speed_out"], PLACE["speed_in"]]] = 1.0
+    for name, value in values.items():
+        numbers[PLACE[name]] = value
+    return numbers
+
+
+def test_a_delayed_lag_is_that_of_scipy(two_joints: Machine) -> None:
+    u = make_commands(20.0, 0)
+    side = make_side(two_joints, u)
+    path = side.simulate(0, pure_numbers(delay_s=0.3, speed_lag_s=0.4))[0]
+    # SciPy integrates path' = v, v' = (u - v) / 0.4 under commands held over each period.
+    fine = 10
+    t = np.arange(len(u) * fine) / (RATE_HZ * fine)
+    held = np.repeat(u[:, 0], fine)
+    late = np.concatenate([np.zeros(round(0.3 * RATE_HZ * fine)), held])[: len(held)]
+    system = ([[0.0, 1.0], [0.0, -2.5]], [[0.0], [2.5]], [[1.0, 0.0]], [[0.0]])
+    _, expected, _ = lsim(system, late, t, interp=False)
+    # Two steps a period integrate the lag; their mean lies half a step beside the exact one.
+    assert np.abs(path - expected[::fine, ...].ravel()).max() < 0.02
+
+
+def test_rows_do_not_depend_on_those_simulated_beside_them(two_joints: Machine) -> None:
+    side = make_side(two_joints, make_commands(20.0, 1))
+    base = list_values("mean")
+    rows = [
+        Row("dead_time", (("delay_s", "add", 0.2),)),
+        Row("backlash", (("play", "add", 0.02),)),
+        Row("lag", (("command_lag_s", "add", 0.2),)),
+    ]
+    together = side.simulate(1, change_numbers(base, rows))
+    for row, path in zip(rows, together, strict=True):
+        alone = side.simulate(1, change_numbers(base, [row]))[0]
+        assert np.array_equal(path, alone)
+
+
+def test_the_nuisance_is_a_covariance() -> None:
+    generator = np.random.default_rng(0)
+    columns, residual = generator.normal(size=(3, 12)), generator.normal(size=12)
+    spread = 1.7
+    projection = Projection(columns, spread)
+    covariance = spread * np.eye(12) + columns.T @ columns
+    exact = residual @ np.linalg.solve(covariance, residual)
+    assert projection.measure_squares(residual)[0] == pytest.approx(exact, rel=1e-5)
+    log_likelihood = multivariate_normal(cov=covariance).logpdf(residual)
+    own = -0.5 * (exact + projection.log_determinant + 12 * np.log(2.0 * np.pi * spread))
+    assert own == pytest.approx(log_likelihood)
+
+
+@pytest.mark.parametrize("effect", ["frame_loss", "delay_jitter"])
+def test_courses_are_the_likeliest_of_all(effect: str) -> None:
+    generator = np.random.default_rng(3)
+    samples, delays = 6, 3
+    likelihood = generator.normal(0.0, 2.0, (samples, delays))
+    course = holds.Course(effect, 0.1, 0.7)
+    found = wp.zeros((1, samples), dtype=wp.int32)
+    wp.launch(
+        holds.find_courses,
+        dim=1,
+        inputs=[
+            wp.array(likelihood, dtype=wp.float64),
+            wp.zeros(samples, dtype=wp.int32),
+            wp.array([int(course.is_loss)], dtype=wp.int32),
+            wp.array([course.begins], dtype=wp.float64),
+            wp.array([course.lasts], dtype=wp.float64),
+            wp.array([1.0], dtype=wp.float64),
+            wp.empty((1, 2, delays), dtype=wp.float64),
+            wp.empty((1, samples, delays), dtype=wp.int32),
+        ],
+        outputs=[found],
+    )
+
+    def score(path: tuple[int, ...]) -> float:
+        total = likelihood[np.arange(samples), path].sum()
+        for before, after in zip((0, *path), path, strict=False):
+            total += step(before, after)
+        return total
+
+    def step(before: int, after: int) -> float:
+        off, on = np.log(0.9), np.log(0.7)
+        if effect == "frame_loss":
+            if before == 0:
+                return {0: off, 1: np.log(0.1)}.get(after, -np.inf)
+            return np.log(0.3) if after == 0 else (on if after == before + 1 else -np.inf)
+        ways = [np.log(0.3 / delays)]
+        if after == before:
+            ways.append(off if before == 0 else on)
+        if after == before + 1:
+            ways.append(np.log(0.1) if before == 0 else np.log(0.3 * holds.NEIGHBOUR))
+        if after == before - 1:
+            ways.append(np.log(0.3 * holds.NEIGHBOUR))
+        return max(ways)
+
+    best = max(product(range(delays), repeat=samples), key=score)
+    assert score(tuple(found.numpy()[0].tolist())) == pytest.approx(score(best))
+
+
+def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:
+    case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
+    answer = diagnose(case)
+    assert answer.verdict == "none"
+    assert answer.selected == ()
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "gain", "effect", "number", "size"),
+    [
+        ((0.3, 0.45), (1.0, 1.0), "dead_time", "dead_time_s", 0.15),
+        ((0.3, 0.3), (1.0, 0.8), "flow_gain", "gain", 0.8),
+    ],
+)
+def test_a_changed_joint_is_named_sized_and_proven(
+    two_joints: Machine,
+    delay_s: tuple[float, float],
+    gain: tuple[float, float],
+    effect: str,
+    number: str,
+    size: float,
+) -> None:
+    answer = diagnose(make_case(two_joints, np.array(delay_s), np.array(gain)))
+    assert [(one.effect, one.joints) for one in answer.selected] == [(effect, ("q4",))]
+    estimate = answer.selected[0].parameters[number]["q4"]
+    assert estimate.mean == pytest.approx(size, rel=0.1)
+    assert estimate.ci95[0] <= size <= estimate.ci95[1]
+    assert answer.gap is not None
+    assert answer.gap.closed is not None
+    assert answer.gap.closed.mean > 0.8
+    assert answer.selected[0].identified
+
+
+def test_units_do_not_matter(two_joints: Machine) -> None:
+    joints = []
+    for joint in two_joints.joints:
+        speed = replace(joint.max_speed, value=2.0 * joint.max_speed.value)
+        joints.append(replace(joint, max_speed=speed))
+    other = replace(two_joints, joints=tuple(joints))
+    u = make_commands(20.0, 2)
+    one, two = make_side(two_joints, u), make_side(other, u)
+    assert measure_units(other) == pytest.approx(2.0 * measure_units(two_joints))
+    assert two.q == pytest.approx(0.5 * one.q)
