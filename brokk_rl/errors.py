@@ -52,11 +52,17 @@ class StorageError(BrokkError):
     """A file could not be written; no partial file remains."""
 
 
+MAX_CHOICES = 60
+"""More names than this hide the nearest one; they are listed only where none is near."""
+
+
 def list_choices(name: str, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown name: the nearest choice, then all choices."""
     names = sorted(known)
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
+    if near and len(names) > MAX_CHOICES:
+        return hint.rstrip()
     return f"{hint}choices: {', '.join(names) or 'none'}"
 
 

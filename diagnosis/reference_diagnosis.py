@@ -160,8 +160,7 @@ class ReferenceDiagnosis:
         after = proof.view(proof.after) if named else None
         floor = proof.view_floor()
         survey = self._examine(before, floor, after)
-        selected = [self._describe(one, proof) for one in named]
-        selected.sort(key=lambda one: -one.probability)
+        selected = [self._describe(one, proof) for one in sorted(named, key=_get_nats)]
         verdict = "effects" if selected else decision.verdict
         if verdict == "effects" and not selected:
             verdict = "unknown"
@@ -234,6 +233,14 @@ class ReferenceDiagnosis:
             how = "one clock for commands and positions, or a pulse that both record"
             return ("clock_offset",), how
         return (), None
+
+
+def _get_nats(one: NamedEffect) -> float:
+    """Return the key that puts the effect that earns most first."""
+    if one.finding is not None:
+        return -one.finding.nats
+    assert one.detected is not None, "an effect was found one way or the other"
+    return -one.detected.gain
 
 
 def estimate_probability(nats: float) -> float:

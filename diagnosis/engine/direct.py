@@ -90,13 +90,13 @@ def count_stalls(side: Side, joint: int, path: np.ndarray, noise: float) -> tupl
     return count, int(steady.sum())
 
 
-def weigh_stalls(evidence: Evidence, joint: int) -> float:
-    """Return the evidence that a joint stalls more often on the field than on the reference, nats (Poisson)."""
+def weigh_stalls(evidence: Evidence, joint: int, numbers: np.ndarray) -> float:
+    """Return the evidence that a joint with numbers `(P,)` stalls more often on the field than on the reference, nats (Poisson)."""
     base = evidence.bases[joint]
     noise = float(np.sqrt(base.scale.coefficients[0] + 2.0 * evidence.noises[joint] ** 2))
     seen = []
-    for side in (evidence.field, evidence.reference):
-        path = side.simulate(joint, base.numbers)[0].astype(float)
+    for side, own in ((evidence.field, numbers), (evidence.reference, base.numbers)):
+        path = side.simulate(joint, own)[0].astype(float)
         seen.append(count_stalls(side, joint, path, noise))
     (count, samples), (known, known_samples) = seen
     expected = (known + 0.5) * samples / max(known_samples, 1)
