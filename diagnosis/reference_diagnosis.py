@@ -29,7 +29,8 @@ from diagnosis.case import GapCase
 from diagnosis.closure import Gap, Gate, RivalError
 from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
-from diagnosis.engine.decide import Decider, Decision, Finding
+from diagnosis.engine.changes import JointChange, measure_changes
+from diagnosis.engine.decide import Decider, Decision, EffectFinding
 from diagnosis.engine.holds import hold_commands
 from diagnosis.engine.proof import Floor, Windows, list_windows, run_free
 from diagnosis.engine.rows import Row, change_numbers
@@ -65,7 +66,7 @@ class NamedEffect:
     """
 
     kind: EffectType
-    finding: Finding | None
+    finding: EffectFinding | None
     detected: DetectedEffect | None
 
 
@@ -137,7 +138,7 @@ class ReferenceDiagnosis:
                 found.append(NamedEffect(kinds[name], finding, None))
         return found
 
-    def _name_delay(self, finding: Finding) -> str:
+    def _name_delay(self, finding: EffectFinding) -> str:
         """Return the name of a finding; a delay of all joints that the tool tracker lacks is one of the clock."""
         if finding.name != "dead_time" or len(finding.joints) < self.case.machine.num_joints:
             return finding.name
@@ -174,7 +175,9 @@ class ReferenceDiagnosis:
             gates=(*told, *(proof.judge() if named else ())),
             next_experiment=_propose(selected),
             reason=_explain(verdict, selected, decision, failed),
-            more=survey.more() | {"evidence": _describe_evidence(decision, machine)},
+            more=survey.more()
+            | {"changes": [one.to_json() for one in proof.measure_changes()]}
+            | {"evidence": _describe_evidence(decision, machine)},
         )
         return Outcome(answer, before, after, floor)
 
@@ -220,7 +223,7 @@ class ReferenceDiagnosis:
             edit=None if part is None else part["edit"],
         )
 
-    def _list_alike(self, name: str, finding: Finding) -> tuple[tuple[str, ...], str | None]:
+    def _list_alike(self, name: str, finding: EffectFinding) -> tuple[tuple[str, ...], str | None]:
         """Return what these recordings cannot tell from an effect, and the measurement that would."""
         if geometry.is_tracked(self.case.field, self.case.machine):
             return (), None
@@ -458,6 +461,11 @@ class _Proof:
             joints = dict(zip(self.machine.joint_names, np.sqrt(squares).tolist(), strict=True))
             found[name] = RivalError(float(combine_joints(squares, self.machine)), joints)
         return found
+
+    def measure_changes(self) -> list[JointChange]:
+        """Return how the numbers of each joint changed, named or not."""
+        evidence = self._decider.evidence
+        return measure_changes(evidence, evidence.view_field(self._healthy))
 
     def judge(self) -> list[Gate]:
         """Return whether the repaired simulator beats standing still on every named joint."""

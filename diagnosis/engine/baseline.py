@@ -14,7 +14,7 @@ import numpy as np
 from diagnosis.engine import joint_model
 from diagnosis.engine.measure import (
     PLAIN,
-    Measure,
+    IncrementMeasure,
     Motion,
     Scale,
     fit_memory,
@@ -59,7 +59,7 @@ class JointBaseline:
 
     numbers: np.ndarray
     scale: Scale
-    measure: Measure
+    measure: IncrementMeasure
     motion: Motion
     left_out: np.ndarray
     part: np.ndarray
@@ -70,7 +70,7 @@ class JointBaseline:
 
 
 def linearise(
-    side: Side, joint: int, numbers: np.ndarray, measure: Measure
+    side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the increments of the simulated joint `(N,)` and their slopes over the fitted numbers `(F, N)`."""
     varied = np.repeat(numbers[None], 1 + len(FITTED), 0)
@@ -85,7 +85,7 @@ def fit_numbers(
     side: Side,
     joint: int,
     numbers: np.ndarray,
-    measure: Measure,
+    measure: IncrementMeasure,
     rounds: int,
     fixed: Sequence[str] = (),
 ) -> np.ndarray:
@@ -127,7 +127,7 @@ def fit_numbers(
 
 def guess_numbers(side: Side, joint: int) -> np.ndarray:
     """Return numbers to begin with: the delay and the speed that fit best, `(P,)`."""
-    measure = Measure(side, PLAIN)
+    measure = IncrementMeasure(side, PLAIN)
     trials = np.repeat(MEAN[None], len(FIRST_DELAYS_S), 0)
     trials[:, PLACE["delay_s"]] = FIRST_DELAYS_S
     trials[:, PLACE["pump_load"]] = 0.0
@@ -156,7 +156,7 @@ def split_parts(side: Side) -> np.ndarray:
 def fit_reference(side: Side) -> list[JointBaseline]:
     """Return the baseline of every joint; the demand of `side` is set on the way."""
     joints = range(side.num_joints)
-    plain = Measure(side, PLAIN)
+    plain = IncrementMeasure(side, PLAIN)
     shared = ("droop", "pump_load")
     every = [guess_numbers(side, j) for j in joints]
     every = [fit_numbers(side, j, every[j], plain, 4, shared) for j in joints]
@@ -171,7 +171,7 @@ def fit_reference(side: Side) -> list[JointBaseline]:
     found = []
     for j in joints:
         motion = measure_motion(side, side.simulate(j, every[j])[0])
-        measure = Measure(side, scales[j], motion)
+        measure = IncrementMeasure(side, scales[j], motion)
         numbers = fit_numbers(side, j, every[j], measure, 5)
         found.append(_leave_out(side, j, numbers, scales[j], motion).baseline)
     side.ask_others([one.numbers for one in found])
@@ -190,7 +190,7 @@ def _leave_out(
     side: Side, joint: int, numbers: np.ndarray, scale: Scale, motion: Motion | None
 ) -> _LeftOut:
     """Fit the numbers without each part by one step of Gauss and Newton, and keep what each part then errs by."""
-    measure = Measure(side, scale, motion)
+    measure = IncrementMeasure(side, scale, motion)
     base, slopes = linearise(side, joint, numbers, measure)
     target = measure(side.q[:, joint]).astype(float)
     residual = target - base
@@ -240,7 +240,7 @@ def _fit_scales(side: Side, parts: Sequence[_LeftOut]) -> list[Scale]:
     found = []
     for one, coefficients in zip(parts, own, strict=True):
         mixed = Scale((1.0 - POOLED) * coefficients + POOLED * pooled)
-        measure = Measure(side, mixed, one.baseline.motion)
+        measure = IncrementMeasure(side, mixed, one.baseline.motion)
         scaled = one.increments * measure.weight
         memory = fit_memory(scaled, measure.interval, measure.valid)
         found.append(Scale(mixed.coefficients, memory))

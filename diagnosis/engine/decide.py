@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 
 from diagnosis.engine.direct import find_step, weigh_stalls
-from diagnosis.engine.evidence import Evidence, FieldJoint, JointRow
+from diagnosis.engine.evidence import RowEvidence, FieldJoint, JointRow
 from diagnosis.engine.generic import GenericCauses
-from diagnosis.engine.holds import HeldCommands, Hold, hold_commands
+from diagnosis.engine.holds import HeldCommands, HeldCourse, hold_commands
 from diagnosis.engine.rows import OUTSIDE, SHARED, Row, change_numbers
 from diagnosis.engine.side import Side
 
@@ -39,7 +39,7 @@ HELD_NATS = 60.0
 """So much if it is held commands, which follow whatever is left."""
 BESIDE_STALLS_NATS = 60.0
 COARSE_NATS = 30.0
-"""Evidence of a coarse sensor beyond twice that of the reference."""
+"""RowEvidence of a coarse sensor beyond twice that of the reference."""
 STALL_NATS = 20.0
 MAX_STALLED = 3
 """More joints that stall have a common cause, such as a pump."""
@@ -66,7 +66,7 @@ WHOLE = SHARED | HELD | {"thermal_all"}
 
 
 @dataclass(frozen=True)
-class Finding:
+class EffectFinding:
     """An effect with what it earns.
 
     Attributes:
@@ -81,7 +81,7 @@ class Finding:
     joints: tuple[int, ...]
     nats: float
     rows: Mapping[int, Row] = field(default_factory=dict)
-    hold: Hold | None = None
+    hold: HeldCourse | None = None
 
     @property
     def name(self) -> str:
@@ -104,10 +104,10 @@ class Decision:
     """
 
     verdict: Literal["effects", "none", "unknown"]
-    named: tuple[Finding, ...]
-    rivals: tuple[Finding, ...]
-    seconds: tuple[Finding, ...]
-    outside: Finding | None
+    named: tuple[EffectFinding, ...]
+    rivals: tuple[EffectFinding, ...]
+    seconds: tuple[EffectFinding, ...]
+    outside: EffectFinding | None
     generic: tuple[str, float]
     left: float
 
@@ -122,7 +122,7 @@ class Decider:
     """
 
     def __init__(self, reference: Side, field: Side, noises: np.ndarray | None = None) -> None:
-        self.evidence = Evidence(reference, field)
+        self.evidence = RowEvidence(reference, field)
         if noises is not None:
             self.evidence.noises = noises
         self.generic = GenericCauses(self.evidence)
@@ -144,9 +144,9 @@ class Decider:
         groups = self._weigh_generic(joints, skip)
         direct = []
         if coarse:
-            direct.append(Finding("quantisation", tuple(coarse), 1e3))
+            direct.append(EffectFinding("quantisation", tuple(coarse), 1e3))
         if stalled:
-            direct.append(Finding("stiction", tuple(stalled), 500.0))
+            direct.append(EffectFinding("stiction", tuple(stalled), 500.0))
         named = list(direct)
         best = library[0]
         needed = HELD_NATS if best.effect in HELD else LEAST_NATS
@@ -154,7 +154,7 @@ class Decider:
             needed = max(needed, COARSE_NATS)
         if stalled:
             needed = max(needed, BESIDE_STALLS_NATS)
-        seconds: list[Finding] = []
+        seconds: list[EffectFinding] = []
         left = 0.0
         is_new = best.effect not in [one.effect for one in direct]
         if best.nats >= needed and len(named) < 2 and is_new:
@@ -236,7 +236,7 @@ class Decider:
         joints: Sequence[FieldJoint],
         table: Mapping[str, Mapping[int, JointRow]],
         skip: frozenset[int],
-    ) -> list[Finding]:
+    ) -> list[EffectFinding]:
         """Return all effects with what they earn, the best first."""
         found = [_add_up(effect, rows, skip) for effect, rows in table.items()]
         common = self.evidence.weigh_common("thermal_drift", joints)
@@ -247,7 +247,7 @@ class Decider:
         return sorted(found, key=lambda one: -one.nats)
 
     def _apply(
-        self, numbers: Sequence[np.ndarray], finding: Finding, field: Side | None = None
+        self, numbers: Sequence[np.ndarray], finding: EffectFinding, field: Side | None = None
     ) -> list[FieldJoint]:
         """Return the joints of the field with an effect."""
         changed = []
@@ -259,7 +259,9 @@ class Decider:
             side = hold_commands(side, finding.hold.delays)
         return self.evidence.view_field(changed, side)
 
-    def _is_second(self, first: Finding, second: Finding, named: Sequence[Finding]) -> bool:
+    def _is_second(
+        self, first: EffectFinding, second: EffectFinding, named: Sequence[EffectFinding]
+    ) -> bool:
         """Return whether a second effect earns enough."""
         is_whole = first.effect in WHOLE or second.effect in WHOLE
         shares = bool(set(first.joints) & set(second.joints)) and not is_whole
@@ -284,12 +286,12 @@ class Decider:
         return best, some[best]
 
 
-def _add_up(effect: str, rows: Mapping[int, JointRow], skip: frozenset[int]) -> Finding:
+def _add_up(effect: str, rows: Mapping[int, JointRow], skip: frozenset[int]) -> EffectFinding:
     """Return an effect with the joints that it pays on."""
     if effect in SHARED or effect == "thermal_all":
         nats = sum(row.gain - row.price for row in rows.values()) - JOINT_NATS
         own = {j: row.row for j, row in rows.items()}
-        return Finding(effect, tuple(rows), nats, own)
+        return EffectFinding(effect, tuple(rows), nats, own)
     nets = {}
     for j, row in rows.items():
         net = row.gain - row.price - JOINT_NATS
@@ -303,18 +305,18 @@ def _add_up(effect: str, rows: Mapping[int, JointRow], skip: frozenset[int]) -> 
             total = 0.0
     most = max(nets.values(), default=0.0)
     joints = tuple(j for j, net in nets.items() if net >= JOINT_SHARE * most)
-    return Finding(effect, joints, total, {j: rows[j].row for j in joints})
+    return EffectFinding(effect, joints, total, {j: rows[j].row for j in joints})
 
 
-def _weigh_hold(hold: Hold, num_joints: int) -> Finding:
+def _weigh_hold(hold: HeldCourse, num_joints: int) -> EffectFinding:
     nats = min(hold.gain, STOPS_FACTOR * max(min(hold.starts, hold.stops), 0.0))
     if hold.starts > STARTS_LIMIT * hold.stops:
         nats = min(nats, max(hold.stops, 0.0))
     joints = tuple(range(num_joints))
-    return Finding(hold.course.effect, joints, nats - hold.price - JOINT_NATS, {}, hold)
+    return EffectFinding(hold.course.effect, joints, nats - hold.price - JOINT_NATS, {}, hold)
 
 
-def _choose_hold(holds: Mapping[str, Hold]) -> list[Hold]:
+def _choose_hold(holds: Mapping[str, HeldCourse]) -> list[HeldCourse]:
     """Return the likelier of lost frames and jitter."""
     if len(holds) < 2:
         return list(holds.values())

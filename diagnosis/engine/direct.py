@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
-from diagnosis.engine.evidence import Evidence
+from diagnosis.engine.evidence import RowEvidence
 from diagnosis.engine.side import Side
 
 STEPS = np.geomspace(0.004, 0.2, 240)
@@ -90,7 +90,7 @@ def count_stalls(side: Side, joint: int, path: np.ndarray, noise: float) -> tupl
     return count, int(steady.sum())
 
 
-def weigh_stalls(evidence: Evidence, joint: int, numbers: np.ndarray) -> float:
+def weigh_stalls(evidence: RowEvidence, joint: int, numbers: np.ndarray) -> float:
     """Return the evidence that a joint with numbers `(P,)` stalls more often on the field than on the reference, nats (Poisson)."""
     base = evidence.bases[joint]
     noise = float(np.sqrt(base.scale.coefficients[0] + 2.0 * evidence.noises[joint] ** 2))

@@ -13,7 +13,7 @@ import numpy as np
 
 from diagnosis.engine import rows as row_tables
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, fit_reference, linearise
-from diagnosis.engine.measure import Measure, Scale, measure_motion
+from diagnosis.engine.measure import IncrementMeasure, Scale, measure_motion
 from diagnosis.engine.nuisance import JointNuisance, compute_gain, count_part, estimate_nuisance
 from diagnosis.engine.rows import SHARED, Row, change_numbers
 from diagnosis.engine.side import Side
@@ -78,7 +78,7 @@ class FieldJoint:
         scale = base.scale
         if step or noise:
             scale = Scale(scale.coefficients, () if step else scale.memory, step, noise)
-        self.measure = Measure(side, scale, measure_motion(side, healthy), used)
+        self.measure = IncrementMeasure(side, scale, measure_motion(side, healthy), used)
         self.increments, slopes = linearise(side, joint, numbers, self.measure)
         self.path = side.simulate(joint, numbers)[0].astype(float)
         self.projection = nuisance.project(side, self.path, slopes, self.measure, base.spread)
@@ -120,7 +120,7 @@ class FieldJoint:
         return best
 
 
-class Evidence:
+class RowEvidence:
     """All that reference and field say about the rows.
 
     Args:

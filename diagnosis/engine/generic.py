@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
-from diagnosis.engine.evidence import Evidence, FieldJoint
+from diagnosis.engine.evidence import RowEvidence, FieldJoint
 from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.nuisance import (
     Projection,
@@ -107,7 +107,7 @@ class GenericCauses:
         evidence: The table.
     """
 
-    def __init__(self, evidence: Evidence) -> None:
+    def __init__(self, evidence: RowEvidence) -> None:
         self._evidence = evidence
         self._prices = [self._price(j) for j in range(evidence.reference.num_joints)]
 

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from diagnosis.engine.baseline import JointBaseline
-from diagnosis.engine.evidence import Evidence, FieldJoint
+from diagnosis.engine.evidence import RowEvidence, FieldJoint
 from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.measure import Scale, measure_motion
 from diagnosis.engine.nuisance import Projection, compute_gain
@@ -67,7 +67,7 @@ COURSES = (
 
 
 @dataclass(frozen=True)
-class Hold:
+class HeldCourse:
     """A found course.
 
     Attributes:
@@ -263,11 +263,11 @@ class HeldCommands:
         evidence: The table.
     """
 
-    def __init__(self, evidence: Evidence) -> None:
+    def __init__(self, evidence: RowEvidence) -> None:
         self._evidence = evidence
         self._on_reference: dict[Course, float] = {}
 
-    def find(self, joints: Sequence[FieldJoint]) -> dict[str, Hold]:
+    def find(self, joints: Sequence[FieldJoint]) -> dict[str, HeldCourse]:
         """Return the best course of each effect beside the numbers of the joints, where one earns anything."""
         side, evidence = joints[0].side, self._evidence
         numbers = [joint.numbers for joint in joints]
@@ -285,7 +285,7 @@ class HeldCommands:
                 total[: len(gains)] += gains
             return total
 
-        found: dict[str, Hold] = {}
+        found: dict[str, HeldCourse] = {}
         for course, delays in _search_courses(bank, side):
             if not delays.any():
                 continue
@@ -297,7 +297,7 @@ class HeldCommands:
             best = found.get(course.effect)
             if best is None or gain - price > best.gain - best.price:
                 starts, stops = float(gains[rising].sum()), float(gains[~rising].sum())
-                found[course.effect] = Hold(course, delays, gain, price, starts, stops)
+                found[course.effect] = HeldCourse(course, delays, gain, price, starts, stops)
         return found
 
     def _price(self, course: Course) -> float:

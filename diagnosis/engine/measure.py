@@ -80,7 +80,7 @@ class Scale:
 PLAIN = Scale(np.array([FIRST_VARIANCE, 0.0, 0.0, 0.0, 0.0]))
 
 
-class Measure:
+class IncrementMeasure:
     """Linear map from a path of one joint to independent increments of about unit variance.
 
     Args:

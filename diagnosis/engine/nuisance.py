@@ -13,7 +13,7 @@ import numpy as np
 
 from diagnosis.engine import joint_model
 from diagnosis.engine.baseline import FITTED, NUM_PARTS, JointBaseline, linearise
-from diagnosis.engine.measure import Measure
+from diagnosis.engine.measure import IncrementMeasure
 from diagnosis.engine.side import Side
 
 AGEING = joint_model.list_values("ageing")[FITTED]
@@ -105,7 +105,12 @@ class JointNuisance:
     parts: list[Projection]
 
     def project(
-        self, side: Side, path: np.ndarray, slopes: np.ndarray, measure: Measure, spread: float
+        self,
+        side: Side,
+        path: np.ndarray,
+        slopes: np.ndarray,
+        measure: IncrementMeasure,
+        spread: float,
     ) -> Projection:
         """Return the projection of a joint on a side, from its simulated path and slopes."""
         wander = measure(list_wander(side, path)).astype(float)

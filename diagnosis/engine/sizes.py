@@ -15,9 +15,9 @@ from brokk_rl.gravity import GRAVITY_M_S2
 from brokk_rl.machine import Machine
 from diagnosis.closure import Estimate
 from diagnosis.effect_library import EffectType
-from diagnosis.engine.decide import Finding
+from diagnosis.engine.decide import EffectFinding
 from diagnosis.engine.evidence import FieldJoint
-from diagnosis.engine.holds import Hold
+from diagnosis.engine.holds import HeldCourse
 from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.rows import Row, list_effect_rows
 from diagnosis.engine.side import UNIT_S, measure_full_loads, measure_units
@@ -67,7 +67,7 @@ class SizedRow:
     relative: float
 
 
-def size_finding(finding: Finding, joints: Sequence[FieldJoint]) -> dict[int, SizedRow]:
+def size_finding(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, SizedRow]:
     """Return the rows of an effect in the registry's form, by joint, from the joints without it."""
     plain = [row for row in list_effect_rows() if row.effect == finding.name and is_plain(row)]
     found = {}
@@ -81,7 +81,7 @@ def size_finding(finding: Finding, joints: Sequence[FieldJoint]) -> dict[int, Si
     return found
 
 
-def fit_rows(finding: Finding, joints: Sequence[FieldJoint]) -> dict[int, Row]:
+def fit_rows(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, Row]:
     """Return the rows of a finding with sizes fitted to these joints; for one without rows those of its effect."""
     found = {}
     for j in finding.joints:
@@ -121,7 +121,7 @@ def _estimate_error(row: Row, joint: FieldJoint) -> float:
 
 
 def describe_numbers(
-    kind: EffectType, rows: dict[int, SizedRow], hold: Hold | None, machine: Machine
+    kind: EffectType, rows: dict[int, SizedRow], hold: HeldCourse | None, machine: Machine
 ) -> dict[str, dict[str, Estimate]]:
     """Return the numbers of an effect with intervals, by name and joint (or `machine`)."""
     found: dict[str, dict[str, Estimate]] = {}
@@ -195,7 +195,7 @@ def _measure_stretched_share(joint: int, machine: Machine) -> float:
     return float(measure_full_loads(machine)[joint]) * GRAVITY_M_S2 / force
 
 
-def _describe_hold(hold: Hold, machine: Machine) -> dict[str, float]:
+def _describe_hold(hold: HeldCourse, machine: Machine) -> dict[str, float]:
     """Return the numbers of held commands from their course."""
     delays = hold.delays
     if not hold.course.is_loss:
