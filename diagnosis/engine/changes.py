@@ -12,7 +12,7 @@ import numpy as np
 
 from diagnosis.closure import Estimate, serialize_estimate
 from diagnosis.engine.baseline import DEVIATION, FITTED, fit_numbers, linearise
-from diagnosis.engine.evidence import RowEvidence, FieldJoint
+from diagnosis.engine.evidence import FieldJoint, RowEvidence
 from diagnosis.engine.joint_model import NAMES, PLACE
 from diagnosis.engine.side import measure_units
 

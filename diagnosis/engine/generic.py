@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
-from diagnosis.engine.evidence import RowEvidence, FieldJoint
+from diagnosis.engine.evidence import FieldJoint, RowEvidence
 from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.nuisance import (
     Projection,

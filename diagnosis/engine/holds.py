@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from diagnosis.engine.baseline import JointBaseline
-from diagnosis.engine.evidence import RowEvidence, FieldJoint
+from diagnosis.engine.evidence import FieldJoint, RowEvidence
 from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.measure import Scale, measure_motion
 from diagnosis.engine.nuisance import Projection, compute_gain

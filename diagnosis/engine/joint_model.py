@@ -3,7 +3,7 @@
 A joint takes commands and measured poses and gives its speed, integrated to a path. It never takes
 its own measured speed. The joints therefore decouple, and a poor model cannot run away. An effect is
 a change of some numbers; those that a healthy machine does not need are 0.
-Priors, steps and ageing come from the comparison in `benchmarks/diagnosis`.
+Priors and ageing were chosen on practice plants of two makes; docs/diagnosis.md has the figures.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ PLAIN_FORMS = frozenset(
 SIZE_STEPS = np.array([0.8, 0.88, 0.94, 1.0, 1.06, 1.14, 1.25])
 """Multiples of a size at which its likelihood is read."""
 FORM_ERROR = 0.1
-"""Relative error of a size that its form makes, 1 sigma; see `benchmarks/diagnosis`."""
+"""Relative error of a size that its form makes, 1 sigma. Chosen by hand: no comparison is recorded."""
 SIGMAS = 1.96
 
 
