@@ -493,7 +493,7 @@ class _Proof:
         return _view_runs(self._case.reference, reference, windows, paths)
 
 
-def _apply(numbers: Sequence[np.ndarray], rows: Mapping[int, SizedRow]) -> list[np.ndarray]:
+def _apply(numbers: Sequence[np.ndarray], rows: Mapping[int, Row]) -> list[np.ndarray]:
     """Return the numbers of all joints with an effect."""
     found = list(numbers)
     for j, row in rows.items():

@@ -203,12 +203,12 @@ class Decider:
     def _find_coarse(self) -> list[int]:
         """Return the joints with a coarse sensor on the field; their steps enter the scale."""
         found, evidence = [], self.evidence
-        for j in np.flatnonzero(evidence.noises == 0.0):
+        for j in np.flatnonzero(evidence.noises == 0.0).tolist():
             nats, step = find_step(evidence.field, j)
             known, _ = find_step(evidence.reference, j)
             if nats > 2.0 * known + COARSE_NATS:
                 evidence.steps[j] = step
-                found.append(int(j))
+                found.append(j)
         return found
 
     def _find_stalled(

@@ -6,6 +6,7 @@ Axes: `T` samples, `K` delays, `M` models of the course.
 """
 
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 # The kernel is compiled by Warp; a type checker reads it as ordinary Python.
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ Axes: `C` candidates, `D` distinct command paths, `T` samples, `S` sub-steps, `P
 """
 
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
 # Kernels are compiled by Warp; a type checker reads them as ordinary Python.
 
 from __future__ import annotations

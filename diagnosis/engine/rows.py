@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from diagnosis.engine.joint_model import NAMES, PLACE
 
-Change = tuple[str, Literal["add", "scale", "least"], float]
-"""A number, how it changes, and by what: added, times `1 + value`, or raised to at least the value."""
+Change = tuple[str, str, float]
+"""A number, how it changes, and by what: `add`, `scale` (times `1 + value`), or `least` (raised to it)."""
 
 
 @dataclass(frozen=True)

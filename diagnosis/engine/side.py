@@ -120,7 +120,7 @@ class Side:
         first = np.zeros(len(distinct), dtype=int)
         first[which] = np.arange(len(numbers))
         shape = (len(distinct), self.num_samples * self.substeps)
-        spool = wp.empty(shape, dtype=wp.float32, device=DEVICE)
+        spool = wp.empty(shape, dtype=float, device=DEVICE)
         commands, begins = self._shared
         wp.launch(
             kernel.simulate_spool,
@@ -129,8 +129,8 @@ class Side:
             outputs=[spool],
             device=DEVICE,
         )
-        path = wp.empty((len(numbers), self.num_samples), dtype=wp.float32, device=DEVICE)
-        flow = wp.empty((len(numbers), self.num_samples), dtype=wp.float32, device=DEVICE)
+        path = wp.empty((len(numbers), self.num_samples), dtype=float, device=DEVICE)
+        flow = wp.empty((len(numbers), self.num_samples), dtype=float, device=DEVICE)
         poses, loads, load, stops, time_s = self._own[joint]
         wp.launch(
             kernel.simulate_path,
