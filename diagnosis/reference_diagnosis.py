@@ -43,7 +43,7 @@ from diagnosis.stages import Survey, examine_gap
 
 DIRECT_NATS = 4.0
 NAME_NATS = 12.0
-"""What a joint and a name cost where tool points or the scatter of samples show an effect."""
+"""Cost of a joint and of a name where tool points or the scatter of samples show an effect."""
 BLOCK_WINDOWS = 4
 """Windows in a row that belong to one half of the field."""
 LEAST_GAP = 0.02

@@ -1,4 +1,4 @@
-"""What changed between reference and field, joint by joint, named or not.
+"""Changes between reference and field, joint by joint, named or not.
 
 The numbers of each joint are fitted to the field as they were to the reference. Their differences
 are told with intervals, in words that need no effect.
@@ -26,7 +26,7 @@ IN_UNITS = {"play": "", "creep": "_s"}
 
 @dataclass(frozen=True)
 class JointChange:
-    """How one number of a joint changed.
+    """Change of one number of a joint.
 
     Attributes:
         joint: Name of the joint.

@@ -25,11 +25,11 @@ from diagnosis.engine.side import Side
 LEAST_NATS = 22.0
 """An effect that earns less is not named."""
 JOINT_NATS = 6.0
-"""What each joint of an effect costs, for its size and its form."""
+"""Cost of each joint of an effect; for its size and its form."""
 JOINT_SHARE = 0.1
 """A joint that earns less, of what the best joint earns, does not have the effect."""
 BESIDES_NATS = {"load_dependence": 12.0, "compliance": 30.0}
-"""What an effect costs besides. Pose explains nearly the same as load. A person's short reversals excite the
+"""Further cost of an effect. Pose explains nearly the same as load. A person's short reversals excite the
 mass of a heavy joint, a test programme does not: unchanged machines of a make with such joints earned up to
 48 nats of compliance, joints of other makes with air in the oil 60 to 3,500."""
 SECOND_SHARE = 0.03
@@ -57,7 +57,7 @@ GENERIC_NATS = 45.0
 """A row outside the library, or a flexible column, that earns so much more than the best effect."""
 LEFT_SHARE = 0.6
 LEFT_NATS = 40.0
-"""What may remain beside the named effects, of what they earn, and beyond."""
+"""Most that may remain beside the named effects, of what they earn, and beyond."""
 HUNTING_NATS = 150.0
 HUNTING_FACTOR = 1.5
 
@@ -92,7 +92,7 @@ class EffectFinding:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the engine says.
+    """Verdict of the engine and its reasons.
 
     Attributes:
         verdict: `effects`, `none` or `unknown`.

@@ -1,4 +1,4 @@
-"""What recordings show directly: coarse sensors, and joints that stand still in the middle of a motion.
+"""Findings that need no fit of sizes: coarse sensors, and joints that stand still in the middle of a motion.
 
 Axes: `T` samples.
 """

@@ -38,7 +38,7 @@ LEAST_NATS = 5.0
 
 @dataclass(frozen=True)
 class Course:
-    """How a delay comes and goes.
+    """Law by which a delay comes and goes.
 
     Attributes:
         effect: `frame_loss`: it grows with each lost frame and ends at once; `delay_jitter`: it

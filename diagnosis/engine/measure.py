@@ -36,7 +36,7 @@ COARSE_SPEED = (0.02, 0.17)
 
 @dataclass(frozen=True)
 class Motion:
-    """How much a simulated joint moves near each sample, `(T,)` each, units.
+    """Motion of a simulated joint near each sample, `(T,)` each, units.
 
     Attributes:
         travelled: Over an interval.

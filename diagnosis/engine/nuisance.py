@@ -1,4 +1,4 @@
-"""What a machine does without any effect: its numbers age, and its speed wanders slowly.
+"""Changes of a machine without any effect: its numbers age, and its speed wanders slowly.
 
 Both are columns with a prior in the covariance of the increments. What they explain costs nothing,
 and no hypothesis earns by it.
