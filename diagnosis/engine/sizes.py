@@ -72,7 +72,7 @@ def size_finding(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[i
     plain = [row for row in list_effect_rows() if row.effect == finding.name and is_plain(row)]
     found = {}
     for j in finding.joints:
-        some = [row for row in plain if suits(row, joints[j])]
+        some = [row for row in plain if is_possible(row, joints[j])]
         if not some:
             continue
         best = some[int(np.argmax(joints[j].score(some)))]
@@ -100,7 +100,7 @@ def is_plain(row: Row) -> bool:
     return tuple(name for name, _, _ in row.changes) in PLAIN_FORMS
 
 
-def suits(row: Row, joint: FieldJoint) -> bool:
+def is_possible(row: Row, joint: FieldJoint) -> bool:
     """Return whether the registry has a row for a joint: creep follows the weight where that is known."""
     names = {name for name, _, _ in row.changes}
     is_loaded = bool(np.abs(joint.side.loads[joint.joint]).max() > 1e-3)

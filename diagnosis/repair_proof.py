@@ -1,0 +1,268 @@
+"""Free runs of the machine as it was and of the repaired one over the field, and what they prove.
+
+Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from actuators import open_loop
+from actuators.scales import choose_horizon_s
+from brokk_rl.commands import view_recordings
+from brokk_rl.record import Recording
+from diagnosis.attribution import judge_edit
+from diagnosis.bootstrap import draw_weights, summarise_draws
+from diagnosis.case import GapCase
+from diagnosis.closure import Gap, Gate, RivalError
+from diagnosis.engine.changes import JointChange, measure_changes
+from diagnosis.engine.decide import Decider, EffectFinding
+from diagnosis.engine.holds import hold_commands
+from diagnosis.engine.proof import Floor, Windows, list_windows, run_free
+from diagnosis.engine.rows import Row, change_numbers
+from diagnosis.engine.side import Side, choose_stride, measure_units
+from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
+from diagnosis.rivals import measure_rivals
+
+BLOCK_WINDOWS = 4
+"""Windows in a row that belong to one half of the field."""
+LEAST_GAP = 0.02
+"""Least gap over the error, so that its share can be told where the floor nearly reaches it."""
+
+
+class RepairProof:
+    """Free runs over the field, cross-fitted in two halves, and their errors.
+
+    Args:
+        case: The recordings.
+        decider: The engine that decided.
+        findings: Its named effects, the best first.
+        generator: Draws the bootstraps.
+    """
+
+    def __init__(
+        self,
+        case: GapCase,
+        decider: Decider,
+        findings: Sequence[EffectFinding],
+        generator: np.random.Generator,
+    ) -> None:
+        self.machine = case.machine
+        self._case = case
+        self._decider = decider
+        self._findings = findings
+        self._generator = generator
+        evidence = decider.evidence
+        self._field = evidence.field
+        self._healthy = [base.numbers for base in evidence.bases]
+        horizon_s = choose_horizon_s(case.machine)
+        self.windows = list_windows(self._field, horizon_s)
+        self.half = np.arange(len(self.windows.first)) // BLOCK_WINDOWS % 2
+        self.floor = Floor(evidence.reference, evidence.bases, horizon_s)
+        self.weights = draw_weights(len(self.windows.first), generator)
+        self.sizes: dict[str, dict[int, SizedRow]] = {}
+        """Rows of each effect in the registry's form, by joint."""
+        self._rows = self._fit_rows(None)
+        self._halves = [self._fit_rows(self._list_used(half)) for half in (0, 1)]
+        self._runs: dict[frozenset[str], np.ndarray] = {}
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Measured positions, `(W, K, J)`, rad or m."""
+        return self._field.q[self.windows.rows] * measure_units(self.machine)
+
+    @property
+    def before(self) -> np.ndarray:
+        """Free runs of the machine as it was, `(W, K, J)`."""
+        return self.run(frozenset())
+
+    @property
+    def after(self) -> np.ndarray:
+        """Free runs with all named effects."""
+        return self.run(frozenset(one.effect for one in self._findings))
+
+    def _list_used(self, half: int) -> np.ndarray:
+        """Return the samples outside the windows of a half, `(T,)` bool."""
+        used = np.ones(self._field.num_samples, dtype=bool)
+        used[self.windows.rows[self.half == half]] = False
+        return used
+
+    def _fit_rows(self, used: np.ndarray | None) -> dict[str, dict[int, Row]]:
+        """Return the rows of each named effect, one fitted beside the others, to the samples `used`."""
+        numbers, side = list(self._healthy), self._field
+        found: dict[str, dict[int, Row]] = {}
+        for finding in self._findings:
+            found[finding.effect] = {}
+            if finding.hold is not None:
+                side = hold_commands(side, finding.hold.delays)
+                self.sizes[finding.effect] = {}
+                continue
+            joints = self._decider.evidence.view_field(numbers, side, used)
+            if used is None:
+                self.sizes[finding.effect] = size_finding(finding, joints)
+            found[finding.effect] = fit_rows(finding, joints)
+            numbers = _apply(numbers, found[finding.effect])
+        return found
+
+    def run(self, effects: frozenset[str]) -> np.ndarray:
+        """Return free runs with some of the named effects, each window with sizes of the other half."""
+        if effects not in self._runs:
+            side = self._field
+            for finding in self._findings:
+                if finding.effect in effects and finding.hold is not None:
+                    side = hold_commands(side, finding.hold.delays)
+            runs = []
+            for sizes in self._halves:
+                numbers = list(self._healthy)
+                for name in effects:
+                    numbers = _apply(numbers, sizes[name])
+                runs.append(run_free(side, self.windows, numbers))
+            chosen = self.half[:, None, None] == 0
+            self._runs[effects] = np.where(chosen, runs[0], runs[1])
+        return self._runs[effects]
+
+    def measure_squares(self, paths: np.ndarray) -> np.ndarray:
+        """Return mean squares of free runs in each draw, `(1 + B, J)`."""
+        return self.weights @ np.square(paths - self.measured).mean(1)
+
+    def measure_errors(self, paths: np.ndarray) -> np.ndarray:
+        """Return the error of free runs in each draw, all joints together, `(1 + B,)`."""
+        return combine_joints(self.measure_squares(paths), self.machine)
+
+    @cached_property
+    def floor_squares(self) -> np.ndarray:
+        """Mean squares at the floor in each draw, `(1 + B, J)`."""
+        numbers, side = list(self._healthy), self._field
+        for finding in self._findings:
+            numbers = _apply(numbers, self._rows[finding.effect])
+            if finding.hold is not None:
+                side = hold_commands(side, finding.hold.delays)
+        joints = self._decider.evidence.view_field(numbers, side)
+        return self.weights @ self.floor.foresee(self.windows, joints)
+
+    def measure_gap(self) -> Gap:
+        """Return the errors and the share that is closed."""
+        before, after = self.measure_errors(self.before), self.measure_errors(self.after)
+        floor = combine_joints(self.floor_squares, self.machine)
+        closed, reason = None, "no effect is named"
+        if self._findings:
+            closed = summarise_draws(self._share(before - after))
+            reason = ""
+        joints = describe_joints(
+            self.machine,
+            np.sqrt(self.measure_squares(self.before)[0]),
+            np.sqrt(self.measure_squares(self.after)[0]),
+            np.sqrt(self.floor_squares[0]),
+        )
+        return Gap(
+            before=float(before[0]),
+            after=float(after[0]),
+            floor=float(floor[0]),
+            closed=closed,
+            unit=choose_unit(self.machine),
+            floor_of="reference",
+            joints=joints,
+            reduced=summarise_draws((before - after) / np.maximum(before, 1e-12)),
+            closed_reason=reason,
+        )
+
+    def _share(self, fewer: np.ndarray) -> np.ndarray:
+        """Return differences of errors over the gap of the same draw, `(1 + B,)`."""
+        before = self.measure_errors(self.before)
+        floor = combine_joints(self.floor_squares, self.machine)
+        return fewer / np.maximum(before - floor, LEAST_GAP * before)
+
+    @cached_property
+    def parts(self) -> dict[str, dict[str, Any]]:
+        """Part of each effect: its Shapley value, and what its removal restores."""
+        names = [one.effect for one in self._findings]
+        every = frozenset(names)
+        before, after = self.measure_errors(self.before), self.measure_errors(self.after)
+        values = compute_shapley(names, lambda some: -self.measure_errors(self.run(some)))
+        found = {}
+        for name, fewer in values.items():
+            reduced = summarise_draws(fewer / np.maximum(before, 1e-12))
+            without = self.measure_errors(self.run(every - {name}))
+            rise = summarise_draws((without - after) / np.maximum(before, 1e-12))
+            restored, identified = judge_edit(reduced, rise)
+            edit = {"restored": restored, "reduced": reduced.mean, "rise_without": rise.mean}
+            closed = summarise_draws(self._share(fewer))
+            found[name] = {"closed": closed, "identified": identified, "edit": edit}
+        return found
+
+    @cached_property
+    def rivals(self) -> dict[str, RivalError]:
+        """Errors of standing still and of an ARX on the field."""
+        recordings = view_recordings(self._case.field, self.machine)
+        horizon_s = choose_horizon_s(self.machine)
+        cut = open_loop.cut_windows(recordings, self.machine, horizon_s, horizon_s)
+        found = {}
+        for name, one in measure_rivals(cut).items():
+            if one.squares is None:
+                found[name] = RivalError(None, {}, one.reason)
+                continue
+            squares = one.squares.mean(0)
+            joints = dict(zip(self.machine.joint_names, np.sqrt(squares).tolist(), strict=True))
+            found[name] = RivalError(float(combine_joints(squares, self.machine)), joints)
+        return found
+
+    def measure_changes(self) -> list[JointChange]:
+        """Return how the numbers of each joint changed, named or not."""
+        evidence = self._decider.evidence
+        return measure_changes(evidence, evidence.view_field(self._healthy))
+
+    def judge(self) -> list[Gate]:
+        """Return whether the repaired simulator beats standing still on every named joint."""
+        joints = sorted({j for one in self._findings for j in one.joints})
+        after = np.sqrt(self.measure_squares(self.after)[0])
+        still = self.rivals["hold"].joints
+        found = []
+        for j in joints:
+            name = self.machine.joint_names[j]
+            passed = bool(after[j] <= still[name])
+            text = f"{name}: {after[j]:.3g} with the effects, {still[name]:.3g} standing still"
+            found.append(Gate(f"beats_hold_{name}", passed, float(after[j]), still[name], text))
+        return found
+
+    def view(self, paths: np.ndarray) -> WindowedRuns:
+        """Return free runs beside the recordings of the field."""
+        return _view_runs(self._case.field, self._field, self.windows, paths)
+
+    def view_floor(self) -> WindowedRuns:
+        """Return the left-out runs beside the recordings of the reference."""
+        reference = self._decider.evidence.reference
+        windows = self.floor.windows
+        measured = reference.q[windows.rows]
+        paths = (measured - self.floor.errors) * measure_units(self.machine)
+        return _view_runs(self._case.reference, reference, windows, paths)
+
+
+def _apply(numbers: Sequence[np.ndarray], rows: Mapping[int, Row]) -> list[np.ndarray]:
+    """Return the numbers of all joints with an effect."""
+    found = list(numbers)
+    for j, row in rows.items():
+        found[j] = change_numbers(found[j], [row])[0]
+    return found
+
+
+def _view_runs(
+    recordings: Sequence[Recording], side: Side, windows: Windows, paths: np.ndarray
+) -> WindowedRuns:
+    """Return paths `(W, K, J)` beside their recordings, thinned out as the engine read them."""
+    stride = choose_stride(side.machine)
+    thin = []
+    for one in recordings:
+        rows = slice(0, one.num_samples // stride * stride, stride)
+        extra = {name: values[rows] for name, values in one.extra.items()}
+        part = replace(one, t_s=one.t_s[rows], u=one.u[rows], q=one.q[rows], extra=extra)
+        thin.append(part)
+    source = np.searchsorted(side.starts, windows.first, "right") - 1
+    row = windows.first + 1 - side.starts[source]
+    return WindowedRuns(thin, source, row, paths)
