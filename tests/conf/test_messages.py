@@ -173,14 +173,6 @@ def test_tab_completes_options(brokk: Callable[..., Any], monkeypatch: pytest.Mo
     assert "mode=identify" in brokk("-sc", "query=bash").out
 
 
-def test_help_is_short_and_says_how_to_begin(brokk: Callable[..., Any]) -> None:
-    done = brokk("--help")
-    assert done.code == 0
-    for part in ("brokk mode=list", "brokk mode=doctor", "-m", "session.out"):
-        assert part in done.out
-    assert len(done.out.splitlines()) < 25
-
-
 def test_windows_is_refused_with_the_way_that_works(
     brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -77,19 +77,3 @@ def test_a_passage_that_is_not_there_once_is_an_error(place: Path, text: str) ->
     with pytest.raises(figures.FigureError):
         figures.write_page(claim.page, [claim])
     assert (place / "page.md").read_text() == text
-
-
-def test_a_value_that_the_file_lacks_is_an_error(place: Path) -> None:
-    (place / "page.md").write_text("A frame takes 62.5 ms of 60.")
-    (place / "benchmarks/speed.json").write_text("{}")
-    (claim,) = figures.read_claims()
-    assert "'ms'" in figures.find_drift(claim)
-
-
-def test_figures_of_a_macro_are_found_too() -> None:
-    claim = figures.Claim(
-        "page: macro", Path("page.md"), {}, "abc", "one", "run", (),
-        "{% macro row(x) %}| a | {{ x | short }} |{% endmacro %}\n{{ row(0.951) }}\n{{ row(-2) }}",
-    )  # fmt: skip
-    assert claim.render() == "| a | .95 |\n| a | -2.00 |"
-    assert claim.locate("x\n| a | .90 |\n| a | 1.00 |\ny") == (2, 26)

@@ -106,34 +106,6 @@ def test_a_planted_violation_is_found(
     assert len(rule({module: text})) == 1
 
 
-@pytest.mark.parametrize(
-    ("rule", "module", "text"),
-    [
-        (rules.floors, "tasks.terms", "from brokk_rl.sim import scene"),
-        (rules.floors, "diagnosis.answer", "from actuators.models.lag import Lag"),
-        (
-            rules.floors,
-            "brokk_rl.machine",
-            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from brokk_rl.sim import model",
-        ),
-        (rules.doors, "brokk_rl.sim.probe", "import mujoco"),
-        (rules.prints, "brokk_rl.modes.list", "print('hello')"),
-        (
-            rules.docstrings,
-            "brokk_rl.a",
-            '"""A."""\ndef _b(): pass\nclass C:\n    """C."""\n    def check(self): pass',
-        ),
-        (rules.units, "brokk_rl.a", "def f(num_envs, tilt_rad): pass"),
-        (rules.uncommented_numbers, "a.yaml", "a: 127.0.0.1\nb: 1  # m\nc:  # s\n  d: 2"),
-        (rules.uncommented_numbers, "a.yaml", "a: null\n# m; by hand\nb: [0.0, 1.0]"),
-    ],
-)
-def test_what_is_allowed_is_not_found(
-    rule: Callable[[Mapping[str, str]], list[str]], module: str, text: str
-) -> None:
-    assert rule({module: text}) == []
-
-
 def test_no_file_names_the_workplace_it_was_written_at() -> None:
     # put together here, so that this file does not name them either
     places = [

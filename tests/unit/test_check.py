@@ -257,13 +257,6 @@ def test_home_is_above_the_ground(tmp_path: Path) -> None:
     assert read(text, tmp_path).build().home == pytest.approx([-0.5, 0.1])
 
 
-def test_an_unknown_joint_is_answered_with_the_nearest(urdf: Path) -> None:
-    with pytest.raises(ConfigError, match="did you mean 'lift'"):
-        import_model(urdf, "arm", ModelChoices(chain=("left",)))
-    with pytest.raises(ConfigError, match="did you mean 'tool0'"):
-        import_model(urdf, "arm", ModelChoices(tip="tool"))
-
-
 def test_a_robot_in_a_scene_stands_at_the_origin(tmp_path: Path) -> None:
     turned = nest("a").replace('pos="0.5 0 0"', 'pos="3 4 0.2" euler="0 0 90"')
     machine = read(SCENE.format(turned, ""), tmp_path).build()
@@ -345,16 +338,6 @@ def test_a_check_makes_the_files_of_a_machine_that_other_modes_take(
     page = Path("made/check.html").read_text()
     for text in first["missing"]:
         assert text in done.out and re.split("['<]", text)[0] in page
-
-
-def test_the_shipped_machine_can_be_trained(brokk: Callable[..., Any]) -> None:
-    done = brokk("mode=check", "subject.num_starts=64", "session.out=run")
-    assert done.code == 0, done.err
-    found = json.loads(Path("run/check.json").read_text())
-    assert found["problems"] == found["unfit"] == []
-    assert 5.0 < found["reach"]["furthest_m"] < 5.25, "reach about 5.2 m"
-    assert 0.2 < found["starts"]["can be done"] < 0.4
-    assert found["contact"] == ["q4_link", "q5_link"]
 
 
 def test_drives_that_are_too_stiff_are_named_with_a_stiffness_that_is_not(machine: Machine) -> None:

@@ -52,10 +52,3 @@ def test_each_link_of_the_site_leads_to_a_file(site: Path) -> None:
             if not re.match(r"[a-z]+:", link) and not (page.parent / unquote(link)).exists():
                 missing.add((page.relative_to(site).as_posix(), link))
     assert missing == set()
-
-
-def test_each_config_group_has_its_page(site: Path) -> None:
-    effects = (site / "reference/options/effect.html").read_text()
-    assert "gap_rad" in effects and "taken up at reversals" in effects
-    for group in ("machine", "task", "actuator", "perception_ellipse"):
-        assert (site / f"reference/options/{group}.html").is_file()

@@ -62,10 +62,6 @@ def roll(model: Any, machine: Machine, u: torch.Tensor) -> torch.Tensor:
     return torch.stack(path)
 
 
-def test_it_holds_the_effects_on_actuation_and_sensing(machine: Machine) -> None:
-    assert list(option("effect", "library").effects) == EFFECTS
-
-
 @pytest.mark.parametrize(
     "name", [name for name in EFFECTS if name not in ("frame_loss", "delay_jitter", "sensor_noise")]
 )

@@ -392,22 +392,6 @@ def test_a_loop_behind_a_person_goes_on_exactly_when_restored(machine: Machine) 
     assert all(torch.equal(value, first[name]) for name, value in state_of(other).items())
 
 
-def test_another_episode_is_another_person_with_the_hands_off(machine: Machine) -> None:
-    loop = loop_with(machine, option("follower", "person"))
-    for _ in range(12):
-        loop.step(torch.ones(8, 5))
-    before = state_of(loop)
-    assert before["follower.hand"].any(1).all()
-    loop.episode_length_buf = torch.where(
-        torch.arange(8) < 2, loop.max_episode_length - 1, loop.episode_length_buf
-    )
-    loop.step(torch.ones(8, 5))
-    after = state_of(loop)
-    assert not after["follower.hand"][:2].any() and not after["follower.seen"][:2].any()
-    changed = after["follower.drawn.delay_s"] != before["follower.drawn.delay_s"]
-    assert changed[:, 0].tolist() == [True, True, *[False] * 6]
-
-
 def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_path: Path) -> None:
     task = replace(option("task", "borehole_insertion"), episode_s=6.0)
     plant = runs.plant(machine, task, follower=option("follower", "person"))

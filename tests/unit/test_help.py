@@ -11,7 +11,6 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from brokk_rl import registry
 from brokk_rl.help import MAIN_MODES, add_comments, collect_comments
 
 
@@ -59,17 +58,6 @@ def test_the_command_alone_says_how_to_begin_and_starts_nothing(
     for name in MAIN_MODES:
         assert f"brokk mode={name} " in done.out
     assert len(done.out.splitlines()) < 25
-
-
-def test_a_mode_that_is_not_there_is_explained(brokk: Callable[..., Any]) -> None:
-    done = brokk("mode=identfy", "--help")
-    assert done.code == 2 and "did you mean 'identify'?" in done.err
-
-
-def test_a_field_has_the_meaning_of_its_docstring() -> None:
-    meanings = registry.read_attributes("brokk_rl.session.Session")
-    assert meanings["out"] == "Run folder."
-    assert list(meanings) == ["out", "seed", "device"]
 
 
 def test_values_that_bear_the_name_of_a_group_are_values(brokk: Callable[..., Any]) -> None:

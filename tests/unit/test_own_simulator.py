@@ -178,18 +178,6 @@ def test_steps_and_a_planned_run_agree(arm: Path) -> None:
     assert np.sqrt(np.square(error).mean()) < 5 * NOISE_RAD
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        ({"source": "my_sim.py"}, "expected module:function"),
-        ({"source": "nowhere.xml"}, "there is no such file"),
-    ],
-)
-def test_a_simulator_that_cannot_be_is_refused(change: dict[str, str], text: str) -> None:
-    with pytest.raises(ConfigError, match=text):
-        replace(api._load_option("actuator", "own"), **change)
-
-
 def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: Path) -> None:
     simulator: Any = api._load_simulator(arm)
     with pytest.raises(ConfigError, match="no joint 'wrist'; it has shoulder, elbow"):
@@ -241,20 +229,6 @@ def test_a_simulator_that_no_name_leads_to_is_refused_with_what_to_write() -> No
 def test_a_diagnosis_of_no_recordings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="expected a recording or more"):
         api.diagnose(api.RecordingSet((), make_machine("hinge")), tmp_path, "servo")
-
-
-def test_what_cannot_be_asked_about_is_one_line(
-    pendulum: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level("INFO"):
-        effect_library.load_effects(make_machine("hinge"), None, api._load_simulator(pendulum))
-    (line,) = [one.getMessage() for one in caplog.records if "not asked about" in one.getMessage()]
-    assert (
-        "joint_friction, joint_damping, joint_armature, drive_gain, drive_limit (my_pendulum:step has "
-        "no" in line
-    )
-    assert "base_tilt, extrinsics, link_length (machine" in line
-    assert line.endswith("is known by its joints only)")
 
 
 def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:

@@ -496,23 +496,6 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(
             assert hole.in_view
 
 
-def test_the_conditions_of_the_benchmark_are_what_they_are_called(rig: StereoRig) -> None:
-    chance = np.random.default_rng(5)
-    scenes = {
-        name: [compose_scene(kind(name), rig, chance) for _ in range(4)]
-        for name in ("hidden", "decoy", "empty", "dark", "haze")
-    }
-    assert all(abs(scene.hidden[0] - 0.3) < 0.02 for scene in scenes["hidden"])
-    assert all(
-        scene.block and len(scene.block.discs) >= 1 and scene.hidden[0] == 0
-        for scene in scenes["decoy"]
-    )
-    assert all(not scene.hidden for scene in scenes["empty"])
-    assert {scene.block is None for scene in scenes["empty"]} == {True, False}
-    assert all(scene.conditions["light"] == pytest.approx(0.15) for scene in scenes["dark"])
-    assert all(scene.conditions["transmission"] == pytest.approx(0.25) for scene in scenes["haze"])
-
-
 def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: StereoRig) -> None:
     chance = np.random.default_rng(7)
     large = replace(rig, width=640, height=360, focal_px=352.0)

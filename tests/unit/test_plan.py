@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -356,11 +354,6 @@ def test_a_plan_fills_its_time_and_repeats_with_its_seed(
     ).any()
 
 
-def test_no_excitation_is_an_error(machine: Machine, approach: Approach) -> None:
-    with pytest.raises(ConfigError, match="none chosen"):
-        plan_runs({}, machine, approach, 1, 60.0, np.random.default_rng(0))
-
-
 def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach) -> None:
     u = np.zeros((600, 5))
     u[:, 2] = np.where(np.arange(600) < 500, 0.9, -0.2)
@@ -387,31 +380,3 @@ def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach
     later = plan_report.describe_run(PlanTrack(samples[playing[0] + 100 :]), 0, plan.runs[0], 0.05)
     assert later[0]["offset_s"] == 5.0 and later[0]["start_s"] == 0.0
     assert not any(sample.phase[0] == DONE for sample in samples)
-
-
-def test_summary_and_picture_of_a_plan(
-    machine: Machine, approach: Approach, tmp_path: Path
-) -> None:
-    first, second = (
-        constant({0: 0.5}, 4.0, machine.home),
-        constant({1: 0.2}, 100.0, anywhere(machine, 3), name="a_01"),
-    )
-    third = constant({}, 1.0, machine.home, name="a_02")
-    plan = ExcitationPlan(runs=((first, second, third),), run_s=60.0, names=("a",))
-    track = played(plan.runs, machine, approach, run_s=60.0)
-    found = plan_report.summarise_plan(plan, track, machine)
-    json.dumps(found, allow_nan=False)
-    one, two, three = found["runs"][0]
-    assert (
-        one["end_s"] - one["start_s"] == pytest.approx(4.0)
-        and one["cut_s"] == 0.0
-        and one["joints"]["q1"]["commanded"] == 1.0
-    )
-    # 4 s at half of 0.4 rad/s, less what the dead time leaves for later
-    assert one["joints"]["q1"]["travel_rad"] == pytest.approx(0.2 * (4.0 - 0.55), abs=0.02)
-    assert two["cut_s"] > 40.0 and three["start_s"] is None and three["cut_s"] == 1.0
-    assert found["run_time_unused_s"] == [0.0]
-    plan_report.draw_plan(
-        plan, track, machine, predict_tool_speed(machine, track.q[:, 0]), tmp_path / "plan.png"
-    )
-    assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")

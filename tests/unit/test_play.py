@@ -16,7 +16,6 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
-from brokk_rl.play.settings import PlaySettings
 from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import ClassicalPolicy
 
@@ -221,24 +220,6 @@ def test_a_dial_changes_how_the_machine_moves(made: Callable) -> None:
     assert abs(moved[1] / moved[0] - 1) > 0.2
 
 
-def test_what_there_is_not_is_refused_with_the_choices(made: Callable) -> None:
-    session = made()
-    with pytest.raises(ConfigError, match="choices: classical, person"):
-        session.choose_driver("robot")
-    with pytest.raises(ConfigError, match=r"did you mean 'backlash\.gap_rad'"):
-        session.turn_dial("backlash.gap", 1.0)
-    with pytest.raises(ConfigError, match="expected a world of 0 to 1, got 2"):
-        session.select_world(2)
-
-
-def test_the_observation_is_the_policys_own(made: Callable) -> None:
-    session = made()
-    session.select_world(1)
-    run(session, 5)
-    groups = session.loop.get_observations()
-    np.testing.assert_array_equal(session.read_observation(), groups["policy"][1].numpy())
-
-
 def test_a_gamepad_moves_the_levers(tmp_path: Path) -> None:
     events = [(0, 32767, 0x82, 3), (9, 16384, 0x02, 0), (12, -3000, 0x02, 1), (15, 1, 0x01, 4)]
     path = tmp_path / "js0"
@@ -252,16 +233,3 @@ def test_a_gamepad_moves_the_levers(tmp_path: Path) -> None:
     pad.close()
     with pytest.raises(ConfigError, match=r"play.gamepad=.*gone: No such file.*ls /dev/input"):
         Gamepad(tmp_path / "gone", "play.gamepad")
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("port", 80), ("worlds", 0), ("speed", 11.0), ("seed", -1), ("seconds", 0)]
-)
-def test_bad_settings_are_named(field: str, value: float) -> None:
-    good = {
-        "port": 8080, "worlds": 1, "speed": 1.0, "driver": "policy",
-        "neutral": True, "gamepad": None, "gamepad_axes": (0,), "seed": 0, "device": "cpu",
-        "seconds": None,
-    }  # fmt: skip
-    with pytest.raises(ConfigError, match=f"{field}: expected"):
-        PlaySettings(**good | {field: value})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from brokk_rl.progress import SHARE, ItemProgress, track_items
+from brokk_rl.progress import SHARE, ItemProgress
 
 
 @pytest.fixture
@@ -52,8 +52,3 @@ def test_resumed_work_has_the_speed_of_this_run_and_ends_at_the_total(clock: lis
     assert work.describe() == "80%, about 0 min left"
     work.reach(1.01, note="300 steps/s")
     assert work.describe() == "100%, 300 steps/s"
-
-
-def test_items_are_counted_as_they_are_used() -> None:
-    assert list(track_items(range(3), "files")) == [0, 1, 2]
-    assert list(track_items(iter("ab"), "letters", 2)) == ["a", "b"]

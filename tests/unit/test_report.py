@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -87,34 +86,6 @@ def test_a_page_needs_nothing_from_elsewhere() -> None:
     assert policies and "default-src 'none'" in str(policies[0])
 
 
-def test_a_picture_file_is_in_the_page_byte_by_byte(tmp_path: Path) -> None:
-    figure().savefig(tmp_path / "a.png")
-    page = Report("a")
-    page.add_picture(tmp_path / "a.png")
-    (source,) = (
-        attributes["src"] for tag, attributes in Reader(page.render()).tags if tag == "img"
-    )
-    assert source is not None
-    kind, data = source.split(",")
-    assert (
-        kind == "data:image/png;base64"
-        and base64.b64decode(data) == (tmp_path / "a.png").read_bytes()
-    )
-
-
-def test_columns_of_figures_are_aligned_and_the_best_is_marked() -> None:
-    page = Report("a")
-    page.add_table(
-        ["joint", "error", "why"],
-        [["q1", Cell(0.012345, best=True), "x"], ["q2", None, "y"], ["q3", "0.50", "z"]],
-    )
-    cells = [
-        attributes.get("class") for tag, attributes in Reader(page.render()).tags if tag == "td"
-    ]
-    assert cells == ["number best", None, "number", None, "number", None]
-    assert ">▸ 0.0123<" in page.render() and ">–<" in page.render()
-
-
 def test_rows_of_another_length_are_refused() -> None:
     with pytest.raises(ValueError, match="expected 2 cells"):
         Report("a").add_table(["a", "b"], [["only one"]])
@@ -129,10 +100,3 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> Non
     assert "new" in (tmp_path / "page.html").read_text() and [
         p.name for p in tmp_path.iterdir()
     ] == ["page.html"]
-
-
-def test_a_missing_picture_is_said(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="cannot read picture"):
-        Report("a").add_picture(tmp_path / "none.png")
-    with pytest.raises(StorageError, match="expected one of"):
-        Report("a").add_picture(tmp_path / "none.bmp")

@@ -182,11 +182,6 @@ def test_a_trained_policy_is_read_back_as_it_was_written(bundle: Bundle) -> None
         assert torch.equal(again.act(groups), NetworkPolicy(bundle.actor, bundle.loop).act(groups))
 
 
-def test_an_empty_folder_holds_no_policy(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"holds no policy \(policy\.json is missing\)"):
-        find_policy(str(tmp_path))
-
-
 def corrupt(path: Path, content: bytes) -> None:
     path.write_bytes(content)
 

@@ -322,12 +322,3 @@ def test_the_divergence_of_updates_falls_to_a_tenth_while_the_policy_settles() -
     assert runs.small(max_env_steps=100, settling=0.0).divergence(1.0) == 0.01
     with pytest.raises(ConfigError, match=r"settling: expected a number from 0 to 1"):
         runs.small(max_env_steps=100, settling=1.5)
-
-
-def test_observations_that_the_task_does_not_give_are_named(
-    machine: Machine, tmp_path: Path
-) -> None:
-    small = runs.small(max_env_steps=ITERATION)
-    runner = small.runner | {"obs_groups": {"actor": ["touch"], "critic": ["policy"]}}
-    with pytest.raises(ConfigError, match=r"obs_groups\.actor: the task gives no group touch"):
-        runs.make(machine, tmp_path, replace(small, runner=runner))

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import wandb
-from composed import option
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brokk_rl.errors import ConfigError
@@ -49,12 +48,6 @@ def test_a_run_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
     assert [(one.step, one.value) for one in events] == [
         (step, float(step >= 5)) for step in range(10)
     ]
-
-
-def test_wandb_is_offline_unless_asked() -> None:
-    assert option("tracking", "wandb").mode == "offline" and isinstance(
-        option("tracking", "none"), NoTracking
-    )
 
 
 @pytest.mark.slow

@@ -143,33 +143,6 @@ def test_every_answer_can_be_given_with_gloves(
         assert min(button.bounding_box()["width"], button.bounding_box()["height"]) >= 64
 
 
-def test_the_whole_questionnaire_by_click(
-    tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
-    given = dict(zip(tlx.SCALES, (0, 25, 45, 70, 95, 100), strict=True))
-    for screen, (scale, value) in enumerate(given.items()):
-        at(page, screen)
-        page.locator(f"#study [data-value='{value}']").click()
-        until(page, f"() => window.sitting().ratings.{scale} === {value}")
-        page.locator("#study .primary").click()
-    weights = dict.fromkeys(tlx.SCALES, 0)
-    for screen in range(6, 21):
-        at(page, screen)
-        button = page.locator("#study .pair button").nth(screen % 2)
-        weights[button.get_attribute("data-scale")] += 1
-        button.click()
-    at(page, 21)
-    assert page.locator("#study h1").inner_text() == "All questions are answered"
-    page.locator("#study .primary").click()
-    until(page, "() => window.sitting().kind === 'trial'")
-    found = answers(tmp_path)
-    assert found["ratings"] == given and found["finished"] and tlx.check(found) == []
-    assert tlx.compute_weighted_tlx(found) == pytest.approx(
-        sum(weights[scale] * given[scale] for scale in given) / 15
-    )
-
-
 def test_the_whole_questionnaire_by_key_in_german(
     tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
 ) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import every, option
+from composed import option
 
 from actuators.person import HumanFollower
 from brokk_rl.kinematics import compute_tool_kinematics
@@ -117,11 +117,6 @@ def test_the_follower_does_what_is_advised_and_without_advice_nothing(machine: M
         np.tile([0.5, 0.0, 0.0, 0.0, 0.0], (len(START), 1)),
     )
     assert moved[-1, :, 0] == pytest.approx(0.5, abs=0.15) and not moved[..., 1:].any()
-
-
-@every("operator")
-def test_every_operator_says_that_it_is_simulated_in_the_list(name: str) -> None:
-    assert "imulated" in (type(option("operator", name)).__doc__ or "")
 
 
 @pytest.mark.slow

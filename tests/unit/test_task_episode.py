@@ -86,13 +86,6 @@ def test_holes_lie_in_their_ranges_and_the_scene_holds_the_target(machine: Machi
     assert (start["target_pitch_rad"] == torch.tensor(torch.pi / 2)).all()
 
 
-def test_poses_have_many_pitches_and_no_block_near(machine: Machine) -> None:
-    start = option("task", "goal_pose").build(machine, 1, CPU).starts(256, 5)
-    pitch = start["target_pitch_rad"]
-    assert pitch.min() >= 0.6 and pitch.max() <= 2.0 and pitch.std() > 0.2
-    assert ((start["scene"][:, :2] - start["target_m"][:, :2]).norm(dim=1) > 15.0).all()
-
-
 @pytest.mark.parametrize(
     ("distance_m", "reason"),
     [
@@ -483,26 +476,6 @@ def test_penalties_grow_with_the_share_of_worlds_whose_last_episode_succeeded(
     assert stage.step().reward.tolist() == [1.0] * 4
     process.reset(done | ~done, stage.start)
     assert stage.step().reward.tolist() == [0.25] * 4, "and falls again where they fail"
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"memory": 14}, r"task\.memory: expected at most the 13 samples .* got 14"),
-        ({"figures": {}}, "figures.success_strict: expected"),
-    ],
-)
-def test_values_that_do_not_fit_are_refused(
-    change: dict[str, Any], told: str, machine: Machine
-) -> None:
-    with pytest.raises(ConfigError, match=told):
-        replace(option("task", "borehole_insertion"), **change).build(machine, 1, CPU)
-
-
-def test_a_hole_that_is_narrower_than_the_chisel_is_refused() -> None:
-    task = option("task", "borehole_insertion")
-    with pytest.raises(ConfigError, match=r"hole.radius_m: expected more than the chisel's 0.04 m"):
-        replace(task, hole=replace(task.hole, radius_m=0.03))
 
 
 def test_terms_of_ones_own_extend_what_the_critic_sees(machine: Machine) -> None:
