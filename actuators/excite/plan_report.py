@@ -10,8 +10,6 @@ from matplotlib.axes import Axes
 
 from actuators.excite.player import Sample
 from actuators.excite.schedule import ExcitationPlan
-from actuators.recordings.preview import PreviewResult
-from actuators.recordings.preview_report import draw_preview, measure_picture_height
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, RED, draw_grid, make_figure, save_figure
@@ -158,9 +156,8 @@ def draw_plan(
     machine: Machine,
     tool_speed_m_s: np.ndarray | None,
     path: Path,
-    preview: PreviewResult | None = None,
 ) -> None:
-    """Draw the first run as PNG: segments, commands, predicted positions, tool speed, and the preview.
+    """Draw the first run as PNG: segments, commands, predicted positions and tool speed.
 
     Args:
         plan: Gives names.
@@ -169,19 +166,12 @@ def draw_plan(
         tool_speed_m_s: Predicted speed of the tool point in this run, `(T,)`, where the geometry is
             known.
         path: Where to write.
-        preview: Effects that the plan could tell.
     """
     has_tool = tool_speed_m_s is not None
     rows = machine.num_joints + has_tool
-    heights = [STRIP_INCHES + INCHES_A_ROW * rows]
-    if preview:
-        heights.append(measure_picture_height(machine))
-    whole = make_figure(WIDTH_INCHES, sum(heights))
-    parts = whole.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
-    if preview:
-        draw_preview(parts[1], preview, machine)
+    whole = make_figure(WIDTH_INCHES, STRIP_INCHES + INCHES_A_ROW * rows)
     ratios = [0.55, *[1.0] * rows]
-    axes = parts[0].subplots(rows + 1, 1, sharex=True, height_ratios=ratios)
+    axes = whole.subplots(rows + 1, 1, sharex=True, height_ratios=ratios)
     minutes = track.t_s / 60.0
     for j, axis in enumerate(axes[1 : machine.num_joints + 1]):
         _draw_joint(axis, minutes, track.q[:, 0, j], track.u[:, 0, j], machine, j)
@@ -196,9 +186,9 @@ def draw_plan(
     title = f"{machine.name}: {', '.join(plan.names)}; {plan.run_s / 60.0:g} minutes"
     if len(plan.runs) > 1:
         title += f", the first of {len(plan.runs)} runs, each with draws of its own"
-    parts[0].suptitle(f"{title}. Predicted by a nominal machine.", x=0.01, ha="left", fontsize=12)
+    whole.suptitle(f"{title}. Predicted by a nominal machine.", x=0.01, ha="left", fontsize=12)
     handles, labels = axes[1].get_legend_handles_labels()
-    parts[0].legend(handles, labels, loc="outside lower left", ncols=12, frameon=False, fontsize=9)
+    whole.legend(handles, labels, loc="outside lower left", ncols=12, frameon=False, fontsize=9)
     save_figure(whole, path)
 
 

@@ -81,7 +81,7 @@ class Collect:
     preview: EffectPreview | None
 
     def run(self) -> None:
-        """Write `plan.png` and `plan.json`, both with the preview, and `recordings/<run>_<part>.parquet` into the run folder.
+        """Write `plan.png`, `plan.json` with the preview, and `recordings/<run>_<part>.parquet` into the run folder.
 
         Raises:
             ConfigError: the plan finds no room in a run.
@@ -128,7 +128,7 @@ class Collect:
         write_json(self.session.folder / "plan.json", summary | told)
         tool_speed_m_s = predict_tool_speed(machine, track.q[:, 0])
         path = self.session.folder / "plan.png"
-        plan_report.draw_plan(plan, track, machine, tool_speed_m_s, path, preview)
+        plan_report.draw_plan(plan, track, machine, tool_speed_m_s, path)
         if preview:
             preview_report.show_preview(preview, machine)
         unplayed = set()

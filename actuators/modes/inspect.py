@@ -26,7 +26,6 @@ from brokk_rl.commands import view_recordings
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.plot import make_figure
 from brokk_rl.progress import track_items
 from brokk_rl.record import Breach, Recording
 from brokk_rl.report import Report
@@ -349,9 +348,6 @@ class Inspect:
                 *preview_report.describe_pairs(preview), "Effects that nothing here tells apart."
             )
         page.add_list(preview_report.list_remarks(preview))
-        figure = make_figure(14.0, preview_report.measure_picture_height(self.machine))
-        preview_report.draw_preview(figure, preview, self.machine)
-        page.add_picture(figure, "smallest over typical size; green: told, red: not told")
 
 
 def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:

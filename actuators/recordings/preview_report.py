@@ -1,12 +1,9 @@
-"""Preview of a diagnosis in the terminal, in reports and in pictures."""
+"""Preview of a diagnosis in the terminal and in reports."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from actuators.recordings.preview import EffectLimit, EffectPreview, PreviewResult
 from brokk_rl.console_table import print_table, print_text
@@ -14,9 +11,6 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.record import Recording
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure, SubFigure
 
 log = logging.getLogger(__name__)
 
@@ -31,13 +25,6 @@ UNTOLD = {
     "frames": "the more often commands change, the smaller ones show",
 }
 """What is said of effects whose smallest size is not foretold."""
-COLOURS = ("#009e73", "#f0e442", "#d55e00")
-"""Told with ease, just told, not told: distinguishable by those who see no red or green (Okabe and
-Ito)."""
-LOWEST_RATIO, HIGHEST_RATIO = 0.1, 10.0
-"""Ends of the colours, smallest over typical size."""
-CELL_INCHES = 0.34
-"""Height of a row of the picture."""
 
 
 def run_preview(
@@ -122,43 +109,6 @@ def show_preview(result: PreviewResult, machine: Machine) -> None:
             print_table(head, rows, name)
     for remark in (EXPLANATION, *list_remarks(result)):
         print_text(remark)
-
-
-def measure_picture_height(machine: Machine) -> float:
-    """Return the height that the picture needs, inches."""
-    return 2.4 + CELL_INCHES * machine.num_joints
-
-
-def draw_preview(figure: Figure | SubFigure, result: PreviewResult, machine: Machine) -> None:
-    """Draw the smallest over the typical size of each effect on each joint."""
-    from matplotlib.colors import LinearSegmentedColormap, LogNorm
-
-    groups, names = _group_limits(result), machine.joint_names
-    ratios = np.full((machine.num_joints, len(groups)), np.inf)
-    for column, limits in enumerate(groups):
-        for one in limits:
-            if one.smallest is not None:
-                rows = [names.index(joint) for joint in one.joints]
-                ratios[rows, column] = one.smallest / one.typical
-    axis: Any = figure.subplots()
-    colours = LinearSegmentedColormap.from_list("told", COLOURS)
-    axis.imshow(
-        np.clip(ratios, LOWEST_RATIO, HIGHEST_RATIO),
-        norm=LogNorm(LOWEST_RATIO, HIGHEST_RATIO),
-        cmap=colours,
-        aspect="auto",
-    )
-    for (j, column), ratio in np.ndenumerate(ratios):
-        text = "–" if np.isinf(ratio) else f"{ratio:.2g}"
-        axis.text(column, j, text, ha="center", va="center", fontsize=8)
-    axis.set_yticks(range(len(names)), names)
-    labels = [_name_numbers(result)[one[0].effect, one[0].number] for one in groups]
-    axis.set_xticks(range(len(groups)), labels, rotation=60, ha="right", fontsize=8)
-    axis.set_title(
-        f"smallest size that {result.minutes:.1f} minutes of these motions would tell, over the typical one",
-        loc="left",
-        fontsize=10,
-    )
 
 
 def _group_limits(result: PreviewResult) -> list[list[EffectLimit]]:
