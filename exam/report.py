@@ -1,8 +1,8 @@
-"""The report of an exam: table of all candidates, confusion, reliability, detection."""
+"""The report of an exam: tables of all candidates, and the confusion of each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from brokk_rl.console_table import MISSING
-from brokk_rl.plot import BLUE, GREY, ORANGE, add_legend, make_figure, save_figure
+from brokk_rl.plot import make_figure, save_figure
 from brokk_rl.report import Cell, embed_picture, render_page, write_page
 from brokk_rl.session import write_text
 
@@ -42,14 +42,6 @@ ROWS = {
     "closed_missing": ("effects named without a share", False),
 }
 """Label of each metric, and whether more of it is better."""
-CAPTIONS = {
-    "confusion": "One effect: the truth (rows) and the first name of the answer (columns). "
-    "A name of its class counts as the true one.",
-    "reliability": "Share of true statements over their probability. Larger points are more "
-    "statements, bars are 95 % intervals.",
-    "size": "One effect: share of right names and of the verdict none, over its size (of typical) "
-    "and over its change of the motion.",
-}
 
 
 def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
@@ -105,22 +97,25 @@ def format_markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
 def write_report(
     folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Write `exam.html`, its table `exam.md`, and the pictures of each candidate.
-
-    The pictures are `confusion_<name>.png`, `reliability_<name>.png` and `size_<name>.png`.
-    """
+    """Write `exam.html`, its table `exam.md`, and `confusion_<name>.png` of each candidate."""
     cases = next(iter(tables.values()))["cases"]
     metrics = []
     for label, *cells in build_rows(tables):
         metrics.append((label, cells))
+    pictures = {}
+    for name, one in tables.items():
+        figure = draw_confusion(one)
+        if figure is not None:
+            path = folder / f"confusion_{name}.png"
+            save_figure(figure, path)
+            pictures[name] = embed_picture(path)
     values = {
         "title": f"Exam of {', '.join(tables)}",
         "exam": exam,
         "cases": _join_counts({kind: count for kind, count in cases.items() if count}),
         "tables": tables,
         "metrics": metrics,
-        "pictures": {name: _save_pictures(folder, name, one) for name, one in tables.items()},
-        "captions": CAPTIONS,
+        "pictures": pictures,
         "columns": COLUMNS,
         "join_counts": _join_counts,
     }
@@ -130,18 +125,6 @@ def write_report(
 
 def _join_counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
-
-
-def _save_pictures(folder: Path, name: str, table: Mapping[str, Any]) -> dict[str, str]:
-    """Write the pictures of a candidate, and return them as addresses that hold their data."""
-    found = {}
-    for stem, draw in DRAWINGS.items():
-        figure = draw(table)
-        if figure is not None:
-            path = folder / f"{stem}_{name}.png"
-            save_figure(figure, path)
-            found[stem] = embed_picture(path)
-    return found
 
 
 def draw_confusion(table: Mapping[str, Any]) -> Figure | None:
@@ -169,53 +152,3 @@ def draw_confusion(table: Mapping[str, Any]) -> Figure | None:
     axis.set_yticks(range(len(there)), there, fontsize=8)
     axis.set(xlabel="said", ylabel="there")
     return figure
-
-
-def _get_rates(metrics: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values, `(K,)`, and the lengths of their error bars, `(2, K)`."""
-    value = np.array([metric["value"] for metric in metrics])
-    low, high = np.array([metric["ci95"] for metric in metrics]).T
-    return value, np.maximum([value - low, high - value], 0)  # rounding may make them negative
-
-
-def draw_reliability(table: Mapping[str, Any]) -> Figure | None:
-    """Draw the rate of true statements over their probability."""
-    bins = table["reliability"]
-    if not bins:
-        return None
-    figure = make_figure(4.6, 4.2)
-    axis = figure.add_subplot()
-    axis.plot([0, 1], [0, 1], color=GREY, linewidth=1)
-    stated, (true, error) = [one["stated"] for one in bins], _get_rates(bins)
-    axis.errorbar(stated, true, error, fmt="none", ecolor=BLUE, linewidth=1)
-    axis.scatter(stated, true, s=[12 + 4 * one["of"] for one in bins], color=BLUE, zorder=3)
-    axis.set(xlabel="stated probability", ylabel="true", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    return figure
-
-
-def draw_detection(table: Mapping[str, Any]) -> Figure | None:
-    """Draw the detection curve over size and over the change of the motion."""
-    if not table["by_size"]:
-        return None
-    figure = make_figure(9.0, 3.4)
-    scales = (
-        ("by_size", "size, of typical", 1.0),
-        ("by_motion", "change of motion over 5 s, mrad", 1000.0),
-    )
-    curves = (("right", "rightly named", BLUE), ("none", "none", ORANGE))
-    for axis, (key, label, scale) in zip(figure.subplots(1, 2, sharey=True), scales, strict=True):
-        bins = table[key]
-        for name, words, colour in curves:
-            value, error = _get_rates([one[name] for one in bins])
-            axis.errorbar(range(len(bins)), value, error, color=colour, marker="o", label=words)
-        labels = []
-        for one in bins:
-            span = f"{one['from'] * scale:g} to {one['to'] * scale:g}"
-            labels.append(f"{span}\n({one['right']['of']})")
-        axis.set_xticks(range(len(bins)), labels, fontsize=7)
-        axis.set(xlabel=label, ylim=(-0.03, 1.03))
-    add_legend(figure, figure.axes[0])
-    return figure
-
-
-DRAWINGS = {"confusion": draw_confusion, "reliability": draw_reliability, "size": draw_detection}
