@@ -99,9 +99,6 @@ def write_report(
 ) -> None:
     """Write `exam.html`, its table `exam.md`, and `confusion_<name>.png` of each candidate."""
     cases = next(iter(tables.values()))["cases"]
-    metrics = []
-    for label, *cells in build_rows(tables):
-        metrics.append((label, cells))
     pictures = {}
     for name, one in tables.items():
         figure = draw_confusion(one)
@@ -114,7 +111,7 @@ def write_report(
         "exam": exam,
         "cases": _join_counts({kind: count for kind, count in cases.items() if count}),
         "tables": tables,
-        "metrics": metrics,
+        "metrics": [(label, cells) for label, *cells in build_rows(tables)],
         "pictures": pictures,
         "columns": COLUMNS,
         "join_counts": _join_counts,

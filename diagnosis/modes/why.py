@@ -156,7 +156,7 @@ class Why:
 
     def _examine(self) -> StoryStage:
         command = [
-            "mode=doctor_policy", f"doctor.log={_quote(self.log)}",
+            "mode=doctor_policy", f"doctor.log={json.dumps(self.log)}",
             f"policy={self.policy_path}", *self._choose_simulator(),
             f"doctor.sent={str(self.sent).lower()}",
         ]  # fmt: skip
@@ -166,7 +166,7 @@ class Why:
 
     def _diagnose(self) -> StoryStage:
         command = [
-            "mode=diagnose", f"diagnosis.field={_quote(self.log)}", *self._choose_simulator()
+            "mode=diagnose", f"diagnosis.field={json.dumps(self.log)}", *self._choose_simulator()
         ]  # fmt: skip
         if self.machine.interface != "speed":
             command.append(f"fit={FITS[self.machine.interface]}")
@@ -201,10 +201,3 @@ class Why:
 
 def _make_stage(title: str, command: list[str], takes: tuple[str, ...]) -> StoryStage:
     return StoryStage(title=title, command=tuple(command), takes=takes, links={}, needs=None)
-
-
-def _quote(patterns: str | tuple[str, ...]) -> str:
-    """Return globs as one value of the command; relative ones are seen from where it was typed."""
-    if isinstance(patterns, str):
-        return json.dumps(patterns)
-    return json.dumps(list(patterns))

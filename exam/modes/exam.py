@@ -284,7 +284,5 @@ class Exam:
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:
-    rows = []
-    for label, *cells in report.build_rows(tables):
-        rows.append([str(label), *map(report.format_cell, cells)])
+    rows = [list(map(report.format_cell, row)) for row in report.build_rows(tables)]
     print_table(["", *tables], rows)
