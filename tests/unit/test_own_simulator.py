@@ -257,7 +257,6 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
         own=api._load_option("actuator", "own"),
         sent=True,
         target_in_base_m=None,
-        resume=None,
     )
     parser = OverridesParser.create()
     for stage in (asked._examine(), asked._diagnose(), asked._evaluate("all", "[library]")):
