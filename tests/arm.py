@@ -7,7 +7,10 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 
+from brokk_rl.commands import read_targets
+from brokk_rl.history import History
 from brokk_rl.machine import Dimension, Joint, Machine
 from brokk_rl.record import Recording, make_motion
 
@@ -136,3 +139,17 @@ def limit_force(spec: Any) -> None:
     drive = spec.actuators[0]
     drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     drive.forcerange = np.array([-5.0, 5.0])
+
+
+def run_servo(model: Any, machine: Machine, u: np.ndarray) -> np.ndarray:
+    """Returns positions after each command `(T, J)`, from rest at the first one."""
+    start = torch.as_tensor(read_targets(u[0], machine), dtype=torch.float32)
+    rows = torch.as_tensor(u, dtype=torch.float32)
+    shape = (1, machine.num_history, 1)
+    history = History(q=start.repeat(*shape), u=rows[0].repeat(*shape))
+    found = []
+    for command in rows:
+        history.push_u(command[None])
+        history.push_q(model.step(history))
+        found.append(history.q[0, -1].numpy().copy())
+    return np.array(found)

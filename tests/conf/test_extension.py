@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from packages import install_package
 
-from brokk_rl import registry
 from brokk_rl.sweep import name_job
 
 PARTS = '''"""Parts of another package."""
@@ -98,20 +97,6 @@ def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
     return folder
 
 
-def test_its_options_show_in_the_list(mine: Path, brokk: Callable[..., Any]) -> None:
-    done = brokk("mode=list")
-    assert done.code == 0
-    for part in (
-        "sticky",
-        "An actuator that never moves.",
-        "wave",
-        "dowser",
-        "Finds nothing, ever.",
-        "(mine.conf)",
-    ):
-        assert part in done.out
-
-
 def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
     assert brokk("mode=show", "actuator=mine/sticky", "session.out=run").code == 0
     assert (tmp_path / "run" / "seen.json").read_text() == '["Sticky", "Wave", "Dowser"]'
@@ -144,10 +129,6 @@ def test_an_entry_point_without_its_package_is_named(mine: Path, brokk: Callable
     done = brokk("mode=list")
     assert done.code == 2
     assert "mine.missing" in done.err
-
-
-def test_nothing_is_ours_but_conf_without_extensions() -> None:
-    assert next(iter(registry.find_packages())) == registry.CORE
 
 
 def test_a_failed_run_says_so_in_its_record(

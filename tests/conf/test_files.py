@@ -115,11 +115,6 @@ def test_a_sweep_takes_files_beside_options(
             ("'_target_: os.system' is no actuator", "actuators.models.lag.FirstOrderLag"),
         ),
         (
-            "actuator",
-            "_target_: actuators.effects.speed.Backlash\ngap_rad: 0.1\n",
-            ("is no actuator",),
-        ),
-        (
             "effect",
             "backlash: {_target_: os.system}\n",
             ("'backlash._target_: os.system' is no effect",),
@@ -151,8 +146,6 @@ def test_a_sweep_takes_files_beside_options(
         ),
         ("experiment", "hydra: {sweep: {dir: /}}\n", ("Hydra's own settings",)),
         ("experiment", "defaults: [override /hydra/launcher: joblib]\n", ("Hydra's own settings",)),
-        ("actuator", "a: 1\nb: [2\nc: 3\n", ("line 3: no valid YAML",)),
-        ("actuator", "- a\n", ("expected a mapping",)),
         ("actuator", "", ("expected a mapping",)),
     ],
 )
@@ -166,13 +159,6 @@ def test_a_file_that_does_more_than_name_values_is_refused(
     for part in told:
         assert part in done.err
     assert [path.name for path in tmp_path.iterdir()] == ["given.yaml"]
-
-
-def test_a_missing_file_is_named(brokk: Callable[..., Any], tmp_path: Path) -> None:
-    done = brokk("mode=train", "actuator=@lag.yaml")
-    assert done.code == 2
-    assert f"actuator=@lag.yaml: there is no such file (seen from {tmp_path})" in done.err
-    assert "cannot be read as text" in brokk("mode=train", "actuator=@.").err
 
 
 def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Callable[..., Any]) -> None:

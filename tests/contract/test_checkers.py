@@ -16,7 +16,6 @@ from composed import option
 from brokk_rl.checks import check_actuator, check_excitation, check_finder, check_link, check_task
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.contracts.vision import FrameDetections, HolePose
-from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
@@ -241,8 +240,3 @@ def test_a_broken_excitation_is_found(
     )
     with pytest.raises(AssertionError, match=message):
         check_excitation(broken, machine)
-
-
-def test_the_truth_needs_a_unit_axis() -> None:
-    with pytest.raises(ConfigError, match="unit vector"):
-        replace(option("perception", "truth"), axis_in_base=(0.0, 0.0, 2.0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -138,21 +137,6 @@ def test_evaluating_the_policy_again_gives_the_same_figures(run: Path) -> None:
     assert found["policies"] == {name: first[name] for name in ("trained", "classical")}
 
 
-def test_a_policy_alone_can_be_evaluated_on_any_task(run: Path) -> None:
-    out = "session.out=poses"
-    command(
-        run.parent,
-        "mode=evaluate",
-        "task=goal_pose",
-        "policy=classical",
-        out,
-        "actuator=lag",
-        "session.device=cpu",
-        *FEW,
-    )
-    check_evaluation(read(run.parent / "poses" / "evaluation.json"), "classical", 8)
-
-
 def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
     command(run.parent, "mode=export", f"policy={run}", "session.out=export")
     made = run.parent / "export"
@@ -162,17 +146,6 @@ def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
     assert (made / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
     assert read(made / "policy.json")["observation"] == read(run / "policy.json")["observation"]
     assert read(made / "policy.json")["parity"]["largest_difference"] < 1e-3
-
-
-def test_goal_pose_trains_and_exports_with_the_pitch_in_the_vector(run: Path) -> None:
-    command(run.parent, "mode=train", "task=goal_pose", "session.out=goal", *SMALL, *FEW)
-    contract = read(run.parent / "goal" / "policy.json")
-    assert (
-        contract["observation"]["size"] == 134
-        and contract["observation"]["order"][-1] == "pitch_rad (1)"
-    )
-    graph = onnx.load(run.parent / "goal" / "policy.onnx").graph
-    assert graph.input[0].type.tensor_type.shape.dim[1].dim_value == 134
 
 
 def test_bench_measures_physics_control_step_and_training(run: Path) -> None:
@@ -202,18 +175,3 @@ def test_bench_measures_physics_control_step_and_training(run: Path) -> None:
         found["physics_env_steps_per_s"] > found["env_steps_per_s"] > found["train_env_steps_per_s"]
     )
     assert found["batch_env_steps_per_s"] > 0
-
-
-def test_a_policy_of_another_task_is_refused_by_message(
-    run: Path, brokk: Callable[..., Any]
-) -> None:
-    done = brokk(
-        "mode=evaluate",
-        "task=goal_pose",
-        f"policy={run}",
-        "actuator=lag",
-        "session.out=wrong",
-        "session.device=cpu",
-        *FEW,
-    )
-    assert done.code == 2 and "task=" in done.err and not Path("wrong").exists()

@@ -13,7 +13,7 @@ from composed import option
 
 from actuators.models.hydraulic import Hydraulic
 from actuators.models.lag import FirstOrderLag
-from actuators.models.parameters import expand_per_joint, open_valve, select_commands_in_force
+from actuators.models.parameters import open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import GRAVITY_M_S2, Gravity
 from brokk_rl.history import History
@@ -310,21 +310,6 @@ def test_spread_draws_within_its_width_anew_at_each_reset(machine: Machine) -> N
     again = model.state["drawn_gain"]
     assert (again[2000:] == drawn[2000:]).all()
     assert (again[:2000] != drawn[:2000]).float().mean() > 0.99
-
-
-def test_an_unknown_spread_lists_the_choices(machine: Machine) -> None:
-    with pytest.raises(ConfigError, match=r"actuator\.spread: 'speed' is no parameter; .*gain"):
-        lag(spread={"speed": 0.1}).build(machine, 1, CPU)
-
-
-def test_a_table_by_joint_needs_every_joint_or_other(machine: Machine) -> None:
-    assert expand_per_joint({"q2": 2, "other": 1}, machine, "x").tolist() == [1, 2, 1, 1, 1]
-    # A table for several machines.
-    assert expand_per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [1, 1, 1, 1, 1]
-    with pytest.raises(ConfigError, match="x: no value for q1, q3, q4, q5"):
-        expand_per_joint({"q2": 2.0}, machine, "x")
-    with pytest.raises(ConfigError, match="x: 'q6' is no joint"):
-        expand_per_joint({"q6": 2.0}, machine, "x")
 
 
 @pytest.mark.parametrize(

@@ -213,17 +213,3 @@ def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine
     save_file(tensors, path, metadata=header)
     with pytest.raises(CheckpointError, match="do not fit the network"):
         load_networks(str(path), "mlp", machine)
-
-
-def test_weights_of_others_are_refused(tmp_path: Path, machine: Machine) -> None:
-    save_file({"a": torch.zeros(1)}, tmp_path / "a.safetensors")
-    with pytest.raises(CheckpointError, match="not an actuator of ours"):
-        load_networks(str(tmp_path / "a.safetensors"), "mlp", machine)
-
-
-def test_another_kind_of_actuator_is_refused(tmp_path: Path, machine: Machine) -> None:
-    checkpoint.write_checkpoint(
-        tmp_path / "a.safetensors", "arx", machine, {"weight": torch.zeros(5, 38)}, {}
-    )
-    with pytest.raises(CheckpointError, match="holds a 'arx' of schema 1, expected a 'mlp'"):
-        load_networks(str(tmp_path / "a.safetensors"), "mlp", machine)

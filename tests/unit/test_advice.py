@@ -14,7 +14,6 @@ from hydra.utils import instantiate
 
 from actuators.person import HumanFollower
 from brokk_rl.checks import check_task
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.observation import ObservationEncoder, list_pose_parts
 from brokk_rl.rl.loop import ControlLoop
@@ -200,10 +199,3 @@ def test_a_contract_says_what_the_policy_knows_of_the_person(machine: Machine) -
         and told["advice"]["joints_at_once"] == (2, 4)
     )
     assert "advice" not in option("task", "borehole_insertion").build(machine, 1, CPU).describe()
-
-
-def test_a_delay_below_zero_is_refused() -> None:
-    with pytest.raises(
-        ConfigError, match=r"delay_s: expected a finite number of 0 or more.* got -0\.1"
-    ):
-        advice(delay_s=-0.1)

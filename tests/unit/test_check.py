@@ -22,7 +22,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.modes.check import check_machine
 from brokk_rl.sim.arm_model import ModelChoices
 from brokk_rl.sim.machine_trial import try_machine
-from brokk_rl.sim.model import ASSETS, compile_model
+from brokk_rl.sim.model import ASSETS
 from brokk_rl.sim.model_import import ImportedMachine, import_model
 from brokk_rl.sim.scene import make_empty_scenes
 
@@ -365,31 +365,3 @@ def test_a_machine_that_is_known_by_its_joints_only_is_no_error() -> None:
     found = check_machine(option("machine", "mini_excavator"), 10, np.random.default_rng(0))
     assert found.problems == [] and found.reach == {}
     assert any("recorded and identified" in text for text in found.missing)
-
-
-def test_a_joint_without_travel_is_a_problem(machine: Machine) -> None:
-    first = machine.joints[0]
-    stuck = dataclasses.replace(
-        first,
-        lower=dataclasses.replace(first.lower, value=0.0),
-        upper=dataclasses.replace(first.upper, value=0.0),
-        home=0.0,
-    )
-    broken = dataclasses.replace(machine, joints=(stuck, *machine.joints[1:]))
-    found = check_machine(broken, 10, np.random.default_rng(0))
-    assert any("upper must be above lower" in text for text in found.problems)
-
-
-def test_an_import_is_compiled_with_its_meshes(tmp_path: Path) -> None:
-    file = tmp_path / "ball.stl"
-    trimesh.creation.icosphere(1, 0.1).export(file)
-    mesh = '<asset><mesh name="m" file="ball.stl"/></asset>'
-    text = SCENE.format(nest("a", inside='<geom type="mesh" mesh="m" pos="1 0 0"/>'), mesh)
-    found = read(text, tmp_path)
-    (tmp_path / "model.xml").write_text(found.mjcf)
-    for name, data in found.meshes.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(data)
-    machine = dataclasses.replace(found.build(), mjcf=str(tmp_path / "model.xml"))
-    assert compile_model(machine, 0.01, visual=True).nmesh == 1
-    assert compile_model(machine, 0.01).nmesh == 0

@@ -15,7 +15,6 @@ from scipy import stats
 
 from brokk_rl.comparison import (
     average_seeds,
-    describe_differences,
     find_differences,
     find_runs,
     list_figures,
@@ -97,26 +96,6 @@ def test_a_task_without_the_figures_of_an_insertion_has_its_own(tmp_path: Path) 
     assert list_figures(tabulate_runs([load_run(folder)], [])) == ["success_strict", "height_m"]
 
 
-def test_runs_are_found_in_their_order_below_a_sweep(sweep: Path) -> None:
-    (sweep / "1_ideal").rename(sweep / "10_ideal")
-    assert [path.name for path in find_runs([str(sweep)])] == [
-        "0_ideal",
-        "2_mlp",
-        "3_mlp",
-        "10_ideal",
-    ]
-    assert [path.name for path in find_runs([str(sweep / "*_mlp"), str(sweep / "2_mlp")])] == [
-        "2_mlp",
-        "3_mlp",
-    ]
-
-
-def test_only_what_differs_is_a_column_and_seeds_are_not(sweep: Path) -> None:
-    assert find_differences([load_run(folder) for folder in find_runs([str(sweep)])]) == [
-        "actuator"
-    ]
-
-
 def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
     ideal, mlp = average(*find_runs([str(sweep)]), columns=["actuator"])
     assert (ideal["actuator"], ideal["seeds"]) == ("ideal", [0, 1])
@@ -149,15 +128,6 @@ def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
     rows = average(tmp_path / "run")
     assert [row["policy"] for row in rows] == ["trained", "classical"]
     assert np.isnan(rows[0]["success_paper"])
-
-
-def test_a_broken_evaluation_is_named(sweep: Path) -> None:
-    (sweep / "0_ideal" / "evaluation.json").write_text("{}")
-    with pytest.raises(ConfigError, match=r"0_ideal.*episodes"):
-        tabulate_runs([load_run(sweep / "0_ideal")], [])
-    (sweep / "0_ideal" / "evaluation.json").write_text("{")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_run(sweep / "0_ideal")
 
 
 def test_the_command_writes_table_csv_and_picture(
@@ -193,20 +163,6 @@ def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path)
     assert (ideal["success_strict"], mlp["success_strict"]) == (0.5, 0.7)
 
 
-def test_a_sweep_over_a_whole_node_is_told_apart_by_its_values(tmp_path: Path) -> None:
-    for index, weight in enumerate((0.5, 0.0)):
-        write_run(tmp_path / str(index), "mlp", 0, 0.9)
-        record = json.loads((tmp_path / str(index) / "session.json").read_text())
-        record["overrides"] = [f"task.reward={{progress:{{weight:{weight}}}}}"]
-        (tmp_path / str(index) / "session.json").write_text(json.dumps(record))
-        (tmp_path / str(index) / "resolved.yaml").write_text(
-            f"task: {{reward: {{progress: {{weight: {weight}}}}}}}\n"
-        )
-    assert find_differences([load_run(folder) for folder in find_runs([str(tmp_path)])]) == [
-        "task.reward.progress.weight"
-    ]
-
-
 def test_learning_curves_are_thinned_and_say_when_success_was_reached(
     sweep: Path, brokk: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -219,16 +175,6 @@ def test_learning_curves_are_thinned_and_say_when_success_was_reached(
     rows = list(csv.DictReader((tmp_path / "compared" / "learning.csv").read_text().splitlines()))
     assert [float(row["seconds"]) for row in rows[:3]] == [1.0, 5.0, 9.0]
     assert (tmp_path / "compared" / "learning.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_a_row_says_only_what_most_others_do_not_share() -> None:
-    rows = [
-        {"task.noise.a": 1, "rl.a": 2},
-        {"task.noise.a": 1, "rl.a": 3},
-        {"task.noise.a": 4, "rl.a": 2},
-    ]
-    assert describe_differences(pd.DataFrame(rows)) == ["", "rl.a 3", "task.noise.a 4"]
-    assert describe_differences(pd.DataFrame({"task.memory": [13, 1]})) == ["memory 13", "memory 1"]
 
 
 def test_the_interquartile_mean_drops_the_outer_quarters() -> None:

@@ -59,13 +59,6 @@ def test_commands_are_full_at_the_stated_values_whichever_side_they_lie_on() -> 
     )
 
 
-def test_a_neutral_outside_the_full_commands_is_refused() -> None:
-    with pytest.raises(
-        ConfigError, match="neutral 4 must lie between full_plus 10 and full_minus 5"
-    ):
-        CommandColumn(column="c", neutral=4.0, full_plus=10.0, full_minus=5.0)
-
-
 def test_positions_are_interpolated_and_commands_held(
     tmp_path: Path, excavator: Machine, reader: ColumnMap
 ) -> None:
@@ -156,27 +149,6 @@ def test_a_bad_log_is_refused_by_name(
         reader.read(logged(tmp_path, rows), excavator)
 
 
-def test_a_missing_column_is_refused_with_the_nearest_name(
-    tmp_path: Path, excavator: Machine, reader: ColumnMap
-) -> None:
-    path = logged(tmp_path, lines(), HEADER.replace("Stick Ms", "Stick Mes"))
-    with pytest.raises(
-        RecordingError,
-        match=r"dig\.csv: column 'Stick Ms' is missing or holds no numbers; did you mean 'Stick Mes'\?",
-    ):
-        reader.read(path, excavator)
-
-
-def test_two_columns_of_one_name_are_refused(
-    tmp_path: Path, excavator: Machine, reader: ColumnMap
-) -> None:
-    path = logged(tmp_path, [f"{line},1.0" for line in lines()], HEADER + ",Boom Ms")
-    with pytest.raises(
-        RecordingError, match=r"dig\.csv: several columns are named 'Boom Ms'.*Boom Ms#1"
-    ):
-        reader.read(path, excavator)
-
-
 def test_a_log_with_decimal_commas_and_windows_line_ends_is_read(
     tmp_path: Path, excavator: Machine, reader: ColumnMap
 ) -> None:
@@ -189,12 +161,6 @@ def test_a_log_with_decimal_commas_and_windows_line_ends_is_read(
     (recording,) = replace(reader, delimiter=";", decimal=",").read(tmp_path / "dig.csv", excavator)
     np.testing.assert_array_equal(recording.q, expected.q)
     np.testing.assert_array_equal(recording.u, expected.u)
-
-
-def test_what_is_no_text_is_refused(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
-    (tmp_path / "dig.csv").write_bytes(b"\xff\xfe\x00\x81" * 40)
-    with pytest.raises(RecordingError, match=r"dig\.csv: (0 rows of data|no column of numbers)"):
-        reader.read(tmp_path / "dig.csv", excavator)
 
 
 def test_a_map_of_another_machine_is_refused(
@@ -252,15 +218,6 @@ def test_one_bad_log_leaves_no_recording_of_the_others(brokk: Callable[..., Done
     assert done.code == 2
     assert "b.csv: line 9 (row 7), column 'Boom Cmd': 'off' is not a number" in done.err
     assert not list(Path().rglob("*.parquet"))
-
-
-def test_a_map_and_a_machine_that_do_not_belong_together_are_said(
-    brokk: Callable[..., Done],
-) -> None:
-    logged(Path(), lines())
-    done = brokk("mode=convert", "machine=mini_excavator", "convert.input=*.csv")
-    assert done.code == 2
-    assert "choose machine=… and import=… that belong together" in done.err
 
 
 def test_two_logs_of_one_name_are_refused(brokk: Callable[..., Done]) -> None:

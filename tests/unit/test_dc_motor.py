@@ -12,8 +12,6 @@ import pytest
 import torch
 from composed import option
 
-from brokk_rl.errors import ConfigError
-
 CPU = torch.device("cpu")
 SUPPLY_V, OHM, CONSTANT, GEAR, ROTOR = 12.0, 2.0, 0.02, 100.0, 2e-6
 """A motor of 12 V that stalls at 12 Nm behind its gear, and turns at 6 rad/s without a load."""
@@ -78,8 +76,3 @@ def test_a_supply_sags_under_a_motor_that_stalls() -> None:
     assert float(full) == pytest.approx(0.8 * STALL_NM)
     free = model.motor.compute_stall(torch.ones(1, 1), torch.full((1, 1), NO_LOAD))
     assert float(free) == pytest.approx(STALL_NM), "without a current nothing sags"
-
-
-def test_a_motor_refuses_numbers_that_make_no_sense() -> None:
-    with pytest.raises(ConfigError, match=r"no_load_m_s: expected > 0"):
-        build(no_load_m_s=0.0)

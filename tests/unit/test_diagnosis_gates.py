@@ -14,8 +14,8 @@ from gaps import reach, recording
 from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
-from diagnosis import effect_library, gates, report_checks, verdict
-from diagnosis.answer import Answer, Ranked, Selected, Where
+from diagnosis import effect_library, gates, verdict
+from diagnosis.answer import Answer, Ranked, Where
 from diagnosis.closure import Estimate, Gap, Gate, RivalError, read_rivals
 from diagnosis.gap import GapClosure
 from diagnosis.motion_floor import LeftOutErrors
@@ -346,23 +346,6 @@ def test_a_size_at_its_bound_is_marked(machine: Machine) -> None:
     assert {joint: one.at_bound for joint, one in found.items()} == {
         "q1": False, "q2": True, "q3": True
     }  # fmt: skip
-
-
-def test_the_report_says_bounds_edits_and_gates_in_words() -> None:
-    one = Selected(
-        effect="dead_band", joints=("q3",), probability=0.9, gap_closed=None, identified=False,
-        parameters={"extend": {"q3": Estimate(0.3, (0.2, 0.4), at_bound=True), "q4": Estimate(0.1, (0.0, 0.2))}},
-        edit={"restored": 0.21},
-    )  # fmt: skip
-    assert "extend q3 of dead band" in report_checks.describe_bounds(one)
-    assert "q4" not in report_checks.describe_bounds(one)
-    assert "21 % of this effect's part" in report_checks.describe_edit(one)
-    assert report_checks.describe_edit(replace(one, identified=True)) == ""
-    assert report_checks.describe_edit(replace(one, identified=None)) == ""
-    lines = report_checks.list_failed_gates(
-        [Gate("near_floor", False, 2.5, 1.75, "too far"), Gate("limits", True, 0.0, 0.05, "sound")]
-    )
-    assert lines == ["failed: near_floor (2.5, limit 1.75): too far"]
 
 
 def test_gates_and_rivals_are_written_as_the_format_says() -> None:

@@ -16,7 +16,6 @@ from composed import option
 from pendulum import run_drive
 
 from actuators.models.friction import LOADS, compute_dry_friction
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from diagnosis import api
 
@@ -125,11 +124,6 @@ def test_a_fit_recovers_the_whole_of_m5(arm: Machine, tmp_path: Path) -> None:
     fitted = option("fit", "force").fit(arm, logs, [], tmp_path, 0, CPU)
     for name, value in TRUE.items():
         assert getattr(fitted, name)["arm"] == pytest.approx(value, rel=0.05), name
-
-
-def test_a_fit_refuses_terms_that_it_does_not_know() -> None:
-    with pytest.raises(ConfigError, match=r"'stribek' is no term.*stribeck"):
-        replace(option("fit", "force"), terms=("stribek",))
 
 
 def test_effects_of_friction_are_numbers_of_the_drive(arm: Machine) -> None:

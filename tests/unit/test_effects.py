@@ -343,16 +343,6 @@ def test_a_number_is_found_by_gradient_over_several_runs(machine: Machine) -> No
         torch.testing.assert_close(guess.detach(), torch.full((1, 5), value), rtol=0.1, atol=0)
 
 
-def test_a_replaced_parameter_is_not_drawn_again(machine: Machine) -> None:
-    model = effect("flow_gain", gain=[0.5, 0.9]).wrap(
-        shipped("actuator", "ideal").build(machine, 2, CPU), machine, 2, CPU
-    )
-    model.parameters["gain"] = torch.full((2, 5), 1.5)
-    model.reset(torch.ones(2, dtype=torch.bool))
-    path = roll(model, machine, torch.ones(1, 2, 5))
-    torch.testing.assert_close((path[1] - path[0])[:, 0], torch.full((2,), 1.5 * 0.4 * 0.05))
-
-
 def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:
     inner = shipped("actuator", "ideal").build
     band, cut = effect("dead_band", extend=0.2, retract=0.2), effect("saturation", level=0.6)

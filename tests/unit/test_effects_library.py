@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
 import torch
 from composed import option
-from omegaconf import OmegaConf
 
 from actuators.effects.composition import Library
 from actuators.identify import dead_time
@@ -18,7 +16,6 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.effect_library import load_effects
 
 CPU = torch.device("cpu")
 EFFECTS = """
@@ -150,17 +147,6 @@ def test_a_run_goes_on_exactly_from_its_state(machine: Machine) -> None:
     assert torch.equal(roll(other, machine, u), on) and torch.equal(other.measure(u[0]), seen)
 
 
-def test_chances_of_one_effect_are_not_those_of_another(machine: Machine) -> None:
-    specs = [fixed("frame_loss", probability=0.5), fixed("delay_jitter", jitter_s=0.05)]
-    model = library(1.0, *specs).wrap(
-        option("actuator", "ideal").build(machine, 3000, CPU), machine, 3000, CPU
-    )
-    roll(model, machine, torch.ones(1, 3000, 5))
-    lost = (model.state["frame_loss.sent"][:, -1, 0] == 0).float()
-    pair = torch.stack((lost, model.state["delay_jitter.delay"][:, 0]))
-    assert lost.mean().item() > 0.4 and torch.corrcoef(pair)[0, 1].abs() < 0.06
-
-
 def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: Machine) -> None:
     """Both would break the trace; a CUDA graph can hold what is left."""
     u = commands(machine, 20, 4)
@@ -233,24 +219,3 @@ def test_what_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -
         changes = {"effects": {name: option("effect", name) for name in names}, "share": 0.1}
     with pytest.raises(ConfigError, match=message):
         replace(option("effect", "library"), **changes)
-
-
-def test_wide_machines_differ_as_those_of_the_library_and_more() -> None:
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        words = ["mode=train", "session.out=unused", "effect=[library,wide]"]
-        effects = OmegaConf.to_container(hydra.compose("config", overrides=words).effect)
-    library, wide = effects["library"], effects["wide"]
-    assert wide["effects"].keys() == library["effects"].keys()
-    for name, effect in library["effects"].items():
-        for key, value in effect.items():
-            other = wide["effects"][name][key]
-            if isinstance(value, list):
-                assert other[0] <= value[0] <= value[1] <= other[1], (name, key)
-            else:
-                assert other == value, (name, key)
-
-
-def test_the_diagnosis_knows_single_effects_beside_options_that_hold_many() -> None:
-    names = [kind.name for kind in load_effects(option("machine", "brokk170"))]
-    assert "backlash" in names
-    assert not {"library", "wide"} & set(names)

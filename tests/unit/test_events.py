@@ -184,17 +184,3 @@ def test_what_cannot_be_varied_is_refused_by_name(machine: Machine) -> None:
     twice = {"mass": event("mass"), "heavy": event("mass")}
     with pytest.raises(ConfigError, match="two of mass, heavy change mass"):
         build_varied_world(NATIVE, twice, machine, CPU, 1)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"factor": (0.0, 1.0)}, "factor"),
-        ({"factor": (1.2, 0.8)}, "factor"),
-        ({"when": "sometimes"}, "when"),
-        ({"when": "interval", "interval_s": None}, "interval_s"),
-    ],
-)
-def test_numbers_that_make_no_sense_are_refused(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        event("mass", **changes)

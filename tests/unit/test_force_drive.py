@@ -165,8 +165,3 @@ def test_a_force_is_averaged_over_a_period() -> None:
     np.testing.assert_allclose(
         signal.average(np.array([0.0, 0.005, 0.01]), 0.005), [2.0, 7.0, 12.0]
     )
-
-
-def test_a_force_drive_refuses_other_machines(machine: Machine) -> None:
-    with pytest.raises(ConfigError, match="is commanded by speed"):
-        option("actuator", "force").build(machine, 1, CPU)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -256,14 +256,3 @@ def test_a_model_that_stands_still_is_no_good_news(
         "num_history of machine 'brokk170' to 19 or more",
     ):
         assert any(part in text for text in texts)
-
-
-def test_what_makes_no_sense_is_refused_by_name(brokk: Callable[..., Any]) -> None:
-    for override, message in (
-        ("identify.folds=1", "folds: expected a whole number of 2 or more"),
-        ("identify.hold_out=2", "hold_out: expected a whole number of 3 or more"),
-        ("identify.stride_s=0", "stride_s: expected a finite number above 0"),
-        ("~fit@baselines.arx", "baselines: arx must be among them"),
-    ):
-        done = brokk("mode=identify", "identify.recordings=none/*", override)
-        assert done.code == 2 and message in done.err

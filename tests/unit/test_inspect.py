@@ -259,9 +259,3 @@ def test_parts_of_a_run_that_overlap_in_time_are_told(
     assert (
         "run sound: a_1.parquet begins 5.0 s before a_0.parquet ends; look at the clock" in done.out
     )
-
-
-def test_inspecting_nothing_is_an_error(brokk: Callable[..., object]) -> None:
-    done = brokk("mode=inspect", "inspect.recordings=nothing/*.parquet")
-    assert done.code == 2
-    assert "no recording matches nothing/*.parquet" in done.err

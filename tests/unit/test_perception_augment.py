@@ -15,7 +15,6 @@ import yaml
 from hydra.utils import instantiate
 
 import conf
-from brokk_rl.errors import ConfigError
 from perception.train import augmentation, evaluation
 from perception.train.samples import Crop, Samples, TrainingViews, cut_windows
 
@@ -192,11 +191,3 @@ def test_a_crop_is_the_part_that_opencv_cuts_out() -> None:
         1.5 * np.cos(np.arctan2(matrix[1, 0], matrix[0, 0])), rel=1e-4
     )
     assert np.abs(seen - theirs).max() < 0.03
-
-
-@pytest.mark.parametrize(
-    "bad", [{"probability": 1.5}, {"sigma_px": (2.0, 1.0)}, {"sigma_px": (-1.0, 1.0)}]
-)
-def test_ranges_that_make_no_sense_are_refused(bad: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="Blur"):
-        replace(SHIPPED["blur"], **bad)

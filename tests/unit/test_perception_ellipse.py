@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 from drawn_ellipses import count_matches, draw_negative, draw_occluded, draw_pattern, overlap
 
 from brokk_rl.contracts.vision import Ellipse
-from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_part
 from perception.contracts import SizePrior
 from perception.ellipse import conic
@@ -160,11 +157,6 @@ def test_only_the_region_is_looked_at(detector) -> None:
     roi[:, 120:] = True
     assert [round(one.x) for one in detector.detect(picture, roi, None)] == [180]
     assert detector.detect(picture, np.zeros(picture.shape, bool), None) == []
-
-
-def test_absurd_settings_are_refused() -> None:
-    with pytest.raises(ConfigError, match="coverage"):
-        replace(load_part("ellipse"), coverage=0.0)
 
 
 def row(one: Ellipse) -> np.ndarray:

@@ -50,14 +50,6 @@ def test_without_a_block_nothing_is_looked_at_and_it_is_said() -> None:
     assert not found.holes and found.rejected[0].stage == "segment"
 
 
-def test_a_flat_disc_is_refused_in_words() -> None:
-    frame, masks, _ = drawn(depth_m=0.0)
-    finder = finder_with(masks)
-    found = finder.find(frame)
-    assert not found.holes
-    assert any("flat dark disc" in finder.explain(one) for one in found.rejected)
-
-
 @pytest.mark.parametrize("factor", [0.5, 2.0, 10.0])
 def test_depth_of_a_wrong_scale_is_named_by_its_factor(factor: float) -> None:
     frame, masks, _ = drawn()

@@ -14,11 +14,10 @@ import pytest
 import yaml
 from composed import option
 
-from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
 from perception.label import cuboid as label_placing
-from perception.label.camera_pose import Charuco, GivenPoses, TagGrid
+from perception.label.camera_pose import Charuco, TagGrid
 from perception.label.cuboid import compute_pixel_rays, trace_rays
 from perception.label.outline_match import match_outline
 from perception.label.refinement import (
@@ -164,17 +163,6 @@ def test_an_outline_on_mere_texture_is_never_kept() -> None:
     assert match_outline(outline, np.full((540, 960), 255, np.float32), 14.0) is None
 
 
-def test_a_placing_that_says_too_little_shows_how_it_should_look(tmp_path: Path) -> None:
-    for told in (
-        {},
-        {"corners_px": [[1, 2], [3, 4], [5, 6]], "thickness_m": 1.0},
-        {"corners_m": [[1, 2]], "thickness_m": 1},
-    ):
-        (tmp_path / "placing.yaml").write_text(yaml.safe_dump(told))
-        with pytest.raises(ConfigError, match="expected YAML such as"):
-            label_placing.read_placing(tmp_path / "placing.yaml")
-
-
 def test_rays_meet_a_cuboid_where_a_second_renderer_says(
     footage: tuple[Path, list[cuboid.View]],
 ) -> None:
@@ -202,21 +190,6 @@ def test_a_board_tells_where_the_camera_was(name: str) -> None:
     np.testing.assert_allclose(
         pose.world_from_camera[:3, :3], view.base_from_camera[:3, :3], atol=0.01
     )
-
-
-def test_a_frame_without_board_is_refused() -> None:
-    gray = np.full((200, 300, 3), 128, np.uint8)
-    frame = Frame(
-        color=gray,
-        depth_m=gray[..., 0].astype(np.float32),
-        camera_matrix=np.eye(3),
-        base_from_camera=None,
-        t_s=0.0,
-    )
-    with pytest.raises(FrameError, match="0 corners of the board are seen"):
-        option("perception/camera_pose", "charuco").build().locate(frame)
-    with pytest.raises(FrameError, match="no pose of the camera"):
-        GivenPoses(poses=None).build().locate(frame)
 
 
 def board_view(spec: Charuco | TagGrid) -> Frame:

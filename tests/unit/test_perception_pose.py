@@ -226,30 +226,6 @@ def test_a_wall_is_lit_by_as_much_as_was_drawn_whatever_the_gradient_of_dust() -
     assert WallLight(1.5, 0.01).log_ratio == 0.0
 
 
-def test_in_dust_a_spot_must_be_darker_than_the_grain_and_lit_on_its_wall_or_differ_by_camera(
-    estimator,
-) -> None:
-    _, masks, ellipse = drawn()
-    spot = appearance.Interior(
-        darkness=0.9, slope=0.0, deeper=0.2, unknown=0.4, nearer=0.0, around=0.9, contrast=3.0
-    )
-    lit, even = WallLight(0.3, 0.02), WallLight(0.0, 0.02)
-    sunlit, shaded = WallLight(0.0, 0.02, 0.2, 0.4), WallLight(0.0, 0.02, 0.2, 0.05)
-    for inside, parallax, light, passes in (
-        (spot, 1.0, lit, True),
-        (spot, 1.0, even, False),
-        (spot, 1.0, sunlit, True),
-        (spot, 1.0, shaded, False),
-        (spot, 3.0, even, True),
-        (spot, float("nan"), WallLight(float("nan"), float("nan")), False),
-        (replace(spot, contrast=1.0), 1.0, lit, False),
-    ):
-        refused = estimator._check_appearance(
-            inside, parallax, light, masks, pose_row(ellipse), ellipse, True
-        )
-        assert (refused is None) == passes
-
-
 @pytest.mark.parametrize("arm", [True, False])
 def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(
     arm: bool, estimator

@@ -18,7 +18,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from perception import dataset
-from perception.render.block_sampler import build_frame, draw_block
+from perception.render.block_sampler import build_frame
 from perception.render.camera_sensor import (
     CameraExposure,
     LinearCamera,
@@ -308,23 +308,6 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Stereo
     assert np.isnan(stereo.depth_m(left, right, 1056.0, 0.12)[:, :20]).all()
 
 
-def test_chips_break_the_rim_and_dents_lie_beside_it() -> None:
-    ranges = kind("struck").block
-    target, normal = np.array([0.0, 0.0, 2.0]), np.array([0.0, -0.5, -0.9])
-    for seed in range(5):
-        block = draw_block(ranges, target, normal, 0.0, np.random.default_rng(seed))
-        (hole,) = block.holes
-        away = np.array([np.linalg.norm((one.center_m - hole.center_m)[:2]) for one in block.chips])
-        # a ball's radius on the face follows from its height above it
-        height = np.array([(one.center_m - hole.center_m)[2] for one in block.chips])
-        wide = np.sqrt(np.array([one.radius_m for one in block.chips]) ** 2 - height**2)
-        on_rim = np.isclose(away, hole.radius_m)
-        assert ranges.chips[0] <= on_rim.sum() <= ranges.chips[1]
-        assert ranges.dents[0] <= (~on_rim).sum() <= ranges.dents[1]
-        assert (away - wide)[~on_rim].min() >= hole.radius_m - 1e-9, "a dent leaves the rim whole"
-        assert (wide[on_rim] <= ranges.chip_m[1] + 1e-9).all()
-
-
 def test_dust_takes_contrast_as_it_says() -> None:
     depth = np.full((40, 60), 2.0, np.float32)
     light = np.where(np.arange(60) < 30, 0.2, 0.8).astype(np.float32)[None, :, None] * np.ones(
@@ -537,24 +520,6 @@ def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(
         brokk("mode=render", "scene=varied", "session.out=two", "session.seed=1", *size).code == 0
     )
     assert digests(tmp_path / "two" / "frames")["00000.color.png"] != first["00000.color.png"]
-
-
-def test_the_left_picture_alone_is_that_of_a_pair(
-    brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    size = (
-        "rig.width=160",
-        "rig.height=90",
-        "rig.focal_px=88.0",
-        "render.count=1",
-        "studio.depth=none",
-    )
-    assert brokk("mode=render", "session.out=pair", *size).code == 0
-    assert brokk("mode=render", "session.out=alone", "studio.pair=false", *size).code == 0
-    pair, alone = (digests(tmp_path / name / "frames") for name in ("pair", "alone"))
-    assert pair.pop("00000.right.png") and pair == alone
-    refused = brokk("mode=render", "session.out=none", "studio.pair=false")
-    assert refused.code == 2 and "no pair to match" in refused.err
 
 
 def test_truth_and_masks_come_back_as_they_were_written(rig: StereoRig, tmp_path: Path) -> None:

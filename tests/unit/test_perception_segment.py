@@ -74,18 +74,6 @@ def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
     assert (found & view.mouth).sum() > 0.9 * view.mouth.sum()
 
 
-def test_a_frame_without_depth_is_refused_by_name() -> None:
-    view = cuboid.seen(cuboid.looking((-2.0, 0.0, 1.0), (0.0, 0.0, 0.3)), (320, 180))
-    blind = replace(
-        view.frame, depth_m=np.full_like(view.frame.depth_m, np.nan), name="folder/0007"
-    )
-    with pytest.raises(
-        FrameError,
-        match=r"folder/0007: depth is known in 0\.0% of the pixels, depth_plane needs 5%",
-    ):
-        option("perception/segmenter", "depth_plane").build().segment(blind)
-
-
 def test_a_sloppy_edge_moves_onto_that_of_the_picture() -> None:
     gray = np.full((180, 320), 60, np.uint8)
     gray[:, 160:] = 180

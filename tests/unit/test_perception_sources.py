@@ -15,13 +15,13 @@ import pytest
 import yaml
 from composed import option
 
-from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.extensions import load_mode, load_part
+from brokk_rl.errors import FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import dataset
 from perception.calibrate.extrinsics import CameraExtrinsics
 from perception.render.stereo_camera import StereoRig
-from perception.sources import realsense, simulator, zed
+from perception.sources import realsense, simulator
 from perception.sources.folder import FrameFolder
 from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
 
@@ -432,22 +432,6 @@ def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(
     np.testing.assert_array_equal(frame.camera_matrix, MATRIX)
 
 
-def test_a_zed_is_recorded_with_the_lens_that_its_library_tells(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    pyzed(monkeypatch)
-    out = tmp_path / "out"
-    mode = load_mode("mode=record_camera", "capture=zed", "count=1", f"session.out={out}")
-    mode.run()
-    told = yaml.safe_load((out / "frames/camera.yaml").read_text())
-    assert told["size_px"] == [WIDTH, HEIGHT] and told["K"] == MATRIX.tolist()
-    assert told["baseline_m"] == pytest.approx(0.11986) and not any(told["dist"])
-    with folder(out / "frames").build() as source:
-        frame = source.read_latest()
-    assert frame is not None and frame.right is not None
-    assert frame.color[0, 0].tolist() == [12, 11, 10] and (frame.depth_m[1:] == 1.5).all()
-
-
 def test_a_recording_of_a_zed_ends_and_knows_where_the_camera_was(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -485,23 +469,6 @@ def test_a_lens_whose_inverse_is_told_bends_as_opencv_says() -> None:
     )
     seen = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
     np.testing.assert_allclose(seen, pixel, atol=0.3)
-
-
-def test_a_zed_that_is_not_there_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyzed", None)
-    with pytest.raises(FrameError, match="comes with the ZED SDK"):
-        option("perception/source", "zed").build().__enter__()
-    pyzed(monkeypatch)
-    monkeypatch.setattr(StubZed, "status", "CAMERA NOT DETECTED")
-    with pytest.raises(FrameError, match="CAMERA NOT DETECTED"):
-        option("perception/source", "zed").build().__enter__()
-    with pytest.raises(FrameError, match="this SDK does not know"):
-        replace(option("perception/source", "zed"), depth_mode="ULTRA").build().__enter__()
-
-
-def test_depth_that_is_filled_in_is_refused() -> None:
-    with pytest.raises(ConfigError, match="invents depth"):
-        replace(option("perception/source", "zed"), sensing="fill")
 
 
 def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -590,12 +557,3 @@ def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
         source.show((-3.0, 0.0, 0.7, 0.0, 1.0, 0.05), np.zeros((0, 3)))
         with pytest.raises(FrameError, match="behind the camera"):
             source.read_latest()
-
-
-def test_devices_close_twice_without_complaint() -> None:
-    for device in (
-        zed.ZedDevice(option("perception/source", "zed")),
-        realsense.RealSenseDevice(option("perception/source", "realsense")),
-    ):
-        device.close()
-        device.close()

@@ -27,14 +27,6 @@ def test_jobs_take_different_gpus_and_leave_them_again() -> None:
         assert third == "2"
 
 
-def test_a_gpu_named_twice_has_two_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(sweep.OFFERED, "0,0,cpu")
-    with sweep.take_place() as first, sweep.take_place() as second, sweep.take_place() as third:
-        assert (first, second, third) == ("0", "0", "cpu") and os.environ[
-            "CUDA_VISIBLE_DEVICES"
-        ] == ""
-
-
 def test_a_job_waits_until_a_place_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(sweep.OFFERED, "7")
     held = sweep.take_place()

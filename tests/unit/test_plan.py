@@ -26,7 +26,7 @@ from actuators.excite.player import (
 )
 from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
 from brokk_rl.contracts.actuator import Segment
-from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.errors import LinkError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
@@ -255,25 +255,6 @@ def test_the_tool_speed_is_that_of_the_kinematics(machine: Machine) -> None:
         .norm()
     )
     assert predict_tool_speed(machine, q) == pytest.approx(np.full(41, 0.1 * radius_m), rel=1e-3)
-
-
-def test_a_machine_without_bodies_has_no_tool_speed_to_bound(
-    machine: Machine, approach: Approach
-) -> None:
-    bare = replace(
-        machine,
-        joints=tuple(replace(joint, body=None) for joint in machine.joints),
-        tool_m=None,
-        mjcf=None,
-    )
-    assert predict_tool_speed(bare, np.zeros((3, 5))) is None
-    with pytest.raises(ConfigError, match="max_tool_speed_m_s"):
-        played(
-            [[constant({}, 1.0, bare.home)]],
-            bare,
-            approach,
-            CommandGuards(max_command=1.0, max_tool_speed_m_s=0.5),
-        )
 
 
 class Stuck(NominalLink):

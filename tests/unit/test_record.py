@@ -236,9 +236,3 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(StorageError, match="No space left on device; nothing was left behind"):
         record.write_recording(recording(), tmp_path / "a.parquet")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_later_adds_seconds() -> None:
-    assert (
-        record.add_seconds("2026-11-20T10:00:00.000+00:00", 90.5) == "2026-11-20T10:01:30.500+00:00"
-    )

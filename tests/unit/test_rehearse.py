@@ -108,13 +108,3 @@ def test_without_a_found_effect_nothing_is_retrained(
     played.found = "# none: nothing was found\n"
     assert brokk("experiment=gap_loop", "session.out=story").code == 0
     assert list(played.commands)[-1] == "diagnosis"
-
-
-def test_a_stage_takes_only_what_a_story_has(brokk: Callable[..., Done]) -> None:
-    done = brokk("experiment=gap_loop", "stages.policy.takes=[weather]")
-    assert done.code == 2 and "weather" in done.err and "evaluation" in done.err
-
-
-def test_a_mode_without_a_story_says_so(brokk: Callable[..., Done]) -> None:
-    done = brokk("mode=rehearse")
-    assert done.code == 2 and "experiment=gap_loop" in done.err

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from arm import run_servo
 from composed import option
 from scipy.integrate import solve_ivp
 
@@ -41,20 +42,6 @@ def arm() -> Machine:
     return option("machine", "so101")
 
 
-def run(model: Any, machine: Machine, u: np.ndarray) -> np.ndarray:
-    """Returns positions after each command `(T, J)`, from rest at the first one."""
-    start = torch.as_tensor(read_targets(u[0], machine), dtype=torch.float32)
-    rows = torch.as_tensor(u, dtype=torch.float32)
-    shape = (1, machine.num_history, 1)
-    history = History(q=start.repeat(*shape), u=rows[0].repeat(*shape))
-    found = []
-    for command in rows:
-        history.push_u(command[None])
-        history.push_q(model.step(history))
-        found.append(history.q[0, -1].numpy().copy())
-    return np.array(found)
-
-
 def step_commands(machine: Machine, num: int = 40) -> np.ndarray:
     u = np.full((num, machine.num_joints), -0.5)
     u[5:] = 0.5
@@ -66,7 +53,7 @@ def test_a_servo_follows_its_differential_equation(arm: Machine, damping: float)
     servo = replace(
         option("actuator", "servo"), dead_time_s=0.05, response_s=0.06, damping=damping, top_speed=50.0
     )  # fmt: skip
-    found = run(servo.build(arm, 1, CPU), arm, step_commands(arm))[:, 0]
+    found = run_servo(servo.build(arm, 1, CPU), arm, step_commands(arm))[:, 0]
     step_s = 5 * arm.period_s + 0.05
 
     def solve(t_s: float, y: np.ndarray) -> list[float]:
@@ -80,14 +67,16 @@ def test_a_servo_follows_its_differential_equation(arm: Machine, damping: float)
 
 def test_an_ideal_servo_is_at_its_target_after_a_period(arm: Machine) -> None:
     u = np.random.default_rng(0).uniform(-0.1, 0.1, (30, arm.num_joints)).cumsum(0).clip(-1, 1)
-    found = run(replace(option("actuator", "servo"), top_speed=50.0).build(arm, 1, CPU), arm, u)
+    found = run_servo(
+        replace(option("actuator", "servo"), top_speed=50.0).build(arm, 1, CPU), arm, u
+    )
     np.testing.assert_allclose(found, read_targets(u, arm), atol=1e-6)
 
 
 def test_play_and_sag_hold_the_joint_beside_its_target(arm: Machine) -> None:
     servo = replace(option("actuator", "servo"), play_rad=0.02, sag_rad=0.03, sag_slope=0.1)
     wave = np.sin(np.linspace(0.0, 3 * np.pi, 200))[:, None] * np.full(arm.num_joints, 0.5)
-    found = run(servo.build(arm, 1, CPU), arm, wave)
+    found = run_servo(servo.build(arm, 1, CPU), arm, wave)
     target = read_targets(wave, arm)
     middle = (arm.lower + arm.upper) / 2
     # up at row 20, down at row 100: half of the play behind, and the sag below
@@ -112,7 +101,7 @@ def test_effects_on_targets_are_what_the_servo_has_inside(arm: Machine) -> None:
         for key, value in numbers.items():
             around.parameters[key].fill_(value)
     inside = replace(ideal, dead_time_s=0.04, play_rad=0.02, sag_rad=0.03, sag_slope=0.1)
-    found, expected = (run(one, arm, wave) for one in (around, inside.build(arm, 1, CPU)))
+    found, expected = (run_servo(one, arm, wave) for one in (around, inside.build(arm, 1, CPU)))
     # the play works on the sagged target: a tenth of half the play
     np.testing.assert_allclose(found, expected, atol=1.1e-3)
 
@@ -226,14 +215,16 @@ def test_play_holds_a_joint_about_its_target_less_the_sag(arm: Machine) -> None:
         model = kind.wrap(model, arm, 1, CPU)
         for name, value in numbers[kind.name].items():
             model.parameters[name].fill_(value)
-    np.testing.assert_allclose(run(model, arm, u)[20:], run(whole, arm, u)[20:], atol=1e-5)
+    np.testing.assert_allclose(
+        run_servo(model, arm, u)[20:], run_servo(whole, arm, u)[20:], atol=1e-5
+    )
 
 
 def test_a_servo_is_fitted_again_to_other_recordings(arm: Machine) -> None:
     servo = replace(option("actuator", "servo"), play_rad=0.03, sag_rad=0.02)
     generator = np.random.default_rng(1)
     u = 0.5 * np.sin(np.cumsum(generator.uniform(0.02, 0.25, (500, arm.num_joints)), 0))
-    q = run(servo.build(arm, 1, CPU), arm, u)
+    q = run_servo(servo.build(arm, 1, CPU), arm, u)
     # A command acts on the position of the row after it.
     log = record.make_motion(arm, "log", arm.period_s * np.arange(499), u[1:], q[:-1])
     fit = option("fit", "servo")

@@ -132,17 +132,6 @@ def test_a_sitting_is_walked_through_by_touch(
     assert json.loads((tmp_path / "trials" / "P01_1_01.json").read_text())["outcome"] == "inserted"
 
 
-def test_every_answer_can_be_given_with_gloves(
-    asked: Conductor, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
-    at(page, 0)
-    box = page.locator("#study .scale button").first.bounding_box()
-    assert box["width"] * box["height"] > 55 * 100, "a fingertip in a glove: 15 by 26 mm"
-    for button in page.locator("#study .answers button").all():
-        assert min(button.bounding_box()["width"], button.bounding_box()["height"]) >= 64
-
-
 def test_the_whole_questionnaire_by_key_in_german(
     tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
 ) -> None:

@@ -163,27 +163,3 @@ def test_a_study_needs_neither_torch_nor_simulator() -> None:
         ).stdout
         == "[]\n"
     )
-
-
-def test_what_cannot_be_done_is_said(brokk: Callable[..., Any]) -> None:
-    done = brokk("mode=study", "study.do=simulate", "ground=none", "session.out=run")
-    assert done.code == 2 and "ground=twin" in done.err
-    done = brokk("mode=study", "study.do=report", "study.folder=nowhere", "session.out=run")
-    assert done.code == 2 and "holds no study" in done.err
-    for override, said in (
-        ("ground=none", "needs study.folder"),
-        ("deploy=auto", "people move the machine"),
-        ("bench=guided", "bench=twin"),
-    ):
-        done = brokk(
-            "preset=study",
-            override,
-            *(["follower=person"] if "guided" in override else []),
-            "ground=none",
-            "session.out=run",
-        )
-        assert done.code == 2 and said in done.err
-    done = brokk("preset=study", "ground=none", "study.folder=nowhere", "session.out=run")
-    assert done.code == 2 and "holds no study" in done.err
-    done = brokk("mode=study", "study.do=erase", "session.out=run")
-    assert done.code == 2 and "needs study.participant" in done.err

@@ -315,22 +315,3 @@ def test_a_scene_that_cannot_be_built_is_refused(machine: Machine, tmp_path: Pat
         find_site("nowhere.xml", native)
     with pytest.raises(ConfigError, match="sim=kinematic builds no scene"):
         find_site(str(path), cast(Any, Kinematic()))
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (lambda: term("tasks.terms:nothing"), "observation term .* cannot be found"),
-        (lambda: term("tasks.terms:commands", std=0.0), "std: expected"),
-        (
-            lambda: UniformCommand(lowest=(0.0, 1.0), highest=(1.0,)),
-            "expected as many values as lowest",
-        ),
-        (lambda: make(termination={}), "expected a time limit"),
-        (lambda: make(observation={"error": None}), "expected one term or more"),
-        (lambda: make(episode_s=0.1), "episode_s: expected more than success.after_s"),
-    ],
-)
-def test_a_bad_value_is_refused(change: Any, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
-        change()

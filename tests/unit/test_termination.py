@@ -105,17 +105,3 @@ def test_a_list_that_cannot_end_an_episode_is_refused(terms: dict[str, Any], tol
     task = option("task", "goal_pose")
     with pytest.raises(ConfigError, match=told):
         dataclasses.replace(task, termination=terms)
-
-
-@pytest.mark.parametrize(
-    ("make", "told"),
-    [
-        (lambda: ends("nothing"), "termination term .* cannot be found"),
-        (lambda: ends("TYPE_CHECKING"), "is no function"),
-        (lambda: ends("success", "end"), "outcome: expected"),
-        (lambda: ends("joint_limit"), "missing a required argument: 'margin'"),
-    ],
-)
-def test_a_bad_value_of_a_term_is_refused(make: Any, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
-        make()

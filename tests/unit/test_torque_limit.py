@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from arm import make_machine
+from arm import make_machine, run_servo
 from composed import option
 from scipy.integrate import solve_ivp
 
@@ -36,20 +36,6 @@ def make_servo(**numbers: Any) -> Servo:
     return replace(option("actuator", "servo"), top_speed=50.0, **numbers)
 
 
-def run(model: Any, machine: Machine, u: np.ndarray) -> np.ndarray:
-    """Returns positions after each command `(T, J)`, from rest at the first one."""
-    start = torch.as_tensor(read_targets(u[0], machine), dtype=torch.float32)
-    rows = torch.as_tensor(u, dtype=torch.float32)
-    shape = (1, machine.num_history, 1)
-    history = History(q=start.repeat(*shape), u=rows[0].repeat(*shape))
-    found = []
-    for command in rows:
-        history.push_u(command[None])
-        history.push_q(model.step(history))
-        found.append(history.q[0, -1].numpy().copy())
-    return np.array(found)
-
-
 def limit_torque(model: Any, machine: Machine, shortage: float) -> Any:
     """Returns the model with the effect around it."""
     spec = replace(option("effect", "torque_limit"), shortage=shortage)
@@ -66,7 +52,7 @@ def test_a_saturated_joint_accelerates_by_its_limit(arm: Machine) -> None:
     servo = make_servo(response_s=0.05, damping=1e-6, limit_rad=0.02)
     u = np.tile([[0.0, 0.0]], (8, 1))
     u[5:] = 0.5  # 0.75 rad away
-    found = run(servo.build(arm, 1, CPU), arm, u)
+    found = run_servo(servo.build(arm, 1, CPU), arm, u)
     np.testing.assert_allclose(found[-1], 0.5 * 8.0 * 0.06**2, rtol=1e-3)
     np.testing.assert_allclose(found[5], 0.5 * 8.0 * 0.02**2, rtol=1e-3)
 
@@ -77,7 +63,7 @@ def test_a_saturated_joint_comes_up_slower_than_down(arm: Machine) -> None:
     for to, speed_rad_s in ((0.9, 0.2), (-0.9, -0.6)):
         u = np.zeros((40, 2))
         u[5:] = to
-        found = run(servo.build(arm, 1, CPU), arm, u)
+        found = run_servo(servo.build(arm, 1, CPU), arm, u)
         np.testing.assert_allclose(
             (found[-1] - found[-6]) / (5 * arm.period_s), speed_rad_s, rtol=1e-3
         )
@@ -91,7 +77,7 @@ def test_damping_of_the_firmware_lies_within_the_limit(arm: Machine) -> None:
     for to, speed_rad_s in ((0.9, 0.4), (-0.9, -1.2)):
         u = np.zeros((45, 2))
         u[5:] = to
-        found = run(servo.build(arm, 1, CPU), arm, u)
+        found = run_servo(servo.build(arm, 1, CPU), arm, u)
         np.testing.assert_allclose(
             (found[-1] - found[-6]) / (5 * arm.period_s), speed_rad_s, rtol=2e-3
         )
@@ -103,7 +89,7 @@ def test_a_joint_falls_where_the_limit_is_below_its_sag(arm: Machine, response_s
     u = np.zeros((150, 2))
     weak = make_servo(response_s=response_s, damping=1.0, sag_rad=0.05, limit_rad=0.04)
     strong = replace(weak, limit_rad=0.06)
-    fallen, kept = (run(one.build(arm, 1, CPU), arm, u) for one in (weak, strong))
+    fallen, kept = (run_servo(one.build(arm, 1, CPU), arm, u) for one in (weak, strong))
     if response_s == 0.0:
         np.testing.assert_allclose(fallen[-1], arm.lower, atol=1e-5)
     else:  # 0.01 / (2 * 0.04) rad/s
@@ -114,7 +100,7 @@ def test_a_joint_falls_where_the_limit_is_below_its_sag(arm: Machine, response_s
 def test_the_weight_of_a_falling_joint_is_that_of_its_place(arm: Machine) -> None:
     """With 0.06 + 0.1 q of sag and a limit of 0.04 the joint falls no further than -0.2 rad."""
     servo = make_servo(response_s=0.04, damping=1.0, sag_rad=0.06, sag_slope=0.1, limit_rad=0.04)
-    found = run(servo.build(arm, 1, CPU), arm, np.zeros((1500, 2)))
+    found = run_servo(servo.build(arm, 1, CPU), arm, np.zeros((1500, 2)))
     np.testing.assert_allclose(found[-1], -0.2, atol=1e-3)
 
 
@@ -143,7 +129,7 @@ def test_a_limited_servo_follows_its_differential_equation(
     solved: Any = solve_ivp(
         solve, (0.0, t_s[-1]), [targets[0], 0.0], t_eval=t_s, max_step=1e-3, rtol=1e-6, atol=1e-8
     )
-    found = run(servo.build(arm, 1, CPU), arm, u)[:, 0]
+    found = run_servo(servo.build(arm, 1, CPU), arm, u)[:, 0]
     assert np.abs(found - targets).max() > limit_rad  # it is reached
     np.testing.assert_allclose(found, solved.y[0], atol=5e-4)  # of steps by 0.5 rad
 
@@ -175,36 +161,38 @@ def test_a_limited_servo_moves_as_a_position_actuator_of_mujoco(arm: Machine) ->
         sag_rad=mass * 9.81 / stiffness,
         limit_rad=limit_n / stiffness,
     )
-    found = run(servo.build(arm, 1, CPU), arm, u)[:, 0]
+    found = run_servo(servo.build(arm, 1, CPU), arm, u)[:, 0]
     np.testing.assert_allclose(found, expected, atol=2e-3)  # of steps by 0.5 m
-    free = run(replace(servo, limit_rad=None).build(arm, 1, CPU), arm, u)[:, 0]
+    free = run_servo(replace(servo, limit_rad=None).build(arm, 1, CPU), arm, u)[:, 0]
     assert np.abs(free - expected).max() > 0.1
 
 
 def test_a_limit_that_never_acts_changes_no_bit(arm: Machine) -> None:
     servo = make_servo(dead_time_s=0.03, response_s=0.04, damping=0.5, play_rad=0.01, sag_rad=0.01)
     u = draw_levels(arm, 2)
-    plain = run(servo.build(arm, 1, CPU), arm, u)
+    plain = run_servo(servo.build(arm, 1, CPU), arm, u)
     beyond = replace(servo, limit_rad=2.0)  # targets step by 1.2 rad at most
-    np.testing.assert_array_equal(run(beyond.build(arm, 1, CPU), arm, u), plain)
+    np.testing.assert_array_equal(run_servo(beyond.build(arm, 1, CPU), arm, u), plain)
     neutral = limit_torque(servo.build(arm, 1, CPU), arm, 0.0)
-    np.testing.assert_array_equal(run(neutral, arm, u), plain)
+    np.testing.assert_array_equal(run_servo(neutral, arm, u), plain)
 
 
 def test_the_effect_is_the_limit_of_the_servo(arm: Machine) -> None:
     """5 % of a travel of 3 rad over a shortage of 5 is a limit of 0.03 rad; the lower limit counts."""
     servo = make_servo(response_s=0.04, damping=0.8, sag_rad=0.01, firmware_damping=0.5)
     u = draw_levels(arm, 3)
-    inside = run(replace(servo, limit_rad=0.03).build(arm, 1, CPU), arm, u)
-    around = run(limit_torque(servo.build(arm, 1, CPU), arm, 5.0), arm, u)
+    inside = run_servo(replace(servo, limit_rad=0.03).build(arm, 1, CPU), arm, u)
+    around = run_servo(limit_torque(servo.build(arm, 1, CPU), arm, 5.0), arm, u)
     np.testing.assert_allclose(around, inside, atol=1e-5)
     for own_rad, shortage in ((0.03, 2.0), (0.3, 5.0)):
         both = limit_torque(replace(servo, limit_rad=own_rad).build(arm, 1, CPU), arm, shortage)
-        np.testing.assert_allclose(run(both, arm, u), inside, atol=1e-5)
+        np.testing.assert_allclose(run_servo(both, arm, u), inside, atol=1e-5)
     # the damping within is that of the limit that counts
     own = replace(servo, limit_rad=0.03, firmware_damping=0.1)
     both = limit_torque(own.build(arm, 1, CPU), arm, 2.0)
-    np.testing.assert_allclose(run(both, arm, u), run(own.build(arm, 1, CPU), arm, u), atol=1e-5)
+    np.testing.assert_allclose(
+        run_servo(both, arm, u), run_servo(own.build(arm, 1, CPU), arm, u), atol=1e-5
+    )
     assert "limit_rad" not in servo.build(arm, 1, CPU).parameters  # no number to be tuned
 
 
@@ -309,7 +297,7 @@ def test_a_withheld_limit_is_named(arm: Machine, tmp_path: Any, limit_n_m: float
 def test_a_limit_is_fitted_where_it_is_asked_for(arm: Machine) -> None:
     servo = make_servo(response_s=0.04, damping=0.8, limit_rad=0.05)
     u = np.concatenate([draw_levels(arm, seed, 20, 25) for seed in range(2)])
-    q = run(servo.build(arm, 1, CPU), arm, u)
+    q = run_servo(servo.build(arm, 1, CPU), arm, u)
     # A command acts on the position of the row after it.
     log = make_motion(arm, "log", arm.period_s * np.arange(len(u) - 1), u[1:], q[:-1])
     fit = option("fit", "servo")

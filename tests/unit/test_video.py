@@ -7,7 +7,6 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from composed import option
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
-from brokk_rl.errors import ConfigError
 from deploy.page.video_relay import VideoRelay
 from deploy.runtime.process import ChildProcess
 from deploy.video.settings import SOCKET, VideoProcessConfig
@@ -65,14 +63,6 @@ def test_a_time_code_survives_blur_and_noise_and_a_wrong_block_is_noticed(t_s: f
 
 def test_a_picture_without_a_code_is_not_read() -> None:
     assert read_time_code(np.full((360, 640), 128, np.uint8)) is None
-
-
-def test_settings_that_make_no_sense_are_refused() -> None:
-    video = option("video", "pattern")
-    with pytest.raises(ConfigError, match="cameras: expected one or more"):
-        replace(video, cameras={})
-    with pytest.raises(ConfigError, match="min_bitrate"):
-        replace(video, min_bitrate=5_000_000)
 
 
 def test_who_has_no_token_does_not_reach_the_video_process(tmp_path: Path) -> None:
