@@ -23,11 +23,11 @@ from brokk_rl.errors import ConfigError, SimulationError, TrainingError
 from brokk_rl.plot import GREY, draw_grid, make_figure, save_figure
 from brokk_rl.policy_folder import list_checkpoints
 from brokk_rl.progress import SHARE, ItemProgress
-from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.spec import spec
 
 if TYPE_CHECKING:
+    from brokk_rl.rl.group import TrainingGroup
     from brokk_rl.rl.loop import ControlLoop
 
 log = logging.getLogger(__name__)

@@ -27,7 +27,10 @@ def composed(*overrides: str) -> DictConfig:
 
 @pytest.mark.parametrize(("group", "name"), PARTS)
 def test_every_option_composes_and_is_what_its_spec_says(group: str, name: str) -> None:
-    cfg = composed("~mode", "+machine=brokk170", f"+{group}@subject={name}").subject
+    if group == "deploy":  # its parts come from the mode
+        cfg = composed("mode=deploy", f"deploy={name}").deploy
+    else:
+        cfg = composed("~mode", "+machine=brokk170", f"+{group}@subject={name}").subject
     if "_target_" in cfg and not OmegaConf.missing_keys(cfg) - {"out"}:
         given = {"out": "somewhere"} if group == "session" else {}
         build_node({**OmegaConf.to_container(cfg, resolve=True), **given}, group)
