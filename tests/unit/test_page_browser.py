@@ -234,6 +234,12 @@ def test_the_page_comes_back_after_the_server_was_away(
         assert set(feed.requests) == {OperatorRequest("start", "")}
 
 
+def list_alarms(page: Any) -> list[str]:
+    """Return the names of the alarms that the page shows."""
+    texts = page.locator("#alarms .alarm").all_inner_texts()
+    return [one.partition(":")[0].partition(" ·")[0] for one in texts]
+
+
 def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_shown(
     feed: Scripted, opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,11 +259,8 @@ def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_sho
         assert page.locator("#safety").inner_text() == "Unknown"
         assert page.locator("#deadman").inner_text() == "Unknown"
         assert page.locator("#scene").is_hidden() and page.locator("#left").is_hidden()
-        alarms = page.locator("#alarms .alarm").all_inner_texts()
-        assert [one.partition(":")[0].partition(" ·")[0] for one in alarms] == [
-            "STOP NOT CONFIRMED",
-            "NO CONNECTION",
-        ]
+        # The list is drawn a few times a second, the answer at once.
+        eventually(lambda: list_alarms(page) == ["STOP NOT CONFIRMED", "NO CONNECTION"])
         monkeypatch.undo()
         page.wait_for_selector("body:not(.lost)")
         page.keyboard.press("Escape")

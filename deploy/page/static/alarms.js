@@ -4,7 +4,7 @@ const KEPT_MS = 10000;  // an alarm that came and went within a blink is still r
 export class AlarmList {
   constructor(list) {
     this.list = list;
-    this.known = new Map();  // by key: the alarm, when it began, and when it ended (null while it lasts)
+    this.known = new Map();  // by key: the alarm, its place among those of its time, when it began, and when it ended (null while it lasts)
     this.drawn = "";
   }
 
@@ -12,11 +12,11 @@ export class AlarmList {
   draw(alarms, tell, now) {
     const keys = new Set();
     let fresh = false;
-    for (const alarm of alarms) {
+    for (const [place, alarm] of alarms.entries()) {
       const key = `${alarm.level} ${alarm.name} ${alarm.detail.replace(/[\d.]+ ms$/, "")}`, before = this.known.get(key);
       keys.add(key);
       if (!before || before.ended !== null) fresh ||= alarm.level === "alarm";
-      this.known.set(key, { alarm, began: before && before.ended === null ? before.began : now, ended: null });
+      this.known.set(key, { alarm, place, began: before && before.ended === null ? before.began : now, ended: null });
     }
     for (const [key, one] of this.known) {
       if (keys.has(key)) continue;
@@ -24,7 +24,7 @@ export class AlarmList {
       if (now - one.ended > KEPT_MS) this.known.delete(key);
     }
     const order = one => (one.ended === null ? 0 : 2) + (one.alarm.level === "alarm" ? 0 : 1);
-    const lines = [...this.known.values()].sort((a, b) => order(a) - order(b)).map(one => ({
+    const lines = [...this.known.values()].sort((a, b) => order(a) - order(b) || a.place - b.place).map(one => ({
       kind: one.ended === null ? one.alarm.level : "over",
       text: `${tell(one.alarm)} · ${Math.floor(((one.ended ?? now) - one.began) / 1000)} s`,
     }));
