@@ -88,7 +88,7 @@ def measure_interior(
         nearer = float(np.mean(before[inside]))
         inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
     if inside.sum() < 8:
-        return Interior(*[np.nan] * 4, nearer, *[np.nan] * 2)
+        return Interior(np.nan, np.nan, np.nan, np.nan, nearer, np.nan, np.nan)
     values = smooth[inside]
     darkness = float(np.percentile(values, 25.0)) / face
     unknown = float(np.mean(~known[inside]))
