@@ -161,9 +161,7 @@ class ReferenceDiagnosis:
             gates=(*told, *(proof.judge() if named else ())),
             next_experiment=_propose(selected),
             reason=_explain(verdict, selected, decision, failed),
-            more=survey.more()
-            | {"changes": [one.to_json() for one in proof.measure_changes()]}
-            | {"evidence": _describe_evidence(decision, machine)},
+            more=survey.more() | {"evidence": _describe_evidence(decision, machine)},
         )
         return Outcome(answer, before, after, floor)
 

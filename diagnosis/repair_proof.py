@@ -20,7 +20,6 @@ from diagnosis.attribution import judge_edit
 from diagnosis.bootstrap import draw_weights, summarise_draws
 from diagnosis.case import GapCase
 from diagnosis.closure import Gap, Gate, RivalError
-from diagnosis.engine.changes import JointChange, measure_changes
 from diagnosis.engine.decide import Decider, EffectFinding
 from diagnosis.engine.holds import hold_commands
 from diagnosis.engine.proof import Floor, Windows, list_windows, run_free
@@ -212,11 +211,6 @@ class RepairProof:
             joints = dict(zip(self.machine.joint_names, np.sqrt(squares).tolist(), strict=True))
             found[name] = RivalError(float(combine_joints(squares, self.machine)), joints)
         return found
-
-    def measure_changes(self) -> list[JointChange]:
-        """Return how the numbers of each joint changed, named or not."""
-        evidence = self._decider.evidence
-        return measure_changes(evidence, evidence.view_field(self._healthy))
 
     def judge(self) -> list[Gate]:
         """Return whether the repaired simulator beats standing still on every named joint."""

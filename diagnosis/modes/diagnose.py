@@ -214,7 +214,6 @@ def _print_answer(found: Answer, folder: Path) -> None:
     print_text(f"{found.verdict}: {found.reason}", "bold")
     if found.selected:
         print_table(("effect", "joints", "probability", "numbers", "closes", "same as"), rows)
-    _print_changes(found)
     for line in report_checks.list_failed_gates(found.gates):
         print_text(line)
     for one in found.selected:
@@ -222,17 +221,3 @@ def _print_answer(found: Answer, folder: Path) -> None:
             if line:
                 print_text(line)
     print_text(f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}")
-
-
-def _print_changes(found: Answer) -> None:
-    """Print what surely changed, joint by joint."""
-    by_joint: dict[str, list[str]] = {}
-    for one in found.more.get("changes", []):
-        low, high = one["change"]["ci95"] or (0.0, 0.0)
-        if low > 0.0 or high < 0.0:
-            half = 0.5 * (high - low)
-            text = f"{one['number']} {one['change']['mean']:+.3g} ± {half:.2g}"
-            by_joint.setdefault(one["joint"], []).append(text)
-    if by_joint:
-        rows = [(joint, "\n".join(texts)) for joint, texts in by_joint.items()]
-        print_table(("joint", "what changed"), rows)
