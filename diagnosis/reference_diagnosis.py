@@ -91,7 +91,12 @@ class ReferenceDiagnosis:
         named = [] if failed else self._list_named(decision, detected)
         findings = [one.finding for one in named if one.finding is not None]
         proof = RepairProof(case, decider, findings, self.generator)
-        return self._build_outcome(decision, named, proof, told, failed)
+        judged = proof.judge() if findings or decision.verdict == "none" else []
+        if not failed and (failed := gates.list_failures(judged)):
+            decision = replace(decision, verdict="unknown", named=())
+            named = [one for one in named if one.finding is None]
+            proof = RepairProof(case, decider, [], self.generator)
+        return self._build_outcome(decision, named, proof, (*told, *judged), failed)
 
     def _detect(self) -> list[DetectedEffect]:
         """Return the effects that tool points and the scatter of samples show."""
@@ -149,8 +154,6 @@ class ReferenceDiagnosis:
         survey = self._examine(before, floor, after)
         selected = [self._describe(one, proof) for one in sorted(named, key=_get_nats)]
         verdict = "effects" if selected else decision.verdict
-        if verdict == "effects" and not selected:
-            verdict = "unknown"
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
@@ -158,7 +161,7 @@ class ReferenceDiagnosis:
             where=survey.where(),
             gap=proof.measure_gap(),
             rivals=proof.rivals,
-            gates=(*told, *(proof.judge() if named else ())),
+            gates=tuple(told),
             next_experiment=_propose(selected),
             reason=_explain(verdict, selected, decision, failed),
             more=survey.more() | {"evidence": _describe_evidence(decision, machine)},

@@ -35,9 +35,9 @@ mass of a heavy joint, a test programme does not: unchanged machines of a make w
 SECOND_SHARE = 0.03
 """A second effect earns so much of the first at least: a first one is never quite of the right form."""
 SAME_JOINT_SHARE = 0.5
-"""So much where it shares a joint with the first."""
+"""Least share of the first where both share a joint."""
 HELD_NATS = 60.0
-"""So much if it is held commands, which follow whatever is left."""
+"""Least gain of held commands, which follow whatever is left."""
 BESIDE_STALLS_NATS = 60.0
 COARSE_NATS = 30.0
 """Evidence of a coarse sensor beyond twice that of the reference."""

@@ -18,9 +18,8 @@ from diagnosis.effect_library import EffectType
 from diagnosis.engine.decide import EffectFinding
 from diagnosis.engine.evidence import FieldJoint
 from diagnosis.engine.holds import HeldCourse
-from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.rows import Row, list_effect_rows
-from diagnosis.engine.side import UNIT_S, measure_full_loads, measure_units
+from diagnosis.engine.side import measure_full_loads, measure_units
 
 PLAIN_FORMS = frozenset(
     {
@@ -205,6 +204,3 @@ def _describe_hold(hold: HeldCourse, machine: Machine) -> dict[str, float]:
     mean_frames = (delays > 0).sum() / begins
     persistence = 1.0 - 1.0 / (mean_frames * (1.0 - share))
     return {"probability": share, "persistence": float(np.clip(persistence, 0.0, 0.95))}
-
-
-assert UNIT_S * 0.3 == 1.0 and "demand_limit" in PLACE

@@ -17,11 +17,13 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.case import GapCase
 from diagnosis.engine import holds
+from diagnosis.engine.decide import Decider
 from diagnosis.engine.joint_model import PLACE, list_values
 from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row, change_numbers
 from diagnosis.engine.side import Side, measure_units, stack_side
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
+from diagnosis.repair_proof import RepairProof
 
 RATE_HZ = 20.0
 
@@ -232,6 +234,15 @@ def test_a_changed_joint_is_named_sized_and_proven(
     assert answer.gap.closed is not None
     assert answer.gap.closed.mean > 0.8
     assert answer.selected[0].identified
+
+
+def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machine) -> None:
+    # The second joint goes the other way: a simulator without this errs by twice its motion.
+    case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, -1.0]))
+    reference, field = (stack_side(side, two_joints) for side in (case.reference, case.field))
+    proof = RepairProof(case, Decider(reference, field), [], np.random.default_rng(0))
+    assert [one.passed for one in proof.judge()] == [True, False]
+    assert diagnose(case).verdict == "unknown"
 
 
 def test_units_do_not_matter(two_joints: Machine) -> None:
