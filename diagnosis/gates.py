@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from actuators.recordings.inspection import InspectionThresholds, inspect_recording
+from actuators.recordings.recording_checks import TEXTS, RecordingRemark, name_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Ranked
@@ -21,7 +22,6 @@ from diagnosis.closure import Estimate, Gate
 from diagnosis.gap import GapClosure, combine_joints
 from diagnosis.motion_floor import LeftOutErrors
 from diagnosis.rivals import Rival
-from diagnosis.sanity import TEXTS, RecordingRemark, name_recording
 
 # Limits here were chosen by hand on practice cases from a plant of other making; not searched.
 MAX_REMARK_SHARES = {

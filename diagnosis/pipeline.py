@@ -10,6 +10,7 @@ import numpy as np
 
 from actuators.identify.curve_fit import ValveCurveFit
 from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.recording_checks import examine_recordings
 from brokk_rl.contracts.actuator import Excitation
 from diagnosis import (
     calibration,
@@ -19,7 +20,6 @@ from diagnosis import (
     gates,
     hypotheses,
     next_experiment,
-    sanity,
     speed_curves,
     verdict,
 )
@@ -91,7 +91,7 @@ class DiagnosisPipeline:
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
         tell("recordings", 0.3)
-        remarks = sanity.examine_recordings(self.case.field, self.case.machine, self.thresholds)
+        remarks = examine_recordings(self.case.field, self.case.machine, self.thresholds)
         told = verdict.judge_case(self.case, self.base, remarks, self._known())
         if failed := gates.list_failures(told):
             return self._cannot_tell(failed, told)

@@ -13,11 +13,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from actuators.recordings.recording_checks import name_recording
 from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_joint_panels, remove_frame
 from diagnosis.answer import Outcome
-from diagnosis.sanity import name_recording
 
 BEFORE, AFTER, FLOOR = RED, BLUE, GREY
 IDLE = "#c3cbd3"

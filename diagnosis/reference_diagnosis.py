@@ -13,11 +13,12 @@ import numpy as np
 import torch
 
 from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.recording_checks import examine_recordings
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import gates, geometry, sanity, sensors
+from diagnosis import gates, geometry, sensors
 from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected
 from diagnosis.case import GapCase
 from diagnosis.closure import Gate
@@ -75,7 +76,7 @@ class ReferenceDiagnosis:
         """Return the outcome; `tell` receives the name and the progress of each step."""
         case, machine = self.case, self.case.machine
         tell("recordings", 0.05)
-        remarks = sanity.examine_recordings(case.field, machine, self.thresholds)
+        remarks = examine_recordings(case.field, machine, self.thresholds)
         told = gates.judge_recordings(remarks, case.field, case.reference, machine)
         tell("sensors and tool points", 0.1)
         detected = self._detect()

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from actuators.scales import scale_time
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -27,7 +28,6 @@ from brokk_rl.record import Recording
 from diagnosis.answer import JointGap, RegimeGap, Stage, Where
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points
-from diagnosis.sanity import RecordingRemark, examine_recordings
 from diagnosis.sensors import estimate_sensor_noise
 from diagnosis.where import GapLocation, locate_gap
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.recording_checks import RecordingRemark
 from brokk_rl.commands import view_speeds
 from brokk_rl.machine import Machine
 from diagnosis import gates
@@ -22,7 +23,6 @@ from diagnosis.motion_floor import measure_squares
 from diagnosis.refine import MAX_EXTRAPOLATION, FittedSet
 from diagnosis.residuals import ParameterRay
 from diagnosis.rivals import Rival, measure_rivals
-from diagnosis.sanity import RecordingRemark
 from diagnosis.search import EffectSet
 
 BOUND_TOLERANCE = 1e-3

@@ -10,7 +10,9 @@ import pytest
 import torch
 from composed import option
 
+from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl import cli
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 
 torch.set_num_threads(1)  # small tensors: threads would only wait for each other
@@ -28,6 +30,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def machine() -> Machine:
     """The default machine."""
     return option("machine", "brokk170")
+
+
+@pytest.fixture(scope="session")
+def thresholds() -> InspectionThresholds:
+    """Limits from which a stretch of a recording is worth telling."""
+    return load_part("thresholds")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import pytest
 from gaps import reach, recording
 
 from actuators.recordings.inspection import InspectionThresholds
-from brokk_rl.extensions import load_part
+from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
 from diagnosis import effect_library, gates, verdict
 from diagnosis.answer import Answer, Ranked, Where
@@ -21,13 +21,7 @@ from diagnosis.gap import GapClosure
 from diagnosis.motion_floor import LeftOutErrors
 from diagnosis.residuals import build_rays
 from diagnosis.rivals import Rival
-from diagnosis.sanity import RecordingRemark, examine_recordings
 from diagnosis.search import EffectSet
-
-
-@pytest.fixture(scope="module")
-def thresholds() -> InspectionThresholds:
-    return load_part("thresholds")
 
 
 def by_name(found: list[Gate]) -> dict[str, Gate]:

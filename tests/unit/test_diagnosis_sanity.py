@@ -9,14 +9,8 @@ import pytest
 from gaps import DELAY, recording
 
 from actuators.recordings.inspection import InspectionThresholds
-from brokk_rl.extensions import load_part
+from actuators.recordings.recording_checks import TEXTS, RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
-from diagnosis.sanity import TEXTS, RecordingRemark, examine_recordings
-
-
-@pytest.fixture(scope="module")
-def thresholds() -> InspectionThresholds:
-    return load_part("thresholds")
 
 
 def named(remarks: list[RecordingRemark]) -> dict[str, RecordingRemark]:

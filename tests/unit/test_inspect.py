@@ -7,12 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import hydra
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from composed import option
-from hydra.utils import instantiate
 
 from actuators.recordings.inspection import (
     InspectionThresholds,
@@ -27,13 +25,6 @@ PERIOD_S = 0.05
 DELAY = 11
 """Periods of dead time."""
 NOISE = 0.0003
-
-
-@pytest.fixture(scope="module")
-def thresholds() -> InspectionThresholds:
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["mode=inspect"])
-    return instantiate(cfg.thresholds)
 
 
 def sound(machine: Machine, seconds: float = 60.0) -> Recording:
