@@ -11,7 +11,7 @@ GET_TORCH = $(UV) pip install --quiet --python $(BIN)/python --no-deps --default
 NO_CUDA = $(shell sed -nE 's/^name = "(torch|triton|nvidia-.*|cuda-.*)"$$/--no-install-package \1/p' uv.lock)
 PRESET ?= $(shell nvidia-smi -L >/dev/null 2>&1 && echo preset=gpu || echo preset=laptop)
 
-.PHONY: help play train test test-all mutants figures docs check setup clean
+.PHONY: help play train test test-all mutants results docs check setup clean
 
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -33,8 +33,8 @@ test-all: setup         ## the slow tests too
 mutants: setup          ## one small change at a time to what decides about the valves: do the tests notice?
 	$(BIN)/python tests/mutants.py
 
-figures: setup          ## what the figures of the docs rest on, and which are older than their code
-	$(BIN)/python benchmarks/figures.py
+results: setup          ## render docs/results.md, and mark what is older than its code
+	$(BIN)/python benchmarks/run.py page
 
 docs: setup             ## the documentation site, in site/; search works once it is served: python -m http.server -d site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

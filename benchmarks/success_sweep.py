@@ -4,7 +4,7 @@
       --seeds 1 2 3 4 5 --max-seconds 60 preset=gpu
 
 Each point is a `brokk mode=train` of its own; further words go to it. A point whose folder holds a
-finished training is read again. Writes `sweep.json` and prints medians over seeds.
+finished training is read again. Writes `sweep.json`, a row for each training.
 """
 
 from __future__ import annotations
@@ -17,10 +17,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
-from brokk_rl.console_table import print_table
-from brokk_rl.rl.logger import LEVELS, PROGRESS, WINDOW, find_passing
+from brokk_rl.rl.logger import LEVELS, PROGRESS, find_passing
 from brokk_rl.session import read_record
 
 SIZES = ["num_envs", "epochs", "mini_batches"]
@@ -56,22 +53,6 @@ def read_times(folder: Path, point: dict[str, int]) -> dict[str, Any]:
     return row
 
 
-def print_medians(rows: list[dict[str, Any]]) -> None:
-    """Print medians over seeds; a level counts where most seeds reach it."""
-    lines = []
-    for sizes, members in pd.DataFrame(rows).groupby(SIZES):
-        cells = [f"{size:,}" for size in sizes]
-        for level in LEVELS:
-            times = members[f"seconds_to_{level:.2f}"].astype(float).fillna(float("inf"))
-            median = times.median()
-            cells.append(f"{median:,.1f}" if median < float("inf") else None)
-        rate = (members["env_steps"] / members["seconds"]).median()
-        lines.append([*cells, f"{rate:,.0f}", str(len(members))])
-    headings = [*SIZES, *(f"seconds to {level:.2f}" for level in LEVELS), "training /s", "seeds"]
-    caption = f"Success over the newest {WINDOW:,} episodes of training."
-    print_table(headings, lines, caption=caption)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
@@ -89,7 +70,6 @@ def main() -> None:
         train(folder, point, given.max_seconds, words)
         rows.append(read_times(folder, point))
         (given.folder / "sweep.json").write_text(json.dumps({"rows": rows}, indent=1))
-    print_medians(rows)
 
 
 if __name__ == "__main__":

@@ -54,17 +54,17 @@ def main(path: Path, trials: int) -> None:
             desk.start(name)
         desk.wait_for_state()
         for trial in range(trials):
-            for name, number in (KILLS[trial % len(KILLS)],):
-                desk.set_moving(60.0)
-                key = f"{name} {signal.Signals(number).name}"
-                found.setdefault(key, []).append(desk.still_after(desk.signal(name, number)))
-                if number == signal.SIGSTOP:
-                    desk.signal(name, signal.SIGCONT)
-                    time.sleep(0.1)
-                else:
-                    desk.children[name].end(1.0)
-                    desk.start(name)
-                    desk.wait_for_state(60.0)
+            name, number = KILLS[trial % len(KILLS)]
+            desk.set_moving(60.0)
+            key = f"{name} {signal.Signals(number).name}"
+            found.setdefault(key, []).append(desk.still_after(desk.signal(name, number)))
+            if number == signal.SIGSTOP:
+                desk.signal(name, signal.SIGCONT)
+                time.sleep(0.1)
+            else:
+                desk.children[name].end(1.0)
+                desk.start(name)
+                desk.wait_for_state(60.0)
         for _ in range(trials):
             desk.set_moving(60.0)
             found.setdefault("stop on the page", []).append(
@@ -81,12 +81,6 @@ def main(path: Path, trials: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     circumstances = {"cores": os.cpu_count(), "load": os.getloadavg(), "listener": granted}
     path.write_text(json.dumps(circumstances | {"reactions": table}, indent=2) + "\n")
-    for key, one in table.items():
-        sys.stdout.write(
-            f"{key:28} {one['trials']:3} trials"
-            + "".join(f"  {k} {v}" for k, v in one.items() if k.endswith("ms"))
-            + "\n"
-        )
 
 
 def row(stops: list[Stop]) -> dict[str, float]:

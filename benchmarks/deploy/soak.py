@@ -110,9 +110,6 @@ def main(folder: Path, seconds: float) -> None:
         "memory": memory,
     }
     (folder / "soak.json").write_text(json.dumps(found, indent=1) + "\n")
-    sys.stdout.write(
-        json.dumps({key: found[key] for key in found if key != "memory"}, indent=1) + "\n"
-    )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 #!/bin/bash
-# Makes the segmenter that ships: renders pictures on all cores, trains on a GPU, exports, judges on scenes it has not seen.
+# Makes the segmenter that ships: renders pictures on all cores, trains on a GPU, exports. Training judges by scenes it has not seen.
 #   OUT=<folder> [CORES=16 RENDER_S=200 TRAIN_S=250 GPU=0 START=<network to go on from> SEED=<of the scenes> WIDTHS=<of the network>
 #     FRAMES=<folder> NEGATIVES=<folder>] bash benchmarks/perception/segmenter.sh
 # FRAMES is kept: what lies there from before is learned from too (RENDER_S=0: that alone), and while the network learns the cores go
 # on rendering into it for the next call, by another SEED. Without it pictures lie in $TMPDIR meanwhile, some 0.2 MB each.
-# Leaves in $OUT: segmenter.{safetensors,onnx} (for perception/weights), training.json, masks.json, curve.png, samples.png, log.
-# NEGATIVES holds pictures without a block (python benchmarks/perception/block_free.py --train <folder>): they are learned from, and
+# Leaves in $OUT: segmenter.{safetensors,onnx} (for perception/weights), training.json, curve.png, samples.png, log.
+# NEGATIVES holds pictures without a block: they are learned from, and
 # are surfaces of things in every other call of the renderer.
 # To try it: CORES=1 RENDER_S=90 TRAIN_S=40 SMALL=1 GPU= .
 set -u
@@ -77,28 +77,12 @@ say "trained, $(count train) frames there now: $(ls "$work/run" | tr '\n' ' ')"
 
 keep() {  # whatever is there by now: judging may be cut off
   local file
-  for file in segmenter.safetensors segmenter.onnx training.json masks.json curve.png samples.png; do
+  for file in segmenter.safetensors segmenter.onnx training.json curve.png samples.png; do
     [ -f "$work/run/$file" ] && cp "$work/run/$file" "$OUT/"
   done
   cp "$work/log" "$OUT/log"
 }
 keep
 wait  # for those that still render
-kind=onnx file=segmenter.onnx; [ -f "$work/run/$file" ] || { kind=unet file=segmenter.safetensors; }
-if [ -f "$work/run/$file" ]; then
-  # by condition: one folder of links to the frames of all processes
-  for scene in varied clean haze dark hidden decoy empty; do
-    mkdir -p "$work/judge/$scene"
-    for some in "$frames"/test/"$scene"/*/frames; do
-      for f in "$some"/camera.yaml "$some"/*.truth.json; do
-        [ -f "$f" ] && for g in "${f%truth.json}"*; do ln -sf "$g" "$work/judge/$scene/"; done
-      done
-    done
-    ls "$work/judge/$scene"/*.color.png >/dev/null 2>&1 || rm -r "$work/judge/$scene"
-  done
-  python=$(sed -n '1s/^#! *//p' "$(command -v brokk)"); [ -x "$python" ] || python=python3
-  timeout 600 "$python" benchmarks/perception/masks.py "$work/run/masks.json" $kind segmenter.weights="$work/run/$file" \
-    -- "$work"/judge/* 2>&1 | tee -a "$work/log"
-fi
 tail -5 "$work/render.log" >>"$work/log"; say "done: $OUT"; keep
 rm -rf "$work"

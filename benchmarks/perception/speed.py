@@ -6,7 +6,7 @@ Renders scenes of several conditions at 1 to 4 m. Each is searched as a whole, a
 the tracker steers the finder: around the holes found, moved by 3 mm. Each look is repeated and the
 shortest taken: what else runs on the machine makes the others longer. Writes the milliseconds of
 each stage, the processor time of both kinds of look and of their mean over `search_every` frames,
-what both found, the load that there was meanwhile, and the processor's name.
+what both found, and the load that there was meanwhile.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -73,7 +72,6 @@ def main() -> None:
         "frames": len(looks["whole"]),
         "holes": holes,
         "threads": given.threads,
-        "processor": processor(),
         "opencv": cv2.__version__,
         "load": round(os.getloadavg()[0], 1),
         "ms": table,
@@ -126,15 +124,6 @@ def configured(key: str, *overrides: str) -> Any:
     """Returns one part of a mode's configuration, instantiated."""
     with hydra.initialize_config_module("conf", version_base="1.3"):
         return instantiate(hydra.compose("config", list(overrides))[key], _convert_="all")
-
-
-def processor() -> str:
-    """Returns what the processor calls itself."""
-    told = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
-    names = [
-        line.split(":")[1].strip() for line in told.splitlines() if line.startswith("model name")
-    ]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 if __name__ == "__main__":

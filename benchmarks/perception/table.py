@@ -5,11 +5,8 @@
 
 Each scene is rendered, looked at and forgotten; what came of it is a line of `<out>/frames.jsonl`.
 Called again, it goes on where it stopped, with more scenes or more options too. Writes
-`table.json`, `table.csv`, `table.png`, the error model for `task.noise` into `noise.json`, and
-pictures of what went wrong, with the reasons, into `failures/`. A fixed seed: the same scenes
-everywhere. An option with `stereo.` settings matches the same pictures again with them:
-
-    python benchmarks/perception/table.py <out> plane_conic 'plane_conic stereo.shrink=4' --count 6
+`table.json`, the error model for `task.noise` into `noise.json`, and pictures of what went wrong,
+with the reasons, into `failures/`. A fixed seed: the same scenes everywhere.
 
 Rims as drills leave them, before and after:
 
@@ -21,20 +18,18 @@ Rims as drills leave them, before and after:
 from __future__ import annotations
 
 import argparse
-import csv
 import functools
 import json
 import multiprocessing
 import signal
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import hydra
-import matplotlib.pyplot as plt
 from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress
@@ -59,10 +54,9 @@ VARIATIONS = {
 }
 """Conditions that are a scene with overrides."""
 SHOWN = (
-    "recall", "precision", "decoys_accepted", "position_mm_median", "position_mm_p95", "times_better", "normal_deg_p95",
+    "recall", "precision", "decoys_accepted", "position_mm_median", "position_mm_p95", "normal_deg_p95",
     "along_inside_1_sigma", "across_inside_1_sigma", "normal_inside_1_sigma", "false", "ms_median",
 )  # fmt: skip
-BASELINE = "paper"
 ALL = "all"
 """Condition of the rows over all conditions."""
 
@@ -184,7 +178,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     lines = []
     for option in task.options:
         finder = build_finder(option)
-        tally, found = score_frame(finder, match_again(option, frame), shot.truth)
+        tally, found = score_frame(finder, frame, shot.truth)
         place = {
             "condition": task.condition,
             "distance_m": task.distance_m,
@@ -196,18 +190,6 @@ def look(task: Task) -> list[dict[str, Any]]:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
             show_failure(task, name, frame, found, finder)
     return lines
-
-
-def match_again(option: str, frame: Frame) -> Frame:
-    """Returns the frame with the depth that an option's own stereo settings give."""
-    overrides = [one for one in option.split() if one.startswith("stereo.")]
-    if not overrides:
-        return frame
-    assert frame.right is not None and frame.baseline_m is not None
-    stereo = composed("stereo", "mode=render", *overrides)
-    focal_px = float(frame.camera_matrix[0, 0])
-    depth_m = stereo.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
-    return replace(frame, depth_m=depth_m, depth_shrink=stereo.shrink)
 
 
 def show_failure(
@@ -240,7 +222,7 @@ def renderer(condition: str, distance_m: float, render: tuple[str, ...]) -> Fram
 
 @functools.cache
 def build_finder(option: str) -> StagedFinder:
-    name, *overrides = [one for one in option.split() if not one.startswith("stereo.")]
+    name, *overrides = option.split()
     return composed(
         "perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides
     ).build()
@@ -272,7 +254,7 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
-    """Returns the rows of each condition and of all, with the factor by which the median error is below the baseline's."""
+    """Return the rows of each condition and of all."""
     tallies: dict[tuple, FinderScore] = defaultdict(FinderScore)
     for line in read(path):
         if line["option"] in options:
@@ -286,54 +268,17 @@ def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
         tallies, key=lambda key: (order[key[0]], order[key[1]], key[2])
     ):
         tally = tallies[option, condition, distance_m]
-        row = {
-            "perception": option,
-            "condition": condition,
-            "distance_m": distance_m,
-            **tally.row(),
-        }
-        other = (
-            tallies[BASELINE, condition, distance_m].row()["position_mm_median"]
-            if (BASELINE, condition, distance_m) in tallies
-            else None
-        )
-        mine = row["position_mm_median"]
-        found.append(
-            {**row, "times_better": other / mine if other and mine else None, **tally.noise()}
-        )
+        place = {"perception": option, "condition": condition, "distance_m": distance_m}
+        found.append({**place, **tally.row(), **tally.noise()})
     return found
 
 
 def write(out: Path, found: list[dict[str, Any]]) -> None:
-    """Writes the table as JSON, CSV, picture and error model, and shows it."""
+    """Write the table and the error model as JSON, and show the table."""
     (out / "table.json").write_text(json.dumps(found, indent=1) + "\n")
     noise = {f"{row['perception']}, {row['condition']}, {row['distance_m']:g} m":
              {name: row[name] for name in ("target_bias_m", "along_std_m", "across_std_m")} for row in found}  # fmt: skip
     (out / "noise.json").write_text(json.dumps(noise, indent=1) + "\n")
-    with (out / "table.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, found[0].keys())
-        writer.writeheader()
-        writer.writerows(found)
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
-    for axis, key in zip(axes, ("position_mm_p95", "normal_deg_p95", "recall"), strict=True):
-        for option, condition in dict.fromkeys(
-            (row["perception"], row["condition"]) for row in found
-        ):
-            line = [
-                row
-                for row in found
-                if (row["perception"], row["condition"]) == (option, condition)
-                and row[key] is not None
-            ]
-            if line:
-                place = [row["distance_m"] for row in line]
-                axis.plot(
-                    place, [row[key] for row in line], marker="o", label=f"{option}, {condition}"
-                )
-        axis.set(xlabel="distance, m", title=key, yscale="linear" if key == "recall" else "log")
-    axes[0].legend(fontsize=6)
-    figure.savefig(out / "table.png", dpi=150)
-    plt.close(figure)
     table = Table("perception", "condition", "m", "frames", *SHOWN)
     for row in found:
         cells = ["–" if row[key] is None else f"{row[key]:.3g}" for key in SHOWN]

@@ -39,7 +39,7 @@ LEVELS = (0.95, 0.99)
 """Strict success whose time of training is reported."""
 WINDOW = 4096
 """Newest finished episodes over which success is averaged. Every iteration is asked: with 1,024 a
-training that succeeds in 0.98 of its episodes passed 0.99 by chance (benchmarks/h100/success)."""
+training that succeeds in 0.98 of its episodes passed 0.99 by chance (one H100)."""
 EPISODE = "episode/"
 """Begins the columns of `progress.csv` with means over the episodes of an iteration."""
 NUM_COLUMNS = 3

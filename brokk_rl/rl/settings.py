@@ -198,7 +198,7 @@ class TrainingConfig:
             before the run stops with an error.
         fault_steps: Control steps kept of each world; those of worlds that diverge are written into
             `faults` of the run folder. 0 records nothing; `None`: 100 on a CPU, 0 on a GPU, where
-            100 slow the control step by 8 % (`benchmarks/h100/recorder.json`).
+            100 slow the control step by 8 % (one H100, 16,384 worlds).
         fuse: Let `torch.compile` fuse the small operations around the physics, and on a GPU those of
             PPO, for half a minute of compiling and a C++ compiler. On a CPU, whose physics takes
             less than half of a control step of few worlds, it gains most.

@@ -78,7 +78,7 @@ class WarpSimulator:
         fused: Use our own kernels for dynamics, contact solver and integration (`warp_dynamics`,
             `warp_solver`): 18 launches a substep instead of 60, and none instead of ten per solver
             iteration. The physics is the same. Tests compare it with MuJoCo C on the CPU and on a
-            GPU; `benchmarks/h200` holds its rates.
+            GPU; docs/results.md holds its rates.
         parity_worlds: Worlds in which each machine is compared with MuJoCo C before it is used
             (`brokk_rl.sim.parity`); 0 for no comparison.
     """

@@ -32,7 +32,7 @@ NUM_MACHINES = 200
 """Machines that are drawn; one that is as they are exceeds all of them in 1 of 201 cases a joint."""
 QUANTILE, BEYOND = 0.98, 1.3
 """Quantile of their departures, and the multiple of it from which a joint is blamed. Chosen by hand on
-the development logs of `benchmarks/doctor`."""
+the development logs of the blind exam (commit cc7613e5)."""
 HORIZON_SHARE = 0.5
 """Length of the free runs, of those of the diagnosis: a run has few seconds without contact."""
 WINDOWS_APART = 0.4

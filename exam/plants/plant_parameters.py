@@ -44,7 +44,7 @@ NUISANCES = {
     "warm_up": (-0.01, 0.03),  # change of speed over the first half hour
 }
 """The same for nuisances without a tidy model; all but times scale with the roughness. Chosen by
-hand; `benchmarks/exam/floors.py` measures the resulting floors."""
+hand."""
 
 
 def draw_plant(machine: Machine, seed: int, roughness: float) -> tuple[str, PlantParameters]:

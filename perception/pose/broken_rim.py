@@ -18,7 +18,7 @@ import numpy as np
 from perception.pose import rim
 from perception.pose.alignment import StereoPatch
 
-# Chosen by hand on rendered scenes (benchmarks/perception/rims.py).
+# Chosen by hand on rendered scenes (rims.py of commit 1bfbfc41).
 REACHES = 0.6, 0.45
 """Reach of the profiles across the first circle, in radii, and across the next one: the first one
 may be off by a third of a radius, and chips displace edges by as much."""

@@ -27,7 +27,7 @@ UNDECIDED, UNDECIDED_SCORE = 0.8, 0.5
 told from a flat disc; factor on the score of such a hole, and of one in dust."""
 COVERED = 0.02
 """The same part from which the pictures may differ by an occluder's edge, which dust makes as bright as
-the face. Discs that differed, seed 1001 of benchmarks/perception/dust.py: 0.04, 0.06; eight of ten
+the face. Discs that differed, seed 1001 of dust.py (commit 1bfbfc41): 0.04, 0.06; eight of ten
 holes at most 0.01."""
 FORGIVEN, AT_FIRST = 0.55, 1.4
 """Least visible part of a circle whose ellipse was too small or too long; and factor on the limits

@@ -28,7 +28,7 @@ LEAST_INSIDE, LEAST_POWER, SMOOTH_PX = 60, 0.1, 1.5
 are fully lit; blur before the darkest quarter is taken, px. Chosen by hand."""
 WALL_SKY, DISC_SKY = (0.27, 0.13), (0.0, 0.035)
 """Mean and standard deviation of the share of the sky on the wall of holes and on flat discs in
-dust, for 120 holes and 232 discs at 1 to 4 m of seed 1001 of benchmarks/perception/dust.py; half of
+dust, for 120 holes and 232 discs at 1 to 4 m of seed 1001 of dust.py (commit 1bfbfc41); half of
 them give the same within 0.02."""
 SUN_DIRECTIONS, SUN_HEIGHTS = 24, (0.15, 0.3, 0.6, 1.0, 1.7, 3.0)
 """Directions of the sun around the axis that are tried, and tangents of its height over the face."""

@@ -23,12 +23,7 @@ from brokk_rl.build import build_quick_nodes
 ROOT = Path(__file__).parents[2]
 NEWCOMERS = (ROOT / "README.md", *ROOT.glob("docs/tutorials/*.md"))
 """Pages whose commands are checked in every run of the tests; those of the others are slow."""
-OTHERS = (
-    ROOT / "CONTRIBUTING.md",
-    ROOT / "benchmarks/README.md",
-    *ROOT.glob("docs/*.md"),
-    *ROOT.glob("docs/tutorials/*.ipynb"),
-)
+OTHERS = (ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/tutorials/*.ipynb"))
 BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.M | re.S)
 INLINE = re.compile(r"`((?:\.venv/bin/)?brokk [^`]+)`")
 NOT_COMPOSED = {

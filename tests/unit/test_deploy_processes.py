@@ -1,4 +1,4 @@
-"""Reaction times, with real processes on a multicast bus: a few trials each; benchmarks/reactions.py makes sixty."""
+"""Reaction times, with real processes on a multicast bus: a few trials each; benchmarks/deploy/reactions.py makes sixty."""
 
 from __future__ import annotations
 

@@ -1,0 +1,88 @@
+"""One measurement: its commands, the code that it measures, and the table that comes of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks/results"
+Cell = str | float | int | None
+Table = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A figure of the project that one can make again.
+
+    Attributes:
+        name: Name of its file in `benchmarks/results`.
+        title: Heading of its table on the page.
+        conditions: What was simulated or recorded, how often, and what the baseline is.
+        commands: Commands in their order, run in the root of the repository; `{out}` is an empty
+            folder.
+        code: Files and folders that the figures depend on.
+        read: Reads the rows of the table from that folder.
+        where: Computer that it needs, in words.
+        minutes: Time that it takes there.
+    """
+
+    name: str
+    title: str
+    conditions: str
+    commands: tuple[str, ...]
+    code: tuple[str, ...]
+    read: Callable[[Path], Table]
+    where: str
+    minutes: float
+
+
+def load_json(path: Path) -> Any:
+    """Return the content of a JSON file."""
+    return json.loads(path.read_text())
+
+
+def run_git(*words: str) -> str:
+    """Return what git answers."""
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def hash_code(paths: Sequence[str], commit: str | None = None) -> str:
+    """Return the SHA-256 over names and contents of files as they are, or as they were at a commit."""
+    lines = []
+    if commit is None:
+        for name in run_git("ls-files", "--", *paths).splitlines():
+            if (ROOT / name).is_file():
+                content = (ROOT / name).read_bytes()
+                blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+                lines.append(f"{blob} {name}")
+    else:
+        for line in run_git("ls-tree", "-r", commit, "--", *paths).splitlines():
+            head, name = line.split("\t")
+            lines.append(f"{head.split()[2]} {name}")
+    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
+
+
+def read_evaluation(path: Path, head: dict[str, Any]) -> Table:
+    """Return a row for each policy of an `evaluation.json`."""
+    rows: Table = []
+    for policy, one in load_json(path)["policies"].items():
+        strict, (low, high) = one["success_strict"]["mean"], one["success_strict"]["ci95"]
+        row = head | {
+            "policy": policy,
+            "strict success": round(strict, 3),
+            "95 %": f"{low:.3f} to {high:.3f}",
+            "paper's criterion": round(one["success_paper"]["mean"], 3),
+            "median time, s": round(one["time_to_insert_s"]["median"], 1),
+            "peak force, kN": round(one["peak_force_n"] / 1000.0, 1),
+            "valve travel, 1/s": round(one["valve_travel"], 1),
+            "episodes": one["episodes"],
+        }
+        rows.append(row)
+    return rows

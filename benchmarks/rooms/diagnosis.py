@@ -1,0 +1,110 @@
+"""Measurements of the diagnosis and of the deployment doctor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from measurement import Measurement, Table, load_json
+
+CODE = (
+    "diagnosis",
+    "actuators/effects",
+    "actuators/models",
+    "actuators/identify",
+    "conf/certainty",
+)
+ROWS = {
+    "top1_strictly": "one effect: the right name first",
+    "top1": "the same, equivalents that the answer lists count too",
+    "exactly_one": "one effect: named, equivalents count, and nothing else",
+    "exact_set_strictly": "two or three effects: exact set",
+    "exact_set": "the same, equivalents count too",
+    "set_f1": "two or three effects: F1 of the names",
+    "joints": "joints right, where the effect is",
+    "false_alarms_none": "unchanged machines: given a cause or called unknown",
+    "false_alarms_faint": "machines with a change below the noise: the same",
+    "unknown_recall": "causes outside the library: called unknown",
+    "unknown_auroc": "area under the curve of `unknown`",
+    "unknown_wrongly": "a known effect called unknown",
+    "ece": "calibration error",
+    "cover_90": "90 % intervals that hold the true size",
+    "closed_of_oracle": "gap closed, of what the true effects close; median",
+    "closed_examined": "gap closed on withheld recordings; median",
+    "closed_differs": "stated closing that the examiner contradicts",
+    "closed_missing": "effects named without a share of the gap",
+}
+
+
+def read_marks(folder: Path) -> Table:
+    """Return every rate of the marks of an exam."""
+    marks = load_json(folder / "marks/marks.json")["candidates"]["diagnosis"]
+    rows: Table = []
+    for name, meaning in ROWS.items():
+        one = marks.get(name)
+        if one is not None:
+            low, high = one["ci95"]
+            row = {"": meaning, "reached": round(one["value"], 2), "of": one["of"]}
+            row["95 %"] = f"{low:.2f} to {high:.2f}"
+            rows.append(row)
+    return rows
+
+
+def read_doctor(folder: Path) -> Table:
+    """Return what a blind exam of the doctor came to."""
+    score = load_json(folder / "score.json")
+    rows: Table = []
+    for name in ("faults", "verdicts", "false_alarms"):
+        rows.append({"": name, **score[name]})
+    for name, one in score["by_kind"].items():
+        rows.append({"": f"faults of kind {name}", **one})
+    return rows
+
+
+def list_exam_commands(words: str) -> tuple[str, ...]:
+    """Return the commands that make an exam, answer it and open its labels."""
+    return (
+        f"brokk mode=exam {words} exam_protocol=sealed session.seed=<random, 1000 or more> exam.workers=2 session.out={{out}}/exam",
+        f"brokk mode=exam {words} exam.do=run exam.folder={{out}}/exam session.out={{out}}/answers exam.workers=2",
+        f"brokk mode=exam {words} exam.do=score exam.folder={{out}}/exam +exam.answers.diagnosis={{out}}/answers session.out={{out}}/marks",
+    )
+
+
+MEASUREMENTS = (
+    Measurement(
+        name="exam_valves",
+        title="Sealed exam: machines with valves",
+        conditions="300 simulated machines of a make that nothing was fitted to, answered once. The labels were sealed by a hash, and the engine was "
+        "registered before. Always answering `none` or the most frequent effect names at most 1 of 23 effects. The diagnosis has another engine since then, "
+        "which has sat no sealed exam.",
+        commands=list_exam_commands("exam_plants=held_out"),
+        code=(*CODE, "exam"),
+        read=read_marks,
+        where="two cores",
+        minutes=600,
+    ),
+    Measurement(
+        name="exam_servos",
+        title="Sealed exam: tabletop arms of position servos",
+        conditions="100 simulated arms, the third sealed exam of this kind. The first two had 33 and 31 of 35 single effects by names that count equivalents.",
+        commands=list_exam_commands("machine=so101 exam_plants=servos exam_mix=servos"),
+        code=(*CODE, "exam"),
+        read=read_marks,
+        where="two cores",
+        minutes=300,
+    ),
+    Measurement(
+        name="doctor",
+        title="Blind exam of the deployment doctor",
+        conditions="120 logs with a mistake in the deployed loop, the machine or the task, and 20 without one. Three policies; a third of the logs holds "
+        "commands only. The third of three exams; in the others 114 and 113 of 120 faults were named, with 0 of 20 false alarms. The faults are the project's own. The program of the exam is in that commit only.",
+        commands=(
+            "python benchmarks/doctor/blind_exam.py make {out} --seed 3",
+            "python benchmarks/doctor/blind_exam.py answer {out}",
+            "python benchmarks/doctor/blind_exam.py score {out} {out}/score.json",
+        ),
+        code=("diagnosis/deployment",),
+        read=read_doctor,
+        where="commit cc7613e5, which holds the program and its policies",
+        minutes=60,
+    ),
+)

@@ -1,0 +1,65 @@
+"""Measurements of the borehole finder on rendered stereo pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from measurement import Measurement, Table, load_json
+
+CODE = ("perception", "conf/perception", "conf/stereo.yaml", "conf/scene", "conf/rig")
+
+
+def read_holes(folder: Path) -> Table:
+    """Return recall and errors for each condition and distance."""
+    rows: Table = []
+    for one in load_json(folder / "table.json"):
+        row = {"condition": one["condition"], "distance, m": one["distance_m"]}
+        for title, name, digits in (
+            ("found", "recall", 2),
+            ("discs taken for holes", "decoys_accepted", 2),
+            ("position, mm, 95 %", "position_mm_p95", 1),
+            ("inside 1 sigma, along", "along_inside_1_sigma", 2),
+        ):
+            row[title] = None if one[name] is None else round(one[name], digits)
+        rows.append(row)
+    return rows
+
+
+def read_times(folder: Path) -> Table:
+    """Return the milliseconds of each stage."""
+    times = load_json(folder / "speed.json")["ms"]
+    rows: Table = []
+    for look, stages in times.items():
+        for stage, ms in stages.items():
+            row = {"look": look, "stage": stage}
+            row |= {name: round(value, 1) for name, value in ms.items()}
+            rows.append(row)
+    return rows
+
+
+MEASUREMENTS = (
+    Measurement(
+        name="holes",
+        title="Boreholes in rendered pictures",
+        conditions="Stereo pairs of 1080p by a perfect rig, scenes that no development used (seed 7). No picture of a real block was seen. "
+        "In the rows `decoy` and `empty` flat discs or nothing stand in the place of holes.",
+        commands=(
+            "python benchmarks/perception/table.py {out} plane_conic --count 12 --seed 7 --render rig/sensor=mosaic",
+        ),
+        code=CODE,
+        read=read_holes,
+        where="two cores",
+        minutes=60,
+    ),
+    Measurement(
+        name="stage_times",
+        title="Time of a frame, stage by stage",
+        conditions="A frame of 1080p from both pictures, without the network. `whole` searches the whole picture, `followed` the places of known holes. "
+        "Median and 95 % in ms; `processor_time` is the sum over the stages on one core, the others are wall time.",
+        commands=("python benchmarks/perception/speed.py {out}/speed.json --count 1",),
+        code=CODE,
+        read=read_times,
+        where="one core",
+        minutes=5,
+    ),
+)

@@ -1,0 +1,174 @@
+"""Measurements of policies: success, force and what the training needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from measurement import Measurement, Table, load_json, read_evaluation
+
+PLANTS = ("mlp", "hydraulic", "load_sensing", "post_compensated", "open_center")
+DELAYS_S = ("0.1", "0.3", "0.5")
+EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=false"
+POLICY_CODE = (
+    "tasks", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects", "actuators/weights",
+    "conf/task", "conf/machine", "conf/actuator", "conf/effect",
+)  # fmt: skip
+TRAINING_CODE = (*POLICY_CODE, "brokk_rl/rl", "conf/rl", "conf/preset")
+
+
+def read_plants(folder: Path) -> Table:
+    """Return the rows of the shipped policy and its controller on each plant."""
+    rows: Table = []
+    for plant in PLANTS:
+        rows += read_evaluation(folder / plant / "evaluation.json", {"plant": plant})
+    return rows
+
+
+def read_delays(folder: Path) -> Table:
+    """Return the rows of both policies for each delay of the person."""
+    rows: Table = []
+    for delay_s in DELAYS_S:
+        head = {"delay of the person, s": delay_s}
+        rows += read_evaluation(folder / delay_s / "evaluation.json", head)
+    return rows
+
+
+def read_comparison(folder: Path) -> Table:
+    """Return a row for each group of `mode=compare`: means over seeds with Student's intervals."""
+    rows: Table = []
+    for group in load_json(folder / "comparison/comparison.json")["groups"]:
+        row = {name: str(value) for name, value in group["variation"].items()}
+        strict, (low, high) = group["success_strict"]["mean"], group["success_strict"]["ci95"]
+        row |= {
+            "policy": group["policy"],
+            "seeds": group["runs"],
+            "strict success": round(strict, 3),
+            "95 %": f"{low:.3f} to {high:.3f}",
+            "median time, s": round(group["time_to_insert_s"]["mean"], 1),
+            "peak force, kN": round(group["peak_force_n"]["mean"] / 1000.0, 1),
+            "valve travel, 1/s": round(group["valve_travel"]["mean"], 1),
+        }
+        rows.append(row)
+    return rows
+
+
+def read_story(folder: Path) -> Table:
+    """Return the success of each policy in each simulator and on the changed machine."""
+    rows: Table = []
+    success = load_json(folder / "story/repair/close_gap.json")["success"]
+    for policy, places in success.items():
+        row = {"policy": policy}
+        row |= {place: round(one["mean"], 3) for place, one in places.items()}
+        rows.append(row)
+    return rows
+
+
+MEASUREMENTS = (
+    Measurement(
+        name="shipped_policy",
+        title="The policy that ships",
+        conditions="The shipped policy and the classical controller from the same random starts, one seed, MuJoCo C on a CPU. An episode lasts 20 s. "
+        "Boreholes, their errors, dead time and the effects of `effect=[library]` are random. The baseline is the classical controller.",
+        commands=tuple(
+            f"{EVALUATE} actuator={plant} session.out={{out}}/{plant}" for plant in PLANTS
+        ),
+        code=POLICY_CODE,
+        read=read_plants,
+        where="two cores",
+        minutes=6,
+    ),
+    Measurement(
+        name="short_training",
+        title="`make train`",
+        conditions="Four minutes of training on two cores, one seed. The training begins as the classical controller, which is the baseline. The intervals "
+        "overlap, so no gain over the controller is shown. Seven further trainings of this kind had 0.972 to 0.982.",
+        commands=("brokk mode=train preset=laptop evaluation.video=false session.out={out}/train",),
+        code=TRAINING_CODE,
+        read=lambda folder: read_evaluation(folder / "train/evaluation.json", {}),
+        where="two cores",
+        minutes=6,
+    ),
+    Measurement(
+        name="five_seeds",
+        title="Five trainings on a GPU",
+        conditions="Five seeds, 150 s of training each, 1,024 episodes a policy, judged through the network and on the plant that PPO never used. "
+        "The baseline is the classical controller; in these runs its numbers were those from before its search.",
+        commands=(
+            "brokk -m preset=gpu session.seed=1,2,3,4,5 rl.fuse=false rl.budget.max_env_steps=null evaluation.video=false session.out={out}/seeds",
+            "brokk mode=compare compare.runs={out}/seeds session.out={out}/comparison",
+        ),
+        code=TRAINING_CODE,
+        read=read_comparison,
+        where="one GPU of 80 GB",
+        minutes=20,
+    ),
+    Measurement(
+        name="direct_policies",
+        title="Policies that command alone",
+        conditions="`experiment=direct` has no classical controller beneath it. Five seeds of 40 million control steps, 1,024 episodes each. The "
+        "baseline is the residual policy, trained as long. The last columns are other plants, which no policy met before.",
+        commands=(
+            "brokk -m preset=gpu experiment=direct session.seed=1,2,3,4,5 rl.budget.max_env_steps=40e6 evaluation.video=false session.out={out}/direct",
+            "brokk mode=compare compare.runs={out}/direct session.out={out}/comparison",
+        ),
+        code=TRAINING_CODE,
+        read=read_comparison,
+        where="one GPU of 80 GB",
+        minutes=15,
+    ),
+    Measurement(
+        name="ablations",
+        title="Ablations",
+        conditions="Each row leaves out one choice. Five seeds of 40 million control steps, 1,024 episodes on the plant `hydraulic`, Student's 95 % "
+        "intervals. The baseline is the first row.",
+        commands=(
+            "brokk -m preset=gpu rl.budget.max_env_steps=40e6 session.seed=range(0,5) task.memory=13,1 evaluation.video=false session.out={out}/memory",
+            "brokk mode=compare compare.runs={out}/memory session.out={out}/comparison",
+        ),
+        code=TRAINING_CODE,
+        read=read_comparison,
+        where="one GPU of 80 GB",
+        minutes=15,
+    ),
+    Measurement(
+        name="paper",
+        title="The paper's configuration",
+        conditions="`experiment=paper` is a reading of the paper under which a policy learns, five seeds of 200 million steps. `experiment=paper_literal` "
+        "takes its words as they stand, one seed of 40 million steps. 1,024 episodes each.",
+        commands=(
+            "brokk -m preset=gpu experiment=paper session.seed=1,2,3,4,5 rl.budget.max_env_steps=200e6 evaluation.video=false session.out={out}/paper",
+            "brokk mode=compare compare.runs={out}/paper session.out={out}/comparison",
+        ),
+        code=TRAINING_CODE,
+        read=read_comparison,
+        where="one GPU of 80 GB",
+        minutes=25,
+    ),
+    Measurement(
+        name="guided_person",
+        title="A simulated person follows the advice",
+        conditions="The policy that ships for a person, trained behind 0.2 to 0.4 s of delay, and the classical controller with the same assumption. An episode "
+        "lasts 40 s, one seed. The person moves two to four levers at once. No real person took part.",
+        commands=tuple(
+            f"{EVALUATE} follower=person follower.delay_s={delay_s} policy=tasks:policies/behind_a_person session.out={{out}}/{delay_s}"
+            for delay_s in DELAYS_S
+        ),
+        code=POLICY_CODE,
+        read=read_delays,
+        where="two cores",
+        minutes=8,
+    ),
+    Measurement(
+        name="gap_loop",
+        title="Diagnose, retrain, close the gap",
+        conditions="Boom and stick of the simulated machine extend at half their speed. The diagnosis does not know it, and named `asymmetry` on both and nothing else. "
+        "`before` is the old policy, `after` the retrained one; 50 s a training, 512 episodes.",
+        commands=(
+            "brokk experiment=gap_loop preset=gpu rl.budget.max_seconds=50 evaluation.episodes=512 session.out={out}/story",
+        ),
+        code=(*TRAINING_CODE, "diagnosis"),
+        read=read_story,
+        where="one GPU of 80 GB",
+        minutes=10,
+    ),
+)

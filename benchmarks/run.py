@@ -1,0 +1,171 @@
+"""Measure figures, and render `docs/results.md` from them.
+
+    python benchmarks/run.py list                          # names, where they run, and how long
+    python benchmarks/run.py measure shipped_policy        # runs the commands, writes benchmarks/results/shipped_policy.json
+    python benchmarks/run.py take five_seeds <folder>      # reads a folder that the commands left on another computer
+    python benchmarks/run.py page                          # renders docs/results.md
+
+A result holds commands, machine, commit, and a hash of the code that was measured. The page says
+where that code has changed since.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from measurement import RESULTS, ROOT, Cell, Measurement, Table, hash_code, load_json, run_git
+from rooms import ROOMS
+
+PAGE = ROOT / "docs/results.md"
+HEAD = """# Results
+
+<!-- rendered by `python benchmarks/run.py page`; edit benchmarks/rooms instead -->
+
+This page holds the figures of the project. Each table says what was simulated, the baseline, the
+commands, the machine and the commit. All machines are simulated, but for the logs that are said to be
+real. *Older than its code* means that files which the figure depends on have changed since it was
+measured. Then today's code may give another figure. The file of a figure names this code.
+
+* **Strict success:** the tip is 0.10 m or more below the rim, inside the hole, with 1 cm of clearance.
+* **Paper's criterion:** the weaker criterion of the paper, shown beside it.
+* **Plant:** a simulated machine on which a policy is judged. `mlp` is the network through which policies
+  are trained, `hydraulic` the plant to which it was fitted. Nothing was fitted to `load_sensing`,
+  `post_compensated` and `open_center`.
+
+`python benchmarks/run.py list` names the measurements, and `measure <name>` makes one again.
+"""
+
+
+def list_measurements() -> dict[str, Measurement]:
+    """Return all measurements by name, in the order of the page."""
+    found: dict[str, Measurement] = {}
+    for measurements in ROOMS.values():
+        for one in measurements:
+            found[one.name] = one
+    return found
+
+
+def measure(one: Measurement) -> None:
+    """Run the commands of a measurement and write its result."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        environment["PATH"] = path
+        for command in one.commands:
+            words = shlex.split(command.format(out=folder))
+            subprocess.run(words, cwd=ROOT, env=environment, check=True)
+        take(one, Path(folder))
+
+
+def take(one: Measurement, folder: Path, machine: str | None = None) -> None:
+    """Write the result of a folder that the commands have filled."""
+    result = {
+        "commands": list(one.commands),
+        "machine": machine or describe_machine(),
+        "commit": run_git("rev-parse", "--short=8", "HEAD").strip(),
+        "date": datetime.date.today().isoformat(),
+        "code": list(one.code),
+        "code_sha256": hash_code(one.code),
+        "rows": one.read(folder),
+    }
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{one.name}.json"
+    path.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def describe_machine() -> str:
+    """Return processor, cores, load and GPU of this computer."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    processor = names[0] if names else platform.processor()
+    text = f"{os.cpu_count()} cores of {processor}, load {os.getloadavg()[2]:.0f}"
+    import torch
+
+    return f"{torch.cuda.get_device_name()}, {text}" if torch.cuda.is_available() else text
+
+
+def render_page() -> str:
+    """Return the page of all results."""
+    parts = [HEAD]
+    for room, measurements in ROOMS.items():
+        present = [one for one in measurements if (RESULTS / f"{one.name}.json").exists()]
+        if present:
+            parts.append(f"## {room}\n")
+        for one in present:
+            parts.append(render_result(one, load_json(RESULTS / f"{one.name}.json")))
+    return "\n".join(parts)
+
+
+def render_result(one: Measurement, result: dict[str, Any]) -> str:
+    """Return heading, conditions, table and origin of one result."""
+    commands = "\n".join(result["commands"]).replace("{out}", "<out>")
+    is_current = hash_code(result["code"]) == result["code_sha256"]
+    age = "Today's code." if is_current else "**Older than its code.**"
+    origin = f"{result['machine']}; commit {result['commit']}, {result['date']}"
+    lines = [
+        f"### {one.title}",
+        "",
+        one.conditions,
+        "",
+        render_table(result["rows"]),
+        "",
+        f"{origin}. {age} [File](../benchmarks/results/{one.name}.json).",
+        "",
+        f"```\n{commands}\n```",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def render_table(rows: Table) -> str:
+    """Return rows as a Markdown table; the first row names the columns."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    lines = ["|".join(columns), "|".join("---" for _ in columns)]
+    for row in rows:
+        lines.append("|".join(render_cell(row.get(name)) for name in columns))
+    return "\n".join(f"|{line}|" for line in lines)
+
+
+def render_cell(value: Cell) -> str:
+    """Return a value as the page shows it."""
+    return "" if value is None else str(value)
+
+
+def main() -> None:
+    """Do what the command line asks."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("do", choices=["list", "measure", "take", "page"])
+    parser.add_argument("name", nargs="?", choices=list(list_measurements()))
+    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("--machine", help="computer on which the folder was made")
+    given = parser.parse_args()
+    known = list_measurements()
+    if given.do == "list":
+        for one in known.values():
+            print(f"{one.name:22} {one.minutes:5.0f} min  {one.where}")
+    elif given.do == "page":
+        PAGE.write_text(render_page())
+    elif given.name is None:
+        parser.error("expected the name of a measurement; `list` shows them")
+    elif given.do == "measure":
+        measure(known[given.name])
+    elif given.folder is None:
+        parser.error("expected the folder that the commands have filled")
+    else:
+        take(known[given.name], given.folder, given.machine)
+
+
+if __name__ == "__main__":
+    main()

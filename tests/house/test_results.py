@@ -1,0 +1,64 @@
+"""The results page: rendered from the JSON files, with a mark where the code has changed since."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+AGE = re.compile(r"\*\*Older than its code\.\*\*|Today's code\.")
+
+
+@pytest.fixture(scope="module")
+def benchmarks() -> Iterator[Any]:
+    """The program `benchmarks/run.py`, which is in no package."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "benchmarks"))
+        import run
+
+        yield run
+        for name in [name for name in sys.modules if name.split(".")[0] in ("run", "rooms")]:
+            del sys.modules[name]
+
+
+def test_the_page_shows_the_files(benchmarks: Any) -> None:
+    """Whether a figure is older than its code changes with each commit, so it is left out here."""
+    page = (ROOT / "docs/results.md").read_text()
+    assert AGE.sub("", page) == AGE.sub("", benchmarks.render_page()), "make results"
+
+
+def test_each_result_says_what_it_rests_on(benchmarks: Any) -> None:
+    known = benchmarks.list_measurements()
+    for path in sorted((ROOT / "benchmarks/results").iterdir()):
+        result = json.loads(path.read_text())
+        assert path.stem in known
+        assert all(result[key] for key in ("machine", "commit", "date", "code", "rows")), path
+
+
+def test_a_changed_file_makes_a_figure_older_than_its_code(
+    benchmarks: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = next(iter(benchmarks.list_measurements().values()))
+    result = {
+        "commands": [],
+        "machine": "m",
+        "commit": "c",
+        "date": "d",
+        "code": ["conf"],
+        "rows": [],
+    }
+    result["code_sha256"] = benchmarks.hash_code(["conf"])
+    assert "Today's code." in benchmarks.render_result(one, result)
+    monkeypatch.setattr("pathlib.Path.read_bytes", lambda self: b"changed")
+    assert "Older than its code." in benchmarks.render_result(one, result)
+
+
+def test_benchmarks_stay_small() -> None:
+    size = sum(path.stat().st_size for path in (ROOT / "benchmarks").rglob("*") if path.is_file())
+    assert size < 4e6
