@@ -12,7 +12,7 @@ import sys
 import traceback
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     fits the machine or the simulator beside it.
 
     Args:
-        values: The configuration as plain data, with `run`.
+        values: The configuration as plain data, with `run`; a node may be built already.
         shared: Nodes that others take in, whole or in part. They are built here only if the mode has such
             a field.
 
@@ -50,9 +50,9 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     nodes = {key: value for key, value in values.items() if key != RUN}
     built = build_quick_nodes(values, shared)
     with _refuse_slow_import(), suppress(_SlowImport, _LackingPackageError):  # said below
-        _check_keys(load_class(values[RUN], ""), nodes.keys() - set(shared))
+        _check_keys(load_class(values[RUN], ""), nodes.keys() - set(shared), nodes)
     kind = load_class(values[RUN], "")
-    _check_keys(kind, nodes.keys() - set(shared))
+    _check_keys(kind, nodes.keys() - set(shared), nodes)
     own = {field.name for field in fields(kind)}
     for key in nodes.keys() - built.keys():
         if key in own:
@@ -60,8 +60,8 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     return _call(kind, {key: built[key] for key in nodes if key in built}, "")
 
 
-def _check_keys(kind: type, keys: Collection[str]) -> None:
-    """Refuse keys that a mode does not have."""
+def _check_keys(kind: type, keys: Collection[str], given: Collection[str]) -> None:
+    """Refuse keys that a mode does not have, and a mode that lacks one of its own."""
     known = [field.name for field in fields(kind)]
     for key in sorted(keys):
         if key not in known:
@@ -69,6 +69,10 @@ def _check_keys(kind: type, keys: Collection[str]) -> None:
                 f"the mode has no '{key}'; {list_choices(key, known)}. A preset or experiment that "
                 "sets it is for other modes: leave it out"
             )
+    for field in fields(kind):
+        if field.default is MISSING and field.name not in given:
+            key = field.name
+            raise ConfigError(f"the mode needs '{key}': give {key}=<option>, or leave ~{key} out")
 
 
 def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -> dict[str, Any]:

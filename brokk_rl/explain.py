@@ -7,6 +7,7 @@ import errno
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ from brokk_rl import extras, registry
 from brokk_rl.arguments import ROBOT_FILES, explain_robot
 from brokk_rl.errors import BrokkError, list_choices
 
+CLOSE = 0.8
+"""Likeness of two names from which one is taken for the other misspelt. Chosen by hand: `recording`
+is close to `recordings`, `out` is not to `output`."""
 MISSING_SKIPPED = RunMode.MULTIRUN
 """Mode in which Hydra leaves out groups that must be given: the jobs of a sweep bring them."""
 
@@ -104,7 +108,7 @@ def _explain_missing_option(error: MissingConfigException) -> str:
     ]
     if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
-    return f"there is no {group}={name}; {list_choices(name, offered)}"
+    return f"there is no {group}={name}; {_list_options(group, name, offered)}"
 
 
 def _find_typed(place: str) -> tuple[str, str, str] | None:
@@ -171,13 +175,18 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
 
 def _explain_missing_choice(group: str) -> str:
     names = [option.name for option in registry.list_options() if option.group == group]
-    path = "; or give the folder of a run or of a policy" if group == "policy" else ""
-    return f"{explain_missing_value(group)}; {list_choices('', names)}{path}"
+    return f"{explain_missing_value(group)}; {_list_options(group, '', names)}"
+
+
+def _list_options(group: str, name: str, offered: Sequence[str]) -> str:
+    """Return the end of a message about an option that there is not."""
+    path = "; or the path of a run or policy folder, or of a checkpoint"
+    return list_choices(name, offered) + path * (group == "policy")
 
 
 def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
     """Return what a configuration has in the place of a key that it does not have."""
-    mode = f"mode={registry.read_mode_name(cfg)}"
+    mode = f"mode={cfg.hydra.runtime.choices['mode']}"
     if isinstance(table := OmegaConf.select(cfg, key, default=None), DictConfig):
         fields = [str(field) for field in table if field != "_target_"]
         return f"'{key}' is a table, whose values are given as {key}.<name>=…; {list_choices(value, fields)}"
@@ -198,8 +207,22 @@ def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
             return f"'{key}' is an option: {option.group}={key}"
     if value.endswith(ROBOT_FILES):
         return f"{mode} has no '{leaf}'; {explain_robot(value)}"
-    choices = list_choices(leaf, names if parent else {*names, *groups})
+    here = names if parent else list({*names, *groups})
+    if not get_close_matches(leaf, here) and (keys := _find_keys(cfg, _guess_name(cfg, leaf))):
+        return f"'{parent or mode}' has no '{leaf}'; {_suggest(keys, value)}"
+    choices = list_choices(leaf, here)
     return f"'{parent or mode}' has no '{leaf}'; {choices}; `brokk {mode} --help` lists all values"
+
+
+def _guess_name(cfg: DictConfig, typed: str) -> str:
+    """Return the name of a value that was misspelt, or shortened as in `lr`; empty for none."""
+    names = {}
+    for place, _ in registry.iterate_leaves(OmegaConf.to_container(cfg)):
+        if place[0] != "hydra":
+            names["".join(word[:1] for word in place[-1].split("_"))] = place[-1]
+            names[place[-1]] = place[-1]
+    near = [typed] if typed in names else get_close_matches(typed, names, n=1, cutoff=CLOSE)
+    return names[near[0]] if near else ""
 
 
 def _suggest(keys: Sequence[str], value: str) -> str:

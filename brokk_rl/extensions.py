@@ -202,6 +202,9 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     beside = Path(name).expanduser().parent / str(node.get("mjcf"))
     if group == "machine" and beside.is_file():
         node["mjcf"] = str(beside.resolve())
+    for key, value in node.items():
+        if isinstance(value, (dict, list)):
+            node[key] = _drop_parts(value, str(node.get("_target_")).rpartition(".")[0])
     packages = _read_packages(group)
     package = _find_package(where, group, text, node, packages)
     for place, target in registry.iterate_leaves(node):
@@ -216,6 +219,22 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
                 f"{where}: '{'.'.join(place)}: {target}' is {kind}; {list_choices(str(target), known)}"
             )
     return {str(key): value for key, value in node.items()}, package
+
+
+def _drop_parts(node: Any, module: str) -> Any:
+    """Return plain data without the names of classes in `module`, that of the option's class.
+
+    They are the parts of which that class is made, and its annotations name them.
+    """
+    if isinstance(node, list):
+        return [_drop_parts(value, module) for value in node]
+    if not isinstance(node, dict):
+        return node
+    kept = {}
+    for key, value in node.items():
+        if key != "_target_" or str(value).rpartition(".")[0] != module:
+            kept[key] = _drop_parts(value, module)
+    return kept
 
 
 def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:

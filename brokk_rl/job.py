@@ -28,10 +28,10 @@ def run(cfg: DictConfig) -> float | None:
     """Build the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
     extensions.refuse_ambiguous(HydraConfig.get().runtime.choices)
-    cfg = insert_policy(cfg)
+    cfg, built = insert_policy(cfg)
     values, shared = extensions.read_values(cfg)
     if "session" not in values:
-        mode = build_mode(values, shared)
+        mode = build_mode(values | built, shared)
         distributed.check_together(type(mode), sweep)
         return mode.run()
     folder = choose_run_folder(values)
@@ -39,7 +39,8 @@ def run(cfg: DictConfig) -> float | None:
     try:
         if not (sweep or goes_on) and distributed.read_rank().first:
             require_new_folder(folder)
-        mode = build_mode(values | {"session": values["session"] | {"out": str(folder)}}, shared)
+        built["session"] = values["session"] | {"out": str(folder)}
+        mode = build_mode(values | built, shared)
         distributed.check_together(type(mode), sweep)
         return _run_in_session(mode, values, sweep, goes_on)
     except Exception:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from brokk_rl.errors import CheckpointError, ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, NonNegative, Positive, spec
 
 JointPart = Literal["slew", "arm_1", "arm_2", "arm_3", "boom", "stick", "bucket", "tool"]
 """Parts of demolition machines and excavators; the operator's page has a word and an icon for each."""
@@ -148,9 +148,9 @@ class Machine:
     name: str
     title: str
     mjcf: str | None
-    period_s: float
-    dead_time_s: float
-    num_history: int
+    period_s: Positive
+    dead_time_s: NonNegative
+    num_history: Count
     joints: tuple[Joint, ...]
     tool_m: tuple[Dimension, Dimension, Dimension] | None
     exclusive: tuple[str, ...]

@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from brokk_rl import registry
 from brokk_rl.build import RUN, TARGET, build_node
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import (
     CONTRACT,
     StoredPolicy,
@@ -72,8 +73,10 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     return prepared if is_whole else prepared + _recall_overrides(given)
 
 
-def insert_policy(cfg: DictConfig) -> DictConfig:
-    """Return the configuration with what its policies know of machine and task.
+def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
+    """Return the configuration with what its policies know of machine and task, and built nodes.
+
+    The machine is built for its fingerprint, and not again where it is that of the policy.
 
     Raises:
         CheckpointError: There is no such policy, or it does not fit machine or task.
@@ -84,11 +87,12 @@ def insert_policy(cfg: DictConfig) -> DictConfig:
     target = OmegaConf.select(cfg, f"policy.{TARGET}", default=None)
     if cfg.get(RUN) == TRAIN:
         target = _choose_beginning(cfg, target)
+    built: dict[str, Any] = {}
     if target == TRAINED:
-        cfg = _take_over(cfg)
+        cfg = _take_over(cfg, built)
     if target == SHIPPED:
         try:
-            cfg = _take_over(cfg.copy())
+            cfg = _take_over(cfg.copy(), built)
         except (CheckpointError, ConfigError) as error:
             log.info(
                 "the classical controller acts, for the shipped policy does not fit: %s", error
@@ -98,7 +102,7 @@ def insert_policy(cfg: DictConfig) -> DictConfig:
         for node in (cfg.get(group) or {}).values():
             if node[TARGET] == TRAINED:
                 _insert_task(cfg, node)
-    return cfg
+    return cfg, built
 
 
 def is_going_on(cfg: DictConfig, folder: Path) -> bool:
@@ -203,8 +207,11 @@ def _choose_beginning(cfg: DictConfig, target: str | None) -> str | None:
     return None if is_new else TRAINED  # a run that was stopped before it began knows nothing
 
 
-def _take_over(cfg: DictConfig) -> DictConfig:
-    """Return the configuration with machine, option and behaviour of the first policy."""
+def _take_over(cfg: DictConfig, built: dict[str, Any]) -> DictConfig:
+    """Return the configuration with machine, option and behaviour of the first policy.
+
+    A machine that is built and stays is put into `built`.
+    """
     stored = find_policy(str(cfg.policy.path), may_lack=cfg.get(RUN) == TRAIN)
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
@@ -218,7 +225,10 @@ def _take_over(cfg: DictConfig) -> DictConfig:
     if "task" in cfg:
         cfg = _choose_option(cfg, own, given, stored)
     if "machine" in cfg:
-        brought += _insert_plant(cfg, stored, given)
+        here = build_node(OmegaConf.to_container(cfg.machine, resolve=True), "machine")
+        brought = _insert_plant(cfg, here, stored, given)
+        if not brought:
+            built["machine"] = here
     if "task" in cfg and (num := _insert_behaviour(cfg, own, given, stored)):
         brought.append(f"{num} value{'s' if num > 1 else ''} of its task")
     if brought:
@@ -244,12 +254,13 @@ def _choose_option(
     return changed
 
 
-def _insert_plant(cfg: DictConfig, stored: StoredPolicy, given: set[str]) -> list[str]:
+def _insert_plant(
+    cfg: DictConfig, here: Machine, stored: StoredPolicy, given: set[str]
+) -> list[str]:
     """Put in the machine of the policy, and with another machine the actuator of its training.
 
-    Return what was put in: nothing where the machine is the same.
+    Return what was put in: nothing where the machine is `here`, that of the configuration.
     """
-    here = build_node(OmegaConf.to_container(cfg.machine, resolve=True), "machine")
     name, theirs = stored.contract["machine"], stored.contract["fingerprint"]
     differing = [part for part, stamp in here.fingerprint().items() if theirs.get(part) != stamp]
     if not differing:

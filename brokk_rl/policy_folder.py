@@ -17,6 +17,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
@@ -383,11 +384,11 @@ def find_policy(name: str, may_lack: bool = False) -> StoredPolicy:
             "no such path; `ls runs` lists the runs of this folder"
         )
     if path.is_file():
-        return StoredPolicy(name, path, read_contract(path.parent, name))
+        return StoredPolicy(name, _require_whole(path), read_contract(path.parent, name))
     weights, checkpoints = path / WEIGHTS, list_checkpoints(path)
     contract = read_contract(path, name)
     if checkpoints and _is_newer(checkpoints[-1], weights):
-        return StoredPolicy(name, checkpoints[-1], contract)
+        return StoredPolicy(name, _require_whole(checkpoints[-1]), contract)
     if contract and (may_lack or weights.exists() or (path / ONNX).exists()):
         return StoredPolicy(name, weights, contract)
     lacks = CONTRACT if not contract else f"neither {WEIGHTS} nor a checkpoint, model_*.pt,"
@@ -411,6 +412,13 @@ def find_checkpoint(name: str) -> Path:
             "folder of its training"
         )
     return found[-1]
+
+
+def _require_whole(file: Path) -> Path:
+    """Return a file; refuse a checkpoint that is no whole archive, without torch."""
+    if file.suffix == ".pt" and not zipfile.is_zipfile(file):
+        raise CheckpointError(f"{file} is corrupt or not a checkpoint of ours; take an older one")
+    return file
 
 
 def list_checkpoints(folder: Path) -> list[Path]:

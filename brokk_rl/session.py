@@ -234,10 +234,10 @@ def require_new_folder(folder: Path) -> None:
         raise StorageError(f"{place} is a file. Give a folder with session.out=<folder>.")
     if not os.access(place, os.W_OK):
         raise StorageError(f"cannot write into {place}. Choose session.out=<folder>.")
-    if before := read_record(folder):
-        mode, outcome = before.get("mode", "?"), before.get("outcome", "?")
+    before, checkpoints = read_record(folder) or {}, list(folder.glob("model_*.pt"))
+    if before or checkpoints:
+        mode, outcome = before.get("mode", "?"), before.get("outcome", "no record of it")
         advice = "Give another folder with session.out=<folder>, or delete this one."
-        checkpoints = list(folder.glob("model_*.pt"))
         if mode == "train" and checkpoints:
             newest = max(checkpoints, key=lambda path: path.stat().st_mtime)
             advice += (

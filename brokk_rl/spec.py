@@ -324,8 +324,9 @@ def describe_hint(hint: Any) -> str:
         return f"a list of {', '.join(items)}"
     if origin is dict and arguments[1] is not Any:
         return f"a table, each value {describe_hint(arguments[1])}"
-    if is_dataclass(hint) and len(fields(hint)) <= MOST_NAMED:
-        return f"a table with {', '.join(field.name for field in fields(hint))}"
+    if is_dataclass(hint):
+        names = [field.name for field in fields(hint)]
+        return f"a table with {', '.join(names[:MOST_NAMED])}{', …' * (len(names) > MOST_NAMED)}"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
     words |= {type(None): "null", Any: "a value", tuple: "a list", list: "a list", dict: "a table"}
     return words.get(origin or hint) or getattr(hint, "__name__", str(hint))

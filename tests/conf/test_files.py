@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
+import conf
+
 LAG = """# A fitted actuator.
 _target_: actuators.models.lag.FirstOrderLag
 dead_time_s: {q1: 0.5, other: 0.45}
@@ -179,3 +181,14 @@ def test_a_table_in_the_place_of_a_range_is_explained(brokk: Callable[..., Any])
         f"+effect.stiction.start={table}",
     )
     assert effect["effect"]["stiction"]["start"] == {"q1": [0.05, 0.1], "other": 0.12}
+
+
+def test_a_file_may_name_the_classes_of_its_parts(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    text = (Path(conf.__file__).parent / "machine" / "mini_excavator.yaml").read_text()
+    named = text.replace("lower: {", "lower: {_target_: brokk_rl.machine.Dimension, ")
+    assert named != text
+    (tmp_path / "arm.yaml").write_text(named)
+    cfg = composed(brokk, "mode=check", "machine=@arm.yaml")
+    assert cfg["machine"] == composed(brokk, "mode=check", "machine=mini_excavator")["machine"]

@@ -24,6 +24,7 @@ FILES = {
     "own/actuator/fails.yaml": "_target_: fails.Arm\n",
     "own/actuator/slip.yaml": "_target_: slip.Arm\n",
     "fails.py": "import math\nfrom math import squareroot\n",
+    "old/model_10.pt": "cut off",
     "slip.py": "x = 1\ndef f(:\n",
 }
 """Files in the folder from which the commands are started, by name."""
@@ -56,6 +57,9 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     # keys
     ("mod=train",): ("did you mean 'mode'?",),
     ("hidden_dims=256",): ("rl.runner.actor.hidden_dims=256",),
+    ("lr=1e-4",): ("rl.runner.algorithm.learning_rate=1e-4",),
+    ("mode=import", "logs=x"): ("mode=import --help",),
+    ("mode=inspect", "recording=x"): ("did you mean inspect.recordings=x?",),
     ("mode=play", "session.seed=3"): ("play.seed=3",),
     ("task..memory=3",): ("'task..memory'", "is no key"),
     (*COMPARE, "+session.sed=1"): ("no field 'sed'", "did you mean 'seed'?"),
@@ -85,6 +89,9 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("machine=@list.yaml",): ("expected a mapping",),
     ("machine=@nowhere.yaml",): ("there is no such file",),
     ("--config-dir", "own", "mode=broken"): ("broken.yaml", "line"),
+    ("policy=a#b",): ("there is no policy=a#b", "or the path of a run"),
+    ("policy=old",): ("old/model_10.pt is corrupt", "take an older one"),
+    ("session.out=old",): ("old already holds a run", "session.out=<folder>"),
     COMPARE: ("compare.runs", "nowhere"),
     # values
     ("mode=compare",): ("compare.runs=<value>",),
@@ -95,6 +102,8 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
 }
 """A command, and parts of its message."""
 AFTER_TORCH = {
+    ("~task",): ("the mode needs 'task'", "leave ~task out"),
+    ("mode=check", "subject=arm"): ("subject: expected a table with model, name",),
     ("mode=play", "preset=gpu"): ("the mode has no", "leave it out"),
     ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
     ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
