@@ -12,7 +12,7 @@ import sys
 import traceback
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, is_dataclass
 from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
@@ -124,6 +124,38 @@ def build_node(node: Any, place: str = "") -> Any:
     if TARGET not in node:
         return values
     return _call(load_class(node[TARGET], place), values, place)
+
+
+def describe_spec(value: Any) -> Any:
+    """Return a spec as a node of the configuration: plain data with the class of each part."""
+    if is_dataclass(value) and not isinstance(value, type):
+        node = {TARGET: name_class(value)}
+        for field in fields(value):
+            node[field.name] = describe_spec(getattr(value, field.name))
+        return node
+    if isinstance(value, Mapping):
+        return {key: describe_spec(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [describe_spec(item) for item in value]
+    return value
+
+
+def drop_targets(node: Any, kept: Collection[str] = ()) -> Any:
+    """Return plain data without the names of classes, but for those in `kept`."""
+    if isinstance(node, Mapping):
+        left = {}
+        for key, value in node.items():
+            if key != TARGET or value in kept:
+                left[key] = drop_targets(value, kept)
+        return left
+    if isinstance(node, list):
+        return [drop_targets(value, kept) for value in node]
+    return node
+
+
+def name_class(value: object) -> str:
+    """Return the dotted name of the class of an object, as `_target_` has it."""
+    return f"{type(value).__module__}.{type(value).__qualname__}"
 
 
 def load_class(target: object, place: str) -> Any:

@@ -202,9 +202,7 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     beside = Path(name).expanduser().parent / str(node.get("mjcf"))
     if group == "machine" and beside.is_file():
         node["mjcf"] = str(beside.resolve())
-    for key, value in node.items():
-        if isinstance(value, (dict, list)):
-            node[key] = _drop_parts(value, str(node.get("_target_")).rpartition(".")[0])
+    _drop_parts(node)
     packages = _read_packages(group)
     package = _find_package(where, group, text, node, packages)
     for place, target in registry.iterate_leaves(node):
@@ -221,20 +219,19 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     return {str(key): value for key, value in node.items()}, package
 
 
-def _drop_parts(node: Any, module: str) -> Any:
-    """Return plain data without the names of classes in `module`, that of the option's class.
+def _drop_parts(node: dict[Any, Any]) -> None:
+    """Take the names of classes from the parts of an option: its annotations name them.
 
-    They are the parts of which that class is made, and its annotations name them.
+    A part has its class in the module of the option's own class.
     """
-    if isinstance(node, list):
-        return [_drop_parts(value, module) for value in node]
-    if not isinstance(node, dict):
-        return node
-    kept = {}
-    for key, value in node.items():
-        if key != "_target_" or str(value).rpartition(".")[0] != module:
-            kept[key] = _drop_parts(value, module)
-    return kept
+    from brokk_rl.build import drop_targets
+
+    own, kept = str(node.get("_target_")).rpartition(".")[0], set()
+    for place, target in registry.iterate_leaves(node):
+        if place[-1] == "_target_" and str(target).rpartition(".")[0] != own:
+            kept.add(target)
+    for key in node.keys() - {"_target_"}:
+        node[key] = drop_targets(node[key], kept)
 
 
 def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:

@@ -21,14 +21,13 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
-from brokk_rl.build import RUN, TARGET, build_node
+from brokk_rl.build import RUN, TARGET, build_node, drop_targets
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import (
     CONTRACT,
     StoredPolicy,
     TaskDescription,
-    drop_targets,
     find_policy,
     find_resumed,
     format_value,

@@ -18,8 +18,8 @@ import copy
 import hashlib
 import json
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ import numpy as np
 import yaml
 
 from brokk_rl import registry
-from brokk_rl.build import TARGET
+from brokk_rl.build import TARGET, describe_spec, drop_targets, name_class
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import measure_ranges, restore_encoder
@@ -146,7 +146,7 @@ def describe_task(task: object) -> TaskDescription:
         for part in path.split("."):
             value = getattr(value, part)
         behaviour[path] = json.loads(json.dumps(value, default=asdict))
-    return TaskDescription(name=name_target(_name_class(task)), behaviour=behaviour)
+    return TaskDescription(name=name_target(name_class(task)), behaviour=behaviour)
 
 
 def name_target(target: str) -> str:
@@ -157,37 +157,6 @@ def name_target(target: str) -> str:
             if offered.get(TARGET) == target:
                 return option.name
     return target
-
-
-def describe_spec(value: Any) -> Any:
-    """Return a spec as a node of the configuration: plain data with the class of each part."""
-    if is_dataclass(value) and not isinstance(value, type):
-        node = {TARGET: _name_class(value)}
-        for field in fields(value):
-            node[field.name] = describe_spec(getattr(value, field.name))
-        return node
-    if isinstance(value, Mapping):
-        return {key: describe_spec(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [describe_spec(item) for item in value]
-    return value
-
-
-def drop_targets(node: Any, kept: Collection[str] = ()) -> Any:
-    """Return plain data without the names of classes, but for those in `kept`."""
-    if isinstance(node, Mapping):
-        left = {}
-        for key, value in node.items():
-            if key != TARGET or value in kept:
-                left[key] = drop_targets(value, kept)
-        return left
-    if isinstance(node, list):
-        return [drop_targets(value, kept) for value in node]
-    return node
-
-
-def _name_class(value: object) -> str:
-    return f"{type(value).__module__}.{type(value).__qualname__}"
 
 
 def describe_policy(

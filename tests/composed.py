@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from brokk_rl import extensions, registry
-from brokk_rl.build import build_node
-from brokk_rl.policy_folder import describe_spec, find_policy
+from brokk_rl.build import build_node, describe_spec
+from brokk_rl.policy_folder import find_policy
 
 extensions.register_options([])  # the exam's options are those of an extension
 

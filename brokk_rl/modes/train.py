@@ -13,12 +13,12 @@ import torch
 from scipy import stats
 
 from brokk_rl import distributed
+from brokk_rl.build import describe_spec
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.policy_folder import (
     CONTRACT,
     describe_policy,
-    describe_spec,
     find_resumed,
     list_checkpoints,
     read_contract,

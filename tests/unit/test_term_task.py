@@ -15,7 +15,7 @@ import training as runs
 from composed import option
 from kinematic import Kinematic, KinematicWorld
 
-from brokk_rl.build import build_node
+from brokk_rl.build import build_node, describe_spec
 from brokk_rl.checks import check_task
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
@@ -23,7 +23,7 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.observation import restore_encoder
-from brokk_rl.policy_folder import describe_spec, describe_task
+from brokk_rl.policy_folder import describe_task
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session
