@@ -270,14 +270,10 @@ class StagedFinder:
             frame, face = s.depth.match_near(frame, places)
         masks = Masks(face, None)
         judged = _Judged([], [], [])
-        gray = convert_to_gray(frame)
-        for place, _ in places:
-            with _time_stage(ms, "ellipse"):
-                level = search.plan_level_around(place, gray.shape, s.size_slack, s.comfortable_px)
-                candidates = _remove_duplicates(level.detect(self._detector, gray))
-            near = [one for one in candidates if np.hypot(one.x - place.x, one.y - place.y) < one.a]
-            with _time_stage(ms, "pose"):
-                self._judge(frame, masks, near, judged, None)
+        # The expected rim is the candidate: it is known better than a detector would find it. None
+        # of its edges has been seen yet, so that most of the circle must be.
+        with _time_stage(ms, "pose"):
+            self._judge(frame, masks, [place for place, _ in places], judged, None)
         return self._conclude(judged, masks, frame, ms)
 
     def find_ellipses(self, frame: Frame) -> list[Ellipse]:
@@ -415,7 +411,7 @@ def expect_rim(hole: HolePose, frame: Frame) -> tuple[Ellipse, np.ndarray] | Non
     row = build_chart(center_m, m, frame.camera_matrix).seen(np.array([0.0, 0.0, hole.radius_m]))
     if not np.isfinite(row).all() or not (0 <= row[0] < width and 0 <= row[1] < height):
         return None
-    return Ellipse(*map(float, row), rms_px=0.0, coverage=1.0, score=hole.score), m
+    return Ellipse(*map(float, row), rms_px=0.0, coverage=0.0, score=hole.score), m
 
 
 def rectify(frame: Frame) -> Frame:

@@ -200,27 +200,6 @@ def plan_search_levels(
     return found
 
 
-def plan_level_around(
-    place: Ellipse, shape: tuple[int, ...], slack: float, comfortable_px: float
-) -> SearchLevel:
-    """Return the level around the expected rim of a known hole, in the coarsest suitable resolution.
-
-    Args:
-        place: The rim as expected.
-        shape: Rows and columns of the picture.
-        slack: Allowed relative error of its size.
-        comfortable_px: Least semi-axis in the chosen resolution.
-    """
-    octave = int(np.clip(np.log2(place.a / comfortable_px), 0, OCTAVES - 1))
-    region = np.zeros([-(-size // STEP) for size in shape[:2]], np.uint8)
-    reach = 2.0 * place.a
-    top, left = max(0, int((place.y - reach) / STEP)), max(0, int((place.x - reach) / STEP))
-    bottom, right = int((place.y + reach) / STEP) + 1, int((place.x + reach) / STEP) + 1
-    region[top:bottom, left:right] = 1
-    prior = SizePrior(place.a / (1.0 + slack), place.a * (1.0 + slack))
-    return SearchLevel(2**octave, region, prior)
-
-
 def _split_region(
     here: np.ndarray, size_px: np.ndarray, unknown: np.ndarray, slack: float
 ) -> list[tuple[np.ndarray, SizePrior]]:

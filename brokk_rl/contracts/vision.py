@@ -252,7 +252,9 @@ class BoreholeFinder(Protocol):
     def find(self, frame: Frame) -> FrameDetections:
         """Return the holes of one frame, in camera coordinates or in the base frame.
 
-        The frame is read-only, and the same frame gives the same answer. No hole is no error.
+        The frame is read-only. No hole is no error. The frames are those of one camera, in order: a
+        finder may remember that its pair was good, and answer a frame that shows too little to tell
+        by that. Otherwise the same frame gives the same answer.
 
         Raises:
             FrameError: the frame cannot be used; its message says why.
