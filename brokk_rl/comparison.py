@@ -16,19 +16,20 @@ from glob import glob
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import yaml
 from scipy import stats
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import RESOLVED, read_record
-from brokk_rl.statistics import CONFIDENCE, compute_interquartile_mean, compute_student_interval
+from brokk_rl.statistics import CONFIDENCE, compute_student_interval
 
 EVALUATION = "evaluation.json"
 SUCCESS_RATE = "success_strict"
 LOW, HIGH = "_low", "_high"
 """Endings of the columns with the 95 % interval of a figure."""
+DIFFERENCE = "difference"
+"""Column with the mean difference to the baseline."""
 NOT_FIGURES = ("episodes", "seed")
 """Numbers of `evaluation.json` that are not compared."""
 NOT_COMPARED = ("session", "mode", "hydra", "preset")
@@ -230,65 +231,61 @@ def average_seeds(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
     return averaged.join(low.add_suffix(LOW)).join(high.add_suffix(HIGH)).reset_index()
 
 
-def summarise_methods(
+def compare_to_baseline(
+    groups: pd.DataFrame,
     table: pd.DataFrame,
     columns: Sequence[str],
     wanted: Mapping[str, Any] | None,
-    generator: np.random.Generator,
 ) -> pd.DataFrame:
-    """Return for each method its interquartile mean and its difference to the baseline.
+    """Return the groups with their difference to a baseline in strict success.
 
-    A method is a policy and what varies, over seeds and conditions of evaluation. Differences are
-    those of the same seed and condition. Conditions are averaged first: the seed is the unit of
-    chance.
+    Differences are those of the same seed, evaluated on the same actuator.
 
     Args:
-        table: Result of `tabulate_runs`; rows without a rate of strict success are left out.
-        columns: Its settings.
-        wanted: Values of the baseline; `None` for the first method.
-        generator: Draws the resamples of intervals.
+        groups: Result of `average_seeds`.
+        table: The rows that were averaged.
+        columns: Settings of both.
+        wanted: Values of the baseline; `None` for those of the first group.
 
     Returns:
-        A row for each method: `policy` and settings, `conditions`, `runs`, `mean` and `difference`
-        with their intervals, `is_baseline`, and `by_seed` with the differences.
+        `groups` with `difference`, its interval (Student's, over seeds), and `by_seed`; missing
+        values for the baseline itself.
 
     Raises:
         ConfigError: No method has the values of the baseline, or several have.
     """
-    rated = table.dropna(subset=[SUCCESS_RATE])
-    if EVALUATED_ON not in rated:
-        rated = rated.assign(**{EVALUATED_ON: ""})
     keys = ["policy", *(column for column in columns if column != EVALUATED_ON)]
-    distinct: Any = rated[keys].drop_duplicates()
+    distinct: Any = groups[keys].drop_duplicates()
     methods = distinct.to_dict("records")
-    scores = []
-    for method in methods:
-        own = rated[(rated[keys] == pd.Series(method)).all(axis=1)]
-        scores.append(own.groupby([EVALUATED_ON, "seed"], sort=False)[SUCCESS_RATE].last())
-    baseline = _choose_baseline(methods, wanted) if methods else 0
-    summaries = []
-    for number, (method, own) in enumerate(zip(methods, scores, strict=True)):
-        strata = own.groupby(EVALUATED_ON, sort=False).agg(np.array)
-        mean, interval = compute_interquartile_mean(strata.tolist(), generator)
-        by_seed: Any = (own - scores[baseline]).dropna().groupby("seed").mean()
-        if number == baseline:
+    baseline = _choose_baseline(methods, wanted)
+    found = []
+    for _, group in groups.iterrows():
+        own = _select_scores(table, group[["policy", *columns]])
+        other = group[["policy", *columns]]
+        other[keys] = pd.Series(baseline)
+        by_seed: Any = (own - _select_scores(table, other)).dropna()
+        if group[keys].to_dict() == baseline:
             by_seed = by_seed.iloc[:0]
-        conditions = [condition for condition in strata.index if condition]
-        summary = method | {"conditions": conditions, "runs": len(own), "mean": mean}
-        summary["mean" + LOW], summary["mean" + HIGH] = interval or (None, None)
-        summary |= {"is_baseline": number == baseline, "difference": by_seed.mean()}
-        bounds = compute_student_interval(by_seed.tolist()) or (None, None)
-        summary["difference" + LOW], summary["difference" + HIGH] = bounds
-        summaries.append(summary | {"by_seed": by_seed.to_dict()})
-    return pd.DataFrame(summaries, columns=None if summaries else ["mean" + LOW])
+        low, high = compute_student_interval(by_seed.tolist()) or (None, None)
+        row = {"by_seed": by_seed.to_dict(), DIFFERENCE: by_seed.mean()}
+        found.append(row | {DIFFERENCE + LOW: low, DIFFERENCE + HIGH: high})
+    return groups.join(pd.DataFrame(found, index=groups.index))
 
 
-def _choose_baseline(methods: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any] | None) -> int:
-    """Return the number of the method to which the others are compared."""
+def _select_scores(table: pd.DataFrame, values: pd.Series) -> pd.Series:
+    """Return strict success by seed of the rows with these values."""
+    own = table[(table[list(values.index)] == values).all(axis=1)]
+    return own.groupby("seed", sort=False)[SUCCESS_RATE].last()
+
+
+def _choose_baseline(
+    methods: Sequence[dict[str, Any]], wanted: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """Return the method to which the others are compared."""
     if wanted is None:
-        return 0
+        return methods[0]
     words = {key: str(value) for key, value in wanted.items()}
-    found = [number for number, row in enumerate(methods) if words.items() <= row.items()]
+    found = [row for row in methods if words.items() <= row.items()]
     if len(found) != 1:
         raise ConfigError(
             f"compare.baseline={dict(wanted)}: expected the values of one row, {len(found)} rows "

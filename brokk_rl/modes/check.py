@@ -7,7 +7,7 @@ import logging
 import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -19,14 +19,11 @@ from brokk_rl.errors import BrokkError, ConfigError, StorageError
 from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Dimension, Machine
-from brokk_rl.plot import BLUE, GREY, ORANGE, make_figure, remove_frame, save_figure
-from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import Count, name_spec, spec
 
 if TYPE_CHECKING:
     import torch
-    from matplotlib.figure import Figure
 
     from brokk_rl.contracts.actuator import ActuatorModel
 
@@ -102,8 +99,6 @@ class MachineCheck:
         reach: Extent of the tool point over random poses, m; empty where it is not known.
         contact: Links that may touch something; empty where there is no model.
         starts: Shares of starts of the task that can be done.
-        tips_m: Tool points of the random poses, `(P, 3)`; `None` where they are not known.
-        targets_m: Targets that can be reached, `(M, 3)`; `None` without.
     """
 
     problems: list[str] = field(default_factory=list)
@@ -113,12 +108,6 @@ class MachineCheck:
     reach: dict[str, float] = field(default_factory=dict)
     contact: list[str] = field(default_factory=list)
     starts: dict[str, float] = field(default_factory=dict)
-    tips_m: np.ndarray | None = None
-    targets_m: np.ndarray | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return it as plain JSON data, without the points."""
-        return {key: value for key, value in asdict(self).items() if not key.endswith("_m")}
 
     def summarise(self) -> str:
         """Return the verdict in a sentence."""
@@ -178,7 +167,7 @@ class Check:
     subject: CheckSubject
 
     def run(self) -> None:
-        """Write `check.html`, `check.json` and `workspace.png`; with a model also YAML and MJCF.
+        """Print the check and write `check.json`; with a model also YAML and MJCF.
 
         Raises:
             ConfigError: The model has no serial chain of hinges and slides.
@@ -197,13 +186,9 @@ class Check:
             "machine": machine.name,
             "task": None if is_new else name_spec(self.task),
             "actuator": name_spec(self.actuator),
-            **found.to_json(),
+            **asdict(found),
         }
         write_json(folder / "check.json", facts)
-        picture = _draw_workspace(machine, found)
-        if picture:
-            save_figure(picture, folder / "workspace.png")
-        _write_report(machine, found, facts, folder)
         _show(machine, found)
         if is_new:
             file = folder / f"{machine.name}.yaml"
@@ -212,7 +197,7 @@ class Check:
             print_text(
                 f"next, with a task: brokk mode=check machine=@{file} task=… actuator={actuator}"
             )
-        log.info("report: %s", folder / "check.html")
+        log.info("the same as data: %s", folder / "check.json")
 
     def _import_model(self) -> tuple[Machine, list[str]]:
         """Return the machine of the model and remarks about it; writes its files."""
@@ -253,8 +238,6 @@ class Check:
         except BrokkError as error:
             found.unfit.append(str(error))
             return None
-        if "target_m" in drawn:
-            found.targets_m = drawn["target_m"].numpy()
         return drawn
 
     def _try_simulation(
@@ -297,8 +280,8 @@ def check_machine(machine: Machine, num_poses: int, generator: np.random.Generat
     q = generator.uniform(machine.lower, machine.upper, (num_poses, machine.num_joints))
     load = None
     if machine.has_bodies:
-        found.tips_m = compute_tool_kinematics(machine, q).tip_in_base_m
-        distance_m, height_m = np.hypot(*found.tips_m[:, :2].T), found.tips_m[:, 2]
+        x_m, y_m, height_m = compute_tool_kinematics(machine, q).tip_in_base_m.T
+        distance_m = np.hypot(x_m, y_m)
         found.reach = {
             "furthest_m": float(distance_m.max()),
             "nearest_m": float(distance_m.min()),
@@ -389,26 +372,6 @@ def _is_guessed(dimension: Dimension) -> bool:
     return dimension.confidence == "low"
 
 
-def _write_report(
-    machine: Machine, found: MachineCheck, facts: dict[str, Any], folder: Path
-) -> None:
-    tone = "bad" if found.problems or found.unfit else "good"
-    page = Report(f"Check of {machine.name}", found.summarise(), tone)
-    task = facts["task"] or "none"
-    about = {"machine": machine.title, "task": task, "actuator": facts["actuator"]}
-    page.add_facts(about | found.list_facts())
-    for heading, texts in found.group_remarks().items():
-        page.add_heading(heading.capitalize())
-        page.add_list(texts)
-    if found.tips_m is not None:
-        page.add_picture(
-            folder / "workspace.png", f"Tool points of {len(found.tips_m)} random poses"
-        )
-    page.add_heading("Joints")
-    page.add_table(["joint", *JOINT_COLUMNS.values()], found.list_joints(), JOINT_UNITS)
-    page.write(folder / "check.html")
-
-
 def _show(machine: Machine, found: MachineCheck) -> None:
     """Print the verdict, the joints, and every remark."""
     print_text(f"{machine.name}: {found.summarise()}")
@@ -421,35 +384,3 @@ def _show(machine: Machine, found: MachineCheck) -> None:
         remarks += [(kind, text) for text in texts]
     if remarks:
         print_table([], remarks)
-
-
-def _draw_workspace(machine: Machine, found: MachineCheck) -> Figure | None:
-    """Draw tool points, targets and the arm at home from the side and from above."""
-    if found.tips_m is None:
-        return None
-    pose = compute_tool_kinematics(machine, machine.home)
-    arm = np.concatenate((np.zeros((1, 3)), pose.joints_in_base_m, pose.tip_in_base_m[None]))
-    figure = make_figure(11.0, 5.0)
-    side, top = figure.subplots(1, 2)
-
-    def look_from_side(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.hypot(points[:, 0], points[:, 1]), points[:, 2]
-
-    def look_down(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return points[:, 0], points[:, 1]
-
-    clouds = [(found.tips_m, "tool point", GREY, 1.5)]
-    if found.targets_m is not None:
-        clouds.append((found.targets_m, "target that can be reached", ORANGE, 4.0))
-    for axis, project in ((side, look_from_side), (top, look_down)):
-        for points, label, color, size in clouds:
-            style = {"color": color, "markersize": size, "rasterized": True}
-            axis.plot(*project(points), ".", label=label, **style)
-        axis.plot(*project(arm), "-o", color=BLUE, linewidth=3, label="arm at home")
-        axis.set_aspect("equal", adjustable="datalim")
-        remove_frame(axis)
-    side.axhline(0.0, color="black", linewidth=0.8)
-    side.set(title="from the side", xlabel="distance from the base's axis, m", ylabel="height, m")
-    top.set(title="from above", xlabel="x, m", ylabel="y, m")
-    side.legend(frameon=False, fontsize=8)
-    return figure

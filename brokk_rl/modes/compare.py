@@ -15,17 +15,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
 from brokk_rl.comparison import (
+    DIFFERENCE,
     HIGH,
     LOW,
     EvaluatedRun,
     average_seeds,
+    compare_to_baseline,
     describe_differences,
     find_differences,
     find_runs,
     list_figures,
     list_rates,
     load_run,
-    summarise_methods,
     tabulate_runs,
 )
 from brokk_rl.console_table import print_table
@@ -82,17 +83,16 @@ class Compare:
     compare: RunSelection
 
     def run(self) -> None:
-        """Print tables; write `comparison.*`, of several seeds `seeds.png`, of trainings `learning.*`."""
+        """Print the table; write `comparison.*`, and of trainings `learning.*`."""
         patterns = (self.compare.runs,) if isinstance(self.compare.runs, str) else self.compare.runs
         runs = [load_run(folder) for folder in find_runs(patterns)]
         columns = find_differences(runs)
         table = tabulate_runs(runs, columns)
-        groups = average_seeds(table, columns)
-        generator = self.session.generator("compare")
-        methods = summarise_methods(table, columns, self.compare.baseline, generator)
+        averaged = average_seeds(table, columns)
+        groups = compare_to_baseline(averaged, table, columns, self.compare.baseline)
         folder = self.session.folder
-        content: dict[str, Any] = {"schema": 2, "columns": columns}
-        for name, rows in (("groups", groups), ("runs", table), ("methods", methods)):
+        content: dict[str, Any] = {"schema": 3, "columns": columns}
+        for name, rows in (("groups", groups), ("runs", table)):
             text = str(rows.to_json(orient="records", double_precision=15))
             content[name] = json.loads(text)
         write_json(folder / "comparison.json", content)
@@ -102,12 +102,6 @@ class Compare:
         save_figure(picture, folder / "comparison.png")
         _write_learning(runs, columns, folder)
         _print_groups(groups, columns, words, list_rates(table))
-        bounds: Any = methods["mean" + LOW]
-        if bounds.count():
-            seeds = build_seed_table(methods, columns)
-            print_table(list(seeds.columns), seeds.to_numpy().tolist())
-            write_text(folder / "comparison.tex", format_latex(seeds))
-            save_figure(draw_seeds(methods, seeds["method"].tolist()), folder / "seeds.png")
         log.info("%d runs compared in %s", len(runs), folder)
 
 
@@ -141,47 +135,26 @@ def _print_groups(
             half = (groups[name + HIGH] - groups[name + LOW]) / 2
             shown += half.map(lambda value: "" if pd.isna(value) else f" ±{value:.3f}")
         cells[_name_figure(figure)] = shown.where(groups[name].notna(), None)
+    cells["difference by seed"] = groups.apply(_format_difference, axis=1)
     table = pd.concat([groups["policy"], settings, groups["runs"], pd.DataFrame(cells)], axis=1)
     headings = ["policy", *settings.columns, "seeds", *cells]
     print_table(headings, table.astype(object).where(table.notna(), None).to_numpy().tolist())
+
+
+def _format_difference(group: pd.Series) -> str | None:
+    """Return the difference of a group to the baseline with its interval, as text."""
+    if pd.isna(group[DIFFERENCE]):
+        return None
+    text = f"{group[DIFFERENCE]:+.3f}"
+    if pd.notna(group[DIFFERENCE + LOW]):
+        text += f" ({group[DIFFERENCE + LOW]:+.3f} to {group[DIFFERENCE + HIGH]:+.3f})"
+    return text
 
 
 def label_rows(rows: Any, columns: Sequence[str]) -> list[str]:
     """Return a short name of each row: its policy, and the values that most others lack."""
     texts = describe_differences(rows[list(columns)])
     return [", ".join(filter(None, pair)) for pair in zip(rows["policy"], texts, strict=True)]
-
-
-def build_seed_table(methods: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
-    """Return the table of interquartile means and differences, as text."""
-    settings = [column for column in columns if column in methods]
-    shown = _format_column(methods, "difference", "{:+.3f}")
-    return pd.DataFrame(
-        {
-            "method": label_rows(methods, settings),
-            "runs": methods["runs"].map(str),
-            "interquartile mean": _format_column(methods, "mean", "{:.3f}"),
-            "95 %": _format_interval(methods, "mean", "{:.3f}"),
-            "difference by seed": shown.mask(methods["is_baseline"], "baseline"),
-            "95 % of it": _format_interval(methods, "difference", "{:+.3f}"),
-        }
-    )
-
-
-def _format_column(table: pd.DataFrame, name: str, form: str) -> pd.Series:
-    values: Any = table[name].astype(float)
-    return values.map(lambda value: "–" if pd.isna(value) else form.format(value))
-
-
-def _format_interval(table: pd.DataFrame, name: str, form: str) -> pd.Series:
-    low, high = _format_column(table, name + LOW, form), _format_column(table, name + HIGH, form)
-    joined: Any = low + " to " + high
-    return joined.mask(table[name + LOW].isna(), "")
-
-
-def format_latex(table: pd.DataFrame) -> str:
-    """Return the table of `build_seed_table` for a paper, in LaTeX with the package booktabs."""
-    return table.to_latex(index=False, escape=True, column_format="lrrlrl")
 
 
 def draw_comparison(
@@ -204,21 +177,6 @@ def draw_comparison(
         axis.set_xlabel(_name_figure(figure))
         axis.set_xlim(left=0.0)
     _name_rows(success, label_rows(groups, columns))
-    return picture
-
-
-def draw_seeds(methods: pd.DataFrame, labels: Sequence[str]) -> Picture:
-    """Draw interquartile means with intervals, and the difference to the baseline of each seed."""
-    picture = make_figure(11.0, 1.6 + 0.45 * len(methods))
-    means, differences = picture.subplots(1, 2, sharey=True)
-    _draw_rows(means, methods, "mean", BLUE)
-    _draw_rows(differences, methods, "difference", ORANGE)
-    for row, by_seed in enumerate(methods["by_seed"]):
-        differences.plot(list(by_seed.values()), [row + 0.18] * len(by_seed), ".", color=GREY)
-    differences.axvline(0.0, color="black", linewidth=0.8)
-    means.set_xlabel("interquartile mean of success, 95 % of resamples")
-    differences.set_xlabel("difference to the baseline: each seed, mean, 95 % interval")
-    _name_rows(means, labels)
     return picture
 
 

@@ -15,20 +15,15 @@ from scipy import stats
 
 from brokk_rl.comparison import (
     average_seeds,
+    compare_to_baseline,
     find_differences,
     find_runs,
     list_figures,
     load_run,
-    summarise_methods,
     tabulate_runs,
 )
 from brokk_rl.errors import ConfigError
-from brokk_rl.modes.compare import build_seed_table, format_latex
-from brokk_rl.statistics import (
-    compute_interquartile_mean,
-    compute_student_interval,
-    compute_wilson_interval,
-)
+from brokk_rl.statistics import compute_student_interval, compute_wilson_interval
 
 
 def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any) -> None:
@@ -177,92 +172,39 @@ def test_learning_curves_are_thinned_and_say_when_success_was_reached(
     assert (tmp_path / "compared" / "learning.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_the_interquartile_mean_drops_the_outer_quarters() -> None:
-    # of 0.0, 0.1, …, 0.7 the two lowest and the two highest go: (0.2 + 0.3 + 0.4 + 0.5) / 4
-    strata = [np.array([0.0, 0.7, 0.2, 0.5]), np.array([0.6, 0.1, 0.4, 0.3])]
-    assert compute_interquartile_mean(strata, np.random.default_rng(0))[0] == pytest.approx(0.35)
-    assert compute_interquartile_mean([np.array([0.4])], np.random.default_rng(0)) == (0.4, None)
-
-
-def test_runs_are_drawn_again_within_their_stratum() -> None:
-    # each stratum has equal scores: no resample differs, unless strata are mixed
-    strata = [np.array([0.2, 0.2, 0.2]), np.array([0.8, 0.8, 0.8])]
-    mean, interval = compute_interquartile_mean(strata, np.random.default_rng(0))
-    assert mean == pytest.approx(0.5) and interval == pytest.approx((0.5, 0.5))
-
-
-@pytest.mark.parametrize(
-    ("strata", "mean", "interval"),
-    [
-        ([[0.2, 0.4, 0.95, 0.6], [0.9, 0.7, 0.8, 0.99]], 0.75, (0.55, 0.925)),
-        ([[0.2, 0.4, 0.95, 0.6, 0.7]], 1.7 / 3, (0.8 / 3, 2.6 / 3)),
-    ],
-)
-def test_interquartile_means_are_those_of_rliable(
-    strata: list[list[float]], mean: float, interval: tuple[float, float]
-) -> None:
-    # rliable 1.2.0: get_interval_estimates with aggregate_iqm, 50,000 resamples, numpy's seed 0
-    found, bounds = compute_interquartile_mean(
-        [np.array(scores) for scores in strata], np.random.default_rng(1)
-    )
-    assert found == pytest.approx(mean, abs=1e-9)
-    assert bounds == pytest.approx(interval, abs=0.006)
-
-
-def results_of(actuator: str, scores: dict[str, dict[int, float]]) -> pd.DataFrame:
-    rows = []
-    for condition, rates in scores.items():
-        for seed, rate in rates.items():
-            rows.append(["trained", seed, actuator, condition, rate])
-    names = ["policy", "seed", *COLUMNS, "success_strict"]
-    return pd.DataFrame(rows, columns=names)
-
-
-COLUMNS = ["actuator", "evaluated on"]
-
-
 def test_differences_are_those_of_the_same_seed_and_condition() -> None:
-    table = pd.concat(
-        [
-            results_of("lag", {"ideal": {0: 0.5, 1: 0.9}, "mlp": {0: 0.3}}),
-            results_of("mlp", {"ideal": {1: 1.0, 0: 0.7, 2: 0.0}, "mlp": {0: 0.7}}),
-        ]
+    columns, rows = ["actuator", "evaluated on"], []
+    scores = {
+        ("lag", "ideal"): {0: 0.5, 1: 0.9},
+        ("lag", "mlp"): {0: 0.3},
+        ("mlp", "ideal"): {1: 1.0, 0: 0.7, 2: 0.0},
+        ("mlp", "mlp"): {0: 0.7},
+    }
+    for setting, rates in scores.items():
+        for seed, rate in rates.items():
+            rows.append(["trained", seed, *setting, 100, rate, rate, rate])
+    names = ["policy", "seed", *columns, "episodes", "success_strict"]
+    table = pd.DataFrame(rows, columns=[*names, "success_strict_low", "success_strict_high"])
+    groups = average_seeds(table, columns)
+    base, other_base, other, single = compare_to_baseline(groups, table, columns, None).to_dict(
+        "records"
     )
-    generator = np.random.default_rng(0)
-    base, other = summarise_methods(table, COLUMNS, None, generator).to_dict("records")
-    assert np.isnan(base["difference"])
-    assert other["by_seed"] == pytest.approx({0: 0.3, 1: 0.1})
-    assert other["conditions"] == ["ideal", "mlp"]
-    # mean 0.2, standard error 0.1, t(0.975, 1) = 12.706
+    assert np.isnan(base["difference"]) and np.isnan(other_base["difference"])
+    assert other["by_seed"] == pytest.approx({0: 0.2, 1: 0.1})
+    # mean 0.15, standard error 0.05, t(0.975, 1) = 12.706
     bounds = (other["difference_low"], other["difference_high"])
-    assert bounds == pytest.approx((0.2 - 1.2706, 0.2 + 1.2706), abs=1e-4)
-    chosen = summarise_methods(table, COLUMNS, {"actuator": "mlp"}, generator)
-    assert chosen["is_baseline"].tolist() == [False, True]
+    assert bounds == pytest.approx((0.15 - 0.6353, 0.15 + 0.6353), abs=1e-4)
+    assert single["difference"] == pytest.approx(0.4) and np.isnan(single["difference_low"])
     with pytest.raises(ConfigError, match=r"0 rows have them.*'actuator': 'lag'"):
-        summarise_methods(table, COLUMNS, {"actuator": "lagg"}, generator)
+        compare_to_baseline(groups, table, columns, {"actuator": "lagg"})
 
 
-def test_the_latex_table_holds_names_that_tex_would_misread() -> None:
-    table = pd.concat(
-        [results_of(name, {"": {0: 0.5, 1: 0.7}}) for name in ("load_sensing", "50%")]
-    )
-    methods = summarise_methods(table, COLUMNS, None, np.random.default_rng(0))
-    text = format_latex(build_seed_table(methods, COLUMNS))
-    assert r"load\_sensing & 2 & 0.600" in text and r"50\% & 2" in text
-    assert "+0.000" in text
-    assert text.startswith(r"\begin{tabular}") and r"\bottomrule" in text
-    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
-    assert {row.count("&") - row.count(r"\&") for row in rows} == {5}
-
-
-def test_the_command_writes_the_tables_over_seeds(
+def test_the_command_compares_with_a_baseline(
     sweep: Path, brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
     words = ("mode=compare", f"compare.runs={sweep}", "session.out=compared")
     done = brokk(*words, "compare.baseline={actuator: mlp}")
-    assert done.code == 0 and "interquartile mean" in done.out and "-0.600" in done.out
-    methods = json.loads((tmp_path / "compared/comparison.json").read_text())["methods"]
-    assert methods[0]["by_seed"] == pytest.approx({"0": -0.7, "1": -0.5})
-    assert (tmp_path / "compared/seeds.png").read_bytes()[:4] == b"\x89PNG"
-    assert r"\toprule" in (tmp_path / "compared/comparison.tex").read_text()
+    assert done.code == 0 and "difference by seed" in done.out and "-0.600" in done.out
+    groups = json.loads((tmp_path / "compared/comparison.json").read_text())["groups"]
+    assert groups[0]["by_seed"] == pytest.approx({"0": -0.7, "1": -0.5})
     assert brokk(*words, "compare.baseline={actuator: x}").code == 2
