@@ -206,7 +206,7 @@ def read_answer(path: Path) -> Answer:
         found = json.loads(path.read_text())
         if found["schema"] != SCHEMA:
             raise RecordingError(f"{path}: schema {found['schema']}, expected {SCHEMA}")
-        return _parse_answer(found)
+        return parse_answer(found)
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: cannot be read as a diagnosis ({error})") from error
     except (KeyError, TypeError) as error:
@@ -215,7 +215,8 @@ def read_answer(path: Path) -> Answer:
         ) from error
 
 
-def _parse_answer(found: dict[str, Any]) -> Answer:
+def parse_answer(found: dict[str, Any]) -> Answer:
+    """Return the answer in the content of a `diagnosis.json`."""
     joints, units = {}, {}
     for name, gap in found["where"]["joints"].items():
         units[name] = "m" if "rmse_m" in gap else "rad"

@@ -1,4 +1,4 @@
-"""Scores of all answers of some candidates: the examiner's simulations, tables, published answers."""
+"""Answers of a candidate, from the folder of a run or from a published file, and their scores."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
-from diagnosis import answer
+from diagnosis.answer import ANSWER_FILE, Answer, parse_answer
 from exam import dataset, run_cases, score
 from exam.dataset import end_on_interrupt
 from exam.examiner import examine_case
@@ -23,11 +23,81 @@ from exam.metrics import compute_metrics
 
 log = logging.getLogger(__name__)
 
-BULK = ("curves", "location", "evidence")
-"""Parts of an answer that fill pictures, nine in ten of its bytes, and no score."""
-
+PUBLISHED = ("schema", "verdict", "reason", "selected", "ranking", "where", "gap")
+"""Parts of an answer that are published: those that a score reads. The others are nine in ten of its bytes; a
+published file names them as `left_out`."""
 RUN_FILE = "run.json"
 """File beside answers: who gave them, at which commit, to which labels."""
+EXAMINED_FILE = "examined.json"
+"""The examiner's figures, beside a score and beside published answers."""
+
+
+@dataclass(frozen=True)
+class GivenAnswer:
+    """Answer of a candidate to a case, as it was left.
+
+    Attributes:
+        note: Seconds that it took, or the reason why there is no answer; empty where nothing was noted.
+        content: Content of its `diagnosis.json`, `None` without an answer.
+        left_out: Parts of it that are not published.
+    """
+
+    note: Mapping[str, Any]
+    content: Mapping[str, Any] | None
+    left_out: tuple[str, ...] = ()
+
+    def parse(self) -> Answer | None:
+        """Return the answer."""
+        return None if self.content is None else parse_answer(dict(self.content))
+
+    @property
+    def seconds(self) -> float | None:
+        """Time that the answer took, where it is noted."""
+        if not self.note or self.note["error"]:
+            return None
+        return float(self.note["seconds"])
+
+
+def read_answers(path: Path) -> dict[str, GivenAnswer]:
+    """Return the answers in the folder of `exam.do=run`, or in a published file, by case.
+
+    Raises:
+        RecordingError: there is no answer.
+    """
+    found = {}
+    if path.is_file():
+        for line in path.read_text().splitlines():
+            row = json.loads(line)
+            left_out = tuple(row.get("left_out", ()))
+            found[row["case"]] = GivenAnswer(row["note"], row["answer"], left_out)
+    elif path.is_dir():
+        for place in filter(run_cases.is_begun, path.iterdir()):
+            file = place / ANSWER_FILE
+            content = json.loads(file.read_text()) if file.is_file() else None
+            found[place.name] = GivenAnswer(run_cases.read_note(place), content)
+    if all(one.content is None for one in found.values()):
+        raise RecordingError(f"exam.answers: {path} holds no answer to any case")
+    return found
+
+
+def read_run(answers: Path) -> dict[str, Any]:
+    """Return what `exam.do=run` noted beside answers; empty where nothing is noted, as of a published file."""
+    try:
+        return json.loads((answers / RUN_FILE).read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
+    """Write all answers into one file, a line a case, with their notes and what is left out."""
+    lines = []
+    for case, one in sorted(given.items()):
+        row: dict[str, Any] = {"case": case, "note": dict(one.note), "answer": None}
+        if one.content is not None:
+            row["answer"] = {key: one.content[key] for key in PUBLISHED}
+            row["left_out"] = sorted({*one.left_out, *one.content} - {*PUBLISHED})
+        lines.append(json.dumps(row) + "\n")
+    write_text(path, "".join(lines))
 
 
 @dataclass(frozen=True)
@@ -35,40 +105,84 @@ class AnswerScoring:
     """Everything that answers to an exam are scored by.
 
     Attributes:
+        labels: Its opened labels.
+        classes: Effects that recordings of commands and positions cannot tell apart.
+        of_machine: Effects that all joints have together.
+    """
+
+    labels: Sequence[Mapping[str, Any]]
+    classes: Sequence[Sequence[str]]
+    of_machine: Sequence[str]
+
+    def score_cases(
+        self, given: Mapping[str, GivenAnswer], examined: Mapping[str, Any]
+    ) -> list[score.CaseScore]:
+        """Return the score of each case that somebody began, with the examiner's figures by case."""
+        found = []
+        for label in self.labels:
+            case = label["case"]
+            if case not in given:
+                continue
+            one, examination = given[case], examined.get(case)
+            answer = one.parse()
+            found.append(
+                score.score_answer(
+                    label, answer, self.classes, self.of_machine, one.seconds, examination
+                )
+            )
+        return found
+
+    def build_table(
+        self, given: Mapping[str, GivenAnswer], examined: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return the figures of answers; cases that nobody began are left out and counted."""
+        scores = self.score_cases(given, examined)
+        not_begun = len(self.labels) - len(scores)
+        if not_begun:
+            log.warning(
+                "%d of %d cases were not begun and are left out", not_begun, len(self.labels)
+            )
+        return compute_metrics(scores, not_begun)
+
+
+@dataclass(frozen=True)
+class Examiners:
+    """The examiner's simulations of the answers of some candidates.
+
+    Attributes:
         exam: Folder of the exam.
         labels: Its opened labels.
         machine: The machine as the candidates know it.
         fit: Fit of the examiner's simulator.
-        classes: Effects that recordings of commands and positions cannot tell apart.
-        of_machine: Effects that all joints have together.
     """
 
     exam: Path
     labels: Sequence[Mapping[str, Any]]
     machine: Machine
     fit: ActuatorFit
-    classes: Sequence[Sequence[str]]
-    of_machine: Sequence[str]
 
     def examine(
         self, folders: Mapping[str, Path], place: Path, workers: int
     ) -> dict[str, dict[str, Any]]:
-        """Return the examiner's figures by candidate and case; empty without withheld recordings.
+        """Return the figures by candidate and case; empty without withheld recordings.
 
         Args:
-            folders: Answers of each candidate.
+            folders: Answers of each candidate. Of a published file the figures beside it are taken.
             place: File that keeps the figures, so that an interrupted score goes on.
             workers: Processes.
         """
-        found: dict[str, dict[str, Any]] = {name: {} for name in folders}
+        found: dict[str, dict[str, Any]] = {}
+        for name, folder in folders.items():
+            beside = folder.parent / EXAMINED_FILE
+            is_known = folder.is_file() and beside.is_file()
+            found[name] = json.loads(beside.read_text()).get(name, {}) if is_known else {}
         if place.is_file():
             found |= json.loads(place.read_text())
         todo = []
         for label in self.labels:
             case = label["case"]
-            if label["kind"] not in ("one", "several"):
-                continue
-            if not (self.exam / dataset.WITHHELD_FOLDER / case).is_dir():
+            is_withheld = (self.exam / dataset.WITHHELD_FOLDER / case).is_dir()
+            if label["kind"] not in ("one", "several") or not is_withheld:
                 continue
             begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
             missing = [name for name in begun if case not in found[name]]
@@ -92,67 +206,3 @@ class AnswerScoring:
                 write_json(place, found)
                 progress.advance()
         return found
-
-    def build_table(self, folder: Path, examined: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the figures of the answers in `folder`, and the commit that gave them.
-
-        Args:
-            folder: The answers.
-            examined: The examiner's figures by case.
-
-        Raises:
-            RecordingError: there is no answer.
-        """
-        labels, marks = self.labels, []
-        begun = [label for label in labels if run_cases.is_begun(folder / label["case"])]
-        if len(begun) < len(labels):
-            log.warning(
-                "%s: %d of %d cases sat; the others are left out", folder, len(begun), len(labels)
-            )
-        for label in begun:
-            place = folder / label["case"]
-            said = (
-                answer.read_answer(place / answer.ANSWER_FILE)
-                if (place / answer.ANSWER_FILE).is_file()
-                else None
-            )
-            marks.append(
-                score.score_answer(
-                    label,
-                    said,
-                    self.classes,
-                    self.of_machine,
-                    run_cases.read_seconds(place),
-                    examined.get(label["case"]),
-                )
-            )
-        if all(mark.verdict == "failed" for mark in marks):
-            raise RecordingError(
-                f"exam.answers: {folder} holds no answer to any case of {self.exam}"
-            )
-        table = compute_metrics(marks, len(labels) - len(begun))
-        return {**table, "commit": _read_commit(folder)}
-
-    def publish(self, folder: Path, path: Path) -> None:
-        """Write all answers in `folder` into one file, a line a case, with its time."""
-        lines = []
-        for label in self.labels:
-            place = folder / label["case"]
-            if not run_cases.is_begun(place):
-                continue
-            said = None
-            if (place / answer.ANSWER_FILE).is_file():
-                said = json.loads((place / answer.ANSWER_FILE).read_text())
-                for key in BULK:
-                    said.pop(key, None)
-            note = run_cases.read_note(place)
-            lines.append(json.dumps({"case": label["case"], "note": note, "answer": said}) + "\n")
-        write_text(path, "".join(lines))
-
-
-def _read_commit(folder: Path) -> str | None:
-    """Return the commit that `exam.do=run` noted beside answers; `None` where nothing is noted."""
-    try:
-        return json.loads((folder / RUN_FILE).read_text())["commit"]
-    except (OSError, ValueError, KeyError):
-        return None

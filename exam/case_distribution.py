@@ -253,6 +253,10 @@ class CaseDistribution:
                 kept[name] = trouble
         return replace(self, tracked_share=0.0, troubles=kept)
 
+    def list_shared(self) -> list[str]:
+        """Return the effects that all joints have together."""
+        return [name for name, trouble in self.troubles.items() if trouble.joints == "all"]
+
     def _counts(self) -> dict[str, int]:
         """Return the number of cases of each kind by largest remainders."""
         exact = {kind: self.shares[kind] * self.num_cases for kind in KINDS}

@@ -26,6 +26,8 @@ from exam.case_distribution import CaseDesign, CaseFault
 from exam.generate import CaseRecorder, Half, HalfPlan, RecordedHalf
 
 LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
+OPENED_FILE = "labels.json"
+"""The labels of an opened exam, beside its score: the same bytes."""
 
 
 def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
@@ -51,26 +53,30 @@ def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
     return found
 
 
-def open_labels(folder: Path) -> dict[str, Any]:
-    """Return the labels in `folder`, after comparing them with the published hash.
+def open_labels(folder: Path) -> tuple[dict[str, Any], str]:
+    """Return the labels in `folder` with their hash, and their text as it was sealed.
+
+    They are the sealed ones of an exam, or the published ones beside a score.
 
     Raises:
         RecordingError: labels or hash are missing, or do not belong together.
     """
+    sealed, published = folder / LABELS_FILE, folder / OPENED_FILE
     try:
-        text, published = (
-            (folder / LABELS_FILE).read_text(),
-            (folder / HASH_FILE).read_text().split()[0],
-        )
+        if published.is_file() and not sealed.is_file():
+            text = published.read_text()
+            expected = hashlib.sha256(text.encode()).hexdigest()
+        else:
+            text, expected = sealed.read_text(), (folder / HASH_FILE).read_text().split()[0]
     except (OSError, IndexError) as error:
         raise RecordingError(
-            f"{folder}: expected {LABELS_FILE} and {HASH_FILE}, as exam.do=make leaves them ({error})"
+            f"{folder}: expected {LABELS_FILE} and {HASH_FILE}, as exam.do=make leaves them, or {OPENED_FILE} of a score ({error})"
         ) from error
-    if hashlib.sha256(text.encode()).hexdigest() != published:
+    if hashlib.sha256(text.encode()).hexdigest() != expected:
         raise RecordingError(
-            f"{folder / LABELS_FILE} was changed after it was sealed: its SHA-256 is not that of {HASH_FILE}; make the exam again"
+            f"{sealed} was changed after it was sealed: its SHA-256 is not that of {HASH_FILE}; make the exam again"
         )
-    return json.loads(text)
+    return {**json.loads(text), "labels_sha256": expected}, text
 
 
 CASES_FOLDER, WITHHELD_FOLDER = "cases", "withheld"

@@ -1,23 +1,20 @@
-"""Metrics of an exam: rates with Wilson intervals, all others with bootstrap intervals over cases.
-
-F1 and AUROC are those of scikit-learn (the optional extra `exam`).
-"""
+"""Metrics of an exam over the rows of its cases: rates with Wilson intervals, others with bootstrap intervals."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from importlib import import_module
-from itertools import pairwise
+from dataclasses import dataclass
+from itertools import chain, pairwise
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.statistics import CONFIDENCE, compute_wilson_interval
 from exam.case_distribution import KINDS
-from exam.score import QUIET_KINDS, CaseScore, Claim, ParameterScore
+from exam.score import CaseScore, Claim
 
 NUM_DRAWS = 1000
 """Bootstrap draws; the usual number for 95 % intervals."""
@@ -30,51 +27,92 @@ MOVED_RAD = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 1.0)
 """Edges of the same curve over the change of the motion, rad: each bin doubles."""
 
 Metric = dict[str, Any]
+"""`value`, `of` and `ci95`; `None` where there is nothing to count."""
 
 
-def import_sklearn(module: str, purpose: str) -> Any:
-    """Return a module of scikit-learn.
+@dataclass(frozen=True)
+class MetricDefinition:
+    """A row of the report.
 
-    Raises:
-        ConfigError: scikit-learn is not installed.
+    Attributes:
+        title: Its label.
+        kinds: Kinds of cases that count.
+        collect: Numbers of a case; a case may have none or several.
+        more_is_better: Whether more of it is better; `None`: neither.
+        compute: The metric of the numbers of all cases, with an interval by bootstrap over cases;
+            `None`: the rate of true ones, with Wilson's.
     """
-    try:
-        return import_module(f"sklearn.{module}")
-    except ImportError as error:
-        raise ConfigError(f"{purpose} needs scikit-learn: pip install 'brokk-rl[exam]'") from error
+
+    title: str
+    kinds: tuple[str, ...]
+    collect: Callable[[CaseScore], Sequence[Any]]
+    more_is_better: bool | None
+    compute: Callable[[np.ndarray], float | None] | None = None
 
 
-def compute_rate(right: Sequence[bool]) -> Metric:
-    """Return share, number and Wilson interval."""
-    low, high = compute_wilson_interval(sum(right), len(right))
-    return {
-        "value": float(np.mean(right)) if right else None,
-        "of": len(right),
-        "ci95": [low, high],
-    }
+def drop_none(value: Any) -> list[Any]:
+    """Return the value as a list, empty for `None`."""
+    return [] if value is None else [value]
 
 
-def bootstrap_over_cases(
-    scores: Sequence[CaseScore],
-    metric: Callable[[Sequence[CaseScore]], float | None],
-    seed: int = 0,
-) -> Metric:
-    """Return a metric with its percentile bootstrap interval over cases."""
-    value = metric(scores)
-    if value is None:
-        return {"value": None, "of": len(scores), "ci95": None}
-    generator, drawn = np.random.default_rng(seed), []
-    known: dict[bytes, float | None] = {}  # draws of a few cases repeat
-    for _ in range(NUM_DRAWS):
-        rows = generator.integers(len(scores), size=len(scores))
-        key = rows.tobytes()
-        if key not in known:
-            known[key] = metric(list(map(scores.__getitem__, rows)))
-        if known[key] is not None:
-            drawn.append(known[key])
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(drawn, [tail, 100.0 - tail]) if drawn else (value, value)
-    return {"value": float(value), "of": len(scores), "ci95": [float(low), float(high)]}
+def compute_ratio(rows: np.ndarray) -> float | None:
+    """Return the sum of the first column over that of the second."""
+    total = rows[:, 1].sum()
+    return float(rows[:, 0].sum() / total) if total else None
+
+
+def compute_auroc(rows: np.ndarray) -> float | None:
+    """Return the AUROC of the probability (first column) of cases with the property (second); ties count half."""
+    positive = rows[:, 1] > 0
+    inside, outside = rows[positive, 0], rows[~positive, 0]
+    if not len(inside) or not len(outside):
+        return None
+    return float(stats.mannwhitneyu(inside, outside).statistic / (len(inside) * len(outside)))
+
+
+def compute_ece(rows: np.ndarray) -> float:
+    """Return the expected calibration error of probabilities (first column) of statements (second: 1 if true).
+
+    It is the mean distance of stated probability and rate of true statements over the bins,
+    weighted by their statements.
+    """
+    place = np.minimum((rows[:, 0] * NUM_BINS).astype(int), NUM_BINS - 1)
+    apart = np.bincount(place, rows[:, 0] - rows[:, 1], NUM_BINS)
+    return float(np.abs(apart).sum() / len(rows))
+
+
+def compute_median(rows: np.ndarray) -> float:
+    """Return the median."""
+    return float(np.median(rows))
+
+
+ONE, SEVERAL, KNOWN = ("one",), ("several",), ("one", "several")
+ROWS: dict[str, tuple[Any, ...]] = {
+    "top1": ("one effect: named first", ONE, lambda s: [s.first], True),
+    "top1_equivalent": ("  or a listed equivalent", ONE, lambda s: [s.first_equivalent], True),
+    "exactly_one": ("one effect: it and no other", ONE, lambda s: [s.exact], True),
+    "exactly_one_equivalent": ("  or an equivalent only", ONE, lambda s: [s.exact_equivalent], True),
+    "exact_set": ("two or three effects: exact set", SEVERAL, lambda s: [s.exact], True),
+    "exact_set_equivalent": ("  or equivalents", SEVERAL, lambda s: [s.exact_equivalent], True),
+    "set_f1": ("two or three effects: F1", SEVERAL, lambda s: [s.count_names(s.named)], True, compute_ratio),
+    "set_f1_equivalent": ("  with equivalents", SEVERAL, lambda s: [s.count_names(s.stands_for)], True, compute_ratio),
+    "joints": ("joints right, when the effect or an equivalent is", KNOWN, lambda s: s.joints_right, True),
+    "false_alarms_none": ("unchanged: an effect or unknown", ("none",), lambda s: [s.alarm], False),
+    "false_alarms_faint": ("below noise: a false effect or unknown", ("faint",), lambda s: [s.alarm], False),
+    "unknown_recall": ("outside the library: said unknown", ("outside",), lambda s: [s.verdict == "unknown"], True),
+    "unknown_wrongly": ("a known effect called unknown", KNOWN, lambda s: [s.verdict == "unknown"], False),
+    "missed": ("a known effect called none", KNOWN, lambda s: [s.verdict == "none"], False),
+    "unknown_auroc": ("AUROC of unknown", KINDS, lambda s: [(s.unknown, s.kind == "outside")], True, compute_auroc),
+    "ece": ("calibration error (ECE), with equivalents", KINDS, lambda s: s.claims, False, compute_ece),
+    "parameter_error": ("parameter error, median", KINDS, lambda s: [one.error for one in s.numbers], False, compute_median),
+    "cover_90": ("90 % intervals cover", KINDS, lambda s: [one.in_90 for one in s.numbers], None),
+    "cover_95": ("95 % intervals cover", KINDS, lambda s: [one.in_95 for one in s.numbers], None),
+    "closed_examined": ("gap closed by the examiner, median", KNOWN, lambda s: drop_none(s.examined), True, compute_median),
+    "closed_differs": ("stated closing disagrees with the examiner's", KNOWN, lambda s: drop_none(s.differs), False),
+    "closed_missing": ("effects named without a share", KINDS, lambda s: [s.closed is None] if s.named else [], False),
+}  # fmt: skip
+METRICS = {key: MetricDefinition(*row) for key, row in ROWS.items()}
+"""All metrics of the report's table, in its order."""
 
 
 def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str, Any]:
@@ -87,267 +125,121 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
     by_kind: dict[str, list[CaseScore]] = {kind: [] for kind in KINDS}
     for score in scores:
         by_kind[score.kind].append(score)
-    one, several, outside = by_kind["one"], by_kind["several"], by_kind["outside"]
-    quiet = _select_kinds(scores, QUIET_KINDS)
-    known = one + several
-    joints: list[bool] = []
-    for score in known:
-        joints.extend(score.joints_right)
-    seconds = [score.seconds for score in scores if score.seconds is not None]
-    numbers = _collect_numbers(scores)
-    return {
+    one, outside = by_kind["one"], by_kind["outside"]
+    found: dict[str, Any] = {
         "cases": {kind: len(of_kind) for kind, of_kind in by_kind.items()},
         "sat": {"value": len(scores), "of": len(scores) + not_begun},
         "failed": sum(score.verdict == "failed" for score in scores),
-        "top1": _rate_items(one, attrgetter("first")),
-        "top1_strictly": _rate_items(one, attrgetter("first_strictly")),
-        "exactly_one": _rate_items(one, _is_exact),
-        "macro_f1": bootstrap_over_cases(one, partial(compute_f1, average="macro")),
-        "joints": compute_rate(joints),
-        "exact_set": _rate_items(several, _is_exact),
-        "set_f1": bootstrap_over_cases(several, partial(compute_f1, average="micro")),
-        "false_alarms": _compute_false_alarms(quiet),
-        "false_alarms_none": _compute_false_alarms(by_kind["none"]),
-        "false_alarms_faint": _compute_false_alarms(by_kind["faint"]),
-        "unknown_recall": _rate_items(outside, _is_called_unknown),
-        "unknown_wrongly": _rate_items(known, _is_called_unknown),
-        "unknown_auroc": bootstrap_over_cases(scores, compute_auroc),
-        "ece": bootstrap_over_cases(scores, lambda drawn: compute_ece(collect_claims(drawn))),
-        "reliability": compute_reliability(collect_claims(scores)),
-        "parameter_error": bootstrap_over_cases(scores, compute_parameter_error),
-        "cover_90": _rate_items(numbers, attrgetter("in_90")),
-        "cover_95": _rate_items(numbers, attrgetter("in_95")),
-        "closed_examined": bootstrap_over_cases(known, compute_examined_share),
-        "closed_differs": _rate_items(_select_examined(known), attrgetter("differs")),
-        "closed_missing": _rate_items(_select_named(scores), _is_without_share),
-        "seconds": {"median": _take_median(seconds), "most": max(seconds, default=None)},
+    }
+    for key, metric in METRICS.items():
+        parts = [metric.collect(score) for score in scores if score.kind in metric.kinds]
+        if metric.compute is None:
+            found[key] = compute_rate(list(chain.from_iterable(parts)))
+        else:
+            found[key] = bootstrap_cases(parts, metric.compute)
+    seconds = [score.seconds for score in scores if score.seconds is not None]
+    median = float(np.median(seconds)) if seconds else None
+    return found | {
+        "seconds": {"median": median, "most": max(seconds, default=None)},
+        "reliability": compute_reliability(scores),
         "by_effect": summarize_effects(scores),
-        "confusion": count_confusions(one),
-        "outside": count_outside_answers(outside),
+        "confusion": _count_answers((s.truth[0], (*s.named, s.verdict)[0]) for s in one),
+        "outside": _count_answers((s.outside, "+".join(s.named) or s.verdict) for s in outside),
         "by_size": compute_detection_curve(one, attrgetter("size"), SIZES),
         "by_motion": compute_detection_curve(one, attrgetter("moved_rad"), MOVED_RAD),
     }
 
 
-def _rate_items(items: Sequence[Any], is_right: Callable[[Any], bool]) -> Metric:
-    """Return the rate of the items for which `is_right` holds."""
-    return compute_rate(list(map(is_right, items)))
+def compute_rate(right: Sequence[bool]) -> Metric:
+    """Return share, number and Wilson interval."""
+    interval = compute_wilson_interval(sum(right), len(right))
+    value = float(np.mean(right)) if len(right) else None
+    return {"value": value, "of": len(right), "ci95": list(interval)}
 
 
-def _select_kinds(scores: Sequence[CaseScore], kinds: Sequence[str]) -> list[CaseScore]:
-    return [score for score in scores if score.kind in kinds]
+def bootstrap_cases(
+    numbers: Sequence[Sequence[Any]], compute: Callable[[np.ndarray], float | None], seed: int = 0
+) -> Metric:
+    """Return a metric of the numbers of each case with its percentile bootstrap interval over cases."""
+    parts = [np.array(of_case, dtype=float) for of_case in numbers]
+
+    def compute_of(rows: Iterable[int]) -> float | None:
+        given = [parts[row] for row in rows if len(parts[row])]
+        return compute(np.concatenate(given)) if given else None
+
+    value = compute_of(range(len(parts)))
+    if value is None:
+        return {"value": None, "of": len(parts), "ci95": None}
+    generator = np.random.default_rng(seed)
+    draws = generator.integers(len(parts), size=(NUM_DRAWS, len(parts)))
+    drawn = [one for one in map(compute_of, draws.tolist()) if one is not None]
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    interval = np.percentile(drawn, [tail, 100.0 - tail]).tolist()
+    return {"value": value, "of": len(parts), "ci95": interval}
 
 
-def _collect_numbers(scores: Sequence[CaseScore]) -> list[ParameterScore]:
-    numbers: list[ParameterScore] = []
+def compute_reliability(scores: Sequence[CaseScore]) -> list[Metric]:
+    """Return, by bins of the stated probability, its mean and the rate of true statements."""
+    bins: dict[int, list[Claim]] = {}
+    for claim in chain.from_iterable(score.claims for score in scores):
+        # A certain statement (1.0) belongs to the last bin.
+        place = min(int(claim.probability * NUM_BINS), NUM_BINS - 1)
+        bins.setdefault(place, []).append(claim)
+    found = []
+    for _, inside in sorted(bins.items()):
+        stated, is_true = zip(*inside, strict=True)
+        found.append({"stated": float(np.mean(stated)), **compute_rate(is_true)})
+    return found
+
+
+def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, dict[str, float | None]]:
+    """Return precision, recall and F1 of each effect, strictly, over all cases but those below the noise."""
+    counts: dict[str, dict[str, int]] = {}
+    errors: dict[str, list[float]] = {}
     for score in scores:
-        numbers.extend(score.numbers)
-    return numbers
-
-
-def _is_called_unknown(score: CaseScore) -> bool:
-    return score.verdict == "unknown"
-
-
-def _is_called_none(score: CaseScore) -> bool:
-    return score.verdict == "none"
-
-
-def _has_named_effect(score: CaseScore) -> bool:
-    return score.verdict not in ("none", "failed")
-
-
-def _is_exact(score: CaseScore) -> bool:
-    return len(score.hits) == len(score.truth) == len(score.named)
-
-
-def _compute_false_alarms(quiet: Sequence[CaseScore]) -> Metric:
-    """Return the share of cases without a visible effect whose answer names one."""
-    return _rate_items(quiet, _has_named_effect)
-
-
-def list_labels(score: CaseScore) -> tuple[set[str], set[str]]:
-    """Return the true and the named effects of a case; a name that stands for a true one is it."""
-    stands_for = {said: true for true, said in score.hits}
-    return set(score.truth), {stands_for.get(name, name) for name in score.named}
-
-
-def build_indicators(scores: Sequence[CaseScore]) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Return the effects that occur, and which are true and which are named in each case, `(N, E)`."""
-    labels = [list_labels(score) for score in scores]
-    occurring: set[str] = set()
-    for is_true, is_named in labels:
-        occurring |= is_true | is_named
-    effects = sorted(occurring)
-    column = {effect: number for number, effect in enumerate(effects)}
-    # one empty column more: scikit-learn takes a single column for a binary target
-    true, named = np.zeros((2, len(labels), len(effects) + 1), dtype=int)
-    for row, (is_true, is_named) in enumerate(labels):
-        true[row, list(map(column.__getitem__, is_true))] = 1
-        named[row, list(map(column.__getitem__, is_named))] = 1
-    return effects, true, named
-
-
-def compute_f1(scores: Sequence[CaseScore], average: str) -> float | None:
-    """Return F1 of the named effects; `None` where there is nothing to count.
-
-    Args:
-        scores: Of the cases.
-        average: `micro`: over all effects together; `macro`: the mean over the effects that are
-            true somewhere, so that a name that is true nowhere lowers only the recall of others.
-    """
-    if not scores:
-        return None
-    effects, true, named = build_indicators(scores)
-    columns = np.flatnonzero(true.any(0)) if average == "macro" else np.arange(len(effects))
-    if not len(columns):
-        return None
-    metrics = import_sklearn("metrics", "exam.do=score")
-    found = metrics.f1_score(true, named, labels=columns, average=average, zero_division=0.0)
-    return float(found)
-
-
-def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, Metric]:
-    """Return precision, recall and F1 of each effect over all cases."""
-    effects, true, named = build_indicators(scores) if scores else ([], *np.zeros((2, 0, 0), int))
-    parameters = _collect_numbers(scores)
+        for number in score.numbers:
+            errors.setdefault(number.effect, []).append(number.error)
+        if score.kind == "faint":
+            continue
+        for effect in {*score.truth, *score.named}:
+            row = counts.setdefault(effect, {"right": 0, "wrong": 0, "missed": 0})
+            if effect not in score.truth:
+                row["wrong"] += 1
+            elif effect in score.named:
+                row["right"] += 1
+            else:
+                row["missed"] += 1
     found = {}
-    for number, effect in enumerate(effects):
-        right = int((true[:, number] & named[:, number]).sum())
-        wrong, missed = int(named[:, number].sum()) - right, int(true[:, number].sum()) - right
-        f1 = 2.0 * right / (2 * right + wrong + missed) if right + missed else None
-        errors = [one.error for one in parameters if one.effect == effect]
+    for effect, row in sorted(counts.items()):
+        right = row["right"]
+        named, there = right + row["wrong"], right + row["missed"]
         found[effect] = {
-            "right": right,
-            "wrong": wrong,
-            "missed": missed,
-            "precision": right / (right + wrong) if right + wrong else None,
-            "recall": right / (right + missed) if right + missed else None,
-            "f1": f1,
-            "parameter_error": _take_median(errors),
+            **row,
+            "precision": right / named if named else None,
+            "recall": right / there if there else None,
+            "f1": 2.0 * right / (named + there) if there else None,
+            "parameter_error": float(np.median(errors[effect])) if effect in errors else None,
         }
     return found
 
 
-def count_confusions(one: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
-    """Return, by true effect, the counts of the first names, or of the verdict without a name."""
-    found: dict[str, dict[str, int]] = {}
-    for score in one:
-        # over classes: a name that stands for the true one is counted as it
-        named = score.named[0] if score.named else score.verdict
-        _count(found.setdefault(score.truth[0], {}), score.truth[0] if score.first else named)
-    return found
-
-
-def count_outside_answers(outside: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
-    """Return, by fault outside the library, the counts of the answers."""
-    found: dict[str, dict[str, int]] = {}
-    for score in outside:
-        _count(found.setdefault(str(score.outside), {}), "+".join(score.named) or score.verdict)
-    return found
-
-
-def _count(row: dict[str, int], name: str) -> None:
-    row[name] = row.get(name, 0) + 1
-
-
 def compute_detection_curve(
-    scores: Sequence[CaseScore], measure: Callable[[CaseScore], float], edges: Sequence[float]
-) -> list[Metric]:
-    """Return, by bins of a size, the rate of right names and of the verdict `none`.
-
-    Args:
-        scores: Of cases with one effect.
-        measure: Size of one of them.
-        edges: Edges of the bins; empty bins are left out.
-    """
+    one: Sequence[CaseScore], measure: Callable[[CaseScore], float], edges: Sequence[float]
+) -> list[dict[str, Any]]:
+    """Return, by bins of a size, the rate of right names and of the verdict `none`; empty bins are left out."""
     found = []
     for low, high in pairwise(edges):
-        inside = []
-        for score in scores:
-            if low <= measure(score) < high:
-                inside.append(score)
+        inside = [score for score in one if low <= measure(score) < high]
         if inside:
-            right = _rate_items(inside, attrgetter("first"))
-            none = _rate_items(inside, _is_called_none)
+            right = compute_rate([score.first for score in inside])
+            none = compute_rate([score.verdict == "none" for score in inside])
             found.append({"from": low, "to": high, "right": right, "none": none})
     return found
 
 
-def compute_auroc(scores: Sequence[CaseScore]) -> float | None:
-    """Return the AUROC of the probability of `unknown` for cases outside the library."""
-    is_outside = [score.kind == "outside" for score in scores]
-    if len(set(is_outside)) < 2:
-        return None
-    metrics = import_sklearn("metrics", "exam.do=score")
-    chances = list(map(attrgetter("unknown"), scores))
-    return float(metrics.roc_auc_score(is_outside, chances))
-
-
-def collect_claims(scores: Sequence[CaseScore]) -> list[Claim]:
-    """Return all statements with a probability."""
-    claims: list[Claim] = []
-    for score in scores:
-        claims.extend(score.claims)
-    return claims
-
-
-def compute_reliability(made: Sequence[Claim]) -> list[Metric]:
-    """Return, by bins of the stated probability, its mean and the rate of true statements.
-
-    Not `sklearn.calibration.calibration_curve`: it gives no counts, which the intervals need, and
-    puts a probability on an edge into the bin below it.
-    """
-    bins: list[list[Claim]] = [[] for _ in range(NUM_BINS)]
-    for claim in made:
-        # a certain statement (1.0) belongs to the last bin
-        bins[min(int(claim.probability * NUM_BINS), NUM_BINS - 1)].append(claim)
-    found = []
-    for inside in filter(None, bins):
-        stated = float(np.mean(list(map(attrgetter("probability"), inside))))
-        found.append({"stated": stated, **_rate_items(inside, attrgetter("is_true"))})
+def _count_answers(pairs: Iterable[tuple[Any, str]]) -> dict[str, dict[str, int]]:
+    """Return how often each answer was given, by what is there."""
+    found: dict[str, dict[str, int]] = {}
+    for (there, said), count in Counter(pairs).items():
+        found.setdefault(str(there), {})[said] = count
     return found
-
-
-def compute_ece(made: Sequence[Claim]) -> float | None:
-    """Return the expected calibration error.
-
-    It is the mean distance of stated probability and rate of true statements over the bins,
-    weighted by their statements.
-    """
-    if not made:
-        return None
-    bins = compute_reliability(made)
-    return sum(one["of"] * abs(one["stated"] - one["value"]) for one in bins) / len(made)
-
-
-def compute_parameter_error(scores: Sequence[CaseScore]) -> float | None:
-    """Return the median relative error of the parameters."""
-    return _take_median(map(attrgetter("error"), _collect_numbers(scores)))
-
-
-def _select_examined(scores: Sequence[CaseScore]) -> list[CaseScore]:
-    """Return the cases with a share of the examiner's and one of the answer's."""
-    found = []
-    for score in scores:
-        if score.examined is not None and score.closed is not None:
-            found.append(score)
-    return found
-
-
-def _select_named(scores: Sequence[CaseScore]) -> list[CaseScore]:
-    return [score for score in scores if score.named]
-
-
-def _is_without_share(score: CaseScore) -> bool:
-    return score.closed is None
-
-
-def compute_examined_share(scores: Sequence[CaseScore]) -> float | None:
-    """Return the median closed share of the gap by the examiner's own simulation."""
-    return _take_median(score.examined for score in scores if score.examined is not None)
-
-
-def _take_median(values: Iterable[float]) -> float | None:
-    given = list(values)
-    return float(np.median(given)) if given else None

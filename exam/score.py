@@ -1,54 +1,42 @@
-"""Score of one answer against one label.
+"""Score of one answer against one label: the row of its case.
 
-An answer names an effect rightly, over classes, when it names the true one, one of its class (see
-`CaseDistribution.classes`), or has the true one in its `same_as`; strictly, when it names the true
-one. A case whose effect is below the noise counts as one without a gap.
+A name is right strictly when it is a true effect. It is right with equivalents when it is of the class of
+a true effect (see `CaseDistribution.classes`), or has one in its `same_as`. Figures are strict unless they
+say otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from diagnosis.answer import Answer, Selected
 
-QUIET_KINDS = ("none", "faint")
-"""Kinds of cases in which nothing can be seen."""
-CI95_OVER_SIGMA = 3.92
-"""Length of a 95 % interval of a normal distribution over its standard deviation: 2 times 1.96."""
 CI90_OVER_CI95 = 1.6449 / 1.9600
 """From half a 95 % interval to half a 90 % interval of a normal distribution."""
 
 
 @dataclass(frozen=True)
 class ParameterScore:
-    """A parameter of an effect that was rightly named, on a joint that has it.
+    """A parameter of an effect that is named strictly, on a joint that has it.
 
     Attributes:
         effect: Of which effect.
-        parameter: Its name.
         error: Absolute error over the true distance from the value that changes nothing.
-        deviation: The stated standard deviation, over the same.
-        said: The stated distance from the value that changes nothing, over the same.
         in_95: Whether the 95 % interval holds the truth.
         in_90: The same for the 90 % interval, which is the 95 % interval drawn together as for a
             normal distribution.
     """
 
     effect: str
-    parameter: str
     error: float
-    deviation: float
-    said: float
     in_95: bool
     in_90: bool
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A statement with a probability, and whether it is true."""
+class Claim(NamedTuple):
+    """A statement with a probability, and whether it is true; equivalents count."""
 
     probability: float
     is_true: bool
@@ -60,15 +48,13 @@ class CaseScore:
 
     Attributes:
         case: Which case.
-        kind: Its kind; see `mix.KINDS`.
-        truth: Effects that are there, none of them in a quiet case.
+        kind: Its kind; see `case_distribution.KINDS`.
+        truth: Effects that are there.
         named: Effects that are named, most probable first.
-        hits: Pairs of a true effect and the named one that stands for it, over classes.
+        stands_for: The true effect that each name stands for, equivalents included; empty for none.
         verdict: `effects`, `none`, `unknown`, or `failed` where there is no answer.
-        first: Whether the most probable name is right, over classes; strictly.
-        first_strictly: See `first`.
-        joints_right: Whether a rightly named effect has exactly its joints, for each that joints
-            can have.
+        joints_right: Whether a name that stands for an effect has exactly its joints, for each effect
+            that joints can have.
         unknown: Probability that the cause lies outside the library.
         claims: Statements whose truth the label knows.
         numbers: Parameters of strictly right names.
@@ -77,8 +63,7 @@ class CaseScore:
         closed: Share of the gap closed, by the answer's own account.
         examined: Share of the gap closed on withheld recordings, by the examiner's simulation of
             `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
-        was_examined: Whether the examiner simulated the answer.
-        differs: Whether the examiner's share and the answer's own disagree.
+        differs: Whether the examiner's share and the answer's own disagree; `None` without both.
         seconds: Time the answer took.
         outside: Name of the fault outside the library.
     """
@@ -87,10 +72,8 @@ class CaseScore:
     kind: str
     truth: tuple[str, ...]
     named: tuple[str, ...]
-    hits: tuple[tuple[str, str], ...]
+    stands_for: tuple[str, ...]
     verdict: str
-    first: bool
-    first_strictly: bool
     joints_right: tuple[bool, ...]
     unknown: float
     claims: tuple[Claim, ...]
@@ -99,10 +82,38 @@ class CaseScore:
     moved_rad: float
     closed: float | None
     examined: float | None
-    was_examined: bool
-    differs: bool
+    differs: bool | None
     seconds: float | None
     outside: str | None
+
+    @property
+    def first(self) -> bool:
+        """True if the most probable name is a true effect."""
+        return bool(self.named) and self.named[0] in self.truth
+
+    @property
+    def first_equivalent(self) -> bool:
+        """True if the most probable name stands for a true effect."""
+        return bool(self.named) and bool(self.stands_for[0])
+
+    @property
+    def exact(self) -> bool:
+        """True if the true effects are named and no other."""
+        return sorted(self.named) == sorted(self.truth)
+
+    @property
+    def exact_equivalent(self) -> bool:
+        """True if the names stand for the true effects, each for one."""
+        return sorted(self.stands_for) == sorted(self.truth)
+
+    @property
+    def alarm(self) -> bool:
+        """True if a false effect is named, or the cause called unknown."""
+        return self.verdict == "unknown" or not all(self.stands_for)
+
+    def count_names(self, names: Sequence[str]) -> tuple[int, int]:
+        """Return twice the right ones among names, and names and effects in all: the parts of F1."""
+        return 2 * len({*names} & {*self.truth}), len(names) + len(self.truth)
 
 
 def score_answer(
@@ -123,87 +134,72 @@ def score_answer(
         seconds: Time it took.
         examination: The examiner's own figures; see `examiner.Examination`.
     """
-    kind = label["kind"]
-    true = {one["effect"]: one for one in label["effects"]} if kind not in QUIET_KINDS else {}
-    chosen = (
-        sorted(answer.selected, key=lambda one: -one.probability)
-        if answer and answer.verdict == "effects"
-        else []
-    )
-    pairs = _match_effects(list(true), chosen, classes)
-    stands_for = {id(one): effect for effect, one in pairs}
+    kind, outside = label["kind"], label["outside"]
+    true = {one["effect"]: one for one in label["effects"]}
     verdict = answer.verdict if answer else "failed"
-    top = chosen[0] if chosen else None
-    unknown = _get_probability(answer, "unknown")
-    claims = [Claim(one.probability, id(one) in stands_for) for one in chosen]
-    # a verdict without names is a statement too, and a quiet kind makes "none" true
-    if verdict in ("none", "unknown"):
-        claims.append(
-            Claim(
-                _get_probability(answer, verdict),
-                kind in QUIET_KINDS if verdict == "none" else kind == "outside",
-            )
-        )
-    outside = label["outside"]
-    sizes = [one["size"] for one in label["effects"]] + ([outside["size"]] if outside else [])
-    joints_right: list[bool] = []
-    numbers: list[ParameterScore] = []
-    for effect, one in pairs:
-        if effect not in of_machine:
+    chosen: list[Selected] = []
+    if answer is not None and verdict == "effects":
+        chosen = sorted(answer.selected, key=lambda one: -one.probability)
+    stands_for = match_effects(list(true), chosen, classes)
+    claims, joints_right, numbers = [], [], []
+    for one, effect in zip(chosen, stands_for, strict=True):
+        claims.append(Claim(one.probability, bool(effect)))
+        if effect and effect not in of_machine:
             joints_right.append(set(one.joints) == set(true[effect]["joints"]))
-        # parameters of another effect of the class are other quantities
+        # Parameters of another effect of the class are other quantities.
         if effect == one.effect:
-            numbers.extend(_score_parameters(true[effect], one))
+            numbers.extend(score_parameters(true[effect], one))
+    # A verdict without names is a statement too. An effect below the noise makes `none` true.
+    if verdict == "none":
+        claims.append(Claim(read_probability(answer, verdict), kind in ("none", "faint")))
+    if verdict == "unknown":
+        claims.append(Claim(read_probability(answer, verdict), kind == "outside"))
+    sizes = [one["size"] for one in (*label["effects"], *filter(None, (outside,)))]
     gap = answer.gap if answer else None
+    closed = gap.closed.mean if gap and gap.closed else None
+    examined, differs = None, None
+    if examination is not None:
+        examined = examination["closed"]
+        if examined is not None and closed is not None:
+            differs = bool(examination["differs"])
     return CaseScore(
         case=label["case"],
         kind=kind,
         truth=tuple(true),
         named=tuple(one.effect for one in chosen),
-        hits=tuple((effect, one.effect) for effect, one in pairs),
+        stands_for=tuple(stands_for),
         verdict=verdict,
-        first=top is not None and id(top) in stands_for,
-        first_strictly=top is not None and top.effect in true,
         joints_right=tuple(joints_right),
-        unknown=unknown,
+        unknown=read_probability(answer, "unknown"),
         claims=tuple(claims),
         numbers=tuple(numbers),
         size=max(sizes, default=0.0),
         moved_rad=max(label["moved_rad"].values()),
-        closed=gap.closed.mean if gap and gap.closed else None,
-        examined=examination["closed"] if examination else None,
-        was_examined=examination is not None,
-        differs=bool(examination and examination["differs"]),
+        closed=closed,
+        examined=examined,
+        differs=differs,
         seconds=seconds,
         outside=outside["ailment"] if outside else None,
     )
 
 
-def _match_effects(
+def match_effects(
     true: Sequence[str], chosen: Sequence[Selected], classes: Sequence[Sequence[str]]
-) -> list[tuple[str, Selected]]:
-    """Return each true effect with the name that stands for it; equal names go first."""
-    found, left = [], list(chosen)
-    for stands in (_is_same, lambda effect, one: _is_equivalent(effect, one, classes)):
-        for effect in true:
-            match = next(filter(partial(stands, effect), left), None)
-            if match is not None and effect not in dict(found):
-                found.append((effect, match))
-                left.remove(match)
+) -> list[str]:
+    """Return the true effect that each name stands for, empty for none; equal names go first."""
+    found = [one.effect if one.effect in true else "" for one in chosen]
+    for k, one in enumerate(chosen):
+        if found[k]:
+            continue
+        equivalent = set(one.same_as)
+        for group in classes:
+            if one.effect in group:
+                equivalent.update(group)
+        found[k] = next((e for e in true if e in equivalent and e not in found), "")
     return found
 
 
-def _is_same(effect: str, one: Selected) -> bool:
-    return one.effect == effect
-
-
-def _is_equivalent(effect: str, one: Selected, classes: Sequence[Sequence[str]]) -> bool:
-    if effect in one.same_as:
-        return True
-    return any({effect, one.effect} <= set(group) for group in classes)
-
-
-def _get_probability(answer: Answer | None, name: str) -> float:
+def read_probability(answer: Answer | None, name: str) -> float:
     """Return the probability of `none` or `unknown`; where it is not ranked, 1 or 0 by the verdict."""
     if answer is None:
         return 0.0
@@ -211,35 +207,23 @@ def _get_probability(answer: Answer | None, name: str) -> float:
     return ranked[0] if ranked else float(answer.verdict == name)
 
 
-def _score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterScore]:
-    """Return the marks of all parameters of an effect on the joints that have it and are named."""
+def score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterScore]:
+    """Return the scores of all parameters of an effect on the joints that have it and are named."""
     found = []
     for name, by_joint in true["parameters"].items():
-        said = one.parameters.get(name, {})
-        values = dict(by_joint)
+        said, values = one.parameters.get(name, {}), dict(by_joint)
+        is_shared = len(set(values.values())) == 1 and len(set(said.values())) == 1
         if "machine" in said:  # a number that joints do not have
             values = {"machine": next(iter(by_joint.values()))}
-        elif (
-            len(set(values.values())) == 1
-            and len(set(said.values())) == 1
-            and set(said) >= set(values)
-        ):
+        elif is_shared and set(said) >= set(values):
             values = dict(list(values.items())[:1])  # one that they share counts once
-        for joint, value in values.items():
-            if joint not in said:
-                continue
-            estimate, nothing = said[joint], true["nothing"][name]
-            size, (low, high) = max(abs(value - nothing), 1e-9), estimate.ci95
+        for joint in values.keys() & said.keys():
+            value, estimate = values[joint], said[joint]
+            low, high = estimate.ci95
             short = estimate.mean + CI90_OVER_CI95 * (low - estimate.mean)
             long = estimate.mean + CI90_OVER_CI95 * (high - estimate.mean)
-            number = ParameterScore(
-                effect=one.effect,
-                parameter=name,
-                error=abs(estimate.mean - value) / size,
-                deviation=(high - low) / CI95_OVER_SIGMA / size,
-                said=abs(estimate.mean - nothing) / size,
-                in_95=low <= value <= high,
-                in_90=short <= value <= long,
+            error = abs(estimate.mean - value) / max(abs(value - true["nothing"][name]), 1e-9)
+            found.append(
+                ParameterScore(one.effect, error, low <= value <= high, short <= value <= long)
             )
-            found.append(number)
     return found

@@ -14,11 +14,11 @@ CODE = (
     "conf/certainty",
 )
 ROWS = {
-    "top1_strictly": "one effect: the right name first",
-    "top1": "the same, equivalents that the answer lists count too",
-    "exactly_one": "one effect: named, equivalents count, and nothing else",
-    "exact_set_strictly": "two or three effects: exact set",
-    "exact_set": "the same, equivalents count too",
+    "top1": "one effect: the right name first",
+    "top1_equivalent": "the same, equivalents that the answer lists count too",
+    "exactly_one_equivalent": "one effect: named, equivalents count, and nothing else",
+    "exact_set": "two or three effects: exact set",
+    "exact_set_equivalent": "the same, equivalents count too",
     "set_f1": "two or three effects: F1 of the names",
     "joints": "joints right, where the effect is",
     "false_alarms_none": "unchanged machines: given a cause or called unknown",

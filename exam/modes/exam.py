@@ -12,7 +12,7 @@ import numpy as np
 
 from actuators.contracts import ActuatorFit
 from actuators.excite.schedule import Approach
-from brokk_rl.console_table import print_table
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -20,16 +20,22 @@ from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import effect_library
-from exam import dataset, report, run_cases
-from exam.answer_scoring import RUN_FILE, AnswerScoring
+from exam import dataset, ledger, report, run_cases
+from exam.answer_scoring import (
+    EXAMINED_FILE,
+    RUN_FILE,
+    AnswerScoring,
+    Examiners,
+    publish_answers,
+    read_answers,
+    read_run,
+)
 from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
 from exam.dataset import CaseSet
 from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
 from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
-
-EXAMINED_FILE = "examined.json"
 
 
 @spec
@@ -191,47 +197,40 @@ class Exam:
 
     def _run(self) -> None:
         """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case, and `run.json`."""
-        settings = self.exam
-        cases = self._cases()
-        facts = {
-            "commit": describe_commit(),
-            "labels_sha256": self._facts["labels_sha256"],
-            "candidate": repr(settings.candidate),
-        }
-        write_json(self.session.folder / RUN_FILE, facts)
-        with ItemProgress("cases answered", len(cases)) as progress:
-            failed = run_cases.answer_cases(
-                settings.candidate,
-                cases,
-                self.session.folder,
-                self._known,
-                settings.workers,
-                progress,
-            )
-        if failed:
-            log.warning(
-                "%d of %d cases have no answer; why stands in their %s",
-                failed,
-                len(cases),
-                run_cases.NOTE_FILE,
-            )
-        log.info("answers in %s; exam.do=score opens the labels", self.session.folder)
-
-    def _cases(self) -> list[Path]:
-        found = sorted(filter(Path.is_dir, (self._folder / dataset.CASES_FOLDER).glob("*")))
-        if not found:
+        settings, facts = self.exam, self._read_facts()
+        folder = self._folder / dataset.CASES_FOLDER
+        cases = sorted(filter(Path.is_dir, folder.glob("*")))
+        if not cases:
             raise RecordingError(
                 f"exam.folder={self._folder}: expected cases in {dataset.CASES_FOLDER}/, as exam.do=make writes them"
             )
-        return found
+        run = {
+            "commit": describe_commit(),
+            "labels_sha256": facts["labels_sha256"],
+            "candidate": repr(settings.candidate),
+        }
+        if {"event": ledger.BEGUN, "run": run} not in map(
+            _drop_time, ledger.read_ledger(self._folder)
+        ):
+            hashes = {"labels_sha256": facts["labels_sha256"]}
+            ledger.append_entry(self._folder, ledger.BEGUN, {**hashes, "run": run})
+        write_json(self.session.folder / RUN_FILE, run)
+        known = restrict_machine(self.machine, facts.get("known", "full"))
+        with ItemProgress("cases answered", len(cases)) as progress:
+            failed = run_cases.answer_cases(
+                settings.candidate, cases, self.session.folder, known, settings.workers, progress
+            )
+        if failed:
+            text = "%d of %d cases have no answer; why stands in their %s"
+            log.warning(text, failed, len(cases), run_cases.NOTE_FILE)
+        log.info("answers in %s; exam.do=score opens the labels", self.session.folder)
 
     @property
     def _folder(self) -> Path:
         return Path(self.exam.folder or "")
 
-    @property
-    def _facts(self) -> dict[str, Any]:
-        """Facts of the exam in `exam.folder`.
+    def _read_facts(self) -> dict[str, Any]:
+        """Return the facts of the exam in `exam.folder`.
 
         Raises:
             RecordingError: there is no exam.
@@ -244,45 +243,41 @@ class Exam:
                 f"exam.folder={self._folder}: expected exam.json, as exam.do=make writes it ({error})"
             ) from error
 
-    @property
-    def _known(self) -> Machine:
-        """The machine as the candidates of the exam in `exam.folder` know it."""
-        return restrict_machine(self.machine, self._facts.get("known", "full"))
-
-    def _of_machine(self) -> list[str]:
-        shared = []
-        for name, trouble in self.exam.mix.troubles.items():
-            if trouble.joints == "all":
-                shared.append(name)
-        return shared
-
     def _score(self) -> None:
         """Open the labels; write marks, answers, labels and report; print the table."""
-        labels, facts = dataset.open_labels(self._folder)["cases"], self._facts
-        folders = {name: Path(folder) for name, folder in self.exam.answers.items()}
-        out = self.session.folder
-        marking = AnswerScoring(
-            exam=self._folder,
-            labels=labels,
-            machine=self._known,
-            fit=self.exam.fit,
-            classes=self.exam.mix.classes,
-            of_machine=self._of_machine(),
+        facts, text = dataset.open_labels(self._folder)
+        labels = facts.pop("cases")
+        answers = {name: Path(path) for name, path in self.exam.answers.items()}
+        given = {name: read_answers(path) for name, path in answers.items()}
+        facts["ledger"] = []
+        for path in answers.values():
+            run = read_run(path)
+            facts["ledger"].append(ledger.describe_registration(self._folder, path, run))
+        is_published = not (self._folder / dataset.CASES_FOLDER).is_dir()
+        if not is_published:
+            hashes = {"labels_sha256": facts["labels_sha256"]}
+            ledger.append_entry(self._folder, ledger.OPENED, hashes)
+        out, known = self.session.folder, facts.get("known", "full")
+        examiners = Examiners(
+            self._folder, labels, restrict_machine(self.machine, known), self.exam.fit
         )
-        examined = marking.examine(folders, out / EXAMINED_FILE, self.exam.workers)
+        examined = examiners.examine(answers, out / EXAMINED_FILE, self.exam.workers)
+        scoring = AnswerScoring(labels, self.exam.mix.classes, self.exam.mix.list_shared())
         tables = {}
-        for name, folder in folders.items():
-            tables[name] = marking.build_table(folder, examined.get(name, {}))
+        for name, one in given.items():
+            tables[name] = scoring.build_table(one, examined[name])
+            tables[name]["commit"] = read_run(answers[name]).get("commit")
+            # Answers and labels stand beside the score, so that anybody can score them again.
+            publish_answers(one, out / f"answers_{name}.jsonl")
+        write_text(out / dataset.OPENED_FILE, text)
         write_json(out / "marks.json", {"exam": facts, "candidates": tables})
         report.write_report(out, facts, tables)
-        # what anybody needs to score them again stands beside the score
-        write_text(out / "labels.json", (self._folder / dataset.LABELS_FILE).read_text())
-        for name, folder in folders.items():
-            marking.publish(folder, out / f"answers_{name}.jsonl")
-        _show(tables)
+        rows = [list(map(report.format_cell, row)) for row in report.build_rows(tables)]
+        print_table(["", *tables], rows)
+        for sentence in facts["ledger"]:
+            print_text(sentence)
         log.info("report: %s", out / report.REPORT_FILE)
 
 
-def _show(tables: dict[str, dict[str, Any]]) -> None:
-    rows = [list(map(report.format_cell, row)) for row in report.build_rows(tables)]
-    print_table(["", *tables], rows)
+def _drop_time(entry: dict[str, Any]) -> dict[str, Any]:
+    return {key: entry[key] for key in ("event", "run") if key in entry}

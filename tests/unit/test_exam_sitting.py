@@ -24,9 +24,10 @@ from diagnosis.answer import Answer, Estimate, Gap, Where
 from exam import dataset, examiner, run_cases
 from exam.examiner import ExaminerSimulator, compute_closed, read_effects
 from exam.generate import UNCHANGED_FOLDER, restrict_machine
+from exam.ledger import BEGUN, read_ledger
 
 
-def test_a_run_notes_the_hash_of_the_labels_of_a_sealed_exam(
+def test_a_sealed_exam_knows_its_engine_before_its_labels_are_opened(
     brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
     exam, answers = tmp_path / "exam", tmp_path / "answers"
@@ -40,8 +41,18 @@ def test_a_run_notes_the_hash_of_the_labels_of_a_sealed_exam(
     about = ("mode=exam", f"exam.folder={exam}", "exam_candidate=always_none")
     done = brokk(*about, "exam.do=run", f"session.out={answers}")
     assert done.code == 0, done.err
-    noted = json.loads((answers / "run.json").read_text())
-    assert noted["labels_sha256"] == facts["labels_sha256"]
+    (begun,) = read_ledger(exam)
+    assert begun["event"] == BEGUN and begun["run"]["labels_sha256"] == facts["labels_sha256"]
+    score = (*about, "exam.do=score", f"+exam.answers.none={answers}")
+    for count in range(2):
+        out = tmp_path / f"marks_{count}"
+        assert brokk(*score, f"session.out={out}").code == 0
+        (said,) = json.loads((out / "marks.json").read_text())["exam"]["ledger"]
+        assert "registered before" in said and f"opened {count} times" in said
+    run = json.loads((answers / "run.json").read_text())
+    (answers / "run.json").write_text(json.dumps(run | {"labels_sha256": "other"}))
+    refused = brokk(*score, f"session.out={tmp_path / 'refused'}")
+    assert refused.code == 2 and "got answers to others" in refused.err
 
 
 def test_a_make_that_was_interrupted_goes_on_and_gives_the_same_cases(
@@ -90,7 +101,7 @@ def test_an_exam_of_arms_known_by_their_joints_asks_nothing_that_needs_masses(
     assert done.code == 0, done.err
     known = restrict_machine(machine, "joints")
     assert not known.has_bodies and known.name == "brokk170_joints"
-    labels = dataset.open_labels(exam)
+    labels, _ = dataset.open_labels(exam)
     named = {one["effect"] for label in labels["cases"] for one in label["effects"]}
     assert labels["known"] == "joints" and not any(label["tracked"] for label in labels["cases"])
     assert named and not named & {"encoder_bias", "encoder_scale", "link_length", "base_tilt"}
