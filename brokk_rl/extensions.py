@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from brokk_rl import registry
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.explain import explain_missing_value
+from brokk_rl.plain_files import check_yaml_size, read_plain_file
 
 GROUP = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>.*)", re.DOTALL)
 """An override of a config group: group, package, value."""
@@ -31,6 +32,8 @@ FILE = re.compile(
 )
 """A file in the value of an override: alone, in a list, or among the values of a sweep."""
 PACKAGE = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
+MOST_BYTES = 1 << 20
+"""Size beyond which a file holds no option."""
 EVERYWHERE = "_global_"
 """Package of options that may change any part of the configuration, such as experiments."""
 
@@ -181,7 +184,8 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     """
     where = f"{group}=@{name}"
     try:
-        text = Path(name).expanduser().read_text()
+        text = read_plain_file(Path(name).expanduser(), MOST_BYTES).decode()
+        check_yaml_size(text)
         loaded = OmegaConf.create(text)
     except FileNotFoundError as error:
         raise ConfigError(f"{where}: there is no such file (seen from {Path.cwd()})") from error
@@ -192,7 +196,7 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     except yaml.MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
         raise ConfigError(f"{where}: {line}no valid YAML ({error.problem})") from error
-    except (yaml.YAMLError, OmegaConfBaseException) as error:
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(f"{where}: no valid YAML ({error})") from error
     node = OmegaConf.to_container(loaded, resolve=False) if isinstance(loaded, DictConfig) else None
     if not isinstance(node, dict) or not node:

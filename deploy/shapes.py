@@ -12,7 +12,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from deploy.plain_files import read_json
+from brokk_rl.plain_files import read_json
 
 SCHEMA, MOST_BYTES = 1, 1 << 22
 """Version of the file, and the size beyond which it is none."""

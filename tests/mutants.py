@@ -194,7 +194,8 @@ def survivors(module: str, tests: Sequence[str], only: set[str] | None) -> tuple
         raise SystemExit(f"{tests} fail without any mutant")
     cache_slow_parts()
     forget_modules()
-    pytest.main([*PYTEST, *tests])
+    if pytest.main([*PYTEST, *tests]):
+        raise SystemExit(f"{tests} fail with the cache of slow parts, so that they would kill all")
     gc.freeze()
     for words, tree in mutants(ast.parse(source), source):
         if only is not None and words not in only:

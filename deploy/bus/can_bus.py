@@ -19,8 +19,8 @@ import can
 from can.io.blf import BLFParseError, BLFReader
 
 from brokk_rl.errors import LinkError
+from brokk_rl.plain_files import check_plain_file
 from brokk_rl.spec import Positive, spec
-from deploy.plain_files import check_plain_file
 
 log = logging.getLogger(__name__)
 

@@ -26,9 +26,9 @@ from cantools.database.can import Message, Signal
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.plain_files import check_plain_file
 from brokk_rl.registry import resolve_package_path
 from deploy.kernel.protection import MessageFault, ProtectedChannel, compute_crc8
-from deploy.plain_files import check_plain_file
 
 COUNTER, CRC, STAMP = "Counter", "Crc", "Stamp"
 """Signals of the end-to-end protection; for the stamp see `deploy.kernel.clock`."""

@@ -152,8 +152,10 @@ class BusProcess:
             return SeenTarget((math.nan,) * 3, 0.0, ()) if self._memory.target.number else None
         seen_m = []
         for hole in read_holes(self._memory.holes):
-            if abs(now_s - float(hole["t_s"])) <= self._seen_s:
-                seen_m.append(tuple(hole["center_in_base_m"].tolist()))
+            place_m = tuple(hole["center_in_base_m"].tolist())
+            # A place that is no number shows no face.
+            if abs(now_s - float(hole["t_s"])) <= self._seen_s and all(map(math.isfinite, place_m)):
+                seen_m.append(place_m)
         center_m, age_s = target["center_in_base_m"].tolist(), now_s - float(target["t_s"])
         return SeenTarget(tuple(center_m), age_s, tuple(seen_m))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from deploy.plain_files import read_json
+from brokk_rl.plain_files import read_json
 
 SCHEMA = 2
 """Of the observer's file."""

@@ -19,17 +19,17 @@ import onnxruntime
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, restore_encoder
+from brokk_rl.plain_files import check_plain_file, read_json
 from brokk_rl.policy_folder import TaskDescription
 from brokk_rl.registry import resolve_package_path
-from deploy.plain_files import check_plain_file, read_json
 
 log = logging.getLogger(__name__)
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
 SCHEMAS = (1, 2)
 """Versions of the contract that are read; the first does not describe the policy's task."""
-MOST_JSON_BYTES, MOST_ONNX_BYTES = 1 << 26, 1 << 30
-"""Sizes beyond which a file is none of a policy; the shipped ones have 10 KB and 300 KB."""
+MOST_JSON_BYTES, MOST_ONNX_BYTES = 1 << 21, 1 << 30
+"""Sizes beyond which a file is none of a policy; the shipped ones have 150 KB and 300 KB."""
 ERRORS_ONLY = 3
 """Severity of onnxruntime's log."""
 ROUNDING = 1e-6
@@ -200,7 +200,7 @@ def _is_different(mine: Any, other: Any) -> bool:
             or any(map(_is_different, mine, other))
         )
     if isinstance(mine, (int, float)) and isinstance(other, (int, float)):
-        return abs(mine - other) > ROUNDING
+        return not abs(mine - other) <= ROUNDING  # NaN is no number of a contract
     return mine != other
 
 

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.plain_files import read_json
 from brokk_rl.spec import spec
-from deploy.plain_files import read_json
 from deploy.runtime.shared_memory import Slot
 
 NEAR_M = 0.1

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 import conf
+from brokk_rl.plain_files import check_yaml_size
 
 LAG = """# A fitted actuator.
 _target_: actuators.models.lag.FirstOrderLag
@@ -23,6 +24,10 @@ spread: {}
 EFFECTS = """stiction: {_target_: actuators.effects.command.Stiction, joints: [q3], start: 0.14, stop: 0.1}
 backlash: {_target_: actuators.effects.speed.Backlash, joints: [q3], gap_rad: 0.031}
 """
+BOMB = "a0: &a0 [1, 1]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60))
+MERGED = "a0: &a0 {x: 1}\n" + "".join(
+    f"a{i}: &a{i}\n  <<: [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60)
+)
 
 
 def composed(brokk: Callable[..., Any], *overrides: str) -> dict[str, Any]:
@@ -149,6 +154,10 @@ def test_a_sweep_takes_files_beside_options(
         ("experiment", "hydra: {sweep: {dir: /}}\n", ("Hydra's own settings",)),
         ("experiment", "defaults: [override /hydra/launcher: joblib]\n", ("Hydra's own settings",)),
         ("actuator", "", ("expected a mapping",)),
+        ("machine", BOMB, ("expected at most 20000 values",)),
+        ("guard", MERGED, ("expected at most 20000 values",)),
+        ("actuator", "a: " + 50 * "[" + 50 * "]", ("expected at most 40 levels",)),
+        ("actuator", "a: &a\n  b: *a\n", ("expected an alias of an earlier value, got *a",)),
     ],
 )
 def test_a_file_that_does_more_than_name_values_is_refused(
@@ -161,6 +170,16 @@ def test_a_file_that_does_more_than_name_values_is_refused(
     for part in told:
         assert part in done.err
     assert [path.name for path in tmp_path.iterdir()] == ["given.yaml"]
+
+
+@pytest.mark.parametrize("text", ["a: &a 1\nb: *a\n", "a: &a {x: 1}\nb: [*a, *a]\n"])
+def test_an_alias_of_little_is_read(text: str) -> None:
+    check_yaml_size(text)
+
+
+def test_a_file_without_an_end_is_refused(brokk: Callable[..., Any]) -> None:
+    done = brokk("mode=train", "machine=@/dev/zero")
+    assert done.code == 2 and "expected a plain file" in done.err
 
 
 def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Callable[..., Any]) -> None:

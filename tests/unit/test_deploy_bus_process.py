@@ -217,10 +217,12 @@ def test_the_records_of_the_others_reach_the_logic(rig: Rig) -> None:
     target["t_s"], target["center_in_base_m"] = BEGIN_S - 7.0, (2.5, 0.1, 0.8)
     memory.target.write(target)
     holes = memory.holes.new()
-    holes["count"] = 3
+    holes["count"] = 4
     for number, age_s in enumerate((0.0, LIMITS.target.seen_s, LIMITS.target.seen_s + 0.1)):
         holes["holes"][number]["t_s"] = BEGIN_S - age_s
         holes["holes"][number]["center_in_base_m"] = (2.0, number, 0.7)
+    holes["holes"][3]["t_s"] = BEGIN_S
+    holes["holes"][3]["center_in_base_m"] = (2.0, math.nan, 0.7)  # shows no face
     memory.holes.write(holes)
     rig.process.run_cycle()
     found = rig.logic.inputs[-1][2]

@@ -654,6 +654,7 @@ def test_a_narrower_range_of_a_command_is_kept_and_one_without_zero_is_refused(
     loop.go(0.3)
     assert loop.commands()[-1][1]["Command_q1"] == pytest.approx(0.1)
     assert loop.state is GuardState.ACTIVE
+    path = tmp_path / "without_zero.dbc"
     path.write_text(text.replace(line, line.replace("[-1|1]", "[0.2|1]")))
     with pytest.raises(ConfigError, match="Command_q1"):
         BusDescription(str(path), MACHINE)

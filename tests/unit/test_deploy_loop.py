@@ -4,6 +4,7 @@ refused."""
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -241,6 +242,7 @@ def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
     [
         ({"joints": ["q2", "q1", "q3", "q4", "q5"]}, "joints"),
         ({"rate_hz": 10.0}, "rate_hz"),
+        ({"rate_hz": math.nan}, "rate_hz"),
         ({"exclusive": []}, "exclusive"),
         ({"schema": 9}, "schema"),
         ({"command": {"order": ["q1"], "masked": True}}, "masked commands"),
@@ -326,7 +328,9 @@ def test_networks_of_other_tools_work_or_say_what_is_missing(
 
 
 @pytest.mark.parametrize("name", ["policy.json", "golden.json", "policy.onnx"])
-@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "huge", "nested", "list", "{}", "7"])
+@pytest.mark.parametrize(
+    "kind", ["pipe", "device", "folder", "huge", "nested", "wide", "list", "{}", "7"]
+)
 def test_what_is_no_file_of_a_policy_is_refused_at_once(
     machine: Machine, copied: Path, name: str, kind: str
 ) -> None:
@@ -342,7 +346,8 @@ def test_what_is_no_file_of_a_policy_is_refused_at_once(
         path.touch()
         os.truncate(path, 1 << 33)
     else:
-        path.write_text({"nested": "[" * 100_000, "list": "[1, 2]"}.get(kind, kind))
+        wide = '{"observation": [' + "[]," * 3_000_000 + "[]]}"
+        path.write_text({"nested": "[" * 100_000, "wide": wide, "list": "[1, 2]"}.get(kind, kind))
     with pytest.raises(CheckpointError, match=f"{re.escape(name)}|the contract"):
         PolicyBundle(str(copied), machine)
     assert time.monotonic() - begun_s < 2.0

@@ -1,0 +1,86 @@
+"""Files from elsewhere, read whole: plain ones of a bounded size, no pipes and devices."""
+
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+MOST_NODES, MOST_DEPTH = 20_000, 40
+"""Values of a YAML file with its aliases written out, and levels of nesting, beyond which it is no
+file of options: the largest that the commands write has some hundred values in five levels."""
+
+
+def check_plain_file(path: Path, most_bytes: int) -> None:
+    """Refuse what is no plain file, or too large to be what it should.
+
+    Raises:
+        FileNotFoundError: there is none.
+        OSError: it is a pipe, a device or a folder, or larger than `most_bytes`.
+    """
+    size = path.stat().st_size
+    if not path.is_file():
+        raise OSError(
+            errno.EINVAL, "expected a plain file, got a folder, pipe or device", str(path)
+        )
+    if size > most_bytes:
+        text = f"expected at most {most_bytes} bytes, got {size}"
+        raise OSError(errno.EFBIG, text, str(path))
+
+
+def read_plain_file(path: Path, most_bytes: int) -> bytes:
+    """Return the content of a plain file; see `check_plain_file`."""
+    check_plain_file(path, most_bytes)
+    return path.read_bytes()
+
+
+def read_json(path: Path, most_bytes: int) -> dict[str, Any]:
+    """Return the JSON object in a plain file.
+
+    Raises:
+        OSError: see `check_plain_file`.
+        ValueError: it holds no JSON object, or one that is nested beyond reason.
+    """
+    try:
+        content = json.loads(read_plain_file(path, most_bytes))
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"expected a JSON object, got {type(content).__name__}")
+    return content
+
+
+def check_yaml_size(text: str) -> None:
+    """Refuse YAML that grows beyond reason when its aliases are written out, without writing them.
+
+    Raises:
+        ValueError: it has too many values or levels, or a value that contains itself.
+        yaml.YAMLError: it is no YAML.
+    """
+    sizes: dict[str, int] = {}
+    # Anchor and size of each collection that is not yet closed; the first is the whole text.
+    is_open: list[tuple[str | None, int]] = [(None, 0)]
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        anchor, size = getattr(event, "anchor", None), 1
+        if isinstance(event, yaml.CollectionStartEvent):
+            is_open.append((anchor, 1))
+            if len(is_open) > MOST_DEPTH:
+                raise ValueError(f"expected at most {MOST_DEPTH} levels")
+            continue
+        if isinstance(event, yaml.AliasEvent):
+            if anchor not in sizes:
+                raise ValueError(f"expected an alias of an earlier value, got *{anchor}")
+            size = sizes[anchor]
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, size = is_open.pop()
+        elif not isinstance(event, yaml.ScalarEvent):
+            continue
+        if anchor is not None:
+            sizes[anchor] = size
+        outer, total = is_open[-1]
+        is_open[-1] = outer, total + size
+        if total + size > MOST_NODES:
+            raise ValueError(f"expected at most {MOST_NODES} values with all aliases written out")
