@@ -1,0 +1,28 @@
+"""Pages of the documentation keep their bounds."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+RESULTS = ROOT / "docs/results.md"
+DECIMAL = re.compile(r"(?<![\w.])\d*\.\d+(?![\w.])")
+MOST_WORDS, MOST_WORDS_OF_A_PAGE, MOST_DECIMALS = 26_000, 1_700, 300
+"""The bounds only fall, to 24,000 and 1,500 words."""
+
+
+def count_words(path: Path) -> int:
+    return len(path.read_text().split())
+
+
+def test_the_pages_are_short() -> None:
+    assert sum(map(count_words, PAGES)) <= MOST_WORDS
+    long = {page.name: count_words(page) for page in PAGES if page != RESULTS}
+    assert {name for name, words in long.items() if words > MOST_WORDS_OF_A_PAGE} == set()
+
+
+def test_figures_stand_on_the_results_page() -> None:
+    found = [len(DECIMAL.findall(page.read_text())) for page in PAGES if page != RESULTS]
+    assert sum(found) <= MOST_DECIMALS
