@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import functools
 import hashlib
 import json
+import re
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -53,20 +56,33 @@ def run_git(*words: str) -> str:
     return done.stdout
 
 
-def hash_code(paths: Sequence[str], commit: str | None = None) -> str:
-    """Return the SHA-256 over names and contents of files as they are, or as they were at a commit."""
-    lines = []
-    if commit is None:
-        for name in run_git("ls-files", "--", *paths).splitlines():
-            if (ROOT / name).is_file():
-                content = (ROOT / name).read_bytes()
-                blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
-                lines.append(f"{blob} {name}")
-    else:
-        for line in run_git("ls-tree", "-r", commit, "--", *paths).splitlines():
-            head, name = line.split("\t")
-            lines.append(f"{head.split()[2]} {name}")
-    return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()
+def hash_code(paths: Sequence[str]) -> str:
+    """Return the SHA-256 over names and contents of files, without comments and docstrings."""
+    found = hashlib.sha256()
+    for name in sorted(run_git("ls-files", "--", *paths).splitlines()):
+        if (ROOT / name).is_file():
+            found.update(name.encode() + normalize_source(name, (ROOT / name).read_bytes()))
+    return found.hexdigest()
+
+
+@functools.cache
+def normalize_source(name: str, content: bytes) -> bytes:
+    """Return a file without what changes no figure."""
+    if name.endswith(".yaml"):
+        return re.sub(rb"(^| +)# (?!@package).*$", b"", content, flags=re.M)
+    if not name.endswith(".py"):
+        return content
+    tree = ast.parse(content)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            node.body = [one for one in body if not is_text(one)]  # pyright: ignore
+    return ast.dump(tree).encode()
+
+
+def is_text(node: ast.AST) -> bool:
+    """Return whether a statement is a string alone."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
 def read_evaluation(path: Path, head: dict[str, Any]) -> Table:

@@ -41,21 +41,17 @@ def test_each_result_says_what_it_rests_on(benchmarks: Any) -> None:
         assert all(result[key] for key in ("machine", "commit", "date", "code", "rows")), path
 
 
-def test_a_changed_file_makes_a_figure_older_than_its_code(
+def test_changed_code_makes_a_figure_old_and_a_changed_comment_does_not(
     benchmarks: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = next(iter(benchmarks.list_measurements().values()))
-    result = {
-        "commands": [],
-        "machine": "m",
-        "commit": "c",
-        "date": "d",
-        "code": ["conf"],
-        "rows": [],
-    }
-    result["code_sha256"] = benchmarks.hash_code(["conf"])
+    result = {"commands": [], "machine": "m", "commit": "c", "date": "d", "rows": []}
+    result["code"] = ["brokk_rl/errors.py"]
+    result["code_sha256"] = benchmarks.hash_code(result["code"])
+    source = (ROOT / "brokk_rl/errors.py").read_bytes()
+    monkeypatch.setattr("pathlib.Path.read_bytes", lambda self: source + b"# a remark\n")
     assert "Today's code." in benchmarks.render_result(one, result)
-    monkeypatch.setattr("pathlib.Path.read_bytes", lambda self: b"changed")
+    monkeypatch.setattr("pathlib.Path.read_bytes", lambda self: source + b"x = 1\n")
     assert "Older than its code." in benchmarks.render_result(one, result)
 
 
