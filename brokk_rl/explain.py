@@ -24,7 +24,7 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from brokk_rl import extras, registry
+from brokk_rl import registry
 from brokk_rl.arguments import ROBOT_FILES, explain_robot
 from brokk_rl.errors import BrokkError, list_choices
 
@@ -85,6 +85,8 @@ def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
 
 def _explain_missing_module(lacking: ModuleNotFoundError, chain: list[BaseException]) -> str | None:
     """Explain a package that is not installed; `None` where no extra brings it."""
+    from brokk_rl import extras  # its parts take a while to import
+
     for error in chain:
         # Hydra names the target that it could not load, in one of two ways.
         target = re.search(r"(?:target|loading) '([\w.]+)'", str(error))

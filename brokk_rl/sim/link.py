@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -17,50 +17,26 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.sim.scene import make_nominal_scenes
-from brokk_rl.spec import name_spec, spec
+from brokk_rl.spec import NonNegative, name_spec, spec
 
 LOGGED_STATES = ("oil_c",)
 """States of an actuator model, one number a machine, that the machine's sensors show."""
 
 
-@spec
-class SimulatedMachines:
-    """Simulated machines side by side from home, as fast as they compute: an actuator model.
+class SimulatedLink:
+    """Link to simulated machines, as fast as they compute; each `send` is one control period.
 
-    Attributes:
-        actuator: The machine that is driven; with effects around it, as recordings show it.
-        noise: Standard deviation of the measured positions, rad or m.
-        one_machine: Numbers of effects that are drawn from ranges are drawn once: all runs record
-            the same machine. `False` draws them for each run.
+    Args:
+        config: Gives the actuator and the noise of the measured positions.
+        machine: The machine.
+        num_runs: Machines side by side, `N`.
+        session: Gives the streams of random numbers.
+        device: Where they are computed.
     """
-
-    actuator: Actuator
-    noise: float
-    one_machine: bool
-
-    def check(self) -> None:
-        _check_noise(self.noise)
-
-    @property
-    def source(self) -> str:
-        """The actuator and its effects."""
-        inner = getattr(self.actuator, "actuator", self.actuator)
-        effects = getattr(self.actuator, "effects", {})
-        return "simulator: " + " + ".join([name_spec(inner).capitalize(), *effects])
-
-    def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedMachinesLink:
-        """Return a link to `num_runs` machines."""
-        # a few dozen machines are faster on a CPU
-        device = torch.device("cpu") if session.device == "auto" else session.torch_device()
-        return SimulatedMachinesLink(self, machine, num_runs, session, device)
-
-
-class SimulatedMachinesLink:
-    """Link to simulated machines; each `send` is one control period."""
 
     def __init__(
         self,
-        config: SimulatedMachines,
+        config: SimulatedMachines | SimulatedWorksite,
         machine: Machine,
         num_runs: int,
         session: Session,
@@ -69,25 +45,35 @@ class SimulatedMachinesLink:
         self._noise, self._machine, self._device = config.noise, machine, device
         self._generator = session.generator("link")
         self._shape = (num_runs, machine.num_joints) if num_runs > 1 else (machine.num_joints,)
-        everywhere = torch.ones(num_runs, dtype=torch.bool, device=device)
-        home = torch.as_tensor(machine.home, dtype=torch.float32, device=device)
-        self._history = _make_history(machine, num_runs, device)
-        rest = torch.as_tensor(find_rest(machine.home, machine), dtype=torch.float32, device=device)
-        self._history.reset(everywhere, home.repeat(num_runs, 1), rest.repeat(num_runs, 1))
+        self._everywhere = torch.ones(num_runs, dtype=torch.bool, device=device)
+        shape = (num_runs, machine.num_history, machine.num_joints)
+        self._history = History(
+            q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device)
+        )
         devices = [device] if device.type == "cuda" else []
         with torch.random.fork_rng(devices):  # differences between machines are drawn here
             torch.manual_seed(session.stream("link"))
             self._model = config.actuator.build(machine, num_runs, device)
-            self._model.reset(everywhere)
-        if config.one_machine:
-            _share_drawn_numbers(self._model)
+            self._model.reset(self._everywhere)
         self._logged = _find_logged_states(self._model)
         self._steps = 0
+        self._begin(config)
+
+    def _begin(self, config: Any) -> None:
+        """Put the machines at rest at home."""
+        ends = []
+        for values in (self._machine.home, find_rest(self._machine.home, self._machine)):
+            row = torch.as_tensor(values, dtype=torch.float32, device=self._device)
+            ends.append(row.repeat(len(self._everywhere), 1))
+        self._history.reset(self._everywhere, *ends)
+        if config.one_machine:
+            _share_drawn_numbers(self._model)
         self._measure()
 
     def read(self) -> JointState:
         """Return the state after the last control period; reading twice gives the same."""
-        return JointState(self._steps * self._machine.period_s, self._measured.reshape(self._shape))
+        q = self._measured.reshape(self._shape).copy()
+        return JointState(self._steps * self._machine.period_s, q)
 
     def send(self, command: Command) -> Command:
         """Drive the machines for one control period; NaN and infinity are a standstill."""
@@ -95,7 +81,7 @@ class SimulatedMachinesLink:
         with torch.inference_mode():
             rows = u.reshape(self._measured.shape)
             self._history.push_u(torch.as_tensor(rows, device=self._device))
-            self._history.push_q(self._model.step(self._history))
+            self._history.push_q(self._move(self._model.step(self._history)))
         self._steps += 1
         self._measure()
         return Command(u)
@@ -111,9 +97,42 @@ class SimulatedMachinesLink:
     def __exit__(self, *exc: object) -> None:
         pass
 
+    def _move(self, wanted: torch.Tensor) -> torch.Tensor:
+        """Return the positions to which the model's wanted ones lead, `(N, J)`."""
+        return wanted
+
     def _measure(self) -> None:
         q = self._history.q[:, -1].cpu().numpy().astype(np.float64)
         self._measured = q + self._noise * self._generator.standard_normal(q.shape)
+
+
+@spec
+class SimulatedMachines:
+    """Simulated machines side by side from home, as fast as they compute: an actuator model.
+
+    Attributes:
+        actuator: The machine that is driven; with effects around it, as recordings show it.
+        noise: Standard deviation of the measured positions, rad or m.
+        one_machine: Numbers of effects that are drawn from ranges are drawn once: all runs record
+            the same machine. `False` draws them for each run.
+    """
+
+    actuator: Actuator
+    noise: NonNegative
+    one_machine: bool
+
+    @property
+    def source(self) -> str:
+        """The actuator and its effects."""
+        inner = getattr(self.actuator, "actuator", self.actuator)
+        effects = getattr(self.actuator, "effects", {})
+        return "simulator: " + " + ".join([name_spec(inner).capitalize(), *effects])
+
+    def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedLink:
+        """Return a link to `num_runs` machines."""
+        # a few dozen machines are faster on a CPU
+        device = torch.device("cpu") if session.device == "auto" else session.torch_device()
+        return SimulatedLink(self, machine, num_runs, session, device)
 
 
 @spec
@@ -130,12 +149,9 @@ class SimulatedWorksite:
 
     sim: Simulator
     actuator: Actuator
-    noise: float
+    noise: NonNegative
     hole_in_base_m: tuple[float, float, float]
     start: tuple[float, ...] | None
-
-    def check(self) -> None:
-        _check_noise(self.noise)
 
     @property
     def source(self) -> str:
@@ -156,40 +172,17 @@ class SimulatedWorksite:
             raise ConfigError(
                 f"link.start: expected {machine.num_joints} joint positions, got {len(self.start)}"
             )
-        return SimulatedWorksiteLink(self, machine, session)
+        return SimulatedWorksiteLink(self, machine, 1, session, torch.device("cpu"))
 
 
-class SimulatedWorksiteLink:
-    """Link to a simulated worksite; each `send` is one control period."""
+class SimulatedWorksiteLink(SimulatedLink):
+    """Link to a simulated worksite."""
 
-    def __init__(self, config: SimulatedWorksite, machine: Machine, session: Session) -> None:
-        self._noise, self._machine = config.noise, machine
-        self._generator = session.generator("link")
-        cpu = torch.device("cpu")
-        self._world = config.sim.build(machine, cpu, 1)
-        with torch.random.fork_rng([]):
-            torch.manual_seed(session.stream("link"))
-            self._model = config.actuator.build(machine, 1, cpu)
-        self._history = _make_history(machine, 1, cpu)
-        self._logged = _find_logged_states(self._model)
-        self._steps, self._measured = 0, np.zeros(machine.num_joints)
-        start = config.start if config.start is not None else machine.home
+    def _begin(self, config: Any) -> None:
+        """Build the world and put the machine at its start."""
+        self._world = config.sim.build(self._machine, self._device, 1)
+        start = config.start if config.start is not None else self._machine.home
         self.place(np.array(start), np.array(config.hole_in_base_m))
-
-    def read(self) -> JointState:
-        """Return the state after the last control period; reading twice gives the same."""
-        return JointState(self._steps * self._machine.period_s, self._measured.copy())
-
-    def send(self, command: Command) -> Command:
-        """Drive the machine for one control period; NaN and infinity are a standstill."""
-        u = _limit_command(command)
-        with torch.inference_mode():
-            self._history.push_u(torch.as_tensor(u[None], dtype=torch.float32))
-            self._world.step(self._model.step(self._history) - self._history.q[:, -1])
-            self._history.push_q(self._world.q)
-        self._steps += 1
-        self._measure()
-        return Command(u)
 
     def place(self, q: np.ndarray, hole_in_base_m: np.ndarray) -> None:
         """Put the machine at rest, and the block so that it faces the machine.
@@ -198,42 +191,23 @@ class SimulatedWorksiteLink:
             q: Joint positions, `(J,)`.
             hole_in_base_m: Centre of the hole's rim, `(3,)`.
         """
-        everywhere = torch.ones(1, dtype=torch.bool)
         start, scene = torch.as_tensor(q[None], dtype=torch.float32), make_nominal_scenes(1)
         x, y, z = hole_in_base_m.tolist()
         scene[0, :4] = torch.tensor([x, y, z, math.atan2(y, x)])
         with torch.random.fork_rng([]):
             torch.manual_seed(int(self._generator.integers(2**31)))
-            self._model.reset(everywhere)
-        self._world.reset(everywhere, start, scene)
-        self._history.reset(everywhere, start)
+            self._model.reset(self._everywhere)
+        self._world.reset(self._everywhere, start, scene)
+        self._history.reset(self._everywhere, start)
         self._measure()
 
     def extra(self) -> dict[str, np.ndarray]:
         """Return contact force, and oil temperature where the model has one, each `(1,)`."""
-        state = self._model.state
-        sensors = {name: state[path].numpy().copy() for name, path in self._logged.items()}
-        return sensors | {"force_n": self._world.contact_force_n.numpy().copy()}
+        return super().extra() | {"force_n": self._world.contact_force_n.numpy().copy()}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
-
-    def _measure(self) -> None:
-        q = self._history.q[0, -1].numpy().astype(np.float64)
-        self._measured = q + self._noise * self._generator.standard_normal(q.shape)
-
-
-def _check_noise(noise: float) -> None:
-    if noise < 0:
-        raise ConfigError(f"link.noise: expected 0 or more, got {noise}")
-
-
-def _make_history(machine: Machine, num_runs: int, device: torch.device) -> History:
-    shape = (num_runs, machine.num_history, machine.num_joints)
-    return History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
+    def _move(self, wanted: torch.Tensor) -> torch.Tensor:
+        self._world.step(wanted - self._history.q[:, -1])
+        return self._world.q
 
 
 def _share_drawn_numbers(model: ActuatorModel) -> None:

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -54,85 +54,50 @@ VIDEO_QUALITY = 7
 """Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
 
 
-class SimulatedEpisode(Protocol):
-    """A recorded episode of `T` control steps."""
-
-    @property
-    def q(self) -> np.ndarray:
-        """Joint positions, `(T, J)`, rad or m."""
-        ...
-
-    @property
-    def u(self) -> np.ndarray:
-        """Commands, `(T, J)`, in [-1, 1]."""
-        ...
-
-    @property
-    def force_n(self) -> np.ndarray:
-        """Peak contact force of each step, `(T,)`."""
-        ...
-
-    @property
-    def scene(self) -> np.ndarray:
-        """The scene, `(S,)`; see `sim.scene`."""
-        ...
-
-    @property
-    def target_m(self) -> np.ndarray | None:
-        """Target of the tip in the base frame, `(3,)`; `None` where the task has none."""
-        ...
-
-
 @dataclass(frozen=True)
 class RenderJob:
     """An episode and the file to draw it into; travels to the rendering process as a pickle.
 
     Attributes:
         machine: The machine.
-        q: Joint positions, `(T, J)`.
-        u: Commands, `(T, J)`.
-        force_n: Peak contact force of each step, `(T,)`.
-        scene: The scene, `(S,)`.
-        target_m: Target of the tip, `(3,)` or `None`.
+        episode: A recorded episode of `T` control steps, in numpy: positions `q` and commands `u`,
+            `(T, J)`, contact force `force_n`, `(T,)`, `scene`, `(S,)`, and the target of the tip,
+            `target_m`, `(3,)` or `None`.
         path: The mp4 to write.
         site: MJCF of what stands beside the block.
     """
 
     machine: Machine
-    q: np.ndarray
-    u: np.ndarray
-    force_n: np.ndarray
-    scene: np.ndarray
-    target_m: np.ndarray | None
+    episode: Any
     path: Path
     site: Path | None = None
 
     @property
     def stride(self) -> int:
         """Steps from frame to frame."""
-        return max(1, math.ceil(len(self.q) / MAX_FRAMES))
+        return max(1, math.ceil(len(self.episode.q) / MAX_FRAMES))
 
     def list_frames(self) -> list[int]:
         """Return the steps that are drawn: the last one always."""
-        return sorted({*range(0, len(self.q), self.stride), len(self.q) - 1})
+        return sorted({*range(0, len(self.episode.q), self.stride), len(self.episode.q) - 1})
 
     @property
     def has_block(self) -> bool:
         """True where the block is within the machine's reach; tasks without one put it far away."""
-        return float(np.hypot(*self.scene[:2])) < FAR_M
+        return float(np.hypot(*self.episode.scene[:2])) < FAR_M
 
     @property
     def mark_m(self) -> np.ndarray | None:
         """Target to mark: that of a task without a block, whose hole would show it."""
-        return None if self.has_block else self.target_m
+        return None if self.has_block else self.episode.target_m
 
 
 def render_video(
-    machine: Machine, episode: SimulatedEpisode, path: Path, site: Path | None = None
+    machine: Machine, episode: Any, path: Path, site: Path | None = None
 ) -> Path | None:
     """Write an mp4 to `path` and stills beside it.
 
-    `<stem>_0.png` shows the start, the last still the end.
+    `<stem>_0.png` shows the start, the last still the end. `RenderJob` says what an episode has.
 
     Returns:
         `path`; `None` where no GL library can draw here.
@@ -149,16 +114,7 @@ def render_video(
         return None
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "video.mp4"
-        job = RenderJob(
-            machine=machine,
-            q=np.asarray(episode.q),
-            u=np.asarray(episode.u),
-            force_n=np.asarray(episode.force_n),
-            scene=np.asarray(episode.scene),
-            target_m=None if episode.target_m is None else np.asarray(episode.target_m),
-            path=draft,
-            site=site,
-        )
+        job = RenderJob(machine, episode, draft, site)
         if not _run_renderer(job, library):
             return None
         try:
@@ -234,17 +190,17 @@ def render_job(file: str) -> None:
 
 def write_captions(job: RenderJob) -> list[str]:
     """Return a line for each step: time, tip relative to the rim or the target, contact force."""
-    q = torch.as_tensor(job.q, dtype=torch.float32)
+    q = torch.as_tensor(job.episode.q, dtype=torch.float32)
     tip_m = Kinematics(job.machine).pose(q).tip_in_base_m.numpy()
     lines = []
-    for step, (at_m, force) in enumerate(zip(tip_m, job.force_n, strict=True)):
+    for step, (at_m, force) in enumerate(zip(tip_m, job.episode.force_n, strict=True)):
         where = ""
         if job.has_block:
-            x, y, z = at_m - job.scene[:3]
+            x, y, z = at_m - job.episode.scene[:3]
             side, off_axis_cm = "above" if z > 0 else "below", 100 * math.hypot(x, y)
             where = f"{100 * abs(z):4.0f} cm {side} the rim, {off_axis_cm:5.1f} cm off axis    "
-        elif job.target_m is not None:
-            where = f"{100 * np.linalg.norm(at_m - job.target_m):5.1f} cm to the target    "
+        elif job.episode.target_m is not None:
+            where = f"{100 * np.linalg.norm(at_m - job.episode.target_m):5.1f} cm to the target    "
         lines.append(f"{step * job.machine.period_s:5.1f} s    {where}{force:6.0f} N")
     return lines
 
@@ -320,10 +276,10 @@ def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
     fixed = None if job.mark_m is None else _look_at(job.mark_m, TARGET_VIEW)
     with SceneRenderer(job.machine, job.site) as renderer:
         for step in steps:
-            renderer.set_pose(job.q[step], job.scene)
+            renderer.set_pose(job.episode.q[step], job.episode.scene)
             close = "close" if job.has_block else fixed
             if close is None:  # neither a block nor a target: the tool
-                tool = compute_tool_kinematics(job.machine, job.q[step])
+                tool = compute_tool_kinematics(job.machine, job.episode.q[step])
                 close = _look_at(tool.tip_in_base_m, TOOL_VIEW)
             views = (
                 renderer.render("overview", split, height, job.mark_m),
@@ -333,7 +289,7 @@ def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
             pen = ImageDraw.Draw(picture)
             pen.rectangle((split - 1, 0, split + 1, height), fill="white")
             pen.text((16, 12), lines[step], fill="white", font=font, **outline)
-            _draw_command_bars(pen, job.machine.joint_names, job.u[step], font, height)
+            _draw_command_bars(pen, job.machine.joint_names, job.episode.u[step], font, height)
             yield np.asarray(picture)
 
 

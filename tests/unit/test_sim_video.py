@@ -64,5 +64,5 @@ def test_a_caption_tells_the_distance_to_a_target_without_a_block(machine, motio
     motion.scene[0] = 50.0
     tip = compute_tool_kinematics(machine, motion.q[0]).tip_in_base_m
     motion.target_m = tip + np.array([0.3, 0.0, 0.4])
-    job = video.RenderJob(machine=machine, path=tmp_path, **vars(motion))
+    job = video.RenderJob(machine, motion, tmp_path)
     assert "50.0 cm to the target" in video.write_captions(job)[0]
