@@ -23,7 +23,7 @@ from actuators.identify.training_data import TrainingWindows, list_sources
 from actuators.models import checkpoint
 from actuators.models.checkpoint import ResumeFile, hash_recordings
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.network import Coupled, JointNetworks, Mlp
+from actuators.models.network import JointNetworks, Mlp
 from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
@@ -82,7 +82,7 @@ class FreeRunOptimizer:
         return found
 
     def updater(
-        self, windows: TrainingWindows, batch: int, still_share: float, busy_share: float
+        self, windows: TrainingWindows, batch: int, still_share: float
     ) -> Callable[[], None]:
         """Return one update on `batch` windows a joint as a function.
 
@@ -90,8 +90,7 @@ class FreeRunOptimizer:
         """
 
         def update() -> None:
-            shares, together = (still_share, busy_share), self.networks.coupled
-            self._update(*windows.draw(batch, *shares, self._key, together=together))
+            self._update(*windows.draw(batch, still_share, self._key))
 
         if self._device.type != "cuda":
             return update
@@ -159,7 +158,6 @@ class NetworkFit:
 
     Attributes:
         name: Name of the model in tables and of its checkpoint.
-        network: `mlp`, a network a joint, or `coupled`, in which each joint sees all.
         loss: `rollout` or `one_step`.
         width: Units a joint in each of the two hidden layers.
         quiet: Increments up to this size are none (rad or m in a control period); `null`: the noise
@@ -168,13 +166,10 @@ class NetworkFit:
         one_step_batch: Windows a joint in each of them.
         horizons_s: Horizons of the free runs, one after another.
         updates: Updates at each of the horizons.
-        batch: Windows a joint in each of them; with `coupled` each window is one of all joints.
+        batch: Windows a joint in each of them.
         learning_rate: Of Adam, at the start; falls along a cosine.
         still_share: Part of the windows drawn from all times; most others are times at which the
             joint is commanded.
-        busy_share: Part of the windows drawn from the tenth of all times in which most is commanded
-            at once: joints hinder each other rarely, and where recordings of single joints abound
-                hardly ever.
         average: Decay of the running average of the weights, which is validated and kept.
         validate_every: Updates between two validations.
         validation_s: Horizon of the free run on which the weights are chosen.
@@ -183,7 +178,6 @@ class NetworkFit:
     """
 
     name: str
-    network: Literal["mlp", "coupled"]
     loss: Literal["rollout", "one_step"]
     width: Count
     quiet: float | None
@@ -194,7 +188,6 @@ class NetworkFit:
     batch: Count
     learning_rate: float
     still_share: Share
-    busy_share: Share
     average: float
     validate_every: Count
     validation_s: float
@@ -204,10 +197,6 @@ class NetworkFit:
     def check(self) -> None:
         if self.loss == "rollout" and not self.horizons_s:
             raise ConfigError("horizons_s: loss=rollout needs at least one horizon")
-        if self.still_share + self.busy_share >= 1:
-            raise ConfigError(
-                "still_share: expected room beside busy_share for times at which a joint is commanded"
-            )
 
     def fit(
         self,
@@ -217,7 +206,7 @@ class NetworkFit:
         folder: Path,
         seed: int,
         device: torch.device,
-    ) -> Mlp | Coupled:
+    ) -> Mlp:
         """Fit to `train`, keep the best weights on `validation`, write `<name>.safetensors`.
 
         A fit that was interrupted goes on from `<name>.partial.safetensors`, saved every
@@ -229,8 +218,6 @@ class NetworkFit:
             StorageError: a file could not be written.
         """
         training_data.check_enough(train, machine)
-        if self.network == "coupled":
-            training_data.check_together(train)
         stamp = {
             "fit": {**dataclasses.asdict(self), "save_every_s": None}, "machine": machine.fingerprint(), "seed": seed,
             "device": device.type, "train": hash_recordings(train), "validation": hash_recordings(validation),
@@ -259,9 +246,9 @@ class NetworkFit:
             },
         }
         path = folder / f"{self.name}.safetensors"
-        checkpoint.write_checkpoint(path, self.network, machine, tensors, facts)
+        checkpoint.write_checkpoint(path, "mlp", machine, tensors, facts)
         interruption.remove()
-        return (Coupled if self.network == "coupled" else Mlp)(checkpoint=str(path))
+        return Mlp(checkpoint=str(path))
 
 
 @dataclasses.dataclass
@@ -296,8 +283,8 @@ class _NetworkFitting:
     ) -> None:
         self._config, self._machine, self._train, self._device = config, machine, train, device
         generator = torch.Generator().manual_seed(seed)
-        coupled, joints = config.network == "coupled", machine.num_joints
-        networks = JointNetworks(joints, machine.num_history, config.width, coupled, generator)
+        joints = machine.num_joints
+        networks = JointNetworks(joints, machine.num_history, config.width, generator)
         self._normalise(networks)
         self._descent = FreeRunOptimizer(networks.to(device), machine, seed)
         averaged = self._descent.averaged.named_parameters()
@@ -305,9 +292,8 @@ class _NetworkFitting:
         self._best = torch.full((joints,), math.inf, device=device)
         steps, purpose = self._steps(config.validation_s), "held out to stop the fit by"
         held = TrainingWindows(validation, machine, steps, device, purpose)
-        batch = max(1, VALIDATED // joints) if coupled else VALIDATED
         key = torch.zeros((), dtype=torch.int64, device=device)
-        self._held = held.draw(batch, 0.2, config.busy_share, key, together=coupled)
+        self._held = held.draw(VALIDATED, 0.2, key)
         self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
         for horizon_s in config.horizons_s if config.loss == "rollout" else ():
             self._stages.append(_HorizonStage(horizon_s, config.updates, config.batch))
@@ -336,7 +322,7 @@ class _NetworkFitting:
         config, stage = self._config, self._stages[place.stage]
         steps = max(1, self._steps(stage.horizon_s))
         windows = TrainingWindows(self._train, self._machine, steps, self._device)
-        update = self._descent.updater(windows, stage.batch, config.still_share, config.busy_share)
+        update = self._descent.updater(windows, stage.batch, config.still_share)
         before = sum(earlier.updates for earlier in self._stages[: place.stage])
         total = sum(one.updates for one in self._stages)
         began = saved = time.monotonic()
@@ -362,20 +348,16 @@ class _NetworkFitting:
 
     @torch.no_grad()
     def _validate(self) -> bool:
-        """Validate the averaged weights by free runs; keep the best, per joint if separate."""
+        """Validate the averaged weights by free runs; keep the best of each joint."""
         u, q = self._held
         averaged, path = self._descent.averaged, self._descent.run(u, q)
         error = (path - q[..., averaged.num_history :]).square().mean((1, 2)).sqrt()
         if not bool(error.isfinite().all()):
             raise BrokkError("the fit diverged (NaN in the validation); lower fit.learning_rate")
         better = error < self._best
-        if averaged.coupled:
-            scale = averaged.increment_scale
-            better = ((error / scale).mean() < (self._best / scale).mean()).expand_as(error)
         self._best.copy_(torch.where(better, error, self._best))
         for name, value in averaged.named_parameters():
-            rows = better[: len(value)].view(-1, 1, 1)  # the joints, or one for all
-            self._kept[name].copy_(torch.where(rows, value, self._kept[name]))
+            self._kept[name].copy_(torch.where(better.view(-1, 1, 1), value, self._kept[name]))
         return bool(better.any())
 
     def _state(self) -> dict[str, torch.Tensor]:

@@ -1,19 +1,17 @@
-"""Pictures of an identification: predictions, error over horizon, regimes, dead time."""
+"""Pictures of an identification: predictions, and error over horizon."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
-from actuators.identify.dead_time import DeadTimeEstimate
-from actuators.identify.scores import REGIMES, TAILS, FreeRunScores
+from actuators.identify.scores import TAILS, FreeRunScores
 from actuators.recordings.split import COMMANDED
-from brokk_rl.machine import Machine
 from brokk_rl.plot import (
     BLUE,
     GREY,
@@ -119,77 +117,6 @@ def draw_error_over_horizon(scores: FreeRunScores, model: str) -> Figure:
     figure.supxlabel("time of the free run [s]; the left end is the one-step error", fontsize=10)
     figure.supylabel("RMSE [% of travel]", fontsize=10)
     add_legend(figure, axes[0])
-    return figure
-
-
-def draw_regimes(
-    table: Mapping[str, Any], machine: Machine, model: str, names: Sequence[str]
-) -> Figure:
-    """Draw how fast each model drifts in each regime, one panel a joint."""
-    figure, axes = make_joint_panels(machine, "x")
-    colour = assign_colours(names, model)
-    for axis, joint, travel in zip(
-        axes, machine.joints, machine.upper - machine.lower, strict=True
-    ):
-        rows = table[joint.name]
-        labels = []
-        for y, regime in enumerate(REGIMES):
-            labels.append(
-                f"{regime} ({100 * rows[regime]['time']:.0f} %)"
-                if regime in rows
-                else f"{regime} (0 %)"
-            )
-            for number, name in enumerate(sorted(names, key=lambda name: name == model)):
-                if regime not in rows or rows[regime]["models"][name]["drift_per_s"] <= 0:
-                    continue
-                cell = rows[regime]["models"][name]
-                place = y + 0.5 * ((number + 0.5) / len(names) - 0.5)
-                low, high = cell["ci95"] or [cell["drift_per_s"]] * 2
-                ends = np.maximum(100.0 * np.array([low, high]) / travel, 1e-4)
-                axis.plot(ends, [place] * 2, color=colour[name], lw=1.4)
-                drift = 100.0 * cell["drift_per_s"] / travel
-                label = name if regime == next(iter(rows)) else None
-                size = 6.5 if name == model else 4.5
-                axis.plot(drift, place, "o", color=colour[name], ms=size, label=label)
-        _set_log_scale(axis, "x")
-        axis.set_yticks(range(len(REGIMES)), labels, fontsize=8)
-        axis.set_ylim(len(REGIMES) - 0.5, -0.5)
-        axis.set_title(joint.name, loc="left", fontsize=10)
-        draw_grid(axis, "x")
-    text = "drift: RMS of the error added within a second [% of travel]; in brackets the part of the time"
-    figure.supxlabel(text, fontsize=10)
-    add_legend(figure, axes[0])
-    return figure
-
-
-def draw_dead_times(delays: Mapping[str, DeadTimeEstimate | None], machine: Machine) -> Figure:
-    """Draw the unexplained variance over the delay, one panel a joint, with intervals."""
-    figure, axes = make_joint_panels(machine, "xy")
-    history_s = machine.num_history * machine.period_s
-    drawn = None
-    for axis, (joint, delay) in zip(axes, delays.items(), strict=True):
-        draw_grid(axis)
-        if delay is None:
-            axis.set_title(joint, loc="left", fontsize=10)
-            axis.text(0.5, 0.5, "hardly commanded", transform=axis.transAxes, ha="center")
-            continue
-        drawn = drawn or axis
-        text = f"{delay.value_s:.2f} s" if delay.is_found else "not found"
-        axis.set_title(f"{joint}: {text}", loc="left", fontsize=10)
-        axis.plot(delay.tried_s, 100.0 * delay.left, color=BLUE, lw=1.8)
-        axis.axvspan(*delay.ci95_s, color=BLUE, alpha=0.25, lw=0, label="95 % interval")
-        given = "the machine's dead_time_s"
-        axis.axvline(machine.dead_time_s, color="black", lw=1.0, ls="--", label=given)
-        last_s = delay.tried_s[-1]
-        if history_s < last_s:
-            beyond = "beyond the history"
-            axis.axvspan(history_s, last_s, color=GREY, alpha=0.25, lw=0, label=beyond)
-        _set_log_scale(axis, "y")
-        axis.set_xlim(0.0, last_s)
-    figure.supxlabel("delay [s]", fontsize=10)
-    figure.supylabel("variance of the motion left unexplained [%]", fontsize=10)
-    if drawn:
-        add_legend(figure, drawn)
     return figure
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from actuators import open_loop
 from actuators.identify import dead_time, pictures
 from actuators.identify.dead_time import RESOLUTION_S
-from actuators.identify.scores import FreeRunScores, average_joints, bound_interval, score_regimes
+from actuators.identify.scores import FreeRunScores, average_joints, bound_interval
 from actuators.identify.stages import FitStage, FittedModel, list_recordings
 from actuators.identify.training_data import list_sources
 from actuators.recordings.split import measure_commanded_s
@@ -35,12 +35,6 @@ THIN_COMMAND = 0.5
 """… or no command larger than this both ways."""
 FEW_RUNS = 6
 """Runs to judge by below which an interval from resampling them is coarse."""
-PHRASES = {
-    "at rest": "when it should rest",
-    "alone": "when it moves alone",
-    "with others": "when it moves with others",
-}
-"""Regimes as a sentence names them."""
 DELAY_TOLERANCE_S = 0.05
 """The machine's dead time may differ from that of its joints by this much, s: a control period at
 20 Hz."""
@@ -115,16 +109,6 @@ def _judge_worst_joint(
     unit = machine.joints[machine.joint_names.index(joint)].unit
     percent, rmse = rows[joint]["percent"], rows[joint]["rmse"]
     text = f"Worst joint: {joint}, {percent:.2f} % of its travel ({rmse:.2g} {unit}) after {horizon} s."
-    cells = result["regimes"][joint]
-    if cells:
-        regime = max(
-            cells, key=lambda name: cells[name]["models"][model]["share"] / cells[name]["time"]
-        )
-        time, share = cells[regime]["time"], cells[regime]["models"][model]["share"]
-        text += (
-            f" It drifts most {_phrase_regime(regime)}: {100 * time:.0f} % of the time, "
-            f"{100 * share:.0f} % of the squared drift."
-        )
     return VerdictSentence("plain", text)
 
 
@@ -210,12 +194,6 @@ def _name_joints(some: list[str], every: list[str]) -> str:
     return f"{len(some)} of {len(every)} joints ({', '.join(some)})"
 
 
-def _phrase_regime(regime: str) -> str:
-    if regime in PHRASES:
-        return PHRASES[regime]
-    return regime if regime.startswith(("after", "near")) else f"at {regime}"
-
-
 @dataclass(frozen=True)
 class IdentificationRun:
     """All fits of an identification.
@@ -258,24 +236,18 @@ def build_results(
     last = identified.stages[-1]
     fitted_to = list_recordings(last.train) + list_recordings(last.validation)
     delays = dead_time.estimate_dead_times(fitted_to, machine, delaying)
-    acting = []
-    for delay in delays.values():
-        acting.append(delay.value_s if delay and delay.is_found else machine.dead_time_s)
     result: dict[str, Any] = {
         "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
         "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
     }  # fmt: skip
     result |= _tabulate_errors(scores, identified)
     result["delay_s"] = {joint: _tabulate_delay(delay) for joint, delay in delays.items()}
-    result["regimes"] = score_regimes(scores, np.array(acting))
     result["data"] = _describe_data(identified, fitted_to, scores)
     findings = write_verdict(result, machine)
     result["verdict"] = [{"tone": finding.tone, "text": finding.text} for finding in findings]
     drawings = {
         "prediction": pictures.draw_prediction(scores, model),
         "error_over_horizon": pictures.draw_error_over_horizon(scores, model),
-        "regimes": pictures.draw_regimes(result["regimes"], machine, model, list(scores.predicted)),
-        "dead_time": pictures.draw_dead_times(delays, machine),
     }
     return result, findings, drawings
 

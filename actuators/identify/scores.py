@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from actuators.open_loop import FreeRunWindows
-from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
 from brokk_rl.statistics import CONFIDENCE
 
@@ -49,32 +48,22 @@ class FreeRunScores:
         self.weights = drawn.astype(float)
         self.error = {name: path.astype(float) - measured for name, path in self.predicted.items()}
         self.travel = np.asarray(self.machine.upper - self.machine.lower, dtype=float)
-        self._mean_squares = {name: self.mean(error**2) for name, error in self.error.items()}
+        self._mean_squares = {name: self._mean(error**2) for name, error in self.error.items()}
 
     @property
     def num_runs(self) -> int:
         """Number of runs, `R`."""
         return len(self._runs)
 
-    def mean(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _mean(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean over windows of `values`, `(W, …)`, and of each resample, `(B, …)`.
-
-        NaN where there is no value.
-        """
-        given = np.isfinite(values)
-        return self.ratio(np.where(given, values, 0.0), given)
-
-    def ratio(self, totals: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and resampled means of windows with `counts` values of sum `totals`.
-
-        Both are `(W, …)`.
 
         NaN where there is no value at all; the resamples also where only one run has any: it says
         nothing about other runs.
         """
-        shape = totals.shape[1:]
-        total = self._by_run(totals).reshape(self.num_runs, -1)
-        count = self._by_run(counts).reshape(self.num_runs, -1)
+        given, shape = np.isfinite(values), values.shape[1:]
+        total = self._by_run(np.where(given, values, 0.0)).reshape(self.num_runs, -1)
+        count = self._by_run(given).reshape(self.num_runs, -1)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = total.sum(0) / count.sum(0)
             resampled = (self.weights @ total) / (self.weights @ count)
@@ -161,109 +150,3 @@ def _compare_errors(
         "reduction_percent": float(reduced),
         "reduction_ci95": bound_interval(reduced_again),
     }
-
-
-SECOND_S = 1.0
-"""Length of the pieces into which free runs are cut, s. Chosen by hand; not searched."""
-NEAR_STOP = 0.05
-"""Part of the travel that counts as near a stop."""
-SMALL, LARGE = 0.3, 0.7
-"""Largest command of a second below which it is small, and above which it is large."""
-REGIMES = (
-    "at rest",
-    "alone",
-    "with others",
-    "after a reversal",
-    "near a stop",
-    "small commands",
-    "medium commands",
-    "large commands",
-)
-
-
-def classify_seconds(scores: FreeRunScores, delay_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Return which seconds belong to each regime, `(W, S, J)` bool.
-
-    Args:
-        scores: Holds windows and machine.
-        delay_s: Dead time of each joint, `(J,)`.
-    """
-    cut, machine = scores.cut, scores.machine
-    steps = _count_steps(scores)
-    num_seconds = cut.measured.shape[1] // steps
-    shape = (len(cut.q), num_seconds, steps, machine.num_joints)
-    acting, turned = np.zeros(shape), np.zeros(shape, dtype=bool)
-    for j in range(machine.num_joints):
-        back = min(round(delay_s[j] / machine.period_s), cut.num_before - 2)
-        begin = cut.num_before - 1 - back
-        u, rows = cut.u[..., j], slice(begin, begin + num_seconds * steps)
-        acting[..., j] = u[:, rows].reshape(shape[:-1])
-        turned[..., j] = _find_reversals(u)[:, rows].reshape(shape[:-1])
-    size = np.abs(acting).max(2)
-    q = cut.measured[:, : num_seconds * steps].reshape(shape)
-    margin = NEAR_STOP * scores.travel
-    with np.errstate(invalid="ignore"):
-        near = ((q < machine.lower + margin) | (q > machine.upper - margin)).any(2)
-    moving = size > COMMANDED
-    others = moving.sum(2, keepdims=True) - moving > 0
-    found = (
-        ~moving, moving & ~others, moving & others, turned.any(2), moving & near,
-        moving & (size < SMALL), moving & (size >= SMALL) & (size <= LARGE), moving & (size > LARGE),
-    )  # fmt: skip
-    whole = np.isfinite(q).all(2)
-    return {name: np.asarray(members & whole) for name, members in zip(REGIMES, found, strict=True)}
-
-
-def score_regimes(
-    scores: FreeRunScores, delay_s: np.ndarray
-) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return, by joint and regime, the part of the `time` spent in it and, by model, the drift.
-
-    Drift: root mean square of the error added within a second, `drift_per_s` in rad/s or m/s with
-    `ci95`, and `share` of all that the model's squared drift amounts to. Regimes overlap (a large
-    command can also be a reversal), so shares do not add up to 1.
-    """
-    members = classify_seconds(scores, delay_s)
-    steps = _count_steps(scores)
-    squares = {}
-    for name, error in scores.error.items():
-        at_end = np.concatenate([np.zeros_like(error[:, :1]), error[:, steps - 1 :: steps]], 1)
-        squares[name] = (np.diff(at_end, axis=1) / SECOND_S) ** 2
-    whole = np.any(list(members.values()), axis=0)
-    table: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in scores.machine.joint_names}
-    for regime, inside in members.items():
-        drift = {}
-        for name, square in squares.items():
-            within = np.where(inside, square, 0.0).sum(1)
-            every = np.where(whole, square, 0.0).sum((0, 1))
-            share = within.sum(0) / np.maximum(every, np.finfo(float).tiny)
-            drift[name] = scores.ratio(within, inside.sum(1)), share
-        for j, joint in enumerate(scores.machine.joint_names):
-            if not inside[..., j].any():
-                continue
-            models = {}
-            for name, ((mean, again), share) in drift.items():
-                models[name] = {
-                    "drift_per_s": float(np.sqrt(mean[j])),
-                    "ci95": bound_interval(np.sqrt(again[:, j])),
-                    "share": float(share[j]),
-                }
-            time = float(inside[..., j].sum() / whole[..., j].sum())
-            table[joint][regime] = {"time": time, "models": models}
-    return table
-
-
-def _count_steps(scores: FreeRunScores) -> int:
-    return max(1, round(SECOND_S / scores.machine.period_s))
-
-
-def _find_reversals(u: np.ndarray) -> np.ndarray:
-    """Return the samples at which a command, `(W, T)`, has changed sign, as bool.
-
-    A rest in between does not matter.
-    """
-    sign = np.where(np.abs(u) > COMMANDED, np.sign(u), 0.0)
-    place = np.where(sign != 0, np.arange(u.shape[1]), 0)
-    last = np.take_along_axis(sign, np.maximum.accumulate(place, 1), 1)
-    before = np.pad(last[:, :-1], ((0, 0), (1, 0)))
-    return (sign * before) < 0

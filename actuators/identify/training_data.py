@@ -71,16 +71,10 @@ class TrainingWindows:
                 )
         self._moving = pad_sequence(moving, batch_first=True)  # (J, most)
         self._num_moving = torch.tensor([[len(found)] for found in moving], device=device)
-        self._busy = self._busiest()
         self._joint = torch.arange(len(self.u), device=device)[:, None]
 
     def draw(
-        self,
-        batch: int,
-        still_share: float,
-        busy_share: float,
-        key: torch.Tensor,
-        together: bool = False,
+        self, batch: int, still_share: float, key: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw windows for each joint, mostly of times at which it is commanded.
 
@@ -89,23 +83,17 @@ class TrainingWindows:
         Args:
             batch: Number of windows drawn a joint.
             still_share: Part drawn from all times instead.
-            busy_share: Part drawn from the tenth of all times in which most is commanded at once.
             key: Names the draw, int64 of shape `()`: the same key gives the same windows.
-            together: Each joint gets the windows of all, so that `B` is `J` times `batch`; else its
-                own ones.
 
         Returns:
             Commands and positions, each `(J, B, H + K)`.
         """
-        index = self._index(batch, still_share, busy_share, key)
-        index = index.flatten()[None] if together else index
+        index = self._index(batch, still_share, key)
         u, q = (one.unfold(1, self._length, 1)[self._joint, index] for one in (self.u, self.q))
         return u, q
 
-    def _index(
-        self, batch: int, still_share: float, busy_share: float, key: torch.Tensor
-    ) -> torch.Tensor:
-        still, busy = round(batch * still_share), round(batch * busy_share)
+    def _index(self, batch: int, still_share: float, key: torch.Tensor) -> torch.Tensor:
+        still = round(batch * still_share)
         place = torch.arange(len(self.u) * batch, device=key.device)
         chance = hash_uniform(key * 1_048_576 + place).view(-1, batch)
 
@@ -114,8 +102,7 @@ class TrainingWindows:
 
         rows = (
             self.starts[pick(chance[:, :still], len(self.starts))],
-            self._busy[pick(chance[:, still : still + busy], len(self._busy))],
-            self._moving.gather(1, pick(chance[:, still + busy :], self._num_moving)),
+            self._moving.gather(1, pick(chance[:, still:], self._num_moving)),
         )
         return torch.cat(rows, 1)
 
@@ -123,11 +110,6 @@ class TrainingWindows:
         """Return the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
         count = nn.functional.pad(condition.cumsum(0), (1, 0))
         return self.starts[count[self.starts + self._length] > count[self.starts]]
-
-    def _busiest(self) -> torch.Tensor:
-        """Return the tenth of the starts in whose windows the sum of all commands rises highest."""
-        total = self.u.abs().sum(0).unfold(0, self._length, 1).amax(1)[self.starts]
-        return self.starts[total.argsort(descending=True, stable=True)[: max(1, len(total) // 10)]]
 
 
 log = logging.getLogger(__name__)
@@ -180,21 +162,6 @@ def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
             raise RecordingError(f"too little data: {text}, needed are {minutes}. {advice}")
         log.warning("thin data: %s; errors hardly fall beyond %s. %s", text, minutes, advice)
         return
-
-
-def check_together(recordings: Sequence[Recording]) -> None:
-    """Warn where joints hardly move at the same time: their coupling cannot be learned."""
-    together_s = 0.0
-    for recording in recordings:
-        several = (np.abs(recording.u) > COMMANDED).sum(1) > 1
-        together_s += float(several.sum()) / recording.rate_hz
-    if together_s < AMPLE_S:
-        log.warning(
-            "thin data: several joints are commanded at once for %.1f min; how they share the pump shows in %.2g min or more. "
-            "Record some (mode=collect excitation=levels), or fit=mlp, a network a joint",
-            together_s / 60,
-            AMPLE_S / 60,
-        )
 
 
 def estimate_resting_noise(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:

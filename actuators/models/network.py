@@ -8,7 +8,6 @@ learned in one place holds in another unless the data say otherwise.
 Axes: `J` joints, `B` batch, `H` history, `K` steps.
 """
 
-import math
 from itertools import pairwise
 
 import torch
@@ -22,79 +21,9 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
-COUPLING_WIDTH = 16
-"""Hidden units a joint of `SharedFlow` and `Load`: a delayed curve of the command and a smooth
-function of the pose need few."""
-
-
-class SharedFlow(nn.Module):
-    """Share of its flow that each joint gets when together they demand more than the pump gives.
-
-    Each joint's demand is a small perceptron of its own commands, in units of the pump's flow. Its
-    last weights are positive (by their logarithm): a ReLU in their place dies where recordings of
-    single joints, which never lack flow, abound. All joints get the part `min(1, 1 / sum of
-    demands)`, with a rounded corner whose sharpness is learned. A bottleneck like that of the
-    machine: from few moments of shortage, in which only some joints take part, it holds for all
-    combinations of joints.
-
-    Args:
-        num_joints: Number of joints, `J`.
-        num_history: Samples of commands, `H`.
-        generator: Draws the initial weights.
-    """
-
-    def __init__(
-        self, num_joints: int, num_history: int, generator: torch.Generator | None = None
-    ) -> None:
-        super().__init__()
-        layer = COUPLING_WIDTH, num_history, generator
-        self.weight = _initialise_weights(num_joints, num_history, *layer)
-        self.bias = _initialise_weights(num_joints, 1, *layer)
-        # summed up, a full command asks for about half of the pump: close enough to a shortage to
-        # learn from it
-        self.log_share = nn.Parameter(
-            torch.full((num_joints, COUPLING_WIDTH, 1), math.log(2.0 / COUPLING_WIDTH))
-        )
-        self.log_sharpness = nn.Parameter(torch.full((1, 1, 1), 1.6))
-
-    def forward(self, commands: torch.Tensor) -> torch.Tensor:
-        """Return each joint's share of flow, `(B,)` in (0, 1], for commands `(J, B, H)`."""
-        hidden = torch.relu(torch.baddbmm(self.bias, commands, self.weight))
-        demand = torch.bmm(hidden, self.log_share.exp()).sum(0).squeeze(1)
-        sharpness = self.log_sharpness.exp().view(())
-        # (1 + demand^s)^(-1/s): min(1, 1 / demand) with a rounded corner
-        return torch.exp(-nn.functional.softplus(sharpness * torch.log(demand + 1e-3)) / sharpness)
-
-
-class PoseLoad(nn.Module):
-    """Speed factor of each joint and direction in a pose, due to the load there.
-
-    A factor, so that no pose can move a joint that rests.
-
-    Args:
-        num_joints: Number of joints, `J`.
-        generator: Draws the initial weights.
-    """
-
-    def __init__(self, num_joints: int, generator: torch.Generator | None = None) -> None:
-        super().__init__()
-        layer = COUPLING_WIDTH, num_joints, generator
-        self.weight = _initialise_weights(num_joints, num_joints, *layer)
-        self.bias = _initialise_weights(num_joints, 1, *layer)
-        self.out = nn.Parameter(torch.zeros(num_joints, COUPLING_WIDTH, 2))
-
-    def forward(self, position: torch.Tensor) -> torch.Tensor:
-        """Return factors of both directions, `(J, B, 2)` in (0, 2), at positions `(J, B)`."""
-        seen = position.T.expand(len(position), -1, -1)
-        hidden = torch.tanh(torch.baddbmm(self.bias, seen, self.weight))
-        return 2.0 * torch.sigmoid(torch.bmm(hidden, self.out))
-
 
 class JointNetworks(nn.Module):
     """Per joint a perceptron with two hidden ReLU layers to the next increment (paper, III-A).
-
-    Where they are coupled, their outputs are multiplied by the output of `SharedFlow` for the
-    commands of all joints, and by that of `PoseLoad` for the positions of all.
 
     The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the
     noise of the measurement is none. A machine at rest therefore stays at rest, however long the
@@ -104,7 +33,6 @@ class JointNetworks(nn.Module):
         num_joints: Number of joints, `J`.
         num_history: Samples of commands and positions, `H`.
         width: Units a joint in each hidden layer.
-        coupled: Whether joints know of each other.
         generator: Draws the initial weights.
 
     Buffers:
@@ -123,17 +51,14 @@ class JointNetworks(nn.Module):
         num_joints: int,
         num_history: int,
         width: int,
-        coupled: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.num_history, self.coupled = num_history, coupled
+        self.num_history = num_history
         layers = list(pairwise((2 * num_history, width, width, 1)))
         weight = [_initialise_weights(num_joints, m, n, m, generator) for m, n in layers]
         bias = [_initialise_weights(num_joints, 1, n, m, generator) for m, n in layers]
         self.weight, self.bias = nn.ParameterList(weight), nn.ParameterList(bias)
-        self.flow = SharedFlow(num_joints, num_history, generator) if coupled else None
-        self.load = PoseLoad(num_joints, generator) if coupled else None
         for name in ("command_scale", "increment_scale", "position_scale"):
             self.register_buffer(name, torch.ones(num_joints))
         for name in ("position_center", "quiet"):
@@ -141,9 +66,7 @@ class JointNetworks(nn.Module):
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """Return normalised increments `(J, B)` before the dead zone, for inputs `(J, B, 2 H)`."""
-        output = self._head(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
-        share = None if self.flow is None else self.flow(inputs[..., : self.num_history])
-        return self._hindered(output, inputs[..., -1], share)
+        return self._head(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
 
     def increment(self, output: torch.Tensor) -> torch.Tensor:
         """Return increments `(J, B)` in rad or m, after the dead zone."""
@@ -181,15 +104,12 @@ class JointNetworks(nn.Module):
         seen = seen.reshape(num_joints, batch * steps, size)
         first = torch.baddbmm(self.bias[0], seen, of_command)
         from_commands = first.view(num_joints, batch, steps, -1).unbind(2)
-        shares = None if self.flow is None else self.flow(seen).view(batch, steps).unbind(1)
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
         at, path = q[..., -1], []
         for k in range(steps):
-            position = self._position(at)
-            state = torch.cat([increments, position[..., None]], 2)
+            state = torch.cat([increments, self._position(at)[..., None]], 2)
             output = self._head(torch.baddbmm(from_commands[k], state, of_state))
-            share = None if shares is None else shares[k]
-            moved = self._moved(self._hindered(output, position, share))
+            moved = self._moved(output)
             at = torch.addcmul(at, moved, self.increment_scale[:, None])
             at = at.clamp(lower[:, None], upper[:, None])
             increments = torch.cat([increments[..., 1:], moved[..., None]], 2)
@@ -200,15 +120,6 @@ class JointNetworks(nn.Module):
         """Return the output of the last layer, `(J, B)`, for the first layer before its ReLU."""
         hidden = torch.relu(torch.baddbmm(self.bias[1], torch.relu(hidden), self.weight[1]))
         return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
-
-    def _hindered(
-        self, output: torch.Tensor, position: torch.Tensor, share: torch.Tensor | None
-    ) -> torch.Tensor:
-        """Return outputs `(J, B)` reduced by flow share `(B,)` and load at `position` `(J, B)`."""
-        if self.load is None:
-            return output
-        forth, back = self.load(position).unbind(2)
-        return share * (torch.relu(output) * forth - torch.relu(-output) * back)
 
     def _moved(self, output: torch.Tensor) -> torch.Tensor:
         """Return normalised increments `(J, B)` after the dead zone."""
@@ -245,12 +156,12 @@ class Mlp:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
                 NaN.
         """
-        networks = load_networks(self.checkpoint, "mlp", machine)
+        networks = load_networks(self.checkpoint, machine)
         return NetworkModel(networks.to(device), machine, device)
 
 
 class NetworkModel(MemorylessModel):
-    """Actuator networks at work, separate or coupled. Has no memory beyond the history."""
+    """Actuator networks at work. Has no memory beyond the history."""
 
     def __init__(self, networks: JointNetworks, machine: Machine, device: torch.device) -> None:
         self._networks = networks.requires_grad_(False)
@@ -263,16 +174,16 @@ class NetworkModel(MemorylessModel):
         return self._plant.hold(history.q[:, -1] + networks.increment(output).T)
 
 
-def load_networks(name: str, kind: str, machine: Machine) -> JointNetworks:
-    """Return the networks of a checkpoint, on the CPU; `kind` is `mlp` (separate) or `coupled`.
+def load_networks(name: str, machine: Machine) -> JointNetworks:
+    """Return the networks of a checkpoint, on the CPU.
 
     Raises:
         CheckpointError: as for `Mlp.build`.
     """
     path = checkpoint.find_checkpoint(name)
-    tensors, header = checkpoint.read_checkpoint(path, kind, machine)
-    width, coupled = int(header.get("width", 0)), kind == "coupled"
-    networks = JointNetworks(machine.num_joints, machine.num_history, width, coupled)
+    tensors, header = checkpoint.read_checkpoint(path, "mlp", machine)
+    width = int(header.get("width", 0))
+    networks = JointNetworks(machine.num_joints, machine.num_history, width)
     try:
         networks.load_state_dict(tensors)
     except RuntimeError as error:
@@ -280,24 +191,3 @@ def load_networks(name: str, kind: str, machine: Machine) -> JointNetworks:
             f"{path}: the tensors do not fit the network that its header describes ({error})"
         ) from error
     return networks
-
-
-@spec
-class Coupled:
-    """A perceptron a joint, slowed by a shared pump and by the load of the pose.
-
-    Attributes:
-        checkpoint: A file, or the name of one that ships with the package.
-    """
-
-    checkpoint: str
-
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NetworkModel:
-        """Return a model for any number of environments on `device`.
-
-        Raises:
-            CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
-                NaN.
-        """
-        networks = load_networks(self.checkpoint, "coupled", machine)
-        return NetworkModel(networks.to(device), machine, device)

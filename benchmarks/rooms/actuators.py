@@ -31,7 +31,7 @@ def read_errors(path: Path, head: dict[str, str]) -> Table:
 def read_plant(folder: Path) -> Table:
     """Return the errors of the models that were fitted to sines, and to sines and levels."""
     sines = read_errors(folder / "fit_sine/identification.json", {"fitted to": "sines"})
-    both = read_errors(folder / "coupled/identification.json", {"fitted to": "sines and levels"})
+    both = read_errors(folder / "fit_both/identification.json", {"fitted to": "sines and levels"})
     return sines + both
 
 
@@ -57,7 +57,7 @@ MEASUREMENTS = (
             f"{LEVELS} session.seed=1 collect.run_minutes=10 session.out={{out}}/levels",
             f"{LEVELS} session.seed=2 collect.run_minutes=5 session.out={{out}}/unseen",
             f"brokk mode=identify 'identify.recordings={{out}}/sine/recordings/*' '{TEST}' session.device=cpu session.out={{out}}/fit_sine",
-            f"brokk mode=identify fit=coupled +fit@baselines.mlp=mlp '{TRAIN}' '{TEST}' session.device=cpu session.out={{out}}/coupled",
+            f"brokk mode=identify fit=valve +fit@baselines.mlp=mlp '{TRAIN}' '{TEST}' session.device=cpu session.out={{out}}/fit_both",
         ),
         code=CODE,
         read=read_plant,

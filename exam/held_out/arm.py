@@ -13,11 +13,12 @@ from brokk_rl.spec import spec
 from exam.case_distribution import PlantRun
 from exam.held_out.causes import CAUSES, OutsideCauses
 from exam.held_out.hydraulics import OPEN, STEP_S, Linkage, PilotedSpools, SensingHydraulics
-from exam.held_out.parameters import CHANGES, ArmParameters, change_machine, draw_machine
+from exam.held_out.parameters import CHANGES, change_machine, draw_machine
 from exam.held_out.readings import RunChance, SteppedEncoders
 from exam.plants.electronics import CommandBus
 from exam.plants.family import DrawnPlants, PlantLink
 from exam.plants.linkage import Arm
+from exam.plants.plant_parameters import PlantParameters
 
 MAKE = "sensing"
 SPOOL_STEP = 1e-5
@@ -32,7 +33,7 @@ class SensingArm(PlantLink):
     Args:
         machine: Geometry, masses, limits.
         make: The only one.
-        parameters: Of each run's machine; `severity` is that of its outside cause.
+        parameters: Of each run's machine; `outside_severity` is that of its outside cause.
         runs: The runs.
         steps: Control periods of the longest run.
     """
@@ -41,7 +42,7 @@ class SensingArm(PlantLink):
         self,
         machine: Machine,
         make: str,
-        parameters: Sequence[ArmParameters],
+        parameters: Sequence[PlantParameters],
         runs: Sequence[PlantRun],
         steps: int,
     ) -> None:
@@ -54,11 +55,11 @@ class SensingArm(PlantLink):
         self._noise, self._settling = self._stack_chance("noise"), self._stack_chance("settling")
         phase = np.array([one.phase for one in chance])
         self._causes = OutsideCauses(
-            machine, self._kinds, n["severity"], phase, self._stack_chance("luck")
+            machine, self._kinds, n["outside_severity"], phase, self._stack_chance("luck")
         )
         bus = {
-            "transport_s": n["transport_s"] + n["wait_s"],
-            "jitter_s": 0.5 * n["queue_s"],  # mean delay of the effect, whose delays are uniform
+            "transport_s": n["transport_s"],
+            "jitter_s": 0.5 * n["jitter_s"],  # mean delay of the effect, whose delays are uniform
             "loss": n["loss"],
         }
         self._bus = CommandBus(bus, machine.period_s)
@@ -72,7 +73,7 @@ class SensingArm(PlantLink):
         self._link, self._trace = self._q.copy(), [self._q.copy()]
         self._is_open = np.zeros(self._q.shape, dtype=bool)
         self._motions = np.zeros(self._q.shape, dtype=int)
-        self._half_play = 0.5 * (n["play_rad"] + n["added_play_rad"])
+        self._half_play = 0.5 * (n["play_rad"] + n["gap_rad"])
         self._num_kept = (
             1 + round(machine.period_s / STEP_S) * 12
         )  # stamps are never later than that
@@ -138,11 +139,11 @@ class SensingArm(PlantLink):
         """
         n, run_s = self._n, run_s[:, None]
         own = 1.0 + n["warm_change"] * _compute_warming(run_s / 900.0)  # s: the nuisance's tank
-        return own * (1.0 + n["oil_change"] * _compute_warming(run_s / n["oil_s"]))
+        return own * (1.0 + n["drift"] * _compute_warming(run_s / n["drift_s"]))
 
     def _stamped(self) -> np.ndarray:
         """Return the positions of the moments that the readings are stamped for, `(N, J)`."""
-        late = self._n["late_s"]
+        late = self._n["stamp_s"]
         if not late.any():
             return self._link
         steps = np.minimum(late / STEP_S, len(self._trace) - 1.0)
@@ -174,13 +175,14 @@ class HeldOutPlants(DrawnPlants):
     is_held_out = True
     table = CHANGES
     causes = CAUSES
-    severity = "severity"
 
     def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
         """Return the make of each run: all are of one."""
         return [MAKE] * len(runs)
 
-    def draw(self, machine: Machine, run: PlantRun, roughness: float) -> tuple[str, ArmParameters]:
+    def draw(
+        self, machine: Machine, run: PlantRun, roughness: float
+    ) -> tuple[str, PlantParameters]:
         """Return make and parameters of a run's machine, with its effects.
 
         Raises:

@@ -22,7 +22,8 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.held_out.parameters import ArmParameters, compute_notch_area
+from exam.held_out.parameters import compute_notch_area
+from exam.plants.plant_parameters import PlantParameters
 
 STEP_S = 0.0025
 """Time step, s: a twentieth of a control period; the first mode of a joint lasts 50 of them."""
@@ -66,7 +67,7 @@ class Linkage:
         added_rad: Further turn of the triangle to either end, by a moved mounting, `(N, J)`.
     """
 
-    def __init__(self, numbers: ArmParameters, machine: Machine, added_rad: np.ndarray) -> None:
+    def __init__(self, numbers: PlantParameters, machine: Machine, added_rad: np.ndarray) -> None:
         self._middle = 0.5 * (machine.lower + machine.upper)
         self._half = 0.5 * (machine.upper - machine.lower)
         self._at_rad = numbers["linkage_rad"]
@@ -99,12 +100,12 @@ class PilotedSpools:
         numbers: The machine's, `(N, J)`.
     """
 
-    def __init__(self, numbers: ArmParameters) -> None:
+    def __init__(self, numbers: PlantParameters) -> None:
         self._n = numbers
         shape = numbers["notch"].shape
         self.pilot, self.spool = np.zeros(shape), np.zeros(shape)
         # of an orifice that fills a chamber in 2 T the mean delay is two thirds of T
-        self._fill_s = 1.5 * (numbers["fill_s"] + numbers["added_fill_s"])
+        self._fill_s = 1.5 * (numbers["fill_s"] + numbers["pilot_s"])
         self._slope = np.where(
             numbers["stroke_s"] > 0, 1.0 / np.maximum(numbers["stroke_s"], 1e-6), np.inf
         )
@@ -131,7 +132,7 @@ class PilotedSpools:
         stroke = np.clip(stroke, -n["stop"], n["stop"])
         overlap = np.where(stroke > 0, n["overlap_extend"], n["overlap_retract"])
         beyond = np.maximum(np.abs(stroke) - overlap, 0.0) / (1.0 - overlap)
-        edge = np.where(stroke > 0, n["area_extend"], n["area_retract"])
+        edge = np.where(stroke > 0, n["extend"], n["retract"])
         return np.sign(stroke) * edge * compute_notch_area(beyond, n["notch"])
 
 
@@ -147,7 +148,11 @@ class SensingHydraulics:
     """
 
     def __init__(
-        self, numbers: ArmParameters, machine: Machine, back_flow: np.ndarray, pump_lag: np.ndarray
+        self,
+        numbers: PlantParameters,
+        machine: Machine,
+        back_flow: np.ndarray,
+        pump_lag: np.ndarray,
     ) -> None:
         self._n, self._back_flow, self._pump_lag = numbers, back_flow, pump_lag
         shape = numbers["notch"].shape
@@ -167,7 +172,7 @@ class SensingHydraulics:
         self._viscous = np.where(is_soft, np.minimum(soft, numbers["viscous"]), numbers["viscous"])
         # a soft joint rings: dry friction of full size would end that after one swing
         self._coulomb = numbers["coulomb"] * np.where(is_soft, 0.4, 1.0)
-        self._sink = 0.4 * numbers["sink"] / machine.max_speed
+        self._sink = 0.4 * numbers["leak"] / machine.max_speed
 
     def hold(self, load: np.ndarray) -> None:
         """Let resting cylinders bear their load, over the yield force, `(N, J)`."""
@@ -209,7 +214,7 @@ class SensingHydraulics:
         is_open = opened > OPEN
         # a loose compensator lets the drop change with the load that its inlet feels
         usual = np.where(extends, 0.12 * ratio, 0.12)
-        felt = FORCE_RATIO * n["loose"] * (usual - p_in)
+        felt = FORCE_RATIO * n["sensitivity"] * (usual - p_in)
         relaxed = spring * (1.0 - n["droop"] * p_in) * np.clip(1.0 + felt, 0.05, 2.0)
         head = self._supply - p_in
         drop = np.minimum(NOMINAL_DROP * relaxed, head)
@@ -227,7 +232,7 @@ class SensingHydraulics:
             n["outlet"] * np.where(extends, ratio, 1.0) * opened * np.sqrt(np.maximum(spring, 0.0))
         )
         passed = passed * np.sqrt(
-            np.clip(1.0 + FORCE_RATIO * n["loose"] * (p_out - 0.12), 0.05, 2.0)
+            np.clip(1.0 + FORCE_RATIO * n["sensitivity"] * (p_out - 0.12), 0.05, 2.0)
         )
         regulated = np.sqrt(np.maximum(p_out, 0.0) / (np.maximum(p_out, 0.0) + OUTLET_PRESSURE))
         outlet = passed * regulated

@@ -11,10 +11,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.changes import Change, FaultSizes, add_share, apply_changes, replace_by
-
-ArmParameters = dict[str, np.ndarray]
-"""Parameters by name, `(J,)` each."""
+from exam.plants.changes import Change, FaultSizes, apply_changes
+from exam.plants.faults import FAULTS
+from exam.plants.plant_parameters import PlantParameters
 
 RANGES = {
     "fill_s": (0.02, 0.05),  # time constant of filling a pilot chamber
@@ -22,8 +21,8 @@ RANGES = {
     "overlap_retract": (0.05, 0.13),
     "notch": (0.1, 0.35),  # part of the stroke in which only the notches meter
     "flow_force": (0.0, 0.08),  # of the centring spring's force, at full drop and stroke
-    "area_extend": (0.95, 1.10),  # of the metering edge
-    "area_retract": (1.0, 1.2),
+    "extend": (0.95, 1.10),  # area of the metering edge
+    "retract": (1.0, 1.2),
     "rod_area": (0.6, 0.85),  # over the bore's
     "mode_hz": (4.5, 8.0),  # of the joint on its closed cylinder in the middle of the stroke
     "viscous": (0.08, 0.16),  # friction force at full speed
@@ -45,13 +44,13 @@ NUISANCES = {
 }
 """Ranges of the nuisances; all scale with the roughness."""
 ABSENT = (
-    "wait_s", "queue_s", "loss", "late_s", "added_fill_s", "stroke_s", "sink", "breakaway", "bleed", "loose",
-    "soft_s", "soft_damping", "added_play_rad", "step_rad", "sigma_rad", "bias_rad", "extra_m", "roll_rad",
-    "pitch_rad", "oil_change", "severity",
+    "jitter_s", "loss", "stamp_s", "pilot_s", "stroke_s", "leak", "breakaway", "bleed", "sensitivity",
+    "soft_s", "soft_damping", "gap_rad", "step_rad", "extra_noise_rad", "bias_rad", "extra_m", "roll_rad",
+    "pitch_rad", "drift", "outside_severity",
 )  # fmt: skip
 """Parameters that are 0 in a machine without effects."""
-NEUTRAL = {"stop": 1.0, "spring": 1.0, "scale": 1.0, "oil_s": 700.0}
-"""Parameters of a machine without effects that are not 0. `oil_s`: s, warm-up of a small tank."""
+NEUTRAL = {"stop": 1.0, "spring": 1.0, "scale": 1.0, "drift_s": 700.0}
+"""Parameters of a machine without effects that are not 0. `drift_s`: s, warm-up of a small tank."""
 TRANSPORT_S = (0.38, 0.48)
 """Delay of radio and bus, s; one for all joints."""
 PUMP_DEMAND = (0.16, 0.24)
@@ -62,11 +61,11 @@ PUMP_LAG_S = (0.06, 0.14)
 """Time constant with which the pump follows the sensed load, s."""
 
 
-def draw_machine(machine: Machine, seed: int, roughness: float) -> ArmParameters:
+def draw_machine(machine: Machine, seed: int, roughness: float) -> PlantParameters:
     """Return the parameters of the machine with this seed; `roughness` scales its nuisances."""
     generator = np.random.default_rng([seed, *b"held out"])
     count = machine.num_joints
-    found: ArmParameters = {}
+    found: PlantParameters = {}
     for name, (low, high) in RANGES.items():
         found[name] = generator.uniform(low, high, count)
     for name, (low, high) in NUISANCES.items():
@@ -102,7 +101,7 @@ USUAL_START = 0.08
 """Command at which a usual joint starts."""
 
 
-def _add_stiction(n: ArmParameters, size: FaultSizes) -> None:
+def _add_stiction(n: PlantParameters, size: FaultSizes) -> None:
     """Add friction at rest, and a bleed orifice that only a larger opening overcomes."""
     start = size["start"]
     has = start > 0
@@ -113,55 +112,27 @@ def _add_stiction(n: ArmParameters, size: FaultSizes) -> None:
     n["bleed"] = np.where(has, flow / np.sqrt(np.maximum(n["breakaway"], 1e-6)), 0.0)
 
 
-def _add_flow_gain(n: ArmParameters, size: FaultSizes) -> None:
+def _add_flow_gain(n: PlantParameters, size: FaultSizes) -> None:
     n["spring"] = n["spring"] * size["gain"] ** 2  # flow grows with the root of the drop
 
 
-def _add_flow_sharing(n: ArmParameters, size: FaultSizes) -> None:
+def _add_flow_sharing(n: PlantParameters, size: FaultSizes) -> None:
     """Let the mean demand of all joints be that of the effect; joints keep their own shares."""
     wanted = size["demand"]
     share = n["demand"] / n["demand"].mean()
     n["demand"] = np.where(wanted > 0, np.maximum(n["demand"], share * wanted), n["demand"])
 
 
-# The faults of readings and geometry repeat those of other makes. They add the label's own number,
-# which is what the number means. A shared table would let a change for a make that is developed on
-# reach the one that is held out.
 CHANGES: dict[str, Change] = {
-    "dead_time": (("wait_s", np.add, "dead_time_s"),),
-    "delay_jitter": (("queue_s", np.add, "jitter_s"),),
-    "frame_loss": (("loss", np.add, "probability"),),
-    "clock_offset": (("late_s", np.add, "offset_s"),),
-    "dead_band": (
-        ("overlap_extend", add_share, "extend"),
-        ("overlap_retract", add_share, "retract"),
-    ),
-    "saturation": (("stop", np.minimum, "level"),),
-    "rate_limit": (("stroke_s", np.add, "stroke_s"),),
-    "lag": (("added_fill_s", np.add, "time_constant_s"),),
+    **FAULTS,
     "stiction": _add_stiction,
     "flow_gain": _add_flow_gain,
-    "asymmetry": (
-        ("area_extend", np.multiply, "extend_gain"),
-        ("area_retract", np.multiply, "retract_gain"),
-    ),
-    "load_dependence": (("loose", np.add, "sensitivity"),),
     "flow_sharing": _add_flow_sharing,
-    "creep": (("sink", np.add, "sink_rad_s"),),
-    "thermal_drift": (("oil_change", np.add, "change"), ("oil_s", replace_by, "time_s")),
-    "backlash": (("added_play_rad", np.add, "gap_rad"),),
-    "compliance": (("soft_s", np.add, "ringing_s"), ("soft_damping", replace_by, "damping")),
-    "quantisation": (("step_rad", np.add, "step_rad"),),
-    "sensor_noise": (("sigma_rad", np.add, "sigma_rad"),),
-    "encoder_bias": (("bias_rad", np.add, "bias_rad"),),
-    "encoder_scale": (("scale", np.multiply, "scale"),),
-    "link_length": (("extra_m", np.add, "extra_m"),),
-    "base_tilt": (("roll_rad", np.add, "roll_rad"), ("pitch_rad", np.add, "pitch_rad")),
 }
-"""Change of the parameters by effect. `extrinsics` is not among them: a case has no estimates of
-boreholes to see it by."""
+"""Change of the parameters by effect: those of all makes, which mean the label's own number, and three that
+this make has otherwise."""
 
 
-def change_machine(numbers: ArmParameters, effects: Mapping[str, FaultSizes]) -> ArmParameters:
+def change_machine(numbers: PlantParameters, effects: Mapping[str, FaultSizes]) -> PlantParameters:
     """Return a machine with effects; raises as `apply_changes`."""
     return apply_changes(numbers, effects, CHANGES, "the held-out make")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exam.held_out.parameters import ArmParameters
+from exam.plants.plant_parameters import PlantParameters
 
 BURST_FRAMES = 1.8
 """Mean length of a burst of lost frames; chosen by hand, as of a fading radio link."""
@@ -27,7 +27,7 @@ class RunChance:
         phase: Uniform.
     """
 
-    def __init__(self, seed: int, one: ArmParameters, steps: int) -> None:
+    def __init__(self, seed: int, one: PlantParameters, steps: int) -> None:
         generator = np.random.default_rng([seed, 7])
         count = len(one["loss"])
         self.lost = draw_bursts(generator.random(steps + 1), float(one["loss"].max()))
@@ -63,9 +63,9 @@ class SteppedEncoders:
         numbers: The machine's, `(N, J)`.
     """
 
-    def __init__(self, numbers: ArmParameters) -> None:
+    def __init__(self, numbers: PlantParameters) -> None:
         self._n = numbers
-        self._sigma = np.hypot(numbers["noise_rad"], numbers["sigma_rad"])
+        self._sigma = np.hypot(numbers["noise_rad"], numbers["extra_noise_rad"])
         self._step = np.maximum(numbers["step_rad"], 1e-9)
         self._count: np.ndarray | None = None
 

@@ -12,24 +12,19 @@ from typing import Any
 from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
-from brokk_rl.record import Recording
-from brokk_rl.report import Cell
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
 from diagnosis.answer import ANSWER_FILE
 from exam import scorecard
 from exam.real_cases import DIAGNOSIS_FOLDER, CaseRun, RealCase, RefusalError
+from exam.report import format_cell
 
 log = logging.getLogger(__name__)
 
 RUN_FILE = "run.json"
 """Answer, logs and seconds of a finished case, in its folder."""
-PRINTED = {
-    "machine": False, "verdict": True, "first pick": True, "known, named": False,
-    "phantoms": False, "abstention": True, "closed": False, "apart: less by": False,
-    "seconds (CPU)": False,
-}  # fmt: skip
-"""Columns of the printed table, and whether with their notes."""
+PRINTED = ("machine", "verdict", "first pick", "phantoms", "abstention", "closed", "seconds (CPU)")
+"""Columns of the printed table."""
 
 
 @spec
@@ -135,9 +130,10 @@ def _build_result(case: RealCase, folder: Path) -> dict[str, Any]:
     run = json.loads((folder / RUN_FILE).read_text())
     answer = run.pop("answer")
     errors = scorecard.read_errors(answer, case.machine)
-    scorecard.add_hold_errors(
-        errors, _read_part(folder, "field", case), _read_part(folder, "apart", case), case.machine
-    )
+    if errors["unit"] is not None and "hold" not in errors["rivals"]:
+        field = record.read_recordings(str(folder / "field" / "*.parquet"), case.machine)
+        hold = scorecard.compute_hold_error(field, case.machine, errors["unit"])
+        errors["rivals"]["hold"] = hold
     return {
         "outcome": "answered",
         "reason": "",
@@ -147,12 +143,6 @@ def _build_result(case: RealCase, folder: Path) -> dict[str, Any]:
         "scores": scorecard.score_answer(answer, case.known),
         "errors": errors,
     }
-
-
-def _read_part(folder: Path, part: str, case: RealCase) -> list[Recording]:
-    if not (folder / part).is_dir():
-        return []
-    return record.read_recordings(str(folder / part / "*.parquet"), case.machine)
 
 
 def _read_cpu_s() -> float:
@@ -172,16 +162,10 @@ def _diagnose(work: CaseRun) -> dict[str, Any]:
 
 
 def _print_table(results: dict[str, dict[str, Any]], folder: Path) -> None:
-    """Print the columns of scores; the files have all columns and the notes."""
-    shown = [k for k, name in enumerate(scorecard.COLUMNS) if name in PRINTED]
+    """Print the scores; the files have all columns."""
+    places = [scorecard.COLUMNS.index(name) for name in PRINTED]
     rows = []
     for row in scorecard.build_rows(results):
-        cells = []
-        for k in shown:
-            cell = row[k]
-            if isinstance(cell, Cell) and not PRINTED[scorecard.COLUMNS[k]]:
-                cell = Cell(cell.value)
-            cells.append(scorecard.format_cell(cell))
-        rows.append(cells)
-    print_table([scorecard.COLUMNS[k] for k in shown], rows)
+        rows.append([format_cell(row[place]) for place in places])
+    print_table(PRINTED, rows)
     print_text(f"report: {folder / scorecard.REPORT_FILE}")

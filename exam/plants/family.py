@@ -90,7 +90,6 @@ class DrawnPlants:
     outside_not_on: dict[str, tuple[str, ...]]
     table: ClassVar[Mapping[str, Change]]
     causes: ClassVar[tuple[str, ...]]
-    severity: ClassVar[str] = "outside_severity"
     link: ClassVar[Callable[..., PlantLink]]
 
     def check(self) -> None:
@@ -135,7 +134,7 @@ class DrawnPlants:
                 )
             make, numbers = self.draw(machine, run, self.roughness[run.roughness])
             if run.outside_fault is not None:
-                numbers[self.severity] = run.outside_fault.severity
+                numbers["outside_severity"] = run.outside_fault.severity
             makes.add(make)
             parameters.append(numbers)
         (make,) = makes

@@ -41,7 +41,7 @@ NOT_COMPOSED = {
 }
 """Parts of commands that stand for something that does not compose, and the reason."""
 WITHOUT_VALUES = {
-    "mode=identify fit=coupled …": "the values before the dots stand in the line above it",
+    "mode=identify fit=valve …": "the values before the dots stand in the line above it",
     "mode=diagnose …": "the values before the dots stand in the block above it",
     "diagnosis.case=": "the folder is the reader's",
     "subject.model=arm.urdf": "the file is the reader's",

@@ -39,10 +39,9 @@ def recording(machine: Machine, seed: int) -> Recording:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("coupled", [False, True])
 @pytest.mark.parametrize("horizon", [1, 20])
 def test_a_captured_update_is_the_update(
-    coupled: bool, horizon: int, machine: Machine, monkeypatch: pytest.MonkeyPatch
+    horizon: int, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def as_it_is(step: Callable[[], None], device: torch.device, gradients: bool = False) -> Any:
         return SimpleNamespace(replay=torch.enable_grad()(step))
@@ -52,13 +51,12 @@ def test_a_captured_update_is_the_update(
         with monkeypatch.context() as patch:
             if not captured:
                 patch.setattr(network_fit, capture_graph.__name__, as_it_is)
-            networks = JointNetworks(5, 13, 32, coupled, torch.Generator().manual_seed(0))
+            networks = JointNetworks(5, 13, 32, torch.Generator().manual_seed(0))
             networks.increment_scale.fill_(0.01)
             at_work = FreeRunOptimizer(networks.cuda(), machine, 3)
             update = at_work.updater(
                 TrainingWindows([recording(machine, 0)], machine, horizon, torch.device("cuda")),
                 32,
-                0.2,
                 0.2,
             )
             assert all(
@@ -81,12 +79,9 @@ def test_a_captured_update_is_the_update(
     assert not torch.equal(found[0]["networks.weight.0"], found[0]["averaged.weight.0"])
 
 
-@pytest.mark.parametrize("name", ["mlp", "coupled"])
-def test_a_fit_on_the_gpu_is_as_good_as_on_the_cpu(
-    name: str, machine: Machine, tmp_path: Path
-) -> None:
+def test_a_fit_on_the_gpu_is_as_good_as_on_the_cpu(machine: Machine, tmp_path: Path) -> None:
     config = dataclasses.replace(
-        option("fit", name),
+        option("fit", "mlp"),
         one_step_updates=200,
         one_step_batch=256,
         horizons_s=(0.5, 1.0),
@@ -99,7 +94,7 @@ def test_a_fit_on_the_gpu_is_as_good_as_on_the_cpu(
     for device in ("cpu", "cuda"):
         config.fit(machine, train, validation, tmp_path / device, 0, torch.device(device))
         _, header = checkpoint.read_checkpoint(
-            tmp_path / device / f"{name}.safetensors", name, machine
+            tmp_path / device / "mlp.safetensors", "mlp", machine
         )
         error.append(np.array(list(header["fit"]["validation_rmse"].values())))
     assert error[1] == pytest.approx(error[0], rel=0.25)

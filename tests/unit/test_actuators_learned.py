@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from actuators.models import checkpoint
-from actuators.models.network import Coupled, JointNetworks, Mlp, SharedFlow, load_networks
+from actuators.models.network import JointNetworks, Mlp, load_networks
 from brokk_rl.errors import CheckpointError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -21,8 +21,8 @@ from brokk_rl.machine import Machine
 CPU = torch.device("cpu")
 
 
-def networks(seed: int = 0, coupled: bool = False) -> JointNetworks:
-    return JointNetworks(5, 13, 32, coupled, torch.Generator().manual_seed(seed))
+def networks(seed: int = 0) -> JointNetworks:
+    return JointNetworks(5, 13, 32, torch.Generator().manual_seed(seed))
 
 
 def written(path: Path, machine: Machine, **tensors: torch.Tensor) -> Path:
@@ -62,9 +62,8 @@ def test_inputs_are_commands_increments_and_the_newest_position() -> None:
     torch.testing.assert_close(made.inputs(u, q), expected)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "coupled"])
-def test_a_free_run_in_one_go_is_step_by_step(kind: str, machine: Machine, tmp_path: Path) -> None:
-    made = networks(3, kind == "coupled")
+def test_a_free_run_in_one_go_is_step_by_step(machine: Machine, tmp_path: Path) -> None:
+    made = networks(3)
     made.increment_scale.fill_(0.01)
     lower, upper = (
         torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper)
@@ -74,11 +73,9 @@ def test_a_free_run_in_one_go_is_step_by_step(kind: str, machine: Machine, tmp_p
     q = (0.03 * torch.rand(5, 4, 13, generator=generator)).cumsum(2) - 0.3
     path = made.roll_out(u, q, lower, upper)
     checkpoint.write_checkpoint(
-        tmp_path / "a.safetensors", kind, machine, made.state_dict(), {"width": 32}
+        tmp_path / "a.safetensors", "mlp", machine, made.state_dict(), {"width": 32}
     )
-    model = {"mlp": Mlp, "coupled": Coupled}[kind](
-        checkpoint=str(tmp_path / "a.safetensors")
-    ).build(machine, 4, CPU)
+    model = Mlp(checkpoint=str(tmp_path / "a.safetensors")).build(machine, 4, CPU)
     history = History(
         q=q.permute(1, 2, 0).clone(), u=u[..., :13].roll(1, 2).permute(1, 2, 0).clone()
     )
@@ -86,45 +83,6 @@ def test_a_free_run_in_one_go_is_step_by_step(kind: str, machine: Machine, tmp_p
         history.push_u(u[..., 12 + k].T)
         history.push_q(model.step(history))
         torch.testing.assert_close(history.q[:, -1].T, path[..., k], atol=2e-5, rtol=0)
-
-
-def test_joints_share_a_flow_when_they_ask_for_more_than_there_is() -> None:
-    flow = SharedFlow(3, 4)
-    with torch.no_grad():
-        for value in flow.parameters():
-            value.zero_()
-        flow.log_sharpness.fill_(5.0)  # a corner as good as sharp
-        share = torch.tensor([0.4, 0.8, 0.6])  # of the pump, at full command
-        for unit, sign in enumerate((1.0, -1.0)):
-            flow.weight[:, 1, unit] = sign  # the command two samples before the newest
-            flow.log_share[:, unit, 0] = share.log()
-    commands = torch.zeros(3, 5, 4)
-    commands[0, 0, 1] = 1.0  # alone: 0.4
-    commands[:, 1, 1] = torch.tensor([1.0, -1.0, 0.0])  # 1.2
-    commands[:, 2, 1] = torch.tensor([-1.0, 1.0, 1.0])  # 1.8
-    commands[:, 3, 2] = 1.0  # at another time: nothing
-    torch.testing.assert_close(
-        flow(commands), torch.tensor([1.0, 1 / 1.2, 1 / 1.8, 1.0, 1.0]), atol=2e-3, rtol=0
-    )
-
-
-def test_the_pose_changes_the_speed_of_coupled_joints_only_and_moves_none_that_rests() -> None:
-    generator = torch.Generator().manual_seed(0)
-    u, q = torch.rand(5, 8, 13, generator=generator) * 2.0 - 1.0, torch.zeros(5, 8, 13)
-    other = q.clone()
-    other[3] += 0.5
-    for coupled in (False, True):
-        made = networks(1, coupled)
-        if made.load is not None:
-            torch.nn.init.normal_(made.load.out, generator=generator)
-        here, there = made(made.inputs(u, q)), made(made.inputs(u, other))
-        assert (here[3] != there[3]).all()
-        changed = (here != there)[[0, 1, 2, 4]]
-        assert changed.all() if coupled else not changed.any()
-        with torch.no_grad():
-            made.weight[2].zero_()
-            made.bias[2].zero_()
-        assert (made(made.inputs(u, other)) == 0).all()
 
 
 def test_increments_below_the_noise_are_none() -> None:
@@ -136,9 +94,8 @@ def test_increments_below_the_noise_are_none() -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["mlp", "coupled"])
-def test_the_shipped_machine_at_rest_stays_at_rest(name: str, machine: Machine) -> None:
-    actuator, num_envs = option("actuator", name), 64
+def test_the_shipped_machine_at_rest_stays_at_rest(machine: Machine) -> None:
+    actuator, num_envs = option("actuator", "mlp"), 64
     generator = torch.Generator().manual_seed(0)
     lower, upper = (
         torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper)
@@ -155,9 +112,8 @@ def test_the_shipped_machine_at_rest_stays_at_rest(name: str, machine: Machine) 
         assert (history.q[:, -1] - q).abs().max() < 0.002, f"command {level}"
 
 
-@pytest.mark.parametrize("name", ["mlp", "coupled"])
-def test_the_shipped_model_reaches_a_target_and_stays(name: str, machine: Machine) -> None:
-    model = option("actuator", name).build(machine, 1, CPU)
+def test_the_shipped_model_reaches_a_target_and_stays(machine: Machine) -> None:
+    model = option("actuator", "mlp").build(machine, 1, CPU)
     home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
     target = home + torch.tensor([[0.5, 0.0, 0.4, -0.4, 0.5]])
     history = History(q=torch.zeros(1, 13, 5), u=torch.zeros(1, 13, 5))
@@ -177,7 +133,7 @@ def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
         CheckpointError,
         match=r"no file 'nowhere\.safetensors'.*brokk170\.safetensors.*mode=identify",
     ):
-        load_networks("nowhere.safetensors", "mlp", machine)
+        load_networks("nowhere.safetensors", machine)
 
 
 @pytest.mark.parametrize("keep", [0, 5, 200, -100])
@@ -185,7 +141,7 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path, machine: Machine, kee
     path = written(tmp_path / "a.safetensors", machine)
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(CheckpointError, match=r"a\.safetensors: corrupt or truncated"):
-        load_networks(str(path), "mlp", machine)
+        load_networks(str(path), machine)
 
 
 def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
@@ -193,7 +149,7 @@ def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
         tmp_path / "a.safetensors", machine, quiet=torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0])
     )
     with pytest.raises(CheckpointError, match=r"tensor 'quiet' holds NaN"):
-        load_networks(str(path), "mlp", machine)
+        load_networks(str(path), machine)
 
 
 def test_a_checkpoint_of_another_machine_names_what_differs(
@@ -201,7 +157,7 @@ def test_a_checkpoint_of_another_machine_names_what_differs(
 ) -> None:
     other = dataclasses.replace(machine, name="brokk400", period_s=0.06)
     with pytest.raises(CheckpointError, match="made for another machine: name, control differ"):
-        load_networks(str(written(tmp_path / "a.safetensors", other)), "mlp", machine)
+        load_networks(str(written(tmp_path / "a.safetensors", other)), machine)
 
 
 def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine) -> None:
@@ -212,4 +168,4 @@ def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine
     }
     save_file(tensors, path, metadata=header)
     with pytest.raises(CheckpointError, match="do not fit the network"):
-        load_networks(str(path), "mlp", machine)
+        load_networks(str(path), machine)

@@ -91,7 +91,7 @@ def test_all_together_are_one_around_the_other(machine: Machine) -> None:
 
 @pytest.mark.parametrize("actuator", ["mlp", "lag"])
 def test_where_no_effect_is_there_nothing_changes(actuator: str, machine: Machine) -> None:
-    build, u = option("actuator", actuator).build, commands(machine, 60, 3)
+    build, u = option("actuator", "mlp").build, commands(machine, 60, 3)
     model = replace(option("effect", "library"), share=0.0).wrap(
         build(machine, 3, CPU), machine, 3, CPU
     )
@@ -170,15 +170,14 @@ def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: 
     assert all(torch.equal(value, plain.state[name]) for name, value in traced.state.items())
 
 
-@pytest.mark.parametrize("actuator", ["mlp", "coupled"])
 @pytest.mark.parametrize("shift_s", [-0.05, -0.02, 0.03, 0.05])
 def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
-    actuator: str, shift_s: float, machine: Machine
+    shift_s: float, machine: Machine
 ) -> None:
     """Measured as from recordings of the machine; its resolution is 0.01 s."""
     found = []
     for added in (0.0, shift_s):
-        model = option("actuator", actuator).build(machine, 4, CPU)
+        model = option("actuator", "mlp").build(machine, 4, CPU)
         model = library(1.0, fixed("dead_time", dead_time_s=added)).wrap(model, machine, 4, CPU)
         generator = torch.Generator().manual_seed(0)
         u = (torch.rand(150, 4, 5, generator=generator) * 1.4 - 0.7).repeat_interleave(8, 0) * (

@@ -18,20 +18,21 @@ from exam.case_distribution import PlantRun, UnknownFault
 from exam.held_out import causes, parameters
 from exam.held_out.arm import HeldOutPlants, SensingArm
 from exam.held_out.hydraulics import Linkage, compute_orifice
-from exam.held_out.parameters import ArmParameters, change_machine, draw_machine
+from exam.held_out.parameters import change_machine, draw_machine
 from exam.held_out.readings import SteppedEncoders, draw_bursts
 from exam.plants import out_of_library_faults
 from exam.plants.linkage import Arm
+from exam.plants.plant_parameters import PlantParameters
 
 Q1, Q3, Q4 = 0, 2, 3
 
 
-def clean(machine: Machine) -> ArmParameters:
+def clean(machine: Machine) -> PlantParameters:
     """A machine without nuisances, noise or change of lever, so that numbers can be worked by hand."""
     numbers = draw_machine(machine, 5, 0.0)
     for name, value in {
         "noise_rad": 0.0, "overlap_extend": 0.1, "overlap_retract": 0.1, "notch": 0.2, "flow_force": 0.0,
-        "area_extend": 1.0, "area_retract": 1.0, "linkage_rad": 1.57, "demand": 0.2, "transport_s": 0.4,
+        "extend": 1.0, "retract": 1.0, "linkage_rad": 1.57, "demand": 0.2, "transport_s": 0.4,
         "coulomb": 0.02, "pin": 0.0,
     }.items():  # fmt: skip
         numbers[name] = np.full(machine.num_joints, value)
@@ -40,7 +41,7 @@ def clean(machine: Machine) -> ArmParameters:
 
 def played(
     machine: Machine,
-    runs: list[tuple[ArmParameters, np.ndarray]],
+    runs: list[tuple[PlantParameters, np.ndarray]],
     kinds: list[str | None] | None = None,
     elapsed_s: float = 900.0,
 ) -> np.ndarray:
@@ -67,7 +68,7 @@ def on_q3(machine: Machine, none: float, value: float) -> np.ndarray:
     return np.where(np.arange(machine.num_joints) == Q3, value, none)
 
 
-def find_speeds(machine: Machine, runs: list[tuple[ArmParameters, float]]) -> np.ndarray:
+def find_speeds(machine: Machine, runs: list[tuple[PlantParameters, float]]) -> np.ndarray:
     """Steady speeds of q3, of full speed."""
     q = played(machine, [(numbers, push(machine, level)) for numbers, level in runs])[:, :, Q3]
     return (q[50] - q[40]) / (10 * machine.period_s) / machine.max_speed[Q3]
@@ -199,7 +200,7 @@ def test_frames_are_lost_in_bursts_at_the_stated_share() -> None:
 
 
 def test_a_coarse_encoder_keeps_its_reading_within_its_band(machine: Machine) -> None:
-    numbers = {name: np.zeros((1, 1)) for name in ("noise_rad", "sigma_rad", "bias_rad")}
+    numbers = {name: np.zeros((1, 1)) for name in ("noise_rad", "extra_noise_rad", "bias_rad")}
     numbers |= {"scale": np.ones((1, 1)), "step_rad": np.full((1, 1), 0.01)}
     encoder = SteppedEncoders(numbers)
     shown = [
@@ -215,7 +216,7 @@ def test_each_cause_shows_on_its_joint_and_a_machine_of_severity_zero_is_well(
 ) -> None:
     well = draw_machine(machine, 3, 0.0)
     ill = change_machine(well, {})
-    ill["severity"] = on_q3(machine, 0.0, 1.0)
+    ill["outside_severity"] = on_q3(machine, 0.0, 1.0)
     levels = (0.8, 0.8, 0.0, -0.8, 0.0, 0.25, -0.9, -0.9, -0.9, 0.7, 0.7, 0.7)
     u = np.concatenate([push(machine, level, 50) for level in levels])
     u[:, Q4] = np.where(np.arange(len(u)) % 150 > 109, 0.4, 0.0)  # q3 lifts alone at first
@@ -230,7 +231,7 @@ def test_each_cause_shows_on_its_joint_and_a_machine_of_severity_zero_is_well(
 
 def test_a_moved_stop_ends_the_travel_and_home_can_be_reached(machine: Machine) -> None:
     ill = change_machine(draw_machine(machine, 3, 0.0), {})
-    ill["severity"] = np.ones(machine.num_joints)
+    ill["outside_severity"] = np.ones(machine.num_joints)
     q = played(machine, [(ill, push(machine, 1.0, 200))], ["moved_stop"])[:, 0, Q3]
     # 0.4 of 2.7 rad are cut off the side that is farther from home
     assert q.max() == pytest.approx(machine.upper[Q3] - 0.4 * 2.7, abs=0.003)

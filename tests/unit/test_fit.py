@@ -70,7 +70,7 @@ class KilledError(Exception):
     """Stands for whatever ends a process in the middle of an update."""
 
 
-@pytest.mark.parametrize(("name", "after"), [("mlp", 17), ("coupled", 41), ("mlp", 70)])
+@pytest.mark.parametrize(("name", "after"), [("mlp", 17), ("mlp", 70)])
 def test_an_interrupted_fit_goes_on_as_if_it_had_not_stopped(
     name: str,
     after: int,
@@ -144,35 +144,15 @@ def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine
         for number, part in enumerate(parts)
     ]
     windows = TrainingWindows(marked, machine, 7, CPU)
-    draws = [windows.draw(64, 0.25, 0.25, torch.tensor(key)) for key in (5, 5, 6)]
+    draws = [windows.draw(64, 0.25, torch.tensor(key)) for key in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
     assert torch.equal(draws[0][0], draws[1][0])
     assert not torch.equal(draws[0][0], draws[2][0])
     q = draws[0][1]
     assert (q == q[..., :1]).all()
     assert set(q.unique().tolist()) == {0.0, 1.0, 2.0}
-    moving = draws[0][0][:, 32:].abs() > 0.02
+    moving = draws[0][0][:, 16:].abs() > 0.02
     assert moving.any(2).all()
-
-
-def test_windows_drawn_together_are_the_same_times_for_all_joints(machine: Machine) -> None:
-    part = recording(machine)
-    clock = np.repeat(np.arange(part.num_samples, dtype=np.float32)[:, None], 5, 1)
-    _, q = TrainingWindows([dataclasses.replace(part, q=clock)], machine, 7, CPU).draw(
-        16, 0.2, 0.2, torch.tensor(1), together=True
-    )
-    assert q.shape == (5, 80, 20)
-    assert (q == q[:1]).all()
-    assert len(q[0, :, 0].unique()) > 60
-
-
-def test_busy_windows_are_those_in_which_most_is_commanded_at_once(machine: Machine) -> None:
-    u = np.zeros((400, 5), dtype=np.float32)
-    u[:, 0] = 0.3
-    u[100:120] = 0.4  # all joints: 39 of 381 windows hold some of it
-    part = dataclasses.replace(recording(machine, minutes=400 / 1200), u=u)
-    found, _ = TrainingWindows([part], machine, 7, CPU).draw(40, 0.0, 1.0, torch.tensor(1))
-    assert (found[1:].amax(2) == torch.tensor(0.4)).all()
 
 
 @pytest.mark.parametrize(("noise", "step"), [(3e-4, 0.0), (1e-5, 0.002), (0.0, 0.004)])
@@ -213,17 +193,3 @@ def test_thin_data_is_warned_of(machine: Machine, caplog: pytest.LogCaptureFixtu
             [recording(machine, seed, minutes=4.0) for seed in range(5)], machine
         )
     assert not caplog.text
-
-
-def test_joints_that_never_move_together_are_warned_of(
-    machine: Machine, caplog: pytest.LogCaptureFixture
-) -> None:
-    part = recording(machine, minutes=8.0)
-    u = np.zeros_like(part.u)
-    u[:, 1] = part.u[:, 1]
-    with caplog.at_level(logging.WARNING):
-        training_data.check_together([dataclasses.replace(part, u=u)])
-        assert "several joints are commanded at once for 0.0 min" in caplog.text
-        caplog.clear()
-        training_data.check_together([part])
-        assert not caplog.text

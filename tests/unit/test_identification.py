@@ -156,9 +156,7 @@ def test_an_interrupted_identification_goes_on_and_does_no_fit_twice(
     again = Fit()
     parts = run(identify(machine, tmp_path / "parts", recordings, again, resume=True, folds=3))
     assert len(broken.fitted_to) == 2 and len(again.fitted_to) == 2
-    assert all(
-        parts[key] == whole[key] for key in ("joints", "overall", "against", "regimes", "delay_s")
-    )
+    assert all(parts[key] == whole[key] for key in ("joints", "overall", "against", "delay_s"))
     with pytest.raises(StorageError, match="is of another fit, or of other recordings or windows"):
         run(
             identify(
@@ -202,7 +200,7 @@ def test_the_report_of_a_good_model_says_so(
 ) -> None:
     result = run(identify(machine, tmp_path / "out", recordings, Fit()))
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {
-        "identification.json", "identification.html", "prediction.png", "error_over_horizon.png", "regimes.png", "dead_time.png",
+        "identification.json", "identification.html", "prediction.png", "error_over_horizon.png",
     }  # fmt: skip
     assert (
         result["verdict"][0]["tone"] == "good"
@@ -211,7 +209,7 @@ def test_the_report_of_a_good_model_says_so(
     assert any("inside the history of 0.65 s" in sentence["text"] for sentence in result["verdict"])
     assert "Judged by 2 runs" in result["verdict"][-1]["text"]
     text = (tmp_path / "out" / "identification.html").read_text()
-    assert text.count("data:image/png;base64,") == 4 and "Better beyond doubt" in text
+    assert text.count("data:image/png;base64,") == 2 and "Better beyond doubt" in text
 
 
 @pytest.mark.usefixtures("undrawn")

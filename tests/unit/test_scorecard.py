@@ -104,11 +104,17 @@ def test_shares_are_read_and_errors_apart_are_joined_over_travel(machine: Machin
         "rivals": {"hold": {"rmse_rad": 0.3}},
     }
     found = scorecard.read_errors(given, machine)
-    assert found["reduced"]["mean"] == pytest.approx(0.75)
-    assert found["apart"]["reduced"] == pytest.approx(0.5)
-    assert found["apart"]["before"] == pytest.approx(0.1)
+    assert (found["before"], found["after"]) == (0.4, 0.1)
+    assert found["apart"] == pytest.approx(0.5)
     assert found["rivals"] == {"hold": 0.3}
     assert found["closed"] is None
+
+
+def test_effects_are_contradicted_by_standing_still_and_by_a_rival_that_is_much_better() -> None:
+    errors = {"after": 0.3, "rivals": {"hold": 0.29, "arx": 0.25, "model": 0.19}}
+    scores = {"verdict": "effects"}
+    assert scorecard.list_better_rivals(scores, errors) == ["hold", "model"]
+    assert scorecard.list_better_rivals({"verdict": "unknown"}, errors) == []
 
 
 def test_standing_still_errs_by_the_motion(machine: Machine) -> None:
