@@ -37,7 +37,13 @@ SAME_REGION = 0.6
 ellipse. Chosen by hand: the middle of a region with a broken rim is off by up to 0.35."""
 MOST_CANDIDATES = 16
 """Candidates of a stage that are judged, the best first: each takes about 10 ms."""
-SHAPE_REASONS = ("part of a circle on the face with a rim", "radius, m", "axis ratio on the face")
+SHAPE_REASONS = (
+    "part of a circle on the face with a rim",
+    "radius, m",
+    "axis ratio on the face",
+    consistency.SIZE,
+    consistency.STRETCH,
+)
 """Reasons that refuse an ellipse and not its region: it may have followed the wrong edges."""
 
 EXPLANATIONS = {
@@ -74,6 +80,11 @@ EXPLANATIONS = {
     consistency.STRETCH: (
         "its rim is round only with another focal length",
         "K is that of another resolution or lens: K over this factor would do.",
+    ),
+    consistency.SIZE: (
+        "its rim is round, and by its depth of another size than the holes",
+        "baseline_m, or the unit of depth, is too large by this factor, or perception.pose.radius_m "
+        "too small; with depth from no pair, K is too small by it.",
     ),
     "tilt of the face, rad": (
         "the camera sees the face at too flat an angle",

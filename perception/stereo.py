@@ -24,17 +24,6 @@ _LARGEST_CHANGE_PX = 1.0
 _LEAST_SLOPE = 0.01
 """Least mean squared gradient for refinement, (grey levels a pixel)². Chosen by hand."""
 
-PATCH_PX, BLOCK_PX, FLAT_PX = 25, 5, 1.5
-"""Side of a patch in which disparities are compared with a plane, side of the blocks within it, and
-largest deviation of a flat patch, px. Chosen by hand."""
-PATCHES, LEAST_PATCHES = 150, 8
-"""Most patches, which limits the time, and fewest that decide. Chosen by hand."""
-EVEN_PX = 3.0
-"""Range of disparities from which their true fractions count as evenly distributed. Chosen by hand."""
-WINDOWS = 25.0
-"""Independent windows of a face, over which noise averages out. Chosen by hand: a face of 6 radii
-around a hole of 13 px has about 200 of them; fewer count where a part is hidden."""
-
 
 @dataclass(frozen=True)
 class PicturePart:
@@ -60,9 +49,7 @@ class Stereo:
         consistency_px: Largest error of the match back from right to left.
         speckle_px: Least pixels of a patch that stands alone in depth; 0 keeps all.
         speckle_range_px: Largest step within such a patch.
-        refinements: Most steps of least squares; fewer where they gain nothing; 0 for none.
-        least_gain: Part of the predicted error of a face that a further step must remove; the last
-            step is the first one that removes less. Minus infinity takes all steps.
+        refinements: Steps of least squares; 0 for none.
         refinement_px: Side of the window of a step; odd.
         farthest_m: Largest depth.
     """
@@ -76,7 +63,6 @@ class Stereo:
     speckle_px: int
     speckle_range_px: int
     refinements: int
-    least_gain: float
     refinement_px: Count
     farthest_m: float
 
@@ -183,10 +169,8 @@ class Stereo:
     def _refined(self, left: np.ndarray, right: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Return disparities refined by registration of windows, free in brightness and contrast.
 
-        Each step removes attraction by whole pixels and adds noise. On some pairs the second step
-        already adds more than it removes, so steps end where the predicted error of a face does.
+        Each step removes attraction by whole pixels and adds noise to a pixel.
         """
-        best, best_px = start, predict_face_error(start)
         one = cv2.GaussianBlur(left.astype(np.float32), (0, 0), _SMOOTH_PX)
         other = cv2.GaussianBlur(right.astype(np.float32), (0, 0), _SMOOTH_PX)
         slope = cv2.Sobel(other, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
@@ -212,57 +196,12 @@ class Stereo:
             found = found + np.where(
                 steep > _LEAST_SLOPE, np.clip(step, -_LARGEST_STEP_PX, _LARGEST_STEP_PX), 0.0
             )
-            # Where the start is unknown the comparison is false.
-            now = np.where(np.abs(found - start) < _LARGEST_CHANGE_PX, found, np.nan)
-            error_px = predict_face_error(now)
-            if error_px is not None and best_px is not None:
-                if self.least_gain > 0 and error_px > best_px:
-                    break
-                if error_px > (1.0 - self.least_gain) * best_px:
-                    return now.astype(np.float32)
-            best, best_px = now, error_px
-        return best.astype(np.float32)
+        # Where the start is unknown the comparison is false.
+        near = np.abs(found - start) < _LARGEST_CHANGE_PX
+        return np.where(near, found, np.nan).astype(np.float32)
 
     def _mean(self, values: np.ndarray) -> np.ndarray:
         return cv2.boxFilter(values, -1, (self.refinement_px, self.refinement_px))
-
-
-def predict_face_error(disparity: np.ndarray) -> float | None:
-    """Return the predicted error of the disparity of a face, px; `None` where too little is flat.
-
-    Two parts are measured on the pair itself, without a truth. Noise is the median deviation of
-    flat patches from their planes, and averages out over the windows of a face. The attraction of
-    whole pixels does not: with a bias of `a sin(2 pi d)` the first harmonic of the fractions of
-    disparities is `pi a`, as true fractions are evenly distributed.
-
-    Args:
-        disparity: `(h, w)` px, NaN for unknown.
-    """
-    height, width = disparity.shape
-    # Not more than about `PATCHES`: they decide the time.
-    step = max(PATCH_PX, int(np.sqrt(height * width / PATCHES)))
-    rows = np.arange(0, height - PATCH_PX + 1, step)[:, None, None, None]
-    columns = np.arange(0, width - PATCH_PX + 1, step)[None, :, None, None]
-    side = np.arange(PATCH_PX)
-    patches = disparity[rows + side[:, None], columns + side].reshape(-1, PATCH_PX**2)
-    patches = patches[np.isfinite(patches).all(1)].astype(float)
-    across, down = (some.ravel() for some in np.meshgrid(side, side))
-    design = np.stack([np.ones(len(across)), across, down], axis=1)
-    away = patches - patches @ np.linalg.pinv(design).T @ design.T
-    # A patch across an edge says nothing about the noise of a surface.
-    flat = (np.abs(away) < FLAT_PX).all(1)
-    if np.count_nonzero(flat) < LEAST_PATCHES:
-        return None
-    # Within a pixel or two true fractions are not evenly distributed.
-    if np.ptp(np.percentile(patches[flat].mean(1), (5, 95))) < EVEN_PX:
-        return None
-    noise_px = float(np.median(np.sqrt((away[flat] ** 2).mean(1))))
-    # Noise weakens the harmonic: means of blocks have little, and keep the fractions.
-    blocks = patches[flat].reshape(
-        -1, PATCH_PX // BLOCK_PX, BLOCK_PX, PATCH_PX // BLOCK_PX, BLOCK_PX
-    )
-    harmonic = abs(np.exp(2j * np.pi * blocks.mean((2, 4))).mean())
-    return float(np.hypot(harmonic / (np.pi * np.sqrt(2.0)), noise_px / np.sqrt(WINDOWS)))
 
 
 def shrink_part(

@@ -11,7 +11,7 @@ with the reasons, into `failures/`. A fixed seed: the same scenes everywhere.
 Rims as drills leave them, before and after:
 
     python benchmarks/perception/table.py <out> plane_conic
-    'plane_conic perception.proposer=null perception.pose.broken=1'
+    'plane_conic perception.pose.broken=1'
     --conditions chips_25_mm chips_45_mm percussion spalled struck --distances 1 2 3 --count 20
 """
 

@@ -262,35 +262,3 @@ def measure_slope_axes(
     with np.errstate(invalid="ignore"):
         extents = np.sqrt(np.diag(np.linalg.inv(form[:2, :2])) * level)
     return float(extents[0]), float(extents[1])
-
-
-def solve_circle_poses(
-    ellipse: np.ndarray, camera_matrix: np.ndarray, radius_m: float
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the two circles of a known radius that a camera sees as the same ellipse.
-
-    From the eigenvectors of the cone through the circle (Forsyth et al. 1991).
-
-    Args:
-        ellipse: In the picture, `(5,)`.
-        camera_matrix: `(3, 3)`.
-        radius_m: Radius of the circle.
-
-    Returns:
-        Centre `(3,)` m and unit normal towards the camera `(3,)` of each.
-    """
-    cone = camera_matrix.T @ build_quadratic_forms(ellipse) @ camera_matrix
-    # The sign with one negative eigenvalue: its eigenvector is the axis of the cone.
-    values, vectors = np.linalg.eigh(cone if np.linalg.det(cone) < 0 else -cone)
-    order = [2, 1, 0]
-    (l1, l2, l3), v = values[order], vectors[:, order]
-    along = np.sqrt(max((l1 - l2) / (l1 - l3), 0.0))
-    across = np.sqrt(max((l2 - l3) / (l1 - l3), 0.0))
-    distance = radius_m / np.sqrt(-l1 * l3) * l2
-    found = []
-    for sign in (1.0, -1.0):
-        normal = v @ np.array([sign * along, 0.0, across])
-        center = distance * v @ np.array([sign * along * l3 / l2, 0.0, across * l1 / l2])
-        center = center if center[2] > 0 else -center
-        found.append((center, normal if normal @ center < 0 else -normal))
-    return found

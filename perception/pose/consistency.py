@@ -1,7 +1,7 @@
 """Consistency of a hole with its surroundings: two measures of one thing must agree.
 
-The ring around a hole lies on the plane that was fitted to its face, and a rim that is whole as an
-ellipse is a circle on that plane.
+The ring around a hole lies on the plane that was fitted to its face, and its rim is a circle of the
+known radius on that plane.
 """
 
 from __future__ import annotations
@@ -13,15 +13,23 @@ from brokk_rl.signals import Frame
 from perception.ellipse import conic
 from perception.pose import plane, rim
 from perception.pose.plane import FacePlane, FaceSupport
+from perception.pose.rim import PlaneChart
+from perception.robust_fit import fit_linear
 
+SIZE = "radius of a rim by depth over that of the holes"
 RING_KNOWN = "pixels with depth in the ring around it"
 RING_ON_FACE = "part of the ring around it that lies on its face"
 NEARER = "part of the inside that is nearer than the face"
 STRETCH = "focal length by the roundness of the rim"
-WHOLE, ONE_RIM, LEAST_SLOPE = 0.85, 0.6, 0.07
-"""Visible part of an ellipse from which its shape is that of the rim; least part of a circle that
-must be seen then, over that of the ellipse: 0.73 and more behind an arm and with chips, 0.42 with a
-wrong focal length; squared slope of a face, 15 degrees, from which the shape tells that length."""
+LEAST_SLOPE, LEAST_EDGES = 0.07, 30
+"""Squared slope of a face, 15 degrees, from which the shape of a rim tells the focal length; edges
+from which its seven numbers are determined."""
+REACH = 0.1
+"""Departure from a circle within which its edges are looked for, in radii: a focal length that is
+wrong by a fifth on a face at 45 degrees."""
+NEARBY, MOST_LOG, NUM_TRIALS = 0.05, 0.7, 71
+"""Logarithm of the factor up to which a rim's shape is linear in it, largest one that is tried, and
+number of trials."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which occluders of its rim are searched."""
 
@@ -58,41 +66,79 @@ def check_ring(
     return None
 
 
-def find_stretch(
-    light: np.ndarray,
-    camera_matrix: np.ndarray,
-    face: FacePlane,
-    row: np.ndarray,
-    limits: tuple[float, float, float],
-    least: float,
-) -> float:
-    """Return the focal length over that with which a whole rim is round on its face.
+def measure_stretch(
+    light: np.ndarray, chart: PlaneChart, face: FacePlane, row: np.ndarray
+) -> tuple[float, float] | None:
+    """Return the focal length over that with which a rim is round on its face, and its deviation.
 
     A focal length that is too long by a factor stretches the depth of a pair by it, so that a round
-    rim on a tilted face becomes longer along its slope. 1 where the tilt is too small to tell, or
-    where no other focal length shows the circle.
+    rim on a tilted face becomes longer along its slope.
 
     Args:
         light: Light, `(h, w)` float32.
-        camera_matrix: With the focal length in doubt, `(3, 3)`.
-        face: Plane of the face.
-        row: The ellipse, `(5,)`.
-        limits: Radius in m, its tolerance, and `center_px`; see `rim.fit_rim_circle`.
-        least: Part of the circle that another focal length must show.
+        chart: Coordinates on the face, with the focal length in doubt.
+        face: The face.
+        row: The rim as it is seen, `(5,)`.
+
+    Returns:
+        The factor and the standard deviation of its logarithm; `None` where the tilt is too small
+        to tell, or too few edges are seen.
     """
-    along, across = conic.measure_slope_axes(row, camera_matrix, face.m)
-    ray = np.linalg.solve(camera_matrix, np.array([row[0], row[1], 1.0]))
+    ray = np.linalg.solve(chart.camera_matrix, np.array([row[0], row[1], 1.0]))
     cosine = float(face.normal @ ray) / float(np.linalg.norm(ray))
-    slope = 1.0 / cosine**2 - 1.0
-    if slope < LEAST_SLOPE or not np.isfinite(along / across):
-        return 1.0
-    # The true slope is that of which a circle looks like this.
-    true = (1.0 + slope) / (along / across) ** 2 - 1.0
-    stretch = float(np.clip(np.sqrt(slope / max(true, 1e-6)), 0.1, 10.0))
-    other = camera_matrix / np.array([[stretch], [stretch], [1.0]])
-    other[:2, 2] = camera_matrix[:2, 2]
-    circle = rim.fit_rim_circle(light, row, other, face.m * [1.0, 1.0, stretch], *limits)
-    return stretch if circle is not None and circle.coverage > least else 1.0
+    # A rim that is not round departs from its circle by a part of its size.
+    reach_px = max(rim.NARROW_PX, REACH * float(np.sqrt(row[2] * row[3])))
+    profiles = rim.find_profile_edges(light, row, reach_px, chart)
+    if 1.0 / cosine**2 - 1.0 < LEAST_SLOPE or profiles is None:
+        return None
+    known = np.isfinite(profiles.edges[..., 0])
+    rows = np.flatnonzero(known.any(1))
+    if len(rows) < LEAST_EDGES:
+        return None
+    # The steepest edge of each profile; the robust fit leaves out those that are not the rim's.
+    steepest = np.argmax(np.where(known, profiles.strength, -1.0), axis=1)
+    pixels = profiles.pixels[rows, steepest[rows]]
+    outline = (pixels, row, chart, face)
+    oval, std = _measure_oval(*outline, 0.0)
+    rise = (_measure_oval(*outline, NEARBY)[0][0] - oval[0]) / NEARBY
+    if not abs(rise) > 1e-3:
+        return None
+    logarithm = -oval[0] / rise
+    if abs(logarithm) > NEARBY:
+        # Two tilts show the same length along the slope; only one shows a circle.
+        trials = np.linspace(-MOST_LOG, MOST_LOG, NUM_TRIALS)
+        ovals = [_measure_oval(*outline, float(trial))[0] for trial in trials]
+        logarithm = float(trials[np.argmin(np.linalg.norm(ovals, axis=1))])
+    # Neighbouring edges share their error.
+    pixel_m = float(np.median(profiles.pixel_m))
+    alike_m = rim.ALIKE_PX * pixel_m + rim.ALIKE_M
+    perimeter_m = conic.compute_perimeter(row[2], row[3]) * pixel_m
+    num_alike = max(alike_m * len(profiles.pixel_m) / perimeter_m, 1.0)
+    return float(np.exp(logarithm)), float(std * np.sqrt(num_alike) / abs(rise))
+
+
+def _measure_oval(
+    pixels: np.ndarray, row: np.ndarray, chart: PlaneChart, face: FacePlane, logarithm: float
+) -> tuple[np.ndarray, float]:
+    """Return how oval edges are on a face, along its slope and diagonally, and the deviation.
+
+    Both are relative to the radius, by the focal length over the factor of this logarithm.
+    """
+    factor = float(np.exp(logarithm))
+    matrix = chart.camera_matrix.copy()
+    matrix[[0, 1], [0, 1]] /= factor
+    m = face.m * [1.0, 1.0, factor]
+    ray = np.linalg.solve(matrix, np.array([row[0], row[1], 1.0]))
+    flat = rim.build_chart(ray / (m @ ray), m, matrix)
+    away = flat.flat(pixels)
+    # The line of sight lies above the steepest direction of the face.
+    angle = np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(flat.second @ ray, flat.first @ ray)
+    waves = [np.ones(len(angle))]
+    for number in (1, 2, 3):
+        waves += [np.cos(number * angle), np.sin(number * angle)]
+    distance_m = np.linalg.norm(away, axis=1)
+    solution, cov = fit_linear(np.column_stack(waves), distance_m, 1e-3 * np.median(distance_m))
+    return solution[3:5] / solution[0], float(np.sqrt(cov[3, 3]) / solution[0])
 
 
 def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float:

@@ -13,7 +13,6 @@ from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, Rejection
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, Share, spec
-from perception.contracts import PoseEstimator, PoseEstimatorSpec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, consistency, plane, rim
 from perception.pose.appearance import Interior
@@ -32,6 +31,9 @@ holes at most 0.01."""
 FORGIVEN, AT_FIRST = 0.55, 1.4
 """Least visible part of a circle whose ellipse was too small or too long; and factor on the limits
 for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
+LARGELY, WHOLE = 0.7, 0.85
+"""Visible part of a circle from which its own edges tell how round it is, and of an ellipse whose
+edges do in its place: on a wrong face hardly any circle is seen."""
 BROKEN_SEEN = 0.6
 """Least part of a broken rim with edges: its pieces may lie at any depth, so texture has some too."""
 
@@ -86,8 +88,10 @@ class PlaneConic:
         broken: Part of a rim that is missing though nothing hides it, from which its pieces count
             as broken off; 1 for never.
         on_face: Least part of the innermost ring with depth that lies on the face.
-        agree: Least part of the circle that is seen, over that of the ellipse: both are one rim.
-        stretch: Factor on the focal length from which another one explains that they are not.
+        size_agrees: The same of a rim that is not broken, once its circle is fitted: depth, pair and
+            focal length agree with it.
+        stretch: Factor on the focal length, beyond its uncertainty, from which the roundness of a
+            rim contradicts it.
         nearer: Largest part of the inside with depth that is nearer than the face.
         tilt_rad: Largest angle between the face's normal and the line of sight.
         inner: Inner limit of the face's support in radii of the ellipse; leaves out the bleeding of
@@ -108,8 +112,6 @@ class PlaneConic:
         center_px: Least standard deviation of the centre of a whole rim that no residual shows, px;
             what its waves show comes on top.
         looks: Gates on the appearance.
-        without_depth: Estimator where the face has no depth; `null` for none.
-        blind: Part of the face around a hole with known depth below which `without_depth` serves.
     """
 
     radius_m: Positive
@@ -118,7 +120,7 @@ class PlaneConic:
     coverage: float
     broken: float
     on_face: Share
-    agree: Share
+    size_agrees: Share
     stretch: Annotated[float, Ge(1)]
     nearer: Share
     tilt_rad: float
@@ -134,8 +136,6 @@ class PlaneConic:
     rig_px: float
     center_px: float
     looks: AppearanceGates
-    without_depth: PoseEstimatorSpec | None
-    blind: float
 
     def check(self) -> None:
         if not self.rings or list(self.rings) != sorted(self.rings) or self.rings[0] <= self.inner:
@@ -153,9 +153,6 @@ class PlaneConicEstimator:
 
     def __init__(self, settings: PlaneConic) -> None:
         self.settings = settings
-        self._without_depth: PoseEstimator | None = (
-            settings.without_depth.build() if settings.without_depth else None
-        )
         self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
@@ -164,9 +161,6 @@ class PlaneConicEstimator:
         gray, light, allowed = self._prepare(frame, masks)
         points = self._collect_support(frame, allowed, row)
         face = self._fit_face(frame, points, ellipse)
-        if face is None:
-            assert self._without_depth is not None
-            return self._without_depth.estimate(frame, masks, ellipse)
         if isinstance(face, Rejection):
             return face
         shape = self._check_shape(face, row, frame, ellipse)
@@ -212,18 +206,14 @@ class PlaneConicEstimator:
 
     def _fit_face(
         self, frame: Frame, points: FaceSupport, ellipse: Ellipse
-    ) -> FacePlane | Rejection | None:
-        """Return the plane of the face from depth; `None` where `without_depth` serves in its place."""
+    ) -> FacePlane | Rejection:
+        """Return the plane of the face from depth, or why there is none."""
         s = self.settings
         # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
         pair = plane.compare_pair(frame)
         floor_per_m = s.noise_floor_per_m * pair
         face = plane.fit_plane(points, s.rings, floor_per_m, np.random.default_rng(0))
         if face is None:
-            # Without depth the ellipse alone gives a pose if the camera's place is known.
-            is_blind = frame.base_from_camera is not None and points.known < s.blind
-            if self._without_depth is not None and is_blind:
-                return None
             reason, num_points = "pixels of the face with depth", float(len(points.inverse))
             return Rejection("pose", reason, num_points, float(plane.LEAST), ellipse)
         # Noise above that of any matcher: the surroundings are no single plane.
@@ -262,14 +252,12 @@ class PlaneConicEstimator:
         row = as_row(ellipse) if circle is None else circle.ellipse
         ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
         chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
-        if ellipse.coverage > consistency.WHOLE and seen < s.agree * ellipse.coverage:
-            limits = (s.radius_m, s.radius_tolerance, s.center_px)
-            least = max(seen + 0.2, s.agree)
-            stretch = consistency.find_stretch(
-                light, frame.camera_matrix, face, as_row(ellipse), limits, least
-            )
-            if abs(np.log(stretch)) > np.log(s.stretch):
-                return Rejection("pose", consistency.STRETCH, stretch, 1.0, ellipse)
+        told = None
+        if seen > LARGELY or ellipse.coverage > WHOLE:
+            outline = row if seen > LARGELY else as_row(ellipse)
+            told = consistency.measure_stretch(light, chart, face, outline)
+        if told is not None and abs(np.log(told[0])) > np.log(s.stretch) + 3.0 * told[1]:
+            return Rejection("pose", consistency.STRETCH, told[0], 1.0, ellipse)
         is_broken = 1.0 - seen - consistency.measure_hidden_part(face, row, frame) > s.broken
         if (
             s.broken < 1.0
@@ -289,16 +277,15 @@ class PlaneConicEstimator:
         # then most of the circle must be seen.
         is_sure = has_good_shape and ellipse.coverage >= s.coverage
         least = s.coverage if is_sure else max(s.coverage, FORGIVEN)
-        if ellipse.coverage > consistency.WHOLE:
-            # Ellipse and circle are one rim: of a whole one most must be seen as either.
-            least = max(least, consistency.ONE_RIM * ellipse.coverage)
         if circle is None or circle.coverage < least:
             reason = "part of a circle on the face with a rim"
             seen = 0.0 if circle is None else circle.coverage
             return Rejection("pose", reason, seen, least, ellipse)
-        if abs(circle.radius_m - s.radius_m) > s.radius_tolerance * s.radius_m:
-            limit = s.radius_m * (1.0 + np.sign(circle.radius_m - s.radius_m) * s.radius_tolerance)
-            return Rejection("pose", "radius, m", circle.radius_m, float(limit), ellipse)
+        size = circle.radius_m / s.radius_m
+        limit = s.radius_tolerance if is_broken else s.size_agrees
+        if abs(size - 1.0) > limit:
+            limit = 1.0 + float(np.sign(size - 1.0)) * limit
+            return Rejection("pose", consistency.SIZE, size, limit, ellipse)
         return circle
 
     def _describe_hole(

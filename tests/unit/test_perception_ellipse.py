@@ -59,17 +59,6 @@ def test_a_rim_on_its_plane_is_the_circle_that_it_is() -> None:
     assert axes == pytest.approx([0.05, 0.05], abs=1e-9)
 
 
-def test_one_of_the_two_circles_of_a_known_radius_is_the_true_one() -> None:
-    center, axis = np.array([-0.3, 0.2, 1.5]), np.array([-0.2, -0.6, -0.77])
-    axis /= np.linalg.norm(axis)
-    seen = conic.fit_ellipses(rim(center, axis, 0.05)[None], np.ones((1, 100)))[0]
-    best = min(
-        conic.solve_circle_poses(seen, K, 0.05), key=lambda one: np.linalg.norm(one[0] - center)
-    )
-    assert best[0] == pytest.approx(center, abs=1e-6)
-    assert best[1] == pytest.approx(axis, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("condition", "recall"),
     [("clean", 0.98), ("dark", 0.98), ("haze", 0.98), ("noise_25", 0.9), ("blur", 0.95)],

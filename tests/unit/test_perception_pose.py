@@ -353,27 +353,11 @@ def test_the_mouth_channel_is_believed(estimator) -> None:
     assert isinstance(refused, Rejection) and refused.reason == "mouth probability inside"
 
 
-def test_without_depth_the_known_radius_tells_the_pose(estimator) -> None:
+def test_without_depth_there_is_no_pose(estimator) -> None:
     frame, masks, ellipse = drawn()
-    turn = np.eye(4)
-    turn[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # up is -y of the camera
-    blind = replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), base_from_camera=turn)
-    pose = option("perception/pose", "mono_circle").build().estimate(blind, masks, ellipse)
-    refused = (
-        replace(option("perception/pose", "mono_circle"), normal_rad=0.1)
-        .build()
-        .estimate(blind, masks, ellipse)
-    )
-    assert isinstance(refused, Rejection) and refused.reason.startswith("angle")
-    loose = (
-        replace(option("perception/pose", "mono_circle"), normal_rad=1.2)
-        .build()
-        .estimate(blind, masks, ellipse)
-    )
-    assert isinstance(loose, HolePose) and isinstance(pose, (HolePose, Rejection))
-    assert loose.center_m == pytest.approx(CENTER, abs=1e-3)
-    no_place = estimator.estimate(replace(blind, base_from_camera=None), masks, ellipse)
-    assert isinstance(no_place, Rejection) and no_place.reason.startswith("pixels of the face")
+    blind = replace(frame, depth_m=np.full_like(frame.depth_m, np.nan))
+    refused = estimator.estimate(blind, masks, ellipse)
+    assert isinstance(refused, Rejection) and refused.reason.startswith("pixels of the face")
 
 
 def test_the_papers_estimate_looks_into_the_hole() -> None:
@@ -487,7 +471,7 @@ def test_a_belt_below_a_block_is_not_its_face(estimator) -> None:
     assert isinstance(found, Rejection) or abs(found.center_m[2] - (CENTER[2] - 0.04)) < 0.004
 
 
-@pytest.mark.parametrize("factor", [0.67, 1.5])
+@pytest.mark.parametrize("factor", [0.67, 0.9, 1.1, 1.5])
 def test_a_focal_length_with_which_no_rim_is_round_is_refused_by_its_name(
     estimator, factor: float
 ) -> None:
@@ -499,4 +483,16 @@ def test_a_focal_length_with_which_no_rim_is_round_is_refused_by_its_name(
     found = estimator.estimate(stretched, masks, ellipse)
     assert isinstance(found, Rejection)
     assert found.reason == consistency.STRETCH
-    assert found.value == pytest.approx(factor, rel=0.1)
+    assert found.value == pytest.approx(factor, rel=0.02)
+
+
+@pytest.mark.parametrize("factor", [0.87, 0.93, 1.07, 1.13])
+def test_a_baseline_by_which_a_rim_has_another_size_is_refused_by_its_factor(
+    estimator, factor: float
+) -> None:
+    frame, masks, ellipse = drawn()
+    scaled = replace(frame, depth_m=frame.depth_m * np.float32(factor))
+    found = estimator.estimate(scaled, masks, ellipse)
+    assert isinstance(found, Rejection)
+    assert found.reason == consistency.SIZE
+    assert found.value == pytest.approx(factor, rel=0.01)

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
 from perception.pair_depth import PairDepth
-from perception.stereo import PicturePart, Stereo, predict_face_error
+from perception.stereo import PicturePart, Stereo
 
 FOCAL_PX, BASELINE_M = 1056.0, 0.12
 PULL_PX = FOCAL_PX * BASELINE_M
@@ -95,19 +95,3 @@ def test_fine_depth_and_depth_without_a_pair_stay() -> None:
     frame, on = make_frame(SLANT, SLANT, 4), np.ones_like(SLANT, bool)
     assert faces.build(replace(frame, depth_shrink=1), on) is None
     assert faces.build(replace(frame, right=None), on) is None
-
-
-@pytest.mark.parametrize(("amplitude_px", "noise_px"), [(0.15, 0.1), (0.02, 0.4)])
-def test_attraction_and_noise_predict_the_error_of_a_face(
-    amplitude_px: float, noise_px: float
-) -> None:
-    rows, columns = np.mgrid[:400, :600]
-    true = 20.0 + 0.02 * columns + 0.013 * rows
-    noise = np.random.default_rng(0).normal(0.0, noise_px, true.shape)
-    attracted = true - amplitude_px * np.sin(2 * np.pi * true)
-    found = predict_face_error((attracted + noise).astype(np.float32))
-    assert found == pytest.approx(np.hypot(amplitude_px / np.sqrt(2), noise_px / 5), rel=0.25)
-
-
-def test_a_face_at_one_disparity_predicts_nothing() -> None:
-    assert predict_face_error(np.full((300, 300), 20.3, np.float32)) is None
