@@ -49,6 +49,7 @@ SHAPE_REASONS = (
 EXPLANATIONS = {
     **pair_check.EXPLANATIONS,
     **rim_scale.EXPLANATIONS,
+    **consistency.EXPLANATIONS,
     "part of the picture that is block": (
         "too little of the picture is block",
         "Is the block in sight, the segmenter the right one?",
@@ -64,27 +65,6 @@ EXPLANATIONS = {
     "depth noise on the face, 1/m": (
         "the face around it is no plane",
         "Is it on the block's edge, or is the depth that noisy?",
-    ),
-    consistency.RING_KNOWN: (
-        "the ring around it has hardly any depth, so that its face is not known",
-        "Too dark, too near, or no texture to match.",
-    ),
-    consistency.RING_ON_FACE: (
-        "the ring around it does not lie on the plane that was taken for its face",
-        "Its surroundings are larger than the face: is the block in the mask?",
-    ),
-    consistency.NEARER: (
-        "its inside is nearer than the face",
-        "Something stands there, or its surroundings were taken for the face.",
-    ),
-    consistency.STRETCH: (
-        "its rim is round only with another focal length",
-        "K is that of another resolution or lens: K over this factor would do.",
-    ),
-    consistency.SIZE: (
-        "its rim is round, and by its depth of another size than the holes",
-        "baseline_m, or the unit of depth, is too large by this factor, or perception.pose.radius_m "
-        "too small; with depth from no pair, K is too small by it.",
     ),
     "tilt of the face, rad": (
         "the camera sees the face at too flat an angle",

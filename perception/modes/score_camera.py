@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -121,7 +121,8 @@ class ScoreCamera:
                     if frame is None:
                         return scores, refused
                     camera_from_board = np.linalg.inv(tracker.locate(frame).world_from_camera)
-                    found = finder.find(frame)
+                    # In camera coordinates, as the board tells the truth.
+                    found = finder.find(replace(frame, base_from_camera=None))
                 except FrameError as error:
                     refused[f"{number - 1:05d}"] = str(error)
                     continue

@@ -1,4 +1,4 @@
-"""Segmentation by a network: in onnxruntime as shipped, or in torch as trained.
+"""Segmentation by a network in onnxruntime.
 
 The network runs on the whole picture for the block, then on the block alone, where a hole has
 several times the pixels. It runs once more where the block has grown, and on parts of the picture
@@ -16,7 +16,6 @@ import numpy as np
 
 from brokk_rl.contracts.vision import Masks
 from brokk_rl.errors import CheckpointError
-from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, spec
 from perception.segment.window import Window, bound_block, center_window, cover_picture, tile_halves
@@ -105,39 +104,6 @@ class Onnx:
             return session.run(None, {"picture": picture[None]})[0][0]  # type: ignore[index]
 
         return NetworkSegmenter(infer, size_px, self.margin, gate)
-
-
-@spec
-class Unet:
-    """Run the network of a checkpoint in torch, on a CPU or a GPU.
-
-    Attributes:
-        weights: A safetensors file of `mode=train_perception`: a path, or the name of one that
-            ships with the package.
-        margin: Room around the block in the second run, as a part of its box; `null`: one run.
-        device: `cpu`, `cuda` or `cuda:<index>`.
-    """
-
-    weights: str
-    margin: NonNegative | None
-    device: str
-
-    def build(self) -> NetworkSegmenter:
-        """Return the segmenter.
-
-        Raises:
-            CheckpointError: there is no such network, or it is none of ours.
-            DeviceError: there is no such device.
-        """
-        from perception.segment.unet import build_inference, read_checkpoint
-
-        device = Session(out=".", seed=0, device=self.device).torch_device()
-        network, header = read_checkpoint(find_weights(self.weights))
-        return NetworkSegmenter(
-            build_inference(network.to(device), device),
-            check_size(Path(self.weights), header),
-            self.margin,
-        )
 
 
 class NetworkSegmenter:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import nn
@@ -101,17 +100,6 @@ def read_checkpoint(path: Path) -> tuple[UNet, dict[str, Any]]:
             "one"
         ) from error
     return network.eval().requires_grad_(False), header
-
-
-def build_inference(network: UNet, device: torch.device) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the network as a function from one picture to its probabilities."""
-    module = Probabilities(network).eval()
-
-    def infer(picture: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return module(torch.from_numpy(picture)[None].to(device))[0].cpu().numpy()
-
-    return infer
 
 
 def average_picture(values: torch.Tensor) -> torch.Tensor:

@@ -24,7 +24,7 @@ from perception.render.scene_sampler import compose_scene
 from perception.segment import network as segment_network
 from perception.segment.depth_plane import snap_to_edges
 from perception.segment.network import NetworkSegmenter
-from perception.segment.unet import UNet
+from perception.segment.unet import UNet, read_checkpoint
 from perception.segment.window import Window, bound_block, center_window, cover_picture
 from perception.train import export
 
@@ -202,15 +202,6 @@ def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path:
     export.write_checkpoint(tmp_path / "a.safetensors", network, header)
     parity = export.write_onnx(tmp_path / "a.onnx", network, header, torch.rand(3, 3, 32, 64))
     assert parity < 1e-5
-    view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
-    found = []
-    for name, file in (("unet", "a.safetensors"), ("onnx", "a.onnx")):
-        segmenter = replace(
-            option("perception/segmenter", name), weights=str(tmp_path / file)
-        ).build()
-        found.append(segmenter.segment(view.frame))
-    np.testing.assert_allclose(found[0].block, found[1].block, atol=1e-4)
-    np.testing.assert_allclose(found[0].hole_mask, found[1].hole_mask, atol=1e-4)
 
 
 def test_a_network_that_ships_is_loaded_by_its_name(
@@ -226,15 +217,13 @@ def test_a_network_that_ships_is_loaded_by_its_name(
     export.write_onnx(tmp_path / export.ONNX, network, header, torch.rand(1, 3, 32, 64))
     export.write_onnx(tmp_path / "gate.onnx", network, header, torch.rand(1, 3, 32, 64))
     frame = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90)).frame
-    one, other = (
-        option("perception/segmenter", name).build().segment(frame) for name in ("onnx", "unet")
-    )
-    np.testing.assert_allclose(one.block, other.block, atol=1e-4)
+    masks = option("perception/segmenter", "onnx").build().segment(frame)
+    assert masks.block.shape == frame.color.shape[:2]
 
 
 def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -> None:
     rig = option("rig", "zed_2i_720p")
-    segmenters = [option("perception/segmenter", name).build() for name in ("onnx", "unet")]
+    segmenter = option("perception/segmenter", "onnx").build()
     shared, either = np.zeros(2), np.zeros(2)
     for seed in (101, 102, 103):
         chance, kind = np.random.default_rng(seed), option("scene", "clean")
@@ -254,8 +243,7 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
             base_from_camera=None,
             t_s=0.0,
         )
-        masks, again = (segmenter.segment(frame) for segmenter in segmenters)
-        np.testing.assert_allclose(masks.block, again.block, atol=0.01)
+        masks = segmenter.segment(frame)
         assert masks.hole_mask is not None
         for k, (said, known) in enumerate(
             ((masks.block > 0.5, shot.label.block), (masks.hole_mask > 0.5, shot.label.hole_mask))
@@ -270,11 +258,11 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
 def test_files_that_are_no_network_of_ours_are_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.onnx").write_bytes(b"no network at all")
     (tmp_path / "broken.safetensors").write_bytes(b"no network at all")
-    onnx, unet = option("perception/segmenter", "onnx"), option("perception/segmenter", "unet")
+    onnx = option("perception/segmenter", "onnx")
     with pytest.raises(CheckpointError, match="corrupt or no ONNX file"):
         replace(onnx, weights=str(tmp_path / "broken.onnx")).build()
     with pytest.raises(CheckpointError, match="corrupt or no segmenter"):
-        replace(unet, weights=str(tmp_path / "broken.safetensors")).build()
+        read_checkpoint(tmp_path / "broken.safetensors")
     with pytest.raises(CheckpointError, match=r"there is no file 'nowhere\.onnx'"):
         replace(onnx, weights="nowhere.onnx").build()
     network = UNet((4, 8)).eval()

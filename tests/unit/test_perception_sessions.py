@@ -101,11 +101,11 @@ def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> f
         "std_m: 0.0005\nholes: [{name: A, center_m: [0.3, 0.0, 0.0], radius_m: 0.05}]\n"
     )
     black = np.zeros((8, 8, 3), np.uint8)
-    frames = iter(
-        [Frame(black, black[..., 0].astype(np.float32), np.eye(3), None, 0.0, name="a/0")]
-    )
-    pose = np.eye(4)
-    pose[2, 3] = -2.0
+    pose, base = np.eye(4), np.eye(4)
+    pose[2, 3], base[:3, 3] = -2.0, (1.0, 2.0, 3.0)
+    depth_m = black[..., 0].astype(np.float32)
+    # A camera whose place in the base is known too: the truth is told in its own coordinates.
+    frames = iter([Frame(black, depth_m, np.eye(3), base, 0.0, name="a/0")])
     hole = HolePose(
         np.array(found_m), np.array([0.0, 0.0, -1.0]), 0.05, np.eye(3) * 1e-6, np.zeros((3, 3)), "camera", 1.0, 0.0,
     )  # fmt: skip
@@ -123,7 +123,7 @@ def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> f
             return next(frames, None)
 
     parts: dict[str, Any] = {
-        "perception": SimpleNamespace(find=lambda frame: FrameDetections([hole])),
+        "perception": SimpleNamespace(find=FrameDetections([hole]).in_base_frame),
         "source": Source(),
         "board": SimpleNamespace(locate=lambda frame: CameraPose(pose, 0.1)),
     }

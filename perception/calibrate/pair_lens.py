@@ -1,0 +1,103 @@
+"""Lenses and place of both cameras of a pair, from pictures of a printed board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from brokk_rl.errors import FrameError
+from brokk_rl.signals import Frame
+from perception.label.camera_pose import BoardTracker
+
+LEAST_VIEWS, LEAST_CORNERS = 8, 12
+"""Views, and corners of each that both pictures show: nine numbers of each lens and six of the pair
+are fitted, and a view adds six."""
+LARGEST_PX = 1.0
+"""Largest root mean square reprojection error; 0.25 px with 13 pictures of a hand-held chessboard by
+two cameras of 640 x 480 px (OpenCV's sample data)."""
+LARGEST_FOCAL = 0.01
+"""Largest relative standard deviation of a focal length: 2 cm at 2 m."""
+
+
+@dataclass(frozen=True)
+class BoardPair:
+    """Corners of a board that both pictures of a raw pair show.
+
+    Attributes:
+        board_m: On the board, `(n, 3)` float32.
+        left_px: In the left picture, `(n, 2)` float32.
+        right_px: In the right one.
+    """
+
+    board_m: np.ndarray
+    left_px: np.ndarray
+    right_px: np.ndarray
+
+
+def find_board_pair(
+    tracker: BoardTracker, left: np.ndarray, right: np.ndarray, gamma: float
+) -> BoardPair | None:
+    """Return the corners that two pictures, RGB `(h, w, 3)`, share; `None` for too few."""
+    nothing = np.zeros(left.shape[:2], np.float32)
+    seen: list[dict[tuple[float, ...], np.ndarray]] = []
+    for picture in (left, right):
+        try:
+            frame = Frame(picture, nothing, np.eye(3), None, 0.0, gamma=gamma)
+            corners_m, corners_px = tracker.find_corners(frame)
+        except FrameError:
+            return None
+        seen.append(dict(zip(map(tuple, corners_m.round(6)), corners_px, strict=True)))
+    shared = [corner for corner in seen[0] if corner in seen[1]]
+    if len(shared) < LEAST_CORNERS:
+        return None
+    parts = [np.array(shared), *([one[corner] for corner in shared] for one in seen)]
+    return BoardPair(*(np.asarray(part, np.float32) for part in parts))
+
+
+def calibrate_pair(pairs: Sequence[BoardPair], size_px: tuple[int, int]) -> dict[str, Any]:
+    """Return `K1 D1 K2 D2 R T size_px error_px` as a lens file holds them, by OpenCV.
+
+    Args:
+        pairs: Views of the board, at several distances and tilts.
+        size_px: Columns and rows of a picture.
+
+    Raises:
+        FrameError: the views do not determine the lenses; the message says what they lack.
+    """
+    if len(pairs) < LEAST_VIEWS:
+        raise FrameError(
+            f"lens=board: expected {LEAST_VIEWS} pairs or more in which both pictures show the board, "
+            f"got {len(pairs)}; hold it nearer, still, and in the light"
+        )
+    boards = [one.board_m for one in pairs]
+    sides = [one.left_px for one in pairs], [one.right_px for one in pairs]
+    lenses = []
+    for side, pixels in zip(("left", "right"), sides, strict=True):
+        _, matrix, bent, _, _, std, *_ = cv2.calibrateCameraExtended(
+            boards, pixels, size_px, np.eye(3), np.zeros(5)
+        )
+        doubt = float(std[0, 0] / matrix[0, 0])
+        if not doubt < LARGEST_FOCAL:
+            raise FrameError(
+                f"lens=board: the focal length of the {side} camera is known to {doubt:.1%}, expected "
+                f"{LARGEST_FOCAL:.0%}; tilt the board by 30 degrees, to all sides, and fill the picture"
+            )
+        lenses += [matrix, bent]
+    error_px, *found = cv2.stereoCalibrate(
+        boards, *sides, *lenses, size_px, flags=cv2.CALIB_USE_INTRINSIC_GUESS
+    )
+    if error_px > LARGEST_PX:
+        raise FrameError(
+            f"lens=board: the corners miss by {error_px:.2f} px, expected {LARGEST_PX:g} or less; is the "
+            "board flat, are both pictures of one moment, are its sizes those of board.columns, rows, "
+            "square_m and marker_m?"
+        )
+    names = ("K1", "D1", "K2", "D2", "R", "T")
+    content = {name: np.asarray(value).tolist() for name, value in zip(names, found, strict=False)}
+    for name in ("D1", "D2", "T"):
+        content[name] = np.ravel(content[name]).tolist()
+    return content | {"size_px": list(size_px), "error_px": round(float(error_px), 4)}
