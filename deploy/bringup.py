@@ -3,10 +3,11 @@
 It only listens; the operator moves the machine.
 
     bus         every message at its rate, none refused
-    positions   valid, within the machine's limits, quiet at rest
+    positions   valid, within the machine's limits, quiet at rest, as measured by hand
     dead-man    seen pressed and released
     e-stop      seen pressed and released
-    joints      each joint moved both ways with the operator's own levers: sign, dead time, speed
+    joints      each joint moved alone, both ways, with the operator's own levers: which joint moves,
+                sign, dead time, speed; swapped, turned and doubled joints are named
     shadow      the policy runs along; its advice is recorded, not shown
 """
 
@@ -22,11 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.errors import LinkError
+from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
 from deploy.bus.description import GATEWAY, REMOTE, BusDescription
+from deploy.kernel.guard import GuardTrip
 from deploy.recorder.capture import MCAP, CaptureConfig
 from deploy.recorder.capture_reader import read_capture
 from deploy.runtime.operator_state import AdviceStatus, OperatorState
@@ -50,6 +52,11 @@ MOVED = 0.004
 LONGEST_S = 2.0
 """Time after the beginning of flow within which the joint must have moved. Chosen by hand: longer
 than any dead time that a policy could be trained for."""
+DOUBLED = 1.6
+"""Speed over that of the machine's file from which a joint is doubled: the geometric mean of 1.3, by
+which retracting cylinders are faster (conf/actuator/hydraulic.yaml), and 2."""
+FLOW_FAULTS = (GuardTrip.FLOW_UNASKED, GuardTrip.FLOW_TURNED, GuardTrip.FLOW_SCALED)
+"""Faults of a valve that does not get what the levers ask for."""
 REST_S = 0.5
 """Time for which the joint must have been at rest before. Chosen by hand."""
 ONSET_S = 0.15
@@ -60,68 +67,160 @@ SPEED_S = 0.2
 
 
 @dataclass(frozen=True)
-class JointResponse:
-    """Response of a joint to the flow of its valve.
+class ValvePush:
+    """One valve driven alone and what it moved.
 
     Attributes:
-        agrees: Whether it moves in the direction of its flow, both ways.
-        dead_time_s: From the beginning of flow to the first motion, median.
-        speed: Largest speed seen, rad/s or m/s.
+        joint: Number of the valve's joint.
+        sign: Sign of its flow.
+        moved: Number of the joint that moved most, by its travel.
+        others: Numbers of further joints that moved half as much or more.
+        agrees: Whether the moved joint went in the direction of the flow.
+        dead_time_s: From the beginning of flow to the first motion.
+        speed: Largest speed of the moved joint, rad/s or m/s.
+        ratio: This speed over the one that the flow gives by the machine's file.
     """
 
+    joint: int
+    sign: int
+    moved: int
+    others: tuple[int, ...]
     agrees: bool
     dead_time_s: float
     speed: float
+    ratio: float
+
+
+@dataclass(frozen=True)
+class JointResponse:
+    """Response of the machine to one valve.
+
+    Attributes:
+        valve: Joint whose valve was driven.
+        moves: Joints that moved; the valve's own alone where all is right.
+        agrees: Whether it moves in the direction of its flow, both ways.
+        dead_time_s: From the beginning of flow to the first motion, median.
+        speed: Largest speed seen, rad/s or m/s.
+        ratio: Speed over the one that the machine's file gives, median.
+    """
+
+    valve: str
+    moves: tuple[str, ...]
+    agrees: bool
+    dead_time_s: float
+    speed: float
+    ratio: float
+
+    @property
+    def faults(self) -> list[str]:
+        """Each fault in words."""
+        if self.moves != (self.valve,):
+            return [f"the valve of {self.valve} moves {' and '.join(self.moves)}"]
+        found = []
+        if not self.agrees:
+            found.append(f"{self.valve} is turned: it moves against its flow")
+        if self.ratio > DOUBLED:
+            text = f"{self.valve} is doubled: it moves {self.ratio:.1f} times as fast as the machine's file says"
+            found.append(text)
+        return found
 
     @property
     def text(self) -> str:
         """The response in words."""
-        sign = "sign agrees" if self.agrees else "SIGN TURNED"
-        return f"{sign}, dead time {self.dead_time_s:.2f} s, up to {self.speed:.2f} rad/s"
+        faults = "; ".join(self.faults) or "moves as its flow"
+        return f"{faults}, dead time {self.dead_time_s:.2f} s, up to {self.speed:.2f} rad/s"
 
 
-def measure_joint_response(
-    t_s: np.ndarray, q: np.ndarray, flow: np.ndarray, travel: float
-) -> JointResponse | None:
-    """Return the response of a joint; `None` before it has moved after flow of both signs.
+def find_pushes(
+    t_s: np.ndarray, q: np.ndarray, flow: np.ndarray, machine: Machine
+) -> list[ValvePush]:
+    """Return the pushes of one valve alone from rest that moved anything, in order of time.
+
+    A push counts once its response is over: after `LONGEST_S`, or when the next one begins.
 
     Args:
         t_s: Times, `(T,)`.
-        q: Positions of the joint, `(T,)`, rad or m.
-        flow: Flow of its valve, `(T,)`, of full.
-        travel: Length of its travel.
+        q: Positions, `(T, J)`, rad or m.
+        flow: Flow of the valves, `(T, J)`, of full.
+        machine: Travels and speeds.
     """
     # Flow marks the beginning of a response: levers move earlier, valves answer later.
     is_flowing = np.abs(flow) >= SMALLEST_FLOW
-    began = np.flatnonzero(is_flowing[1:] & ~is_flowing[:-1]) + 1
-    # Both signs are kept apart: a joint that moved one way only proves neither its sign nor its
-    # valve.
-    found: dict[int, list[tuple[bool, float]]] = {1: [], -1: []}
-    for row in began:
-        # at rest before; otherwise the motion answers something else
+    is_any = is_flowing.any(1)
+    began = np.flatnonzero(is_any[1:] & ~is_any[:-1]) + 1
+    travel, pushes = machine.upper - machine.lower, []
+    ends = np.append(began, len(t_s))[1:]
+    for row, following in zip(began, ends, strict=True):
+        end = min(following, int(np.searchsorted(t_s, t_s[row] + LONGEST_S)))
+        driven = np.flatnonzero(is_flowing[row:end].any(0))
         before = t_s[: row + 1] > t_s[row] - REST_S
-        if np.ptp(q[: row + 1][before]) > MOVED * travel / 2:
+        is_moving = np.ptp(q[: row + 1][before], axis=0) > MOVED * travel / 2
+        # What several valves move, or what moved before, answers more than one question.
+        if end == len(t_s) or len(driven) != 1 or is_moving.any():
             continue
-        window = (t_s >= t_s[row]) & (t_s <= t_s[row] + LONGEST_S)
-        moved = q[window] - q[row]
-        away = np.flatnonzero(np.abs(moved) > MOVED * travel)
-        if len(away):
-            sign = int(np.sign(flow[row]))
-            agrees = bool(np.sign(moved[away[0]]) == sign)
-            onset_s = _estimate_onset_s(t_s[window], moved, away[0])
-            found[sign].append((agrees, onset_s - float(t_s[row])))
-    if not found[1] or not found[-1]:
-        return None
-    # Both directions count alike, though an operator may have moved one of them more often.
-    both = [*found[1], *found[-1]]
-    period_s = max(1e-3, float(np.median(np.diff(t_s))))  # of a log that is not empty
+        ways = np.abs(q[row:end] - q[row]).max(0) / travel
+        moved = int(ways.argmax())
+        if ways[moved] > MOVED:
+            others = np.flatnonzero((ways > MOVED) & (ways > ways[moved] / 2)).tolist()
+            others.remove(moved)
+            rows = slice(row, end)
+            joint = int(driven[0])
+            one = t_s[rows], q[rows, moved], flow[rows, joint]
+            pushes.append(_measure_push(joint, moved, tuple(others), *one, machine))
+    return pushes
+
+
+def _measure_push(
+    joint: int,
+    moved: int,
+    others: tuple[int, ...],
+    t_s: np.ndarray,
+    q: np.ndarray,
+    flow: np.ndarray,
+    machine: Machine,
+) -> ValvePush:
+    """Return a push from the positions of the joint that moved and the flow of the driven valve."""
+    way = q - q[0]
+    first = int(np.argmax(np.abs(way) > MOVED * (machine.upper - machine.lower)[moved]))
+    sign = int(np.sign(flow[0]))
     # Differences over a longer step: noise over one sample would look like speed.
-    step = max(1, round(SPEED_S / period_s))
-    speed = np.abs(q[step:] - q[:-step]) / np.maximum(t_s[step:] - t_s[:-step], 1e-6)
+    step = max(1, round(SPEED_S / max(1e-3, float(np.median(np.diff(t_s))))))
+    speed = float((np.abs(q[step:] - q[:-step]) / (t_s[step:] - t_s[:-step])).max(initial=0.0))
+    full = float(np.abs(flow).max()) * float(machine.max_speed[moved])
+    return ValvePush(
+        joint=joint,
+        sign=sign,
+        moved=moved,
+        others=others,
+        agrees=bool(np.sign(way[first]) == sign),
+        dead_time_s=_estimate_onset_s(t_s, way, first) - float(t_s[0]),
+        speed=speed,
+        ratio=speed / full,
+    )
+
+
+def describe_joint(
+    pushes: Sequence[ValvePush], joint: int, names: Sequence[str]
+) -> JointResponse | None:
+    """Return the response to one valve; `None` before it has been pushed both ways.
+
+    A joint that moved one way only proves neither its sign nor its valve.
+    """
+    own = [one for one in pushes if one.joint == joint]
+    if {one.sign for one in own} != {1, -1}:
+        return None
+    moved: Counter[int] = Counter()
+    for one in own:
+        moved.update((one.moved, *one.others))
+    # A joint that moved once among many was moved by somebody else.
+    steady = [number for number, count in moved.items() if 2 * count > len(own)]
     return JointResponse(
-        all(agrees for agrees, _ in both),
-        float(np.median([dead_s for _, dead_s in both])),
-        float(speed.max()),
+        valve=names[joint],
+        moves=tuple(names[number] for number in sorted(steady)),
+        agrees=all(one.agrees for one in own),
+        dead_time_s=float(np.median([one.dead_time_s for one in own])),
+        speed=max(one.speed for one in own),
+        ratio=float(np.median([one.ratio for one in own])),
     )
 
 
@@ -160,6 +259,9 @@ class BringupChecklist(BusAndPolicySettings):
         patience_s: Time that the operator gets for each task.
         shadow_s: Length of the shadow run.
         quiet: Largest standard deviation of a position at rest (rad or m).
+        pose: Joint positions that were measured by hand where the machine rests now; `null`: none
+            were, and no offset of a sensor is found.
+        pose_error: Largest difference to them (rad or m).
         rate: Smallest part of a message's nominal rate.
     """
 
@@ -167,6 +269,8 @@ class BringupChecklist(BusAndPolicySettings):
     patience_s: Positive
     shadow_s: Positive
     quiet: Positive
+    pose: tuple[float, ...] | None
+    pose_error: Positive
     rate: Positive
 
     def run(
@@ -187,8 +291,14 @@ class BringupChecklist(BusAndPolicySettings):
         Raises:
             LinkError: nothing is heard at all, or one of the processes has died.
             CheckpointError: the policy cannot be used on this machine.
+            ConfigError: `pose` has another number of joints.
         """
         self.check_machine(machine)
+        if self.pose is not None and len(self.pose) != machine.num_joints:
+            raise ConfigError(
+                f"bringup.pose: expected {machine.num_joints} positions, got {len(self.pose)}; "
+                f"give those of {', '.join(machine.joint_names)}"
+            )
         memory = LoopMemory.new(machine.num_joints, commands=False)
         # The bring-up never commands: without `commands` there is no request slot at all.
         group = ProcessGroup(memory, self.realtime)
@@ -258,6 +368,8 @@ class _StateChecks:
         self._checklist, self._machine, self._group, self._say = checklist, machine, group, say
         self._memory = group.memory
         self._samples: list[_Sample] = []
+        # By number of the joint, from 1.
+        self._flow_faults: dict[int, GuardTrip] = {}
 
     def run(self) -> list[BringupResult]:
         """Run them."""
@@ -294,9 +406,23 @@ class _StateChecks:
             faults.append(f"{', '.join(noisy)} not quiet")
         if last is None or not last.q_plausible:
             faults.append("not plausible")
-        text = "; ".join(faults) or "valid, inside the limits, quiet"
+        if last is not None and last.trip is GuardTrip.DESCRIPTION:
+            faults.append(last.trip.value)
+        faults += self._list_offsets(q.mean(0))
+        compared = "no pose was measured by hand: offsets were not looked for"
+        if self._checklist.pose is not None:
+            compared = "as measured by hand"
+        text = "; ".join(faults) or f"valid, inside the limits, quiet; {compared}"
         values = {"q": q[-1].tolist(), "standard_deviation": scatter.tolist()}
         return BringupResult("positions", not faults, text, values)
+
+    def _list_offsets(self, q: np.ndarray) -> list[str]:
+        """Return each joint whose position, of `(J,)`, is not the one measured by hand."""
+        pose, found = self._checklist.pose, []
+        for name, here, measured in zip(self._machine.joint_names, q, pose or q, strict=True):
+            if abs(here - measured) > self._checklist.pose_error:
+                found.append(f"{name} has an offset of {here - measured:+.3f}")
+        return found
 
     def _check_switch(self, check: str, field: str, task: str) -> BringupResult:
         """Check that a switch of the state is seen pressed and released."""
@@ -316,20 +442,21 @@ class _StateChecks:
     def _check_joints(self) -> BringupResult:
         machine, names = self._machine, self._machine.joint_names
         self._say(
-            f"move one joint after the other, both ways, a second or more each: {', '.join(names)}"
+            f"move one joint after the other, both ways, half a second or more each, with rests of two seconds: {', '.join(names)}"
         )
         found = self._watch_joints()
         missing = []
         for name in names:
             if name not in found:
                 missing.append(name)
-        turned = [name for name, response in found.items() if not response.agrees]
         dead_s = [response.dead_time_s for response in found.values()]
         faults = []
         if missing:
             faults.append(f"not seen to move both ways: {', '.join(missing)}")
-        if turned:
-            faults.append(f"sign turned: {', '.join(turned)}")
+        for response in found.values():
+            faults += response.faults
+        for joint, trip in sorted(self._flow_faults.items()):
+            faults.append(f"{names[joint - 1]}: {trip.value}")
         # The policy sees only its history: a longer dead time hides the effect of its own
         # commands. The oldest command in it began so many whole periods before the newest position.
         if dead_s and max(dead_s) > machine.num_history * machine.period_s:
@@ -338,14 +465,13 @@ class _StateChecks:
             )
         text = "; ".join(faults)
         if not faults:
-            text = f"signs agree; dead times {min(dead_s):.2f} to {max(dead_s):.2f} s"
+            text = f"each valve moves its own joint, signs agree; dead times {min(dead_s):.2f} to {max(dead_s):.2f} s"
         values = {name: asdict(response) for name, response in found.items()}
         return BringupResult("joints", not faults, text, values)
 
     def _watch_joints(self) -> dict[str, JointResponse]:
         """Return the responses of the joints that the operator moves in time."""
         machine, found = self._machine, dict[str, JointResponse]()
-        travel = machine.upper - machine.lower
         # Samples of the earlier checks hold motion that was not asked for.
         self._samples.clear()
         end_s = time.monotonic() + self._checklist.patience_s
@@ -354,8 +480,9 @@ class _StateChecks:
             t_s = np.array([one.t_s for one in self._samples])
             q = np.array([one.q for one in self._samples])
             flow = np.array([one.flow for one in self._samples])
+            pushes = find_pushes(t_s, q, flow, machine)
             for j, name in enumerate(machine.joint_names):
-                response = measure_joint_response(t_s, q[:, j], flow[:, j], travel[j])
+                response = describe_joint(pushes, j, machine.joint_names)
                 # The first complete response counts, so that a joint is reported once.
                 if response is not None and name not in found:
                     found[name] = response
@@ -398,6 +525,8 @@ class _StateChecks:
             # The state is read faster than it changes; doubles would bias the noise to zero.
             if state is not None and (not self._samples or state.t_s > self._samples[-1].t_s):
                 self._samples.append(_Sample(state.t_s, state.q, state.flow))
+                if state.trip in FLOW_FAULTS:
+                    self._flow_faults[state.observed_joint] = state.trip
             time.sleep(POLL_S)
 
     def _wait_until(self, holds: Callable[[OperatorState], bool]) -> float | None:

@@ -32,6 +32,9 @@ DBC = "deploy:dbc/example_gateway.dbc"
 COMMAND = (0.3, 0.0, -0.3, 0.0, 0.2)
 """What the commander asks for at first; later the same the other way."""
 REACH_RAD = 0.2
+VCAN = "vcan0"
+"""Virtual CAN interface of Linux: sudo modprobe vcan; sudo ip link add vcan0 type vcan up."""
+NO_VCAN = not Path(f"/sys/class/net/{VCAN}").exists()
 
 
 def command(stop: Callable[[], bool], home: np.ndarray, memory: LoopMemory) -> None:
@@ -58,8 +61,10 @@ def free_port() -> int:
         return one.getsockname()[1]
 
 
-def wire() -> CanBus:
-    """Returns a bus that nobody else uses."""
+def wire(kind: str) -> CanBus:
+    """Returns a bus that nobody else uses: multicast datagrams, or the kernel's own `vcan`."""
+    if kind == "vcan":
+        return CanBus(interface="socketcan", channel=VCAN, bitrate=None, port=None, hops=None)
     return CanBus(
         interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port(), hops=0
     )
@@ -85,12 +90,18 @@ class Desk:
         limits: Of the guard.
         folder: Where a session may write.
         commands: Whether the bus process may send at all.
+        kind: Bus, `udp` or `vcan`.
     """
 
     def __init__(
-        self, machine: Machine, limits: GuardLimits, folder: Path, commands: bool = True
+        self,
+        machine: Machine,
+        limits: GuardLimits,
+        folder: Path,
+        commands: bool = True,
+        kind: str = "udp",
     ) -> None:
-        self.machine, self.wire, self.port = machine, wire(), free_port()
+        self.machine, self.wire, self.port = machine, wire(kind), free_port()
         self.memory = LoopMemory.new(machine.num_joints, commands)
         self._description = BusDescription(DBC, machine)
         # The observer's file is of the hydraulic plant, not of the nominal machine of this desk.

@@ -33,10 +33,22 @@ FRAME_FAULTS = (
 """Faults of messages on their way: not sent, one in ten not sent, sent twice, swapped with the
 next, sent 0.2 s late, one bit wrong, cut short, under another identifier, with a counter that
 stands still, with the CRC of another message."""
-SIGNAL_FAULTS = ("stuck", "jump", "drift", "out_of_range", "sign", "mirrored", "invalid")
+SIGNAL_FAULTS = (
+    "stuck",
+    "jump",
+    "drift",
+    "out_of_range",
+    "sign",
+    "mirrored",
+    "invalid",
+    "swapped",
+    "doubled",
+    "offset",
+)
 """Faults of the measured position of the first joint: stands still, one jump, drifts, beyond its
-limits, wrong sign, wrong sign from here on without a jump, called invalid. A stuck, mirrored or turned
-sensor is that of all joints."""
+limits, wrong sign, wrong sign from here on without a jump, called invalid, exchanged with the last
+joint's, twice the way from here on, a constant error. A stuck, mirrored or turned sensor is that of
+all joints."""
 MACHINE_FAULTS = (
     "estop",
     "deadman_released",

@@ -1,7 +1,7 @@
 """Rehearsal of the bring-up: a twin, and a scripted person who does what the checklist asks.
 
 The person leaves the machine at rest while the checklist listens. Then they go round: dead-man,
-emergency stop, each joint both ways. They can fail one chosen check, to see that it is noticed.
+emergency stop, one joint after the other, each both ways. They can fail one chosen check, to see that it is noticed.
 """
 
 from __future__ import annotations
@@ -28,9 +28,11 @@ from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 CHECKS = ("bus", "positions", "dead-man", "e-stop", "joints", "shadow")
 """Checks that can be failed."""
-ROUND_S, PART_S = 12.0, 4.8
-"""Length of a round, and of the part of it for joints that move together. Chosen by hand: a joint
-rests for a second before each motion, longer than the dead time."""
+SENSORS = {"swapped": "swapped", "turned": "mirrored", "doubled": "doubled", "offset": "offset"}
+"""Faults of sensors that the bring-up names, and what each is called by the twin."""
+PART_S = 4.8
+"""Part of a round for each joint. Chosen by hand: a joint rests for a second before each motion,
+longer than the dead time."""
 PUSH = 0.6
 """Deflection of the levers, of full. Chosen by hand: above any dead band."""
 PRESSES_S = {"dead-man": (0.2, 0.8), "e-stop": (1.2, 1.6)}
@@ -40,7 +42,7 @@ JOINTS_S = 2.2
 PUSHES_S = ((1.0, 1.6, -PUSH), (3.4, 4.0, PUSH))
 """Beginning, end and deflection of the motions in a part. Upwards first: downwards, the tool of the
 simulated machine touches the ground, and a joint that is pushed back has no dead time."""
-SOUND_ROUNDS = 3
+SOUND_ROUNDS = 2
 """Rounds after which a person who fails the shadow run spoils it: the joints have been seen by then."""
 SPOILED_S = 1.0
 """Time for which messages or positions are spoiled to fail a check that needs it. Chosen by hand."""
@@ -54,7 +56,7 @@ class RehearsalBench:
         twin: The twin; needs a fault port, for the emergency stop.
         plant: The simulated machine behind it.
         rest_s: Time after the first positions for which the person leaves the machine at rest.
-        fails: Check that the person fails; `null`: none.
+        fails: Check that the person fails, or fault of a sensor (`SENSORS`); `null`: none.
     """
 
     twin: Twin
@@ -68,9 +70,10 @@ class RehearsalBench:
                 "bench=operator: expected twin.remote=false and a twin.fault_port, since the person holds the remote "
                 "and presses the emergency stop"
             )
-        if self.fails is not None and self.fails not in CHECKS:
+        known = (*CHECKS, *SENSORS)
+        if self.fails is not None and self.fails not in known:
             raise ConfigError(
-                f"bench.fails: there is no check '{self.fails}'; {list_choices(self.fails, CHECKS)}"
+                f"bench.fails: there is no check '{self.fails}'; {list_choices(self.fails, known)}"
             )
 
     def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
@@ -89,28 +92,31 @@ class ScriptedPerson:
     Args:
         machine: Its levers and joints.
         fails: Check that the person fails; `None`: none.
+
+    Attributes:
+        round_s: Length of a round.
     """
 
     def __init__(self, machine: Machine, fails: str | None) -> None:
         self._machine, self._fails = machine, fails
         self._map = LeverMap(machine.levers, machine)
         self._full_rad = find_full_angles_rad(machine.levers)
+        self.round_s = JOINTS_S + machine.num_joints * PART_S
 
     def holds(self, switch: str, t_s: float) -> bool:
         """Return whether a switch of `PRESSES_S` is pressed at `t_s`; before 0 none is."""
         begin_s, end_s = PRESSES_S[switch]
-        return t_s >= 0 and switch != self._fails and begin_s <= t_s % ROUND_S < end_s
+        return t_s >= 0 and switch != self._fails and begin_s <= t_s % self.round_s < end_s
 
     def command(self, t_s: float) -> np.ndarray:
         """Return the commands that the levers stand for, `(J,)`."""
-        machine, u = self._machine, np.zeros(self._machine.num_joints)
-        since_s = t_s % ROUND_S - JOINTS_S
-        if t_s < 0 or not 0 <= since_s < 2 * PART_S:
+        u = np.zeros(self._machine.num_joints)
+        since_s = t_s % self.round_s - JOINTS_S
+        if t_s < 0 or since_s < 0:
             return u
-        moved = machine.is_exclusive == (since_s >= PART_S)
         for begin_s, end_s, push in PUSHES_S:
             if begin_s <= since_s % PART_S < end_s:
-                u[moved] = push
+                u[int(since_s / PART_S)] = push
         if self._fails == "joints":
             u[-1] = 0.0
         return u
@@ -127,7 +133,9 @@ class ScriptedPerson:
             return {"fault": "corrupt", "message": "MachineStatus", "seconds": SPOILED_S}
         if self._fails == "positions":
             return {"fault": "drift", "seconds": rest_s}
-        if self._fails == "shadow" and t_s > SOUND_ROUNDS * ROUND_S:
+        if self._fails in SENSORS:
+            return {"fault": SENSORS[self._fails]}
+        if self._fails == "shadow" and t_s > SOUND_ROUNDS * self.round_s:
             return {"fault": "invalid"}
         return None
 

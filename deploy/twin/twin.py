@@ -45,7 +45,7 @@ FLOOD, FLOOD_ID = 30, 0x1FFF0000
 """Frames a cycle of a babbling node, and their identifier: of lowest priority."""
 LEVER_FAULT = 0.5
 """Deflection of a lever that the operator moves, of full."""
-JUMP_RAD, DRIFT_RAD_S, OUT_OF_RANGE_RAD = 0.5, 0.1, 3.1
+JUMP_RAD, DRIFT_RAD_S, OUT_OF_RANGE_RAD, OFFSET_RAD = 0.5, 0.1, 3.1, 0.1
 """Sizes of the faults of a position; any that no joint could reach will do."""
 SENSOR_RANGE_RAD = 3.2
 """Largest position that the example DBC's signals hold."""
@@ -164,7 +164,7 @@ class RunningTwin:
         # The first cycle begins a period at once.
         self._period_began_s = -np.inf
         self._stuck: np.ndarray | None = None
-        self._mirror: np.ndarray | None = None
+        self._origin: np.ndarray | None = None
         remote = self._description.layouts[self._description.message_of("DeadMan")]
         # on some buses a node hears itself; its own remote has been taken in already
         self._own = {remote.frame_id} if twin.remote else set()
@@ -345,13 +345,19 @@ class RunningTwin:
             q = self._stuck
         else:
             self._stuck = None
-        if faults.on("mirrored", "", now_s):
-            self._mirror = q if self._mirror is None else self._mirror
-            q = 2.0 * self._mirror - q
-        else:
-            self._mirror = None
         # The plant's own array must not change with the faults.
         q = q.copy()
+        mirrored, doubled = faults.on("mirrored", "", now_s), faults.on("doubled", "", now_s)
+        # Both go on from where the machine is when they begin.
+        self._origin = q if self._origin is None or not (mirrored or doubled) else self._origin
+        if mirrored:
+            q = 2.0 * self._origin - q
+        if doubled:
+            q[0] = 2.0 * q[0] - self._origin[0]
+        if faults.on("swapped", "", now_s):
+            q[[0, -1]] = q[[-1, 0]]
+        if faults.on("offset", "", now_s):
+            q[0] += OFFSET_RAD
         if faults.on("jump", "", now_s):
             q[0] += JUMP_RAD
         if faults.on("drift", "", now_s):

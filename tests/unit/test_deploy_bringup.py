@@ -21,42 +21,106 @@ from actuators.excite.player import NominalMachine
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from deploy.bringup import BringupResult, JointResponse, _StateChecks, measure_joint_response
+from deploy.bringup import BringupResult, JointResponse, _StateChecks, describe_joint, find_pushes
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
 from deploy.modes.bringup import BringupMode
-from deploy.runtime.process import ChildProcess, CycleTimer
+from deploy.runtime.process import ChildProcess
 from deploy.twin.faults import ActiveFaults, request_fault
-from deploy.twin.rehearsal import CHECKS, ROUND_S, RehearsalBench, ScriptedPerson
+from deploy.twin.rehearsal import CHECKS, SENSORS, RehearsalBench, ScriptedPerson
 from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import Twin
 
-T_S = np.arange(0, 12, 0.01)
+T_S = np.arange(0, 40, 0.01)
+MACHINE = option("machine", "brokk170")
 
 
-def answer(sign: float, dead_s: float, speed: float = 0.2) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions and flow of a joint that is pushed one way and then the other, two seconds each."""
-    flow = 0.5 * ((T_S > 1) & (T_S < 3)) - 0.5 * ((T_S > 7) & (T_S < 9))
-    late = np.interp(T_S - dead_s, T_S, flow)
-    return np.cumsum(sign * speed / 0.5 * late) * 0.01 + 0.0005 * np.sin(97 * T_S), flow
+def sample_machine(dead_s: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and flow of a machine whose valves are pushed one after the other, both ways."""
+    flow = np.zeros((len(T_S), MACHINE.num_joints))
+    for joint in range(MACHINE.num_joints):
+        since_s = T_S - 8.0 * joint
+        flow[(since_s > 1) & (since_s < 1.6), joint] = 0.5
+        flow[(since_s > 4) & (since_s < 4.6), joint] = -0.5
+    q = np.zeros_like(flow)
+    for joint, speed in enumerate(MACHINE.max_speed):
+        late = np.interp(T_S - dead_s, T_S, flow[:, joint])
+        q[:, joint] = np.cumsum(speed * late) * 0.01 + 0.0003 * np.sin(97 * T_S)
+    return q, flow
+
+
+def describe(q: np.ndarray, flow: np.ndarray) -> dict[str, JointResponse | None]:
+    pushes, names = find_pushes(T_S, q, flow, MACHINE), MACHINE.joint_names
+    return {name: describe_joint(pushes, j, names) for j, name in enumerate(names)}
 
 
 @pytest.mark.parametrize("dead_s", [0.1, 0.55])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_sign_dead_time_and_speed_of_a_joint_are_found(sign: float, dead_s: float) -> None:
-    q, flow = answer(sign, dead_s)
-    found = measure_joint_response(T_S, q, flow, travel=2.0)
-    assert found is not None and found.agrees is (sign > 0)
-    assert found.dead_time_s == pytest.approx(dead_s, abs=0.02) and found.speed == pytest.approx(
-        0.2, abs=0.02
-    )
+def test_a_sound_machine_has_no_faults_and_its_dead_time_is_measured(dead_s: float) -> None:
+    for joint, found in enumerate(describe(*sample_machine(dead_s)).values()):
+        assert found is not None and not found.faults
+        assert found.dead_time_s == pytest.approx(dead_s, abs=0.03)
+        assert found.speed == pytest.approx(0.5 * MACHINE.max_speed[joint], rel=0.05)
+        assert found.ratio == pytest.approx(1.0, abs=0.05)
+
+
+def swap_sensors(q: np.ndarray) -> None:
+    q[:, [0, 4]] = q[:, [4, 0]]
+
+
+def turn_sensor(q: np.ndarray) -> None:
+    q[:, 2] *= -1
+
+
+def double_sensor(q: np.ndarray) -> None:
+    q[:, 3] *= 2
+
+
+def repeat_sensor(q: np.ndarray) -> None:
+    q[:, 3] = q[:, 2] + q[:, 3]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (swap_sensors, {"q1": "the valve of q1 moves q5", "q5": "the valve of q5 moves q1"}),
+        (turn_sensor, {"q3": "q3 is turned: it moves against its flow"}),
+        (double_sensor, {"q4": "q4 is doubled: it moves 2.0 times as fast as the machine's file"}),
+        (repeat_sensor, {"q3": "the valve of q3 moves q3 and q4"}),
+    ],
+)
+def test_swapped_turned_and_doubled_joints_are_named_and_no_others(
+    spoil: Callable[[np.ndarray], None], told: dict[str, str]
+) -> None:
+    q, flow = sample_machine()
+    spoil(q)
+    for name, found in describe(q, flow).items():
+        assert found is not None and len(found.faults) == (name in told), found
+        if name in told:
+            assert found.faults[0].startswith(told[name])
 
 
 def test_a_joint_that_moved_one_way_only_or_not_at_all_says_nothing() -> None:
-    q, flow = answer(1.0, 0.5)
-    assert measure_joint_response(T_S[:600], q[:600], flow[:600], 2.0) is None
-    assert measure_joint_response(T_S, np.zeros_like(q), flow, 2.0) is None
+    q, flow = sample_machine()
+    pushed = describe(q[:350], flow[:350])
+    assert set(pushed.values()) == {None}
+    assert not find_pushes(T_S, np.zeros_like(q), flow, MACHINE)
+    assert not find_pushes(T_S[:50], q[:50], flow[:50], MACHINE)
+
+
+def test_valves_that_are_pushed_together_say_nothing() -> None:
+    q, flow = sample_machine()
+    assert not find_pushes(T_S[:700], q[:700], flow[:700] + flow[:700, :1], MACHINE)
+
+
+@pytest.mark.parametrize(("offset", "told"), [(0.1, "q3 has an offset of +0.100"), (0.02, None)])
+def test_an_offset_to_the_pose_measured_by_hand_is_named(offset: float, told: str | None) -> None:
+    pose = tuple(MACHINE.home.tolist())
+    checklist = SimpleNamespace(pose=pose, pose_error=0.03)
+    checks = _StateChecks(checklist, MACHINE, SimpleNamespace(memory=None), print)  # type: ignore[arg-type]
+    assert checks._list_offsets(np.add(MACHINE.home, [0, 0, offset, 0, 0])) == (
+        [told] if told else []
+    )
 
 
 @pytest.mark.parametrize(("dead_s", "passed"), [(0.64, True), (0.66, False)])
@@ -66,34 +130,25 @@ def test_a_dead_time_beyond_the_commands_of_the_history_fails_the_check(
     # 13 commands of 50 ms: the oldest began 0.65 s before the newest position.
     machine = option("machine", "brokk170")
     checks = _StateChecks(SimpleNamespace(), machine, SimpleNamespace(memory=None), print)  # type: ignore[arg-type]
-    found = {name: JointResponse(True, 0.5, 0.2) for name in machine.joint_names}
-    found["q2"] = JointResponse(True, dead_s, 0.2)
+    found = {}
+    for name in machine.joint_names:
+        found[name] = JointResponse(name, (name,), True, 0.5, 0.2, 1.0)
+    found["q2"] = replace(found["q2"], dead_time_s=dead_s)
     monkeypatch.setattr(checks, "_watch_joints", lambda: found)
     assert checks._check_joints().passed is passed
 
 
 def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -> None:
     """Does what the checklist asks for: dead-man, emergency stop, then each joint both ways."""
-    remote = RadioRemote(BusDescription(DBC, machine))
+    remote, person = RadioRemote(BusDescription(DBC, machine)), ScriptedPerson(machine, None)
     begun_s, asked = time.monotonic(), False
     with wire.open(remote.frame_ids) as bus:
-        pace = CycleTimer(remote.period_s)
-        while not stop.is_set():
-            while (left_s := pace.next_s - time.monotonic()) > 0:
-                frame = bus.recv(left_s)
-                if frame is not None:
-                    remote.hear(frame, time.monotonic())
-            pace.begin()
-            # First q1, q3, q4 and q5 together, then q2 with the button.
-            t_s = (time.monotonic() - begun_s) % 9.6
-            remote.deadman = 0.5 < t_s % 2 < 1.0
-            if int(t_s) % 4 == 1 and not asked:
+        for now_s in remote.iterate_cycles(stop.is_set, bus):
+            person.move(remote, now_s - begun_s)
+            if person.holds("e-stop", now_s - begun_s) and not asked:
                 with contextlib.suppress(TimeoutError):
                     request_fault(port, {"fault": "estop", "seconds": 0.3})
-            asked = int(t_s) % 4 == 1
-            part, remote.button_right = t_s % 4.8, t_s >= 4.8
-            pushed = (0.6 if part < 2.0 else -0.6) if 1.0 < part < 1.6 or 3.4 < part < 4.0 else 0.0
-            remote.levers = (0.0, 0.0, pushed, 0.0) if remote.button_right else (pushed,) * 4
+            asked = person.holds("e-stop", now_s - begun_s)
             if remote.is_ready:
                 bus.send(remote.build_frame())
 
@@ -200,7 +255,7 @@ def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
 def sample_person(fails: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A round of the scripted person: commands, dead-man and emergency stop every 20 ms."""
     person = ScriptedPerson(option("machine", "brokk170"), fails)
-    times = np.arange(0.0, ROUND_S, 0.02)
+    times = np.arange(0.0, person.round_s, 0.02)
     held = [[person.holds(name, t_s) for t_s in times] for name in ("dead-man", "e-stop")]
     return np.array([person.command(t_s) for t_s in times]), *map(np.array, held)
 
@@ -210,16 +265,16 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     assert (commands.max(0) > 0.5).all() and (commands.min(0) < -0.5).all()
     # Upwards first: positive commands lower the arm, and home is near the ground.
     assert (commands[np.argmax(commands != 0, axis=0), range(5)] < 0).all()
-    # q2 moves alone, and nothing moves while a switch is pressed.
+    # Each joint moves alone, and nothing moves while a switch is pressed.
     moves = commands != 0
-    assert not (moves[:, 1] & moves[:, [0, 2, 3, 4]].any(1)).any()
+    assert (moves.sum(1) <= 1).all()
     assert deadman.any() and estop.any() and not (deadman | estop)[moves.any(1)].any()
     # At rest for a second before each motion, as long as the slowest answer.
     begins = np.flatnonzero(moves.any(1)[1:] & ~moves.any(1)[:-1]) + 1
     for begin in begins:
         assert not moves[begin - 50 : begin].any()
     person = ScriptedPerson(option("machine", "brokk170"), None)
-    assert not person.command(-1.0).any() and not person.holds("dead-man", -ROUND_S + 0.5)
+    assert not person.command(-1.0).any() and not person.holds("dead-man", -person.round_s + 0.5)
     remote = RadioRemote(BusDescription(DBC, option("machine", "brokk170")))
     person.move(remote, 2.2 + 1.2)
     assert min(remote.levers) == pytest.approx(-0.6) and not remote.button_right
@@ -229,17 +284,18 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     assert remote.deadman and not any(remote.levers)
 
 
-@pytest.mark.parametrize("fails", CHECKS)
+@pytest.mark.parametrize("fails", [*CHECKS, *SENSORS])
 def test_a_scripted_person_fails_the_chosen_check_alone(fails: str) -> None:
     sound, chosen = sample_person(None), sample_person(fails)
     person = ScriptedPerson(option("machine", "brokk170"), fails)
-    late_s = 4 * ROUND_S
+    late_s = 4 * person.round_s
     assert chosen[1].any() == (fails != "dead-man") and chosen[2].any() == (fails != "e-stop")
     same = np.array_equal(sound[0], chosen[0])
     assert same == (fails != "joints") and np.array_equal(sound[0][:, :4], chosen[0][:, :4])
     early, late = person.spoil(0.0, 8.0), person.spoil(late_s, 8.0)
-    assert (early is not None) == (fails in ("bus", "positions"))
-    assert (late is not None) == (fails in ("bus", "positions", "shadow"))
+    early_faults = ("bus", "positions", *SENSORS)
+    assert (early is not None) == (fails in early_faults)
+    assert (late is not None) == (fails in (*early_faults, "shadow"))
     for fault in (early, late):
         if fault is not None:
             ActiveFaults().request(json.dumps(fault).encode(), 0.0)

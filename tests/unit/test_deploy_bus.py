@@ -73,7 +73,7 @@ def _virtual(tmp_path: Path) -> CanBus:
 
 
 def _udp(_: Path) -> CanBus:
-    return udp()
+    return udp("udp")
 
 
 WIRES = pytest.mark.parametrize("make", [_virtual, _udp], ids=["virtual", "udp_multicast"])

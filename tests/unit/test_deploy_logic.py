@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from deploy.bus.description import BusDescription
 from deploy.kernel.bus_logic import LAST_ZEROS, BusInputs, BusLogic, is_armed
 from deploy.kernel.envelope import Envelope
 from deploy.kernel.guard import GuardState, GuardTrip
+from deploy.kernel.limits import GuardLimits
 from deploy.kernel.observer import NOTHING_OBSERVED, Observation, Observer
 from deploy.kernel.protection import MessageFault
 from deploy.kernel.target_check import SeenTarget
@@ -41,12 +43,13 @@ class Loop:
         envelope: Envelope | None = None,
         observer: Observer | None = None,
         needs_page: bool = False,
+        limits: GuardLimits = LIMITS,
     ) -> None:
         self.envelope = envelope
         self.target: SeenTarget | None = None
         self.sender = Sender(bus)
         self.bus = bus
-        self.logic = BusLogic(bus, MACHINE, LIMITS, self.envelope, observer, commands, needs_page)
+        self.logic = BusLogic(bus, MACHINE, limits, self.envelope, observer, commands, needs_page)
         self.sender.receiver = self.logic.receiver
         self.armed, self.armed_s, self.stop_s = True, 0.0, None
         self.u: np.ndarray | None = U
@@ -466,6 +469,27 @@ def test_an_observed_fault_latches_with_its_joint_and_a_released_dead_man_clears
     assert probe.cleared > cleared and loop.state is GuardState.READY
     state = loop.logic.build_state(loop.now_s, True, 0)
     assert state.observed_joint == 0
+
+
+def test_who_only_listens_is_told_of_a_fault_for_ten_seconds() -> None:
+    probe = Probe()
+    loop = Loop(commands=False, observer=probe)  # type: ignore[arg-type]
+    loop.sender.values["DeadMan"] = 0
+    loop.go(0.3)
+    probe.observation = Observation(GuardTrip.JOINT_DRIFTS, 2)
+    loop.go(9.9)
+    assert probe.cleared == 0 and loop.trip is GuardTrip.JOINT_DRIFTS
+    loop.go(0.3)
+    assert probe.cleared > 0
+
+
+def test_without_an_envelope_no_ground_is_known() -> None:
+    for limits, known in ((LIMITS, True), (replace(LIMITS, envelope=None), False)):
+        loop = Loop(limits=limits)
+        loop.target = SeenTarget((2.5, 0.1, -0.1), 0.0, ())
+        loop.go(1.0)
+        below = loop.logic.build_state(loop.now_s, True, 0).target is GuardTrip.TARGET_GROUND
+        assert below is known
 
 
 @pytest.mark.parametrize("missing", ["JointPos1", "ValveFeedback"])

@@ -1,4 +1,7 @@
-"""Reaction times, with real processes on a multicast bus: a few trials each; benchmarks/deploy/reactions.py makes sixty."""
+"""Reaction times, with real processes on a multicast bus, and on SocketCAN where the kernel has `vcan`.
+
+A few trials each; benchmarks/deploy/reactions.py makes sixty.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from composed import option
-from desk import COMMAND, Desk
+from desk import COMMAND, NO_VCAN, VCAN, Desk
 
 from brokk_rl.machine import Machine
 from deploy.kernel.guard import GuardState
@@ -21,12 +24,21 @@ SLACK = 3.0 if os.environ.get("CI") or os.cpu_count() == 2 else 1.0
 the benchmark's."""
 
 
-@pytest.fixture(scope="module")
-def desk(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+BUSES = [
+    "udp",
+    pytest.param("vcan", marks=pytest.mark.skipif(NO_VCAN, reason=f"this kernel has no {VCAN}")),
+]
+
+
+@pytest.fixture(scope="module", params=BUSES)
+def desk(
+    machine: Machine, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Iterator[Desk]:
     with pytest.MonkeyPatch.context() as patch:
         folders = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
         patch.setenv("PYTHONPATH", os.pathsep.join(folders))
-        with Desk(machine, option("guard", "default"), tmp_path_factory.mktemp("desk")) as made:
+        limits, folder = option("guard", "default"), tmp_path_factory.mktemp("desk")
+        with Desk(machine, limits, folder, kind=request.param) as made:
             for name in ("twin", "bus", "commander"):
                 made.start(name)
             made.wait_for_state()
