@@ -52,7 +52,7 @@ MCAP, BLF = "capture.mcap", "frames.blf"
 EARLY = 0.9
 """Part of the time between pictures from which one is due: a camera's period is not exact."""
 FACTS, NUM_FACTS = "brokk", 3
-"""Name of the metadata record, and how often it is written: the majority counts."""
+"""Name of the metadata record, and how often it begins a capture: the majority counts."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,10 @@ class CaptureWriter:
             "schema": "1", "machine": machine.name, "fingerprint": json.dumps(machine.fingerprint()), "dbc": capture.dbc,
             "started_ns": str(time.time_ns()),
         }  # fmt: skip
+        self._facts = facts | capture.facts
         # Without them no capture can be read, and one wrong byte spoils one of them.
         for _ in range(NUM_FACTS):
-            self._mcap.add_metadata(FACTS, facts | capture.facts)
+            self._mcap.add_metadata(FACTS, self._facts)
         now_ns = time.time_ns()
         self._mcap.add_attachment(
             now_ns,
@@ -188,6 +189,8 @@ class CaptureWriter:
 
     def __exit__(self, *exc: object) -> None:
         with contextlib.suppress(OSError):  # the disk may be full; flushed data is whole
+            # Again at the end: the beginning may be lost whole.
+            self._mcap.add_metadata(FACTS, self._facts)
             self._mcap.finish()
             self._blf.stop()
         with contextlib.suppress(OSError):

@@ -6,6 +6,7 @@ import errno
 import json
 import logging
 import mmap
+import os
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,6 @@ import numpy as np
 import zstandard
 from can.io.blf import BLFReader
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
 from mcap.records import (
     Attachment,
     Channel,
@@ -31,7 +31,6 @@ from mcap.records import (
     Statistics,
 )
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
-from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from brokk_rl.errors import RecordingError
@@ -144,7 +143,7 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
     contents, decoder, ahead_ns = CaptureContents(whole=is_whole(path)), _Decoder(), None
     seen: list[tuple[str, Message]] = []
     scan, facts = CaptureScan(path), list[dict[str, str]]()
-    for record in (*_list_summary(path), *scan):
+    for record in (*list_definitions(path), *scan):
         if isinstance(record, Metadata) and record.name == FACTS:
             facts.append(dict(record.metadata))
         elif isinstance(record, Schema):
@@ -201,25 +200,20 @@ def is_whole(path: Path) -> bool:
     """Return whether the capture at `path` was closed properly."""
     if not path.exists():
         raise RecordingError(f"{path}: no such capture")
-    return _read_summary(path) is not None
+    if not path.is_file() or path.stat().st_size < MAGIC_SIZE:
+        return False
+    with path.open("rb") as file:
+        file.seek(-MAGIC_SIZE, os.SEEK_END)
+        return file.read() == MCAP_MAGIC
 
 
-def _read_summary(path: Path) -> Summary | None:
-    if not path.is_file():
-        return None
-    try:
-        with path.open("rb") as file:
-            return make_reader(file).get_summary()
-    except Exception:  # as in `_read_record`
-        return None
+def list_definitions(path: Path) -> list[Any]:
+    """Return schemas and channels that stand outside of chunks, as at the end of a capture.
 
-
-def _list_summary(path: Path) -> list[Any]:
-    """Return schemas and channels from the end of a capture: those in a damaged chunk are known, too."""
-    summary = _read_summary(path)
-    if summary is None:
-        return []
-    return [*summary.schemas.values(), *summary.channels.values()]
+    Those of a damaged chunk are known by them, too.
+    """
+    scan = CaptureScan(path, opens_chunks=False)
+    return [record for record in scan if isinstance(record, (Schema, Channel))]
 
 
 def recover_mcap(path: Path, out: Path) -> tuple[int, int]:
@@ -239,7 +233,7 @@ def recover_mcap(path: Path, out: Path) -> tuple[int, int]:
     with part.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="brokk", library="brokk-rl")
-        for record in (*_list_summary(path), *scan):
+        for record in (*list_definitions(path), *scan):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -301,14 +295,16 @@ class CaptureScan:
 
     Args:
         path: The capture.
+        opens_chunks: Whether the records within chunks are wanted, too.
 
     Attributes:
         num_lost: Messages that are missing, as far as the file says how many it held.
         num_damaged: Places at which something could not be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, opens_chunks: bool = True) -> None:
         self.path, self.num_lost, self.num_damaged = path, 0, 0
+        self._opens_chunks, self._following = opens_chunks, 0
 
     def __iter__(self) -> Iterator[Any]:
         """Yield the records.
@@ -326,17 +322,17 @@ class CaptureScan:
                 yield from self._scan(data)
         except (OSError, ValueError) as error:
             raise RecordingError(f"{self.path}: cannot be read ({error})") from error
-        if self.num_damaged:
+        if self.num_damaged and self._opens_chunks:
             text = "%s: damaged in %d places, at least %d messages are lost"
             log.warning(text, self.path, self.num_damaged, self.num_lost)
 
     def _scan(self, data: mmap.mmap) -> Iterator[Any]:
-        at, count, is_hidden, num_hidden = MAGIC_SIZE, 0, False, 0
+        at, count, is_hidden, num_hidden, self._following = MAGIC_SIZE, 0, False, 0, 0
         is_closed = data[-MAGIC_SIZE:] == MCAP_MAGIC
         while not _is_file_end(data, at):
             record, end = _read_record(data, at)
             if isinstance(record, Chunk):
-                inner = _open_chunk(record)
+                inner = _open_chunk(record) if self._opens_chunks else []
                 is_hidden = inner is None
                 self.num_damaged += is_hidden
                 for one in inner or ():
@@ -351,14 +347,22 @@ class CaptureScan:
             elif record is not None:
                 yield record
             self.num_lost = num_hidden
-            # A wrong length leads to where no record begins.
-            if record is None or not _is_record_start(data, end):
-                end = _find_record(data, at + 1)
+            following = self._find_following(data, at)
+            # A wrong length leads to where no record begins, or beyond the next chunk.
+            if record is None or following < end or not _is_record_start(data, end):
+                end = following
                 if end == len(data) and not is_closed:
-                    log.warning("%s: ends before its end", self.path)
+                    if self._opens_chunks:
+                        log.warning("%s: ends before its end", self.path)
                     return
                 self.num_damaged += 1
             at = end
+
+    def _find_following(self, data: mmap.mmap, at: int) -> int:
+        """Return where the next chunk or record of facts begins after `at`, or the file ends."""
+        if self._following <= at:
+            self._following = _find_record(data, at + 1)
+        return self._following
 
 
 def _read_record(data: mmap.mmap, at: int) -> tuple[Any | None, int]:
@@ -403,16 +407,19 @@ def _open_chunk(chunk: Chunk) -> list[Any] | None:
 
 
 def _find_record(data: mmap.mmap, at: int) -> int:
-    """Return where the next chunk begins, or a record of facts before it, or the end of the file."""
+    """Return where the next chunk or record of facts begins, or the end of the file."""
     name = len(FACTS).to_bytes(4, "little") + FACTS.encode()
-    facts = data.find(name, at + HEAD_BYTES) - HEAD_BYTES
-    if facts >= at and data[facts] == Opcode.METADATA and _is_record_start(data, facts):
-        return facts
-    while (mark := data.find(COMPRESSION, at)) >= 0:
-        begin = mark - CHUNK_HEAD_BYTES - HEAD_BYTES
-        if begin >= at and data[begin] == Opcode.CHUNK and _is_record_start(data, begin):
+    facts = _find_mark(data, at, name, HEAD_BYTES, Opcode.METADATA)
+    chunk = _find_mark(data, at, COMPRESSION, CHUNK_HEAD_BYTES + HEAD_BYTES, Opcode.CHUNK)
+    return min(facts, chunk)
+
+
+def _find_mark(data: mmap.mmap, at: int, mark: bytes, offset: int, opcode: int) -> int:
+    """Return where the next record begins that has `mark` at `offset`, or the end of the file."""
+    begin = at - 1
+    while (begin := data.find(mark, begin + offset + 1) - offset) >= at:
+        if data[begin] == opcode and _is_record_start(data, begin):
             return begin
-        at = mark + 1
     return len(data)
 
 

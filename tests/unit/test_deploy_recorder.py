@@ -214,6 +214,17 @@ def test_a_wrong_byte_anywhere_costs_at_most_its_chunk(
         lost = num_messages - sum(map(len, found.messages.values()))
         assert lost <= num_messages / len(chunks) * 2.5, place
         assert found.facts == whole.facts and (lost == 0 or found.num_damaged)
+    # Bytes that are missing or too many shift all that follows, the index at the end included.
+    for begin, end in (
+        (0, 1000),
+        (chunks[0].chunk_start_offset + 60, chunks[0].chunk_start_offset + 90),
+    ):
+        for shifted in (content[:begin] + content[end:], content[:end] + content[begin:]):
+            path.write_bytes(shifted)
+            found = capture_reader.read_capture(path)
+            lost = num_messages - sum(map(len, found.messages.values()))
+            assert lost <= num_messages / len(chunks) * 2.5, (begin, end)
+            assert found.facts == whole.facts and found.num_damaged
     # A chunk in the middle: its number of messages is known, and the command says it by its code.
     wrong = bytearray(content)
     wrong[chunks[2].chunk_start_offset + 60] ^= 1
