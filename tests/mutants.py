@@ -40,7 +40,7 @@ CORE = {
     "deploy.kernel.under_way": ["test_deploy_guard.py"],
     "deploy.kernel.flow_check": ["test_deploy_checks.py"],
     "deploy.kernel.target_check": ["test_deploy_checks.py"],
-    "deploy.kernel.receiver": ["test_deploy_receiver.py"],
+    "deploy.kernel.receiver": ["test_deploy_receiver.py", "test_deploy_logic.py"],
     "deploy.kernel.bus_logic": ["test_deploy_logic.py"],
     "deploy.kernel.bus_process": ["test_deploy_bus_process.py"],
     "deploy.twin.gateway": ["test_deploy_gateway.py"],

@@ -599,6 +599,21 @@ def test_the_flow_of_levers_is_theirs() -> None:
         loop.sender.values[f"Flow_{name}"] = flow
         loop.go(0.4)
         assert loop.logic.receiver.found.fault is fault, (name, flow)
+    # The levers of a remote that is off ask for nothing.
+    loop.sender.values |= {f"Flow_{names[0]}": 0.0, f"Flow_{joint}": 0.4, "RemoteOn": 0}
+    loop.go(0.4)
+    assert loop.logic.receiver.found.fault is GuardTrip.FLOW_UNASKED
+
+
+@pytest.mark.parametrize("flow", [0.4, -0.4])
+def test_levers_that_nobody_knows_may_ask_for_any_flow_while_they_are_moved(flow: float) -> None:
+    sender = Sender(machine=replace(MACHINE, levers=()))
+    sender.values |= {"FlowSource": 1, "Lever_right_theta": 0.4, "Flow_q3": flow}
+    sender.go(0.4)
+    assert sender.receiver.found.fault is GuardTrip.NONE
+    sender.values["Lever_right_theta"] = 0.0
+    sender.go(0.4)
+    assert sender.receiver.found.fault is GuardTrip.FLOW_UNASKED
 
 
 def test_a_page_that_falls_silent_ends_the_motion_where_one_is_needed() -> None:
