@@ -8,11 +8,11 @@ from typing import Any
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
-from deploy.kernel.envelope import Envelope
+from deploy.checks.envelope import Envelope
+from deploy.checks.observer import Observer
+from deploy.checks.shapes import read_machine_shapes
+from deploy.checks.valve_model import describe_sources, load_observer_file
 from deploy.kernel.limits import GuardLimits
-from deploy.kernel.observer import Observer
-from deploy.kernel.valve_model import describe_sources, load_observer_file
-from deploy.shapes import read_machine_shapes
 
 log = logging.getLogger(__name__)
 

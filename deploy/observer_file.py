@@ -21,9 +21,9 @@ from brokk_rl.record import Recording, read_recordings
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
+from deploy.checks.observer import Observer
+from deploy.checks.valve_model import SCHEMA, describe_sources, load_observer_file
 from deploy.kernel.limits import GuardLimits
-from deploy.kernel.observer import Observer
-from deploy.kernel.valve_model import SCHEMA, describe_sources, load_observer_file
 
 FILE, COUNTS = "observer.json", "observed.json"
 SHIFT_S = 8 * 3600.0
@@ -67,7 +67,7 @@ class AlarmCounts:
 
 @spec
 class ThresholdSettings:
-    """Settings by which thresholds are taken from recordings; see `deploy.kernel.observer`.
+    """Settings by which thresholds are taken from recordings; see `deploy.checks.observer`.
 
     Attributes:
         window_s: Time over which measured and predicted motion are compared.

@@ -45,10 +45,10 @@ CORE = {
     "deploy.kernel.bus_process": ["test_deploy_bus_process.py"],
     "deploy.twin.gateway": ["test_deploy_gateway.py"],
     "deploy.policy.policy_process": ["test_deploy_adviser.py"],
-    "deploy.kernel.envelope": ["test_deploy_envelope.py"],
-    "deploy.shapes": ["test_deploy_envelope.py"],
-    "deploy.kernel.valve_model": ["test_deploy_observer.py"],
-    "deploy.kernel.observer": ["test_deploy_observer.py"],
+    "deploy.checks.envelope": ["test_deploy_envelope.py"],
+    "deploy.checks.shapes": ["test_deploy_envelope.py"],
+    "deploy.checks.valve_model": ["test_deploy_observer.py"],
+    "deploy.checks.observer": ["test_deploy_observer.py"],
 }
 """Modules that decide what reaches the valves, and the tests of each."""
 PYTEST = ["-x", "-q", "--no-header", "--assert=plain"]
@@ -269,7 +269,7 @@ def main(asked: Sequence[str]) -> int:
     wrong, sample = 0, None
     modules = list(asked) or list(CORE)
     if asked and asked[0].isdigit():
-        kernel = [name for name in CORE if name.startswith("deploy.kernel.")]
+        kernel = [name for name in CORE if name.startswith(("deploy.kernel.", "deploy.checks."))]
         sample = draw_sample(kernel, int(asked[0]))
         modules = list(sample)
     for module in modules:

@@ -14,23 +14,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import STAMP, BusDescription
-from deploy.kernel.envelope import Envelope
 from deploy.kernel.guard import (
+    CommandEnvelope,
     CommandRequest,
     Guard,
     GuardDecision,
     GuardInput,
     GuardState,
     GuardTrip,
+    Observation,
 )
 from deploy.kernel.limits import GuardLimits
-from deploy.kernel.observer import Observer
 from deploy.kernel.protection import MessageFault
 from deploy.kernel.receiver import BusReceiver
 from deploy.kernel.target_check import SeenTarget, TargetCheck
@@ -75,6 +76,31 @@ class BusInputs:
     target: SeenTarget | None
 
 
+class MotionObserver(Protocol):
+    """A check of the joints' motion, beside the guard; see `deploy.checks.observer`."""
+
+    @property
+    def observation(self) -> Observation:
+        """The newest result."""
+        ...
+
+    def is_due(self, now_s: float) -> bool:
+        """Return whether a control period has gone by since the last update."""
+        ...
+
+    def update(self, now_s: float, q: np.ndarray, u: np.ndarray) -> None:
+        """Take in a control period: positions at its end, and mean flow, `(J,)` each."""
+        ...
+
+    def forget(self) -> None:
+        """Begin anew: positions are missing or not plausible."""
+        ...
+
+    def clear(self) -> None:
+        """Take back the named fault."""
+        ...
+
+
 class BusLogic:
     """Decisions of one bus cycle: frames to send and the state to publish.
 
@@ -97,8 +123,8 @@ class BusLogic:
         description: BusDescription,
         machine: Machine,
         limits: GuardLimits,
-        envelope: Envelope | None,
-        observer: Observer | None,
+        envelope: CommandEnvelope | None,
+        observer: MotionObserver | None,
         commands: bool,
         needs_page: bool,
     ) -> None:
@@ -187,7 +213,7 @@ class BusLogic:
         u, age_s = tuple(requested.u.tolist()), now_s - requested.t_s
         return CommandRequest(u, age_s, self._target, faces_m, is_seen)
 
-    def _observe(self, observer: Observer, now_s: float) -> None:
+    def _observe(self, observer: MotionObserver, now_s: float) -> None:
         """Let the observer compare the last control period with its model, where one is over."""
         known = self.receiver
         # An armed operator clears a fault by the dead-man. Who only listens has to be told for a while.

@@ -27,8 +27,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
-from deploy.kernel.envelope import Envelope
 from deploy.kernel.limits import GuardLimits, JointBounds, Numbers
 from deploy.kernel.under_way import CommandsUnderWay
 
@@ -88,6 +88,23 @@ class GuardTrip(Enum):
     TARGET_FACE = "borehole off the seen face"
     TARGET_JUMPS = "borehole has just jumped"
     ENVELOPE = "arm too near to ground, machine or a stay-out box"
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Fault of a joint that is not driven or does not move as asked.
+
+    Attributes:
+        fault: The fault, `GuardTrip.NONE` while all joints move as commanded.
+        joint: Number of its joint, -1 without.
+    """
+
+    fault: GuardTrip
+    joint: int
+
+
+NOTHING_OBSERVED = Observation(GuardTrip.NONE, -1)
+"""Where nothing was found, or nobody looks."""
 
 
 @dataclass(frozen=True)
@@ -184,6 +201,21 @@ class GuardDecision:
         return self.state.sends
 
 
+class CommandEnvelope(Protocol):
+    """A check of commands by the place of the arm, beside the guard; see `deploy.checks.envelope`."""
+
+    def limit_command(
+        self,
+        u: Numbers,
+        q: Numbers,
+        under_way_s: Numbers,
+        faces_in_base_m: tuple[Numbers, ...] | None,
+        is_seen: bool,
+    ) -> tuple[Numbers, bool]:
+        """Return the command within the envelope, and whether it was withheld."""
+        ...
+
+
 class Guard:
     """State machine that passes, limits or withholds each requested command.
 
@@ -193,7 +225,9 @@ class Guard:
         envelope: Of the arm; `None`: there is none.
     """
 
-    def __init__(self, limits: GuardLimits, bounds: JointBounds, envelope: Envelope | None) -> None:
+    def __init__(
+        self, limits: GuardLimits, bounds: JointBounds, envelope: CommandEnvelope | None
+    ) -> None:
         self._limits, self._bounds, self._envelope = limits, bounds, envelope
         self._still = (0.0,) * len(bounds.lower)
         self._state, self._cause = GuardState.SILENT, GuardTrip.NONE

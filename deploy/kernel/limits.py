@@ -38,7 +38,7 @@ class StayOutBox:
 
 @spec
 class EnvelopeLimits:
-    """Limits of the envelope; see `deploy.kernel.envelope`.
+    """Limits of the envelope; see `deploy.checks.envelope`.
 
     Attributes:
         shapes: File with the machine's shapes, from `brokk mode=export`: a path, or `package:path`.
@@ -109,7 +109,7 @@ class FlowLimits:
 
 @spec
 class ObserverLimits:
-    """Limits of the observer; its thresholds stand in its file, see `deploy.kernel.observer`.
+    """Limits of the observer; its thresholds stand in its file, see `deploy.checks.observer`.
 
     Attributes:
         path: Its file, from `brokk mode=observe`: a path, or `package:path`.

@@ -26,9 +26,8 @@ from deploy.bus.description import (
 from deploy.guidance import LeverMap, find_full_angles_rad
 from deploy.kernel.clock import GatewayClock
 from deploy.kernel.flow_check import FROM_PC, FlowCheck
-from deploy.kernel.guard import GuardDecision, GuardInput, GuardTrip
+from deploy.kernel.guard import NOTHING_OBSERVED, GuardDecision, GuardInput, GuardTrip, Observation
 from deploy.kernel.limits import GuardLimits, build_joint_bounds
-from deploy.kernel.observer import NOTHING_OBSERVED, Observation
 from deploy.kernel.plausibility import PlausibilityFilter
 from deploy.kernel.protection import ChannelTrust, MessageFault, ProtectedChannel
 from deploy.runtime.operator_state import OperatorState

@@ -28,6 +28,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.signals import Frame
 from deploy.bus.description import BusDescription, MessageLayout
+from deploy.checks.shapes import MachineShapes, read_machine_shapes
 from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.kernel.protection import MessageFault
 from deploy.recorder.topics import TIME, TOPICS, TopicSchema, describe_bus_fields
@@ -35,7 +36,6 @@ from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
-from deploy.shapes import MachineShapes, read_machine_shapes
 
 if TYPE_CHECKING:
     from deploy.recorder.scene_topics import SceneTopics
@@ -65,7 +65,7 @@ class CaptureConfig:
         machine: The machine.
         facts: Further metadata: `source`, `policy`, …
         pictures_hz: Pictures of the camera a second; 0: none.
-        shapes: File with the machine's shapes (`deploy.shapes`); `None`: none are drawn.
+        shapes: File with the machine's shapes (`deploy.checks.shapes`); `None`: none are drawn.
     """
 
     folder: Path

@@ -37,13 +37,13 @@ from google.protobuf.message import Message
 from brokk_rl.kinematics import compute_tool_kinematics, rotate_about_axis
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
+from deploy.checks.shapes import BASE, MachineShapes
 from deploy.kernel.guard import GuardState
 from deploy.page.scene import plan_approach
 from deploy.picture import decode_jpeg, encode_jpeg
 from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import AdviceStatus
 from deploy.runtime.target import NEAR_M
-from deploy.shapes import BASE, MachineShapes
 
 SHAPES, SHAPE_POINTS = "scene/machine", "scene/machine_points"
 TASK, TASK_POINTS = "scene/task", "scene/task_points"

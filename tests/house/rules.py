@@ -66,16 +66,25 @@ DOORS = {
 }
 CLOSED = {
     "deploy": ("brokk_rl.sim", "brokk_rl.rl", "mujoco", "warp", "rsl_rl"),
-    "deploy.kernel.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.kernel.guard": (
+        "torch",
+        "os",
+        "pathlib",
+        "socket",
+        "io",
+        "time",
+        "numpy",
+        "deploy.checks",
+    ),
     "deploy.kernel.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.kernel.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.kernel.under_way": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.kernel.flow_check": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.kernel.target_check": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.kernel.receiver": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.kernel.bus_logic": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.kernel.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.kernel.observer": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.kernel.receiver": ("torch", "os", "pathlib", "socket", "io", "time", "deploy.checks"),
+    "deploy.kernel.bus_logic": ("torch", "os", "pathlib", "socket", "io", "time", "deploy.checks"),
+    "deploy.checks.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.checks.observer": ("torch", "os", "pathlib", "socket", "io", "time"),
 }
 """What a package must not import, whatever its floor: the machine's own computer has neither
 simulator nor trainer."""

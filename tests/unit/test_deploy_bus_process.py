@@ -19,8 +19,7 @@ from deploy.bus.can_bus import CanFrame
 from deploy.kernel import bus_process
 from deploy.kernel.bus_logic import BusInputs, BusLogic
 from deploy.kernel.bus_process import FRAME, BusProcess, BusProcessConfig
-from deploy.kernel.guard import GuardDecision, GuardState, GuardTrip
-from deploy.kernel.observer import NOTHING_OBSERVED, Observation
+from deploy.kernel.guard import NOTHING_OBSERVED, GuardDecision, GuardState, GuardTrip, Observation
 from deploy.kernel.protection import MessageFault
 from deploy.kernel.target_check import SeenTarget
 from deploy.runtime.operator_state import OperatorControls, PageSignal, RequestedCommand

@@ -23,10 +23,10 @@ from brokk_rl.registry import resolve_package_path
 from brokk_rl.sim import shapes
 from brokk_rl.sim.shapes import describe_shapes
 from deploy import guard_setup
-from deploy.kernel.envelope import Envelope, measure_segment_to_box
+from deploy.checks.envelope import Envelope, measure_segment_to_box
+from deploy.checks.shapes import LinkCapsule, MachineShapes, read_machine_shapes
 from deploy.kernel.limits import EnvelopeLimits, Numbers, StayOutBox
 from deploy.kernel.under_way import CommandsUnderWay
-from deploy.shapes import LinkCapsule, MachineShapes, read_machine_shapes
 
 MACHINE = option("machine", "brokk170")
 GUARD = option("guard", "default")

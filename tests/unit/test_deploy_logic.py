@@ -17,11 +17,11 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
+from deploy.checks.envelope import Envelope
+from deploy.checks.observer import Observer
 from deploy.kernel.bus_logic import LAST_ZEROS, BusInputs, BusLogic, is_armed
-from deploy.kernel.envelope import Envelope
-from deploy.kernel.guard import GuardState, GuardTrip
+from deploy.kernel.guard import NOTHING_OBSERVED, GuardState, GuardTrip, Observation
 from deploy.kernel.limits import GuardLimits
-from deploy.kernel.observer import NOTHING_OBSERVED, Observation, Observer
 from deploy.kernel.protection import MessageFault
 from deploy.kernel.target_check import SeenTarget
 from deploy.runtime.operator_state import OperatorControls, PageSignal, RequestedCommand

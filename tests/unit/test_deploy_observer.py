@@ -14,9 +14,9 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from deploy.kernel.guard import GuardTrip
-from deploy.kernel.observer import NOTHING_OBSERVED, Observer, classify_fault
-from deploy.kernel.valve_model import ValvePredictor, describe_sources, load_observer_file
+from deploy.checks.observer import Observer, classify_fault
+from deploy.checks.valve_model import ValvePredictor, describe_sources, load_observer_file
+from deploy.kernel.guard import NOTHING_OBSERVED, GuardTrip
 from deploy.observer_file import ThresholdSettings
 
 MACHINE = option("machine", "brokk170")

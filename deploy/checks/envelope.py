@@ -1,6 +1,6 @@
 """Envelope of the arm: distance to ground, undercarriage and stay-out boxes, and speed at the face.
 
-Pure: numpy, no file, no clock. The shapes come from `deploy.shapes` once at start.
+Pure: numpy, no file, no clock. The shapes come from `deploy.checks.shapes` once at start.
 
 A command takes effect after the dead time, so the guard looks ahead to where the arm comes to rest
 (`deploy.kernel.under_way`). A command is withheld where it brings any part of the arm, at that place
@@ -19,8 +19,8 @@ import numpy as np
 
 from brokk_rl.kinematics import LinkChain
 from brokk_rl.machine import Machine
+from deploy.checks.shapes import BASE, MachineShapes, RoundedBox
 from deploy.kernel.limits import EnvelopeLimits, Numbers
-from deploy.shapes import BASE, MachineShapes, RoundedBox
 
 APART = 2
 """Difference of link numbers from which two links are checked; neighbours always touch."""

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.machine import Machine
-from deploy.kernel.guard import GuardTrip
-from deploy.kernel.valve_model import ValvePredictor
+from deploy.checks.valve_model import ValvePredictor
+from deploy.kernel.guard import GuardTrip, Observation
 
 STILL, TURNED = 0.3, -0.3
 """Ratio of measured to predicted motion below which a joint stands still, and moves the wrong way.
@@ -40,23 +40,6 @@ BLIND_S = 0.3
 """Time after the dead time until the commands before the first look have come to rest. By hand."""
 LATE = 1.5
 """Periods between two updates above which the windows begin anew."""
-
-
-@dataclass(frozen=True)
-class Observation:
-    """Result of the observer.
-
-    Attributes:
-        fault: The fault, `GuardTrip.NONE` while all joints move as commanded.
-        joint: Number of its joint, -1 without.
-    """
-
-    fault: GuardTrip
-    joint: int
-
-
-NOTHING_OBSERVED = Observation(GuardTrip.NONE, -1)
-"""Where nothing was found, or nobody looks."""
 
 
 @dataclass(frozen=True)
