@@ -40,6 +40,8 @@ class InsertionCriteria:
 
     Attributes:
         strict_depth_m: Depth of the tip below the rim, inside the hole.
+        strict_tilt_rad: Largest tilt of the chisel against the hole at that moment.
+        strict_force_n: Largest contact force of the episode.
         chisel_radius_m: Radius of the chisel; the tip is inside when it is off axis by no more than
             the clearance.
         slack_m: Softness of contacts and the corners of the polygon that stands for the round hole.
@@ -49,6 +51,8 @@ class InsertionCriteria:
     """
 
     strict_depth_m: Positive
+    strict_tilt_rad: Positive
+    strict_force_n: Positive
     chisel_radius_m: Positive
     slack_m: Finite
     paper_alignment: Positive
@@ -107,7 +111,11 @@ class BoreholeInsertion(ToolPoseTask):
         return CandidateTargets((x_m, y_m, z_m), down, columns, z_m)
 
     def judge(
-        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+        self,
+        tip_m: torch.Tensor,
+        pitch_rad: torch.Tensor,
+        peak_force_n: torch.Tensor,
+        start: dict[str, torch.Tensor],
     ) -> PoseJudgement:
         """Judge tool poses; see `ToolPoseTask`."""
         rules, rim = self.success, start["target_m"]
@@ -120,8 +128,11 @@ class BoreholeInsertion(ToolPoseTask):
         turn = (start["target_pitch_rad"] - pitch_rad).abs()
         near = 1 / (1 + distance) >= rules.paper_alignment
         aligned = near & (1 / (1 + turn) >= rules.paper_alignment)
+        reached = inside & (below >= rules.strict_depth_m)
+        is_gentle = peak_force_n <= rules.strict_force_n
         return PoseJudgement(
-            success=inside & (below >= rules.strict_depth_m),
+            reached=reached,
+            success=reached & (turn <= rules.strict_tilt_rad) & is_gentle,
             paper_success=aligned & (below >= rules.paper_height_m),
             closeness=_measure_closeness(
                 distance, lateral, turn, below * inside / rules.strict_depth_m

@@ -31,8 +31,6 @@ PITCH_SCALE_RAD = 0.1
 """The same for the pitch error. Chosen by hand."""
 PLAN_STEP_S = 0.1
 """Step of a planned motion: joints turn by 0.05 rad at most. Chosen by hand."""
-MIRRORED = torch.tensor([1.0, -1.0, 1.0])
-"""Factor of a point in the mirror: only its y changes sides."""
 REACH_CENTER_M = 2.0
 """Subtracted from the reach; about the middle of the paper's range, 1.7 to 2.4 m."""
 REACH_DAMPING = 0.05
@@ -332,29 +330,6 @@ class ToolPoseControl:
         if self.adviser is None or proposed is None:
             return u
         return self.adviser.proposal(u, self._forget(proposed, 0.0))
-
-    def mirror(self, signs: torch.Tensor) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-        """Return factor and shift of each number of the groups `policy` and `guide` in the mirror.
-
-        Args:
-            signs: See `brokk_rl.symmetry.compute_joint_signs`, `(J,)`.
-        """
-        across = MIRRORED.to(signs)
-        sides = {TARGET: across, "q": signs, "u": signs, PROPOSALS: signs, PITCH: signs.new_ones(1)}
-        factors, shifts = [], []
-        for name, part in self.encoder.parts.items():
-            factor = sides[name].repeat(part.size // len(sides[name]))
-            mean, std = torch.as_tensor(part.mean), torch.as_tensor(part.std)
-            shift = (sides[name] - 1) * (mean / std).to(signs)
-            factors.append(factor)
-            shifts.append(shift.repeat(part.size // len(shift)))
-        # in the order of `compute_features`: of the errors only the tangential one changes sides
-        errors = torch.cat((across, signs.new_ones(1)))
-        # pitch error at two scales, reach, phase
-        same = signs.new_ones(4)
-        guide = torch.cat((signs, signs, errors, errors, errors, same))
-        policy = torch.cat(factors), torch.cat(shifts)
-        return {"policy": policy, "guide": (guide, torch.zeros_like(guide))}
 
     def _forget(self, history: torch.Tensor, rest: float | None = None) -> torch.Tensor:
         """Return a history `(N, H, J)` with `rest` before the memory; `None`: at rest there."""

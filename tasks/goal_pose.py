@@ -81,15 +81,21 @@ class GoalPose(ToolPoseTask):
         return CandidateTargets(place_m, uniform(pose.pitch_rad), columns, ground)
 
     def judge(
-        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+        self,
+        tip_m: torch.Tensor,
+        pitch_rad: torch.Tensor,
+        peak_force_n: torch.Tensor,
+        start: dict[str, torch.Tensor],
     ) -> PoseJudgement:
         """Judge tool poses; see `ToolPoseTask`."""
         rules = self.tolerance
         distance = (start["target_m"] - tip_m).norm(dim=1)
         turn = (start["target_pitch_rad"] - pitch_rad).abs()
         near = 1 / (1 + distance) >= rules.paper_alignment
+        reached = (distance <= rules.strict_distance_m) & (turn <= rules.strict_pitch_rad)
         return PoseJudgement(
-            success=(distance <= rules.strict_distance_m) & (turn <= rules.strict_pitch_rad),
+            reached=reached,
+            success=reached,
             paper_success=near & (1 / (1 + turn) >= rules.paper_alignment),
             closeness=_measure_closeness(distance, turn),
         )

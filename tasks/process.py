@@ -126,8 +126,10 @@ class TerminationManager:
         timed_out = torch.zeros_like(unsound)
         failed = timed_out
         for name in self._list("success", "failure", "time"):
-            held[name] = self._functions[name](state)
             outcome = self.terms[name].outcome
+            held[name] = self._functions[name](state)
+            if outcome == "success":
+                held[name] = held[name] & ~unsound
             if outcome == "time":
                 timed_out = timed_out | held[name]
                 continue
@@ -299,6 +301,7 @@ class EpisodeProcess(TaskProcess):
         self._endings = TerminationManager(task.termination)
         self.reasons = self._endings.reasons
         self._figures = FigureManager(task.figures)
+        self._success_figure = task.curriculum.figure if task.curriculum else SUCCESS
         self.figures = self._figures.figures
         self.state = {name: make_zeros(*shape) for name, shape in self._list_shapes().items()}
         terms = (f"{REWARD}{name}" for name in task.reward)
@@ -330,7 +333,7 @@ class EpisodeProcess(TaskProcess):
     def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
         """Begin new episodes; see `TaskProcess.reset`."""
         fresh = {START + name: value for name, value in start.items()}
-        fresh |= {"succeeded": self.episode[SUCCESS]} | self._draw_errors(start)
+        fresh |= {"succeeded": self.episode[self._success_figure]} | self._draw_errors(start)
         zero = torch.zeros((), device=mask.device)
         for name, value in self.state.items():
             rows = mask.reshape(-1, *[1] * (value.dim() - 1))

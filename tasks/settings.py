@@ -98,11 +98,13 @@ class PoseJudgement:
     """Judgement of tool poses, `(N,)` each.
 
     Attributes:
-        success: The strict criterion holds, bool.
+        reached: The tool is where the task wants it, bool.
+        success: The strict criterion holds: reached, upright enough and without a blow, bool.
         paper_success: The paper's criterion holds, bool.
         closeness: How near the task is to done, 0 to about 1.
     """
 
+    reached: torch.Tensor
     success: torch.Tensor
     paper_success: torch.Tensor
     closeness: torch.Tensor
@@ -379,9 +381,20 @@ class ToolPoseTask(EpisodeTask):
         raise NotImplementedError
 
     def judge(
-        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+        self,
+        tip_m: torch.Tensor,
+        pitch_rad: torch.Tensor,
+        peak_force_n: torch.Tensor,
+        start: dict[str, torch.Tensor],
     ) -> PoseJudgement:
-        """Judge tool poses, `(N, 3)` and `(N,)`, by what was drawn for their episodes."""
+        """Judge tool poses by what was drawn for their episodes.
+
+        Args:
+            tip_m: Tool points in the base frame, `(N, 3)`.
+            pitch_rad: Pitches of the tool, `(N,)`.
+            peak_force_n: Largest contact forces of the episodes so far, `(N,)`.
+            start: What was drawn, `(N, …)` each.
+        """
         raise NotImplementedError
 
     def describe_success(self) -> dict[str, float]:

@@ -158,11 +158,13 @@ class RewardCurriculum:
 
     Attributes:
         begin: Part of its weight with which each term begins, by its name.
+        figure: Figure of an episode, 0 or 1, that counts as success.
         success: Share of successes up to which these parts hold, and from which on the full weights
             do; linear between them.
     """
 
     begin: dict[str, NonNegative]
+    figure: str
     success: tuple[Share, Share]
 
     def check(self) -> None:
@@ -247,6 +249,11 @@ class EpisodeTask:
                     f"curriculum.begin: there is no reward term {name}; "
                     f"{list_choices(name, self.reward)}"
                 )
+        if self.curriculum and self.figures.get(self.curriculum.figure) is None:
+            name = self.curriculum.figure
+            raise ConfigError(
+                f"curriculum.figure: there is no figure {name}; {list_choices(name, self.figures)}"
+            )
         if self.figures.get(SUCCESS) is None:
             raise ConfigError(f"figures.{SUCCESS}: expected the figure by which policies compare")
 

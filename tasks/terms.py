@@ -103,6 +103,7 @@ class ToolState(StepState):
         reach_m: Distance by which the switch decides, `(N,)`.
         reach_range_m: Good working range (nearest, farthest).
         positioning: Whether only the exclusive joints could move in this step, `(N,)` bool.
+        reached: The tool is where the task wants it, `(N,)` bool; `success` asks for more.
         paper_success: The paper's criterion holds, `(N,)` bool.
         closeness: How near the task is to done, 0 to about 1, `(N,)`.
         closeness_before: The same one step earlier.
@@ -113,6 +114,7 @@ class ToolState(StepState):
     reach_m: torch.Tensor
     reach_range_m: tuple[float, float]
     positioning: torch.Tensor
+    reached: torch.Tensor
     paper_success: torch.Tensor
     closeness: torch.Tensor
     closeness_before: torch.Tensor
@@ -203,6 +205,11 @@ def valve_travel(state: StepState) -> torch.Tensor:
 def held_share(state: StepState) -> torch.Tensor:
     """Part of the counted control steps in which the criterion held."""
     return state.held_share
+
+
+def reached(state: ToolState) -> torch.Tensor:
+    """The tool is where the task wants it, however hard and tilted."""
+    return state.reached
 
 
 def paper_success(state: ToolState) -> torch.Tensor:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from brokk_rl.history import History
     from brokk_rl.machine import Machine
-    from brokk_rl.symmetry import Mirror
 
 STEPS = "steps"
 """Entry of `TaskProcess.state` with the control steps of the running episode. The trainer sets it
@@ -46,7 +45,6 @@ OPTIONAL = {
     "bring_near": "starts near its target",
     "describe": "description of its observation",
     "deployable": "policy that can leave the trainer",
-    "mirror": "mirror image",
     "take_estimate": "target that a sensor estimates",
     "plan": "planned motion",
 }
@@ -186,7 +184,12 @@ class TaskProcess(ABC):
         self.refuse("count_starts")
 
     def bring_near(
-        self, start: dict[str, torch.Tensor], share: float, height_m: tuple[float, float], seed: int
+        self,
+        start: dict[str, torch.Tensor],
+        share: float,
+        height_m: tuple[float, float],
+        way: tuple[float, float],
+        seed: int,
     ) -> dict[str, torch.Tensor]:
         """Return starts of which the first part begins upright above its target, on the CPU.
 
@@ -194,6 +197,7 @@ class TaskProcess(ABC):
             start: Starts, as `starts` returns them.
             share: Part of the starts that are brought near.
             height_m: Heights of the tool point above the target, (lowest, highest).
+            way: Parts of the way back to the arm of the start, (least, most).
             seed: The same seed gives the same heights.
         """
         self.refuse("bring_near")
@@ -215,14 +219,6 @@ class TaskProcess(ABC):
         method also has `describe`.
         """
         self.refuse("deployable")
-
-    def mirror(self) -> Mirror:
-        """Return the mirror of all observation groups and of the action.
-
-        Raises:
-            ConfigError: The machine is not left-right symmetric.
-        """
-        self.refuse("mirror")
 
     def take_estimate(self, target_m: torch.Tensor) -> None:
         """Take estimated targets, `(N, 3)`, in the place of drawn errors, from now on."""

@@ -338,7 +338,7 @@ def _check_model(machine: Machine, found: MachineCheck) -> None:
     found.contact = [model.body(body).name for body in list_touching(model)]
     if not found.contact:
         found.missing.append(
-            "no link can touch anything: contact forces stay 0; give the tool's geoms contype and a <touch> sensor"
+            "no link can touch anything: contact forces stay 0; give the tool's geoms contype"
         )
 
 

@@ -249,7 +249,7 @@ class ControlLoop(VecEnv):
             ConfigError: The task cannot do that.
         """
         self.task.require("bring_near", "give rl.near_starts=null")
-        moved = self.task.bring_near(self.starts, near.share, near.height_m, seed)
+        moved = self.task.bring_near(self.starts, near.share, near.height_m, near.way, seed)
         self.starts = {name: value.to(self.device) for name, value in moved.items()}
         self.begin()
 

@@ -6,7 +6,7 @@ the arithmetic. Here the learning rate and the losses stay on the device. Acting
 and a pass over all mini-batches are one replay of a CUDA graph each.
 
 The stored steps are put in the order of the mini-batches once an update, with the inputs of both
-networks normalised, mirrored and padded. rsl-rl does that in every mini-batch of every pass.
+networks normalised and padded. rsl-rl does that in every mini-batch of every pass.
 
 Where several processes train together a mini-batch is two graphs. Between them one sum over all
 processes takes a single buffer: every gradient and the divergence.
@@ -23,13 +23,13 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Normal
 from torch.nn.utils import get_total_norm
 
+from brokk_rl.contracts.task import Policy
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.rollout import CapturedRollout, pad_columns, run_network
 
@@ -67,13 +67,13 @@ class DevicePPO(PPO):
     _wanted: torch.Tensor
     """`desired_kl`, which may change from update to update."""
     _sums: torch.Tensor
-    _teacher: MLPModel | None = None
+    _teacher: Policy | None = None
     _imitation: torch.Tensor
     """Weight of the distance from the teacher."""
 
-    def follow(self, teacher: MLPModel) -> None:
+    def follow(self, teacher: Policy) -> None:
         """Follow a teacher, with weight 0 until `set_imitation`; call it before the first step."""
-        self._teacher = teacher.requires_grad_(False)
+        self._teacher = teacher
         self._imitation = torch.zeros((), device=self.device)
 
     def set_imitation(self, weight: float) -> None:
@@ -273,45 +273,36 @@ class DevicePPO(PPO):
     def shuffle(self, order: torch.Tensor) -> None:
         """Put the stored steps in `order`, the inputs of the networks ready for use.
 
-        Normalisers and teacher do not change while a rollout is learned. Inputs, actions and the
-        teacher's wishes have a leading axis: the steps, and with a mirror their images.
+        Normalisers and teacher do not change while a rollout is learned.
         """
         storage, num = self.storage, len(order)
         observations: Any = storage.observations.flatten(0, 1)[order]
-        actions: Any = storage.actions.flatten(0, 1)[order]
-        if self.symmetry:
-            observations, actions = self.symmetry.data_augmentation_func(
-                env=self.symmetry.env, obs=observations, actions=actions
-            )
-        samples = {"actions": actions.unflatten(0, (-1, num))}
-        if (teacher := self._teacher) is not None:
-            wanted = teacher.mlp(teacher.get_latent(observations)).clamp(-1.0, 1.0)
-            samples["wanted"] = wanted.unflatten(0, (-1, num))
-        stored = {name: getattr(storage, name) for name in ("values", "returns", "advantages")}
+        samples = {}
+        if self._teacher is not None:
+            samples["wanted"] = self._teacher.act(observations).clamp(-1.0, 1.0)
+        names = ("actions", "values", "returns", "advantages")
+        stored = {name: getattr(storage, name) for name in names}
         stored["log_prob"] = storage.actions_log_prob
         for index, value in enumerate(storage.distribution_params or ()):
             stored[f"{PARAMETER}{index}"] = value
         for name, value in stored.items():
-            samples[name] = value.flatten(0, 1)[order][None]
+            samples[name] = value.flatten(0, 1)[order]
         models = {"actor": self.actor, "critic": self.critic}
         if self._samples is None:
             kind = torch.bfloat16 if self.use_mixed_precision else torch.float32
             self._samples = dict(samples)
             for name, model in models.items():
-                shape = (len(samples["actions"]), num, model.obs_dim)
+                shape = (num, model.obs_dim)
                 self._samples[name] = pad_columns(order.new_zeros(shape, dtype=kind))
         for name, value in samples.items():
             self._samples[name].copy_(value)
         for name, model in models.items():
-            latent = model.get_latent(observations).unflatten(0, (-1, num))
-            self._samples[name][..., : model.obs_dim].copy_(latent)
+            self._samples[name][:, : model.obs_dim].copy_(model.get_latent(observations))
 
     def _differentiate(self, first: int) -> None:
         """Differentiate the loss of the mini-batch that begins at row `first` of the samples."""
         rows = slice(first, first + self._batch_size())
-        batch = {
-            name: value[:, rows].flatten(0, 1) for name, value in (self._samples or {}).items()
-        }
+        batch = {name: value[rows] for name, value in (self._samples or {}).items()}
         loss, figures = self._loss(batch)
         gradients = torch.autograd.grad(loss, self._trained, materialize_grads=True)
         torch.cat([*(g.flatten() for g in gradients), figures[-1:]], out=self._gathered)
@@ -322,23 +313,18 @@ class DevicePPO(PPO):
 
         Schulman et al. 2017, equations 7 and 9, with the weights of rsl-rl.
         """
-        actor, own = self.actor, len(batch["values"])
-        sides = len(batch["actor"]) // own
+        actor = self.actor
         old_values, returns, advantages, old_log_prob = (
             batch[name] for name in ("values", "returns", "advantages", "log_prob")
         )
         if self.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        old_values, returns, advantages, old_log_prob = (
-            value.repeat(sides, 1) if sides > 1 else value
-            for value in (old_values, returns, advantages, old_log_prob)
-        )
         # not by calling the actor: that would draw actions, and torch's check of their spread asks
         # the host
         mixed = self.use_mixed_precision
         actor.distribution.update(run_network(actor.mlp, batch["actor"], mixed))  # type: ignore
         log_prob = actor.get_output_log_prob(batch["actions"])
-        entropy = actor.output_entropy[:own].mean()
+        entropy = actor.output_entropy.mean()
         values = run_network(self.critic.mlp, batch["critic"], mixed)
         ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
         gain = advantages.squeeze(1)
@@ -351,7 +337,7 @@ class DevicePPO(PPO):
         value_loss = value_loss.mean()
         loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         with torch.no_grad():
-            new = tuple(value[:own] for value in actor.output_distribution_params)
+            new = actor.output_distribution_params
             old = tuple(batch[f"{PARAMETER}{index}"] for index in range(len(new)))
             divergence = self._measure_divergence(old, new)
         if self._teacher is not None:

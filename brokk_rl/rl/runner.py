@@ -8,17 +8,16 @@ import logging
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
-from brokk_rl.policy_folder import TaskDescription, find_policy, list_checkpoints, read_checkpoint
+from brokk_rl.policy_folder import TaskDescription, list_checkpoints, read_checkpoint
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.policy import load_policy, scale_output
+from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy, scale_output
 from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
 
@@ -61,8 +60,6 @@ class TrainingRunner(OnPolicyRunner):
         offered = list(map(str, env.get_observations().keys()))
         _require_groups(training.runner["obs_groups"], offered)
         config = training.runner_config()
-        if training.symmetry:
-            config["algorithm"]["symmetry_cfg"] = _mirror_steps(env)
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, config, log_dir=None, device=str(env.device))
@@ -73,7 +70,11 @@ class TrainingRunner(OnPolicyRunner):
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
             if training.teacher:
-                self.alg.follow(load_policy(find_policy(training.teacher.folder), env).actor)
+                folder = training.teacher.folder
+                kind = (
+                    TrainedPolicy(path=folder, task=None) if folder else ClassicalPolicy(task=None)
+                )
+                self.alg.follow(kind.build(env, seed=0))
 
     def run(self) -> None:
         """Train until the budget is spent; save a checkpoint every `save_interval`.
@@ -282,12 +283,3 @@ def _require_groups(asked: Mapping[str, Sequence[str]], offered: Collection[str]
                 f"rl.runner.obs_groups.{network}: the task gives no group {', '.join(missing)}; "
                 f"it gives {', '.join(sorted(offered))}: rl.runner.obs_groups.{network}=[policy]"
             )
-
-
-def _mirror_steps(env: ControlLoop) -> dict[str, Any]:
-    """Return what rsl-rl needs to learn from each step and its mirror image.
-
-    Advantage, return and old probability are those of the step itself (Mittal et al. 2024).
-    """
-    env.task.require("mirror", "give rl.symmetry=false")
-    return {"use_data_augmentation": True, "data_augmentation_func": env.task.mirror().augment}

@@ -79,7 +79,7 @@ REFUSED_CLASSES = {
 REFUSED_PARTS = {
     "rnd_cfg": "random network distillation is not supported; more exploration comes from "
     "rl.runner.actor.distribution_cfg.std_range",
-    "symmetry_cfg": "expected null; rl.symmetry=true learns from each step and its mirror image",
+    "symmetry_cfg": "mirrored steps are not supported: they showed no gain (docs/results.md)",
 }
 """Parts of rsl-rl's algorithm that are not supported, and another way."""
 
@@ -137,15 +137,16 @@ class Exploration:
 
 @spec
 class Teacher:
-    """A trained policy that a training follows at its beginning.
+    """A policy that a training follows at its beginning.
 
     Attributes:
-        folder: Its bundle, as `policy.folder`; its task must act as the one that is trained.
+        folder: Folder of a trained policy, whose task must act as the one that is trained; `null`
+            for the task's classical controller.
         weight: Weight of the mean squared distance between the actions of both at the beginning.
         until: Share of the budget at which the weight has fallen to 0, linearly.
     """
 
-    folder: str
+    folder: str | None
     weight: Positive
     until: PositiveShare
 
@@ -161,10 +162,12 @@ class NearStarts:
     Attributes:
         share: Part of the starts that are moved there, the tool upright above its target.
         height_m: Heights above the target, (lowest, highest).
+        way: Parts of the way back to the drawn arm, (least, most), on which they begin.
     """
 
     share: PositiveShare
     height_m: Range
+    way: Annotated[tuple[Share, Share], Ordered()]
 
 
 FAULT_STEPS = 100
@@ -190,8 +193,6 @@ class TrainingConfig:
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.ppo:CappedGaussian`.
-        symmetry: Learn from each step and its left-right mirror image, at twice the arithmetic of an
-            update. The machine has to be symmetric.
         teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
@@ -218,7 +219,6 @@ class TrainingConfig:
     settling: Share
     output_gain: Positive
     exploration: Exploration | None
-    symmetry: bool
     teacher: Teacher | None
     near_starts: NearStarts | None
     max_fault_rate: Share

@@ -246,14 +246,6 @@ class ArmModel:
             )
             self._add_shapes(made, parent, row + 1, at_m, meshes)
         parent.add_site(name=TIP, pos=tool_m, size=[0.01, 0.01, 0.01])
-        bound = 2.0 * float(np.linalg.norm(tool_m)) + 1.0
-        parent.add_site(name="touch", size=[bound, 0.0, 0.0], group=5)
-        made.add_sensor(
-            name="contact",
-            type=mujoco.mjtSensor.mjSENS_TOUCH,
-            objtype=mujoco.mjtObj.mjOBJ_SITE,
-            objname="touch",
-        )
         made.assets = meshes
         compiled = made.compile()
         return compiled, made.to_xml(), meshes

@@ -32,6 +32,7 @@ import torch
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import find_packages, resolve_package_path
+from brokk_rl.sim.frames import check_frames
 from brokk_rl.sim.scene import add_block, add_site
 
 ASSETS = Path(__file__).parent / "assets"
@@ -41,6 +42,11 @@ DAMPING_RATIO = 0.7
 """Of the servo against the inertia seen at the joint at home; a heavier pose is damped less."""
 
 
+CONTACTS = "contact_force"
+"""Name of the sensor of all contacts."""
+NUM_CONTACTS, LARGEST_FIRST = 16, 2
+"""Contacts of a world that are felt, and MuJoCo's number for the largest forces first. Chosen by hand:
+the chisel of `brokk170` has four at most."""
 MAX_SPEED, SPEED_MARGIN = 20.0, 4.0
 """Joint speed (rad/s or m/s) beyond which a world counts as diverged: forty times what `brokk170`
 can do, and a multiple of what a faster machine can."""
@@ -87,8 +93,9 @@ def compile_model(
     _write_options(spec, timestep_s)
     if not visual:
         _remove_visuals(spec)
+    _add_contact_sensor(spec)
     model = spec.compile()
-    _check_touch(model, machine)
+    check_frames(model, machine)
     add_drive(spec, machine, compute_inertia(model, machine.home).diagonal())
     return spec.compile()
 
@@ -128,13 +135,11 @@ def find_mjcf(machine: Machine) -> Path:
     )
 
 
-def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
-    """Return 1 for the touch sensors among `sensordata`, else 0.
-
-    The sum of the touch sensors is the contact force.
-    """
+def mask_normal_forces(model: mujoco.MjModel) -> np.ndarray:
+    """Return 1 for the normal forces of contacts among `sensordata`, else 0; sum them up."""
     chosen = np.zeros(model.nsensordata)
-    chosen[model.sensor_adr[model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH]] = 1.0
+    sensor = model.sensor(CONTACTS)
+    chosen[int(sensor.adr[0]) : int(sensor.adr[0] + sensor.dim[0]) : 3] = 1.0
     return chosen
 
 
@@ -180,16 +185,13 @@ def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
     return spec
 
 
-def _check_touch(model: mujoco.MjModel, machine: Machine) -> None:
-    """Raise a `ConfigError` where a link can touch something and no touch sensor would feel it."""
-    is_touch = model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH
-    felt = {int(model.site_bodyid[site]) for site in model.sensor_objid[is_touch]}
-    if missing := [body for body in list_touching(model) if body not in felt]:
-        raise ConfigError(
-            f"machine {machine.name}: geoms of {', '.join(model.body(i).name for i in missing)} can touch "
-            "the block, but no touch sensor feels it; add a site around them and a <touch> sensor to "
-            'the MJCF, or give these geoms contype="0" conaffinity="0"'
-        )
+def _add_contact_sensor(spec: mujoco.MjSpec) -> None:
+    """Feel every contact, in the place of the sensors that the MJCF has."""
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    force = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+    sensor = spec.add_sensor(name=CONTACTS, type=mujoco.mjtSensor.mjSENS_CONTACT)
+    sensor.intprm = [force, LARGEST_FIRST, NUM_CONTACTS]
 
 
 def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:
@@ -429,12 +431,6 @@ def _has_branches(model: mujoco.MjModel) -> bool:
     return bool((model.dof_parentid != np.arange(-1, model.nv - 1)).any())
 
 
-def _has_changed_touch(model: mujoco.MjModel) -> bool:
-    is_touch = model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH
-    values = (model.sensor_cutoff, model.sensor_delay, model.sensor_interval[:, 0])
-    return any((value[is_touch] != 0).any() for value in values)
-
-
 FEATURES: dict[str, tuple[Callable[[mujoco.MjModel], Any], tuple[Backend, ...]]] = {
     "a flag actuation=disable, sensor=disable or autoreset=disable": (
         lambda model: model.opt.disableflags & _NEEDED,
@@ -447,7 +443,6 @@ FEATURES: dict[str, tuple[Callable[[mujoco.MjModel], Any], tuple[Backend, ...]]]
         lambda model: model.nplastic or model.jnt_springyield.any(),
         ("native",),
     ),
-    "touch sensors with cut-off, delay or interval": (_has_changed_touch, ("native",)),
     "tendons": (lambda model: model.ntendon, ("native",)),
     "equalities": (lambda model: model.neq, ("native",)),
     "deformable bodies": (lambda model: model.nflex, ("native",)),

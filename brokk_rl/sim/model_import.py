@@ -142,7 +142,7 @@ class _MachineDescription:
             f"dead time ({self._drive.dead_time_s:g} s) and stiffness are guesses; mode=identify measures the dead time."
         )
         self._remarks.append(
-            "Only the last link touches anything; give other links contype, a site and a <touch> sensor in the MJCF."
+            "Only the last link touches anything; give other links contype in the MJCF."
         )
         return ImportedMachine(values, mjcf, meshes, self._remarks)
 

@@ -11,7 +11,7 @@ from mujoco.batch import Batch, SimulationError
 
 from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
-from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model, mask_contact_sensors
+from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model, mask_normal_forces
 from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
@@ -85,11 +85,11 @@ class NativeWorld:
             WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
         )
         self.trace = {"q": self._qpos, "speed": self._qvel, "reference": self._drive.reference}
-        # touch sensors measure in every substep; recording them all catches a peak between two
-        # control steps
+        # contacts are felt in every substep; recording them all catches a peak between two control
+        # steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
         self._sensors = torch.from_numpy(self._recorded["sensordata"])
-        self._is_touch = torch.from_numpy(mask_contact_sensors(self.model))
+        self._is_normal = torch.from_numpy(mask_normal_forces(self.model))
         self.q = torch.zeros(num_worlds, machine.num_joints)
         self.contact_force_n = torch.zeros(num_worlds)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool)
@@ -103,7 +103,7 @@ class NativeWorld:
             self._batch.rollout(self.substeps, record=("sensordata",), out=self._recorded)
         except SimulationError as error:  # those worlds keep the state they had, all others went on
             self.faults[torch.from_numpy(error.ids)] = True
-        self.contact_force_n.copy_((self._sensors @ self._is_touch).amax(1))
+        self.contact_force_n.copy_((self._sensors @ self._is_normal).amax(1))
         self.q.copy_(self._qpos)
         self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(
             self._warning.flatten(1).any(1)

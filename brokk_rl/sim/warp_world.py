@@ -43,8 +43,7 @@ def _keep_peak(
 
     The normal force is the first row of each contact in an elliptic cone.
 
-    The same as the sum of the touch sensors (`sim.native` reads those), for one launch instead of
-    eight.
+    `sim=native` sums up the same.
     """
     world = wp.tid()
     total = wp.float32(0.0)  # a plain literal would be a constant to Warp

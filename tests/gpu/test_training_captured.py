@@ -1,4 +1,4 @@
-"""Training on a real GPU: faults, rewards and the mirror in CUDA graphs; episodes of both simulators."""
+"""Training on a real GPU: faults and rewards in CUDA graphs; episodes of both simulators."""
 
 from __future__ import annotations
 
@@ -155,10 +155,8 @@ def test_paired_episodes_of_the_task_end_alike(
     assert np.median(apart) < 0.1, apart
 
 
-def test_a_training_with_the_mirror_and_a_recorder_stays_captured(
-    machine: Machine, tmp_path: Path
-) -> None:
-    training = replace(runs.small(max_env_steps=NUM * runs.STEPS * 6, symmetry=True), num_envs=NUM)
+def test_a_training_with_a_recorder_stays_captured(machine: Machine, tmp_path: Path) -> None:
+    training = replace(runs.small(max_env_steps=NUM * runs.STEPS * 6), num_envs=NUM)
     loop = make_loop(machine)
     loop.record_faults(20, tmp_path)
     loop.capture()

@@ -43,6 +43,7 @@ def state() -> ToolState:
         u=torch.tensor([[0.5, 0.0, -0.25, 0.0, 1.0]]),
         u_before=torch.tensor([[0.25, 0.0, 0.25, 0.0, 1.0]]),
         success=NO,
+        reached=NO,
         paper_success=NO,
         failed=NO,
         closeness=torch.tensor([0.5]),
@@ -206,7 +207,8 @@ def test_a_heavy_blow_pays_for_what_the_peak_grows_beyond_ten_kilonewtons(
 
 
 def curriculum(**changes: object) -> RewardCurriculum:
-    parts = {"begin": {"command_change": 0.2, "failure": 0.0}, "success": (0.5, 0.9)} | changes
+    parts = {"begin": {"command_change": 0.2, "failure": 0.0}, "success": (0.5, 0.9)}
+    parts |= {"figure": "success_reached"} | changes
     return RewardCurriculum(**parts)  # type: ignore[arg-type]
 
 
@@ -241,4 +243,6 @@ def test_a_curriculum_of_a_term_that_the_task_lacks_is_refused(name: str) -> Non
     task = option("task", name)
     with pytest.raises(ConfigError, match=r"there is no reward term speed; choices: "):
         replace(task, curriculum=curriculum(begin={"speed": 0.5}))
+    with pytest.raises(ConfigError, match=r"there is no figure touched; choices: "):
+        replace(task, curriculum=curriculum(figure="touched"))
     replace(task, curriculum=curriculum(begin={"failure": 0.5}))

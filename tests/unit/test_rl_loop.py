@@ -273,7 +273,7 @@ def test_without_a_compiler_it_says_what_to_do(
 def test_part_of_the_starts_of_a_training_lies_above_the_target(machine: Machine) -> None:
     loop = make(machine)
     before = {name: value.clone() for name, value in loop.starts.items()}
-    loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3)), 1)
+    loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3), way=(0.0, 0.0)), 1)
     start = loop.starts
     pose = Kinematics(machine).pose(start["q"][:32])
     away = pose.tip_in_base_m - start["target_m"][:32]
@@ -295,7 +295,7 @@ def test_a_task_that_cannot_bring_its_starts_near_says_so(
     loop = make(machine)
     monkeypatch.setattr(type(loop.task), "offers", frozenset())
     with pytest.raises(ConfigError, match=r"no starts near its target.*rl\.near_starts=null"):
-        loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3)), 1)
+        loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3), way=(0.0, 0.0)), 1)
 
 
 class _Pointing:

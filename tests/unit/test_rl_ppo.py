@@ -113,11 +113,15 @@ def test_compiled_parts_learn_the_same_as_rsl_rls_own() -> None:
         torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)
 
 
-def _teacher() -> MLPModel:
+class _Teacher(MLPModel):
+    act = MLPModel.forward
+
+
+def _teacher() -> _Teacher:
     torch.manual_seed(7)
     seen = TensorDict({"policy": torch.zeros(1, 7)}, batch_size=[1])
     noise = {"class_name": "GaussianDistribution"}
-    return MLPModel(seen, GROUPS, "actor", 3, (16,), distribution_cfg=noise)
+    return _Teacher(seen, GROUPS, "actor", 3, (16,), distribution_cfg=noise)
 
 
 def test_a_teacher_of_no_weight_changes_nothing() -> None:

@@ -28,10 +28,9 @@ SMALL_MJCF = """
       <body name="swing_link" pos="0 0 1"><joint name="swing"/><geom class="free" size="0.06" fromto="0 0 0 1.5 0 0"/>
         <body name="lance_link" pos="1.5 0 0"><joint name="lance"/>
           <geom name="rod" type="capsule" size="0.04" fromto="0 0 -0.4 0 0 -0.96" contype="1" conaffinity="0"/>
-          <site name="tip" pos="0 0 -1"/><site name="feel" type="sphere" size="3"/>
+          <site name="tip" pos="0 0 -1"/>
         </body></body></body>
   </worldbody>
-  <sensor><touch site="feel"/></sensor>
 </mujoco>"""
 
 

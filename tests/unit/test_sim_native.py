@@ -1,6 +1,8 @@
 """The native world against plain MuJoCo, and what drive, contact, resets and faults must do."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,6 +12,7 @@ import torch
 from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.sim.model import ASSETS
 from brokk_rl.sim.native_world import NativeWorld
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator
@@ -64,6 +67,34 @@ def _lower(
     return peak
 
 
+def _sum_normal_forces(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Returns the sum over all contacts, N."""
+    total, force = 0.0, np.zeros(6)
+    for contact in range(data.ncon):
+        mujoco.mj_contactForce(model, data, contact, force)
+        total += force[0]
+    return total
+
+
+@pytest.mark.parametrize(("size_m", "count"), [(0.02, 1), (3.0, 2)])
+def test_touch_sensors_that_lie_do_not_change_the_force(
+    machine: Machine, size_m: float, count: int, tmp_path: Path
+) -> None:
+    text = (ASSETS / machine.mjcf).read_text()
+    text = text.replace('<site name="tip"', f'<site name="feel" size="{size_m}"/><site name="tip"')
+    sensors = '<touch site="feel"/>' * count
+    text = text.replace("</worldbody>", f"</worldbody><sensor>{sensors}</sensor>")
+    (tmp_path / "arm.xml").write_text(text)
+    scene = make_nominal_scenes(1)
+    q = _above_hole(machine, scene, torch.tensor([[0.15, 0.0]]))
+    peaks = []
+    for one in (machine, replace(machine, mjcf=str(tmp_path / "arm.xml"))):
+        world = _world(one)
+        world.reset(_all(1), q, scene)
+        peaks.append(_lower(machine, world, q, 0.1))
+    assert peaks[0] > 1000.0 and torch.equal(*peaks)
+
+
 def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
     world = _world(machine, 3)
     generator = torch.Generator().manual_seed(0)
@@ -93,7 +124,7 @@ def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
             peak = 0.0
             for _ in range(5):
                 mujoco.mj_step(world._batch.get_model(i), one)
-                peak = max(peak, one.sensordata.sum())
+                peak = max(peak, _sum_normal_forces(world._batch.get_model(i), one))
             assert world.contact_force_n[i].item() == pytest.approx(peak, rel=1e-4, abs=1e-3)
             np.testing.assert_allclose(world._qpos[i].numpy(), one.qpos, atol=1e-6)
             touched = touched or peak > 0

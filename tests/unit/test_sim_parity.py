@@ -27,7 +27,6 @@ CHANGES: dict[str, tuple[str, str]] = {
     "polynomial stiffness": (JOINT, '<joint stiffness="0 500000 0" name="q3"'),
     "friction": (JOINT, '<joint frictionloss="9000" name="q3"'),
     "armature": (JOINT, '<joint armature="900" name="q3"'),
-    "reference": (JOINT, '<joint ref="0.4" name="q3"'),
     "soft limits": (JOINT, '<joint solreflimit="0.2 1" margin="0.05" name="q3"'),
     "adhesion": (TOOL, '<geom adhesion="9000" name="chisel" class="chisel_contact"'),
     "surface velocity": (TOOL, '<geom surfacevel="0.9 0.4 0" name="chisel" class="chisel_contact"'),
@@ -45,12 +44,12 @@ CHANGES: dict[str, tuple[str, str]] = {
     "water": (OPTIONS, f'{OPTIONS}<option density="9000" viscosity="90"/>'),
     "friction cone": (OPTIONS, f'{OPTIONS}<option impratio="20"/>'),
     "fixed length": (
-        "<sensor>",
-        '<tendon><fixed name="t" stiffness="900000"><joint joint="q3" coef="1"/></fixed></tendon><sensor>',
+        "</worldbody>",
+        '</worldbody><tendon><fixed name="t" stiffness="900000"><joint joint="q3" coef="1"/></fixed></tendon>',
     ),
     "coupled joints": (
-        "<sensor>",
-        '<equality><joint joint1="q3" joint2="q4" polycoef="0 1 0 0 0"/></equality><sensor>',
+        "</worldbody>",
+        '</worldbody><equality><joint joint1="q3" joint2="q4" polycoef="0 1 0 0 0"/></equality>',
     ),
 }
 """Parts that an MJCF may have: the text of the shipped one, and what stands there instead."""
@@ -151,13 +150,26 @@ def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
     assert refuse("no actuation").endswith("from the MJCF")
 
 
-def test_actuators_in_an_mjcf_and_links_without_touch_are_refused(machine, tmp_path):
-    own = ("<sensor>", '<actuator><motor name="winch" joint="q3"/></actuator><sensor>')
+def test_actuators_in_an_mjcf_are_refused(machine, tmp_path):
+    own = "</worldbody>", '</worldbody><actuator><motor name="winch" joint="q3"/></actuator>'
     with pytest.raises(ConfigError, match=r"has actuators \(winch\)"):
         compile_model(change_mjcf(machine, tmp_path, own), 0.01)
-    deaf = ('<touch name="q5_force" site="q5_touch"/>', "")
-    with pytest.raises(ConfigError, match=r"geoms of q5_link can touch the block"):
-        compile_model(change_mjcf(machine, tmp_path, deaf), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("joint", "change"),
+    [
+        ("q3", (JOINT, '<joint ref="0.4" name="q3"')),
+        ("q4", ('<body name="q4_link"', '<body euler="0 0.3 0" name="q4_link"')),
+        ("q5", ('<body name="q5_link"', '<body quat="0.99 0.1 0 0" name="q5_link"')),
+        ("q1", ('<body name="undercarriage"', '<body pos="0 0 0.1" name="undercarriage"')),
+    ],
+)
+def test_an_arm_that_does_not_stand_where_the_yaml_has_it_is_refused_by_its_joint(
+    machine, tmp_path, joint, change
+):
+    with pytest.raises(ConfigError, match=rf"m away in random poses: joint {joint} "):
+        compile_model(change_mjcf(machine, tmp_path, change), 0.01)
 
 
 def test_mujoco_c_itself_refuses_what_the_drive_cannot_do(machine, tmp_path):
