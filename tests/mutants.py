@@ -3,6 +3,7 @@
     python tests/mutants.py                          # all of the core, about half an hour
     python tests/mutants.py deploy.kernel.guard       # one module
     python tests/mutants.py 300                      # so many of the kernel, drawn by chance
+    python tests/mutants.py science 200              # so many of what figures rest on
 
 Comparisons turned, off by one boundary, negated conditions, arithmetic exchanged, constants
 changed, statements dropped. Each mutant runs in a forked process. What survives stands in
@@ -51,6 +52,21 @@ CORE = {
     "deploy.checks.observer": ["test_deploy_observer.py"],
 }
 """Modules that decide what reaches the valves, and the tests of each."""
+SCIENCE = {
+    "brokk_rl.kinematics": ["test_kinematics.py"],
+    "brokk_rl.observation": ["test_observation.py"],
+    "brokk_rl.statistics": ["test_compare.py"],
+    "tasks.control": ["test_classical.py", "test_task_masks.py", "test_advice.py"],
+    "tasks.terms": ["test_reward.py", "test_term_task.py"],
+    "diagnosis.engine.decide": ["test_diagnosis_engine.py"],
+    "diagnosis.engine.measure": ["test_diagnosis_engine.py"],
+    "diagnosis.engine.rows": ["test_diagnosis_engine.py"],
+    "diagnosis.engine.sizes": ["test_diagnosis_engine.py"],
+    "exam.answer_scoring": ["test_exam_marks.py"],
+    "exam.score": ["test_exam_marks.py"],
+}
+"""Modules on which figures rest, and the tests of each."""
+OURS = ("brokk_rl", "tasks", "actuators", "diagnosis", "deploy", "exam", "perception", "study")
 PYTEST = ["-x", "-q", "--no-header", "--assert=plain"]
 PYTEST += ["-p", "no:cacheprovider", "-p", "no:unraisableexception", "-p", "no:threadexception"]
 LONGEST_S = 120
@@ -193,7 +209,7 @@ def survivors(module: str, tests: Sequence[str], only: set[str] | None) -> tuple
     if pytest.main([*PYTEST, *tests]):
         raise SystemExit(f"{tests} fail without any mutant")
     cache_slow_parts()
-    forget_modules()
+    forget_modules(module)
     if pytest.main([*PYTEST, *tests]):
         raise SystemExit(f"{tests} fail with the cache of slow parts, so that they would kill all")
     gc.freeze()
@@ -212,12 +228,14 @@ def survivors(module: str, tests: Sequence[str], only: set[str] | None) -> tuple
     return found, count
 
 
-def forget_modules() -> None:
-    """Lets the next import read `deploy` and the tests anew; the tests' helpers hold on to what they have imported."""
+def forget_modules(module: str) -> None:
+    """Let the next import read a module's package and the tests anew, since they hold on to what they imported."""
+    package = module.split(".")[0]
+    packages = OURS if package == "brokk_rl" else (package,)
     for name, one in list(sys.modules.items()):
         file = getattr(one, "__file__", None) or ""
         is_test = file.startswith(str(TESTS)) and name not in ("__main__", "mutants")
-        if name.startswith("deploy.") or is_test:
+        if name.split(".")[0] in packages or is_test:
             del sys.modules[name]
 
 
@@ -247,7 +265,7 @@ def _cache(function: Callable[..., Any]) -> Callable[..., Any]:
 def _killed(module: str, tree: ast.Module, tests: Sequence[str], pytest: types.ModuleType) -> int:
     """Runs the tests against a mutant; 0 where they all pass."""
     made = types.ModuleType(module)
-    forget_modules()
+    forget_modules(module)
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         try:
             parent, _, name = module.rpartition(".")
@@ -267,13 +285,14 @@ def main(asked: Sequence[str]) -> int:
     """
     explained = json.loads(EXPLAINED.read_text())
     wrong, sample = 0, None
+    known = CORE | SCIENCE
     modules = list(asked) or list(CORE)
-    if asked and asked[0].isdigit():
+    if asked and asked[-1].isdigit():
         kernel = [name for name in CORE if name.startswith(("deploy.kernel.", "deploy.checks."))]
-        sample = draw_sample(kernel, int(asked[0]))
+        sample = draw_sample(list(SCIENCE) if asked[0] == "science" else kernel, int(asked[-1]))
         modules = list(sample)
     for module in modules:
-        tests = [str(TESTS / "unit" / name) for name in CORE[module]]
+        tests = [str(TESTS / "unit" / name) for name in known[module]]
         left, count = survivors(module, tests, sample and sample[module])
         reasons = explained.get(module, {})
         new = [one for one in left if one not in reasons]

@@ -43,7 +43,7 @@ def read_marks(folder: Path) -> Table:
     rows: Table = []
     for name, meaning in ROWS.items():
         one = marks.get(name)
-        if one is not None:
+        if one is not None and one["value"] is not None:
             low, high = one["ci95"]
             row = {"": meaning, "reached": round(one["value"], 2), "of": one["of"]}
             row["95 %"] = f"{low:.2f} to {high:.2f}"
