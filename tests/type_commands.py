@@ -78,12 +78,12 @@ def make_folder(folder: Path) -> None:
             (folder / path.name).symlink_to(path)
 
 
-def type_page(page: Path, folder: Path) -> list[tuple[str, int, float]]:
-    """Type the commands of a page; return each with its exit code and seconds."""
+def type_page(page: Path, folder: Path) -> int:
+    """Type the commands of a page, print how each ended, and return how many failed."""
     make_folder(folder)
     environment = os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     environment["PATH"] = f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}"
-    done = []
+    num_failed = 0
     for name, block in find_blocks(page):
         if name:
             (folder / name).write_text(block)
@@ -100,20 +100,22 @@ def type_page(page: Path, folder: Path) -> list[tuple[str, int, float]]:
                 code = 0
             if expected:
                 code = int(code != int(expected[1]))
-            done.append((command, code, time.monotonic() - begun_s))
-    return done
+            seconds = time.monotonic() - begun_s
+            state = "failed" if code else "ok"
+            sys.stdout.write(f"{state:7}{seconds:6.0f} s  {page.name}: {command}\n")
+            sys.stdout.flush()
+            num_failed += bool(code)
+    return num_failed
 
 
 def main() -> int:
     """Type the pages and print a line for each command."""
     pages = [Path(name).resolve() for name in sys.argv[1:]] or PAGES
-    found = []
+    num_failed = 0
     for page in pages:
         with tempfile.TemporaryDirectory() as folder:
-            found += [(page.name, *one) for one in type_page(page, Path(folder))]
-    for name, command, code, seconds in found:
-        sys.stdout.write(f"{'failed' if code else 'ok':7}{seconds:6.0f} s  {name}: {command}\n")
-    return int(any(code for _, _, code, _ in found))
+            num_failed += type_page(page, Path(folder))
+    return int(num_failed > 0)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -292,7 +293,13 @@ def circles(sources: Mapping[str, str]) -> list[str]:
 
 def _trees(sources: Mapping[str, str]) -> Iterator[tuple[str, ast.Module]]:
     for module, text in sources.items():
-        yield module, ast.parse(text)
+        yield module, _parse(text)
+
+
+@functools.cache
+def _parse(text: str) -> ast.Module:
+    """Return the tree of a source; each rule asks for all of them."""
+    return ast.parse(text)
 
 
 def _public(

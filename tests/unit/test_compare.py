@@ -64,7 +64,9 @@ def sweep(tmp_path: Path) -> Path:
     return tmp_path / "sweep"
 
 
-@pytest.mark.parametrize(("successes", "trials"), [(8, 10), (0, 10), (10, 10), (1010, 1024)])
+@pytest.mark.parametrize(
+    ("successes", "trials"), [(8, 10), (0, 10), (10, 10), (1010, 1024), (1, 1)]
+)
 def test_wilson_is_that_of_the_books(successes: int, trials: int) -> None:
     # (p + z²/2n ± z √(p (1 - p)/n + z²/4n²)) / (1 + z²/n)
     z, rate = stats.norm.ppf(0.975), successes / trials
