@@ -1,3 +1,4 @@
+# Not built yet: no container daemon was at hand. It runs `make setup`, which is tested.
 # The whole project for the CPU. For an NVIDIA GPU: docker build --build-arg TORCH=lock . and docker run --gpus all
 FROM python:3.11-slim-bookworm
 # git: commits in the dev container; libegl1, libgl1: films and pictures; libglib2.0-0: OpenCV

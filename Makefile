@@ -11,7 +11,7 @@ GET_TORCH = $(UV) pip install --quiet --python $(BIN)/python --no-deps --default
 NO_CUDA = $(shell sed -nE 's/^name = "(torch|triton|nvidia-.*|cuda-.*)"$$/--no-install-package \1/p' uv.lock)
 PRESET ?= $(shell nvidia-smi -L >/dev/null 2>&1 && echo preset=gpu || echo preset=laptop)
 
-.PHONY: help play train test test-all mutants results docs docs-commands check setup clean
+.PHONY: help play train test test-all mutants results docs docs-commands dist check setup clean
 
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -41,6 +41,9 @@ docs: setup             ## the documentation site, in site/; search works once i
 
 docs-commands: setup    ## type the commands of README and tutorials, an hour; PAGES= for some of them
 	$(BIN)/python tests/type_commands.py $(PAGES)
+
+dist: setup             ## wheel and source distribution, in dist/
+	$(UV) build
 
 check: setup            ## format, lint, types
 	$(BIN)/ruff format --check .
