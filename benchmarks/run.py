@@ -58,9 +58,8 @@ def list_measurements() -> dict[str, Measurement]:
 def measure(one: Measurement) -> None:
     """Run the commands of a measurement and write its result."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-        environment["PATH"] = path
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "PATH": path}
         for command in one.commands:
             words = shlex.split(command.format(out=folder))
             subprocess.run(words, cwd=ROOT, env=environment, check=True)

@@ -293,7 +293,7 @@ def main(asked: Sequence[str]) -> int:
         modules = list(sample)
     for module in modules:
         tests = [str(TESTS / "unit" / name) for name in known[module]]
-        left, count = survivors(module, tests, sample and sample[module])
+        left, count = survivors(module, tests, sample[module] if sample else None)
         reasons = explained.get(module, {})
         new = [one for one in left if one not in reasons]
         gone = [] if sample else [one for one in reasons if one not in left]

@@ -114,10 +114,9 @@ def main() -> None:
         (line["condition"], line["distance_m"], line["number"], line["option"])
         for line in read(path)
     }
+    others = given.out / "failures", given.pictures, given.options[0], tuple(given.render)
     tasks = []
-    for number in range(
-        given.count
-    ):  # scene by scene over all rows: stopped early, all of them have as many
+    for number in range(given.count):  # stopped early, all rows have as many scenes
         for condition in given.conditions:
             for distance_m in given.distances:
                 left = tuple(
@@ -126,19 +125,7 @@ def main() -> None:
                     if (condition, distance_m, number, option) not in done
                 )
                 if left:
-                    tasks.append(
-                        Task(
-                            condition,
-                            distance_m,
-                            number,
-                            left,
-                            given.seed,
-                            given.out / "failures",
-                            given.pictures,
-                            given.options[0],
-                            tuple(given.render),
-                        )
-                    )
+                    tasks.append(Task(condition, distance_m, number, left, given.seed, *others))
     if tasks:
         work(tasks, path, given.processes)
     write(given.out, rows(path, given.options))

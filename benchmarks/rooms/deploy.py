@@ -7,13 +7,8 @@ from pathlib import Path
 from measurement import Measurement, Table, load_json
 
 CODE = (
-    "deploy/kernel",
-    "deploy/bus",
-    "deploy/runtime",
-    "deploy/twin",
-    "conf/guard",
-    "conf/machine",
-)
+    "deploy/kernel", "deploy/bus", "deploy/runtime", "deploy/twin", "conf/guard", "conf/machine",
+)  # fmt: skip
 
 
 def read_reactions(folder: Path) -> Table:

@@ -7,12 +7,8 @@ from pathlib import Path
 from measurement import Measurement, Table, load_json
 
 CODE = (
-    "diagnosis",
-    "actuators/effects",
-    "actuators/models",
-    "actuators/identify",
-    "conf/certainty",
-)
+    "diagnosis", "actuators/effects", "actuators/models", "actuators/identify", "conf/certainty",
+)  # fmt: skip
 ROWS = {
     "top1": "one effect: named first",
     "top1_equivalent": "… or a listed equivalent",

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
-from measurement import ROOT, Measurement, Table, load_json
+from measurement import Measurement, Table, load_json
 
 CODE = ("brokk_rl", "tasks", "actuators/models", "actuators/effects", "conf")
 BENCH = "brokk mode=bench preset=gpu bench.num_envs=[16384] session.out={out}/"
@@ -55,12 +53,8 @@ def read_success(folder: Path) -> Table:
 
 def read_main_path(folder: Path) -> Table:
     """Return how many files and functions run before the first update ends."""
-    script = [sys.executable, "benchmarks/main_path.py"]
-    done = subprocess.run(script, cwd=ROOT, capture_output=True, text=True, check=True)
-    files, functions, jumps = done.stdout.splitlines()[-1].split(", ")
-    return [
-        {"files": files.split()[0], "functions": functions.split()[0], "calls": jumps.split()[0]}
-    ]
+    counts = (folder / "path.txt").read_text().splitlines()[-1].split(", ")
+    return [{count.split()[1]: count.split()[0] for count in counts}]
 
 
 MEASUREMENTS = (
@@ -107,7 +101,7 @@ MEASUREMENTS = (
         name="main_path",
         title="Code on the way to the first update",
         conditions="Files and functions of the project that run from `brokk mode=train` to the end of the first PPO update.",
-        commands=(),
+        commands=("bash -c 'python benchmarks/main_path.py > {out}/path.txt'",),
         code=("brokk_rl", "tasks", "actuators"),
         read=read_main_path,
         where="one core",

@@ -10,8 +10,8 @@ PLANTS = ("mlp", "hydraulic", "load_sensing", "post_compensated", "open_center")
 DELAYS_S = ("0.1", "0.3", "0.5")
 EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=false"
 POLICY_CODE = (
-    "tasks", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects", "actuators/weights",
-    "conf/task", "conf/machine", "conf/actuator", "conf/effect",
+    "tasks", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects",
+    "actuators/weights", "conf/task", "conf/machine", "conf/actuator", "conf/effect",
 )  # fmt: skip
 TRAINING_CODE = (*POLICY_CODE, "brokk_rl/rl", "conf/rl", "conf/preset")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import sys
@@ -20,9 +21,7 @@ def benchmarks() -> Iterator[Any]:
     """The program `benchmarks/run.py`, which is in no package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks"))
-        import run
-
-        yield run
+        yield importlib.import_module("run")
         for name in [name for name in sys.modules if name.split(".")[0] in ("run", "rooms")]:
             del sys.modules[name]
 
