@@ -7,7 +7,7 @@ from pathlib import Path
 from measurement import Measurement, Table, load_json
 
 CODE = (
-    "deploy/kernel", "deploy/bus", "deploy/runtime", "deploy/twin", "conf/guard", "conf/machine",
+    "deploy/kernel", "deploy/checks", "deploy/bus", "deploy/runtime", "deploy/twin", "conf/guard", "conf/machine",
 )  # fmt: skip
 
 
