@@ -7,7 +7,8 @@ held_out           a make of plants for sealed exams only
 run_cases          one process a case
 examiner           the repair of an answer, simulated on withheld recordings
 score              one answer against one label
-answer_scoring     all answers of some candidates
+answer_scoring     answers of a candidate, their scores, published answers
+ledger             who answered with which engine, and when labels were opened
 metrics            rates with intervals, calibration, confusion
 report             table, figures
 constant_answer    a candidate to compare with

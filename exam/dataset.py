@@ -122,7 +122,8 @@ class CaseSet:
             made[half] = self.recorder.record(of_half, folders)
         labels = []
         for name, question, half in zip(names, questions, made["field"], strict=True):
-            labels.append(make_label(name, question, half, self.machine))
+            other_hand = self.halves["field"].has_other_hand(question)
+            labels.append(make_label(name, question, half, self.machine, other_hand))
         return labels
 
 
@@ -206,9 +207,9 @@ def _append_private(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
 
 
 def make_label(
-    name: str, question: CaseDesign, field: RecordedHalf, machine: Machine
+    name: str, question: CaseDesign, field: RecordedHalf, machine: Machine, other_hand: bool
 ) -> dict[str, Any]:
-    """Return the label of a case.
+    """Return the label of a case; `other_hand`: another hand drives the field than the reference.
 
     `moved_rad`: root mean square change of the measured motion by its cause, over 5 s from equal
     starts, by joint.
@@ -217,6 +218,7 @@ def make_label(
         "case": name,
         "kind": question.kind,
         "tracked": question.tracked,
+        "other_hand": other_hand,
         "effects": [_label_fault(fault, machine) for fault in question.faults],
         "outside": None
         if question.outside_fault is None

@@ -50,11 +50,14 @@ class HalfPlan:
 
     Attributes:
         programs: Names of the excitations of each file.
+        other_hand: The same in the other half of the cases, as many files, where another hand drives;
+            empty: all cases have `programs`.
         file_s: Length of a file.
         elapsed_s: Range of the time that the machine has run before a file begins.
     """
 
     programs: tuple[tuple[str, ...], ...]
+    other_hand: tuple[tuple[str, ...], ...]
     file_s: float
     elapsed_s: tuple[float, float]
 
@@ -63,6 +66,14 @@ class HalfPlan:
             raise ConfigError(
                 "exam: each file needs one or more excitations, e.g. [[levels], [levels, holds]]"
             )
+        if self.other_hand and len(self.other_hand) != len(self.programs):
+            raise ConfigError(
+                f"other_hand: expected as many files as programs, {len(self.programs)}, got {len(self.other_hand)}"
+            )
+
+    def has_other_hand(self, question: CaseDesign) -> bool:
+        """Return whether another hand drives this half of a case: by its chance, in half of the cases."""
+        return bool(self.other_hand) and question.chance % 2 == 1
 
 
 @dataclass(frozen=True)
@@ -230,7 +241,8 @@ class CaseRecorder:
         )
 
     def _plan(self, job: RecordingJob) -> ExcitationPlan:
-        names = job.half.programs[job.number]
+        other = job.half.has_other_hand(job.question)
+        names = (job.half.other_hand if other else job.half.programs)[job.number]
         for name in names:
             if name not in self._excitations:
                 raise ConfigError(

@@ -90,6 +90,7 @@ ONE, SEVERAL, KNOWN = ("one",), ("several",), ("one", "several")
 ROWS: dict[str, tuple[Any, ...]] = {
     "top1": ("one effect: named first", ONE, lambda s: [s.first], True),
     "top1_equivalent": ("  or a listed equivalent", ONE, lambda s: [s.first_equivalent], True),
+    "top1_other_hand": ("  field by another hand", ONE, lambda s: [s.first] if s.other_hand else [], True),
     "exactly_one": ("one effect: it and no other", ONE, lambda s: [s.exact], True),
     "exactly_one_equivalent": ("  or an equivalent only", ONE, lambda s: [s.exact_equivalent], True),
     "exact_set": ("two or three effects: exact set", SEVERAL, lambda s: [s.exact], True),
@@ -98,6 +99,7 @@ ROWS: dict[str, tuple[Any, ...]] = {
     "set_f1_equivalent": ("  with equivalents", SEVERAL, lambda s: [s.count_names(s.stands_for)], True, compute_ratio),
     "joints": ("joints right, when the effect or an equivalent is", KNOWN, lambda s: s.joints_right, True),
     "false_alarms_none": ("unchanged: an effect or unknown", ("none",), lambda s: [s.alarm], False),
+    "false_alarms_other_hand": ("  field by another hand", ("none",), lambda s: [s.alarm] if s.other_hand else [], False),
     "false_alarms_faint": ("below noise: a false effect or unknown", ("faint",), lambda s: [s.alarm], False),
     "unknown_recall": ("outside the library: said unknown", ("outside",), lambda s: [s.verdict == "unknown"], True),
     "unknown_wrongly": ("a known effect called unknown", KNOWN, lambda s: [s.verdict == "unknown"], False),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
 import os
@@ -19,6 +18,7 @@ from typing import Any, Protocol
 
 import yaml
 
+from brokk_rl.build import describe_spec
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
@@ -187,21 +187,3 @@ def read_note(answer: Path) -> dict[str, Any]:
         return json.loads((answer / NOTE_FILE).read_text())
     except (OSError, ValueError):
         return {}
-
-
-def read_seconds(answer: Path) -> float | None:
-    """Return how long the answer in a folder took, `None` where there is none."""
-    note = read_note(answer)
-    return None if not note or note["error"] else float(note["seconds"])
-
-
-def describe_spec(value: Any) -> Any:
-    """Return a spec as the plain data of an option file: targets, lists and numbers."""
-    if isinstance(value, (list, tuple)):
-        return [describe_spec(one) for one in value]
-    if not dataclasses.is_dataclass(value) or isinstance(value, type):
-        return value
-    node: dict[str, Any] = {"_target_": f"{type(value).__module__}.{type(value).__name__}"}
-    for field in dataclasses.fields(value):
-        node[field.name] = describe_spec(getattr(value, field.name))
-    return node

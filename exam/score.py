@@ -66,6 +66,7 @@ class CaseScore:
         differs: Whether the examiner's share and the answer's own disagree; `None` without both.
         seconds: Time the answer took.
         outside: Name of the fault outside the library.
+        other_hand: Whether another hand drives the field than the reference.
     """
 
     case: str
@@ -85,6 +86,7 @@ class CaseScore:
     differs: bool | None
     seconds: float | None
     outside: str | None
+    other_hand: bool
 
     @property
     def first(self) -> bool:
@@ -180,6 +182,7 @@ def score_answer(
         differs=differs,
         seconds=seconds,
         outside=outside["ailment"] if outside else None,
+        other_hand=label.get("other_hand", False),
     )
 
 

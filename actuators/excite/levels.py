@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from actuators.excite.poses import draw_start_poses
+from actuators.excite.poses import fill_from_poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
@@ -65,14 +65,15 @@ class Levels:
         before: Sequence[Segment],
     ) -> list[Segment]:
         """Return segments of about `pose_s` each, which fill the time."""
-        total = max(1, int(duration_s / machine.period_s))
-        count = min(max(1, round(duration_s / self.pose_s)), total)
-        starts = draw_start_poses(machine, self.stop_margin, generator)
-        segments = []
-        for i in range(count):
-            start, u = next(starts), self._program(machine, total // count, generator)
-            segments.append(Segment(f"levels_{i:02d}", start, u, "inward", self.stop_margin))
-        return segments
+        return fill_from_poses(
+            "levels",
+            machine,
+            duration_s,
+            self.pose_s,
+            self.stop_margin,
+            generator,
+            lambda steps: self._program(machine, steps, generator),
+        )
 
     def _program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands, `(T, J)`."""

@@ -4,10 +4,11 @@ Under a weight of one sign the unequal speed of the two directions, load depende
 uneven dead band look alike.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from brokk_rl.contracts.actuator import Segment
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 
@@ -44,3 +45,33 @@ def draw_start_poses(
         best = int(np.argmin(cost))
         total += pull[best]
         yield candidates[best]
+
+
+def fill_from_poses(
+    name: str,
+    machine: Machine,
+    duration_s: float,
+    pose_s: float,
+    margin: float,
+    generator: np.random.Generator,
+    program: Callable[[int], np.ndarray],
+) -> list[Segment]:
+    """Return segments of about `pose_s` each, from poses of opposite load, which fill the time.
+
+    Args:
+        name: Of the segments, before their numbers.
+        machine: Limits, masses and geometry.
+        duration_s: Time to fill.
+        pose_s: Length of a segment, about.
+        margin: Distance kept from the stops, as a part of each joint's travel.
+        generator: Draws the poses.
+        program: Commands of so many control periods, `(T, J)`.
+    """
+    total = max(1, int(duration_s / machine.period_s))
+    count = min(max(1, round(duration_s / pose_s)), total)
+    starts = draw_start_poses(machine, margin, generator)
+    found = []
+    for i in range(count):
+        start, u = next(starts), program(total // count)
+        found.append(Segment(f"{name}_{i:02d}", start, u, "inward", margin))
+    return found

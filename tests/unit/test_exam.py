@@ -25,6 +25,7 @@ from diagnosis.answer import ANSWER_FILE
 from exam import dataset, run_cases
 from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
 from exam.constant_answer import ConstantAnswer
+from exam.generate import CaseRecorder
 
 
 def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDesign]:
@@ -250,7 +251,7 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
     first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
     assert run_cases.answer_cases(first, [case], answers, machine, 1, ItemProgress("", 1)) == 1
-    assert run_cases.read_seconds(answers / "0000") is None
+    assert run_cases.read_note(answers / "0000")["error"]
     assert run_cases.answer_cases(second, [case], answers, machine, 1, ItemProgress("", 1)) == 0
     assert run_cases.answer_cases(third, [case], answers, machine, 1, ItemProgress("", 1)) == 0
     given, content = second.given[0]
@@ -262,7 +263,7 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     assert (
         third.given == []
         and (answers / "0000" / ANSWER_FILE).is_file()
-        and run_cases.read_seconds(answers / "0000") is not None
+        and run_cases.read_note(answers / "0000")["error"] is None
     )
 
 
@@ -278,3 +279,22 @@ def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_pa
         )
         with pytest.raises(RecordingError, match=message):
             command.answer(tmp_path, tmp_path / "out", machine)
+
+
+def test_another_hand_drives_the_field_of_half_of_the_cases_and_never_the_reference(
+    tmp_path: Path,
+) -> None:
+    words = ("exam_recording=hands", "exam.field.other_hand=[[work],[work]]")
+    mode = load_mode(*SMALL, *words, "exam.mix.num_cases=20", f"session.out={tmp_path}")
+    exam, questions = mode.exam, mode.questions("")
+    recorder = CaseRecorder(
+        mode.machine, exam.plants, "mild", mode.excitation, exam.approach, mode.machine
+    )
+    by_person = set()
+    for job in recorder.planned(questions, exam.field, "field"):
+        if job.plan.runs[0][0].name.startswith("work"):
+            by_person.add(job.case)
+    expected = {n for n, one in enumerate(questions) if exam.field.has_other_hand(one)}
+    assert by_person == expected and 3 < len(expected) < 17
+    for job in recorder.planned(questions[:4], exam.reference, "reference"):
+        assert job.plan.runs[0][0].name.startswith("levels")

@@ -16,6 +16,7 @@ import pytest
 from composed import option
 from small_exam import SMALL
 
+from brokk_rl.build import describe_spec
 from brokk_rl.errors import RecordingError
 from brokk_rl.extensions import load_mode
 from brokk_rl.machine import Machine
@@ -110,7 +111,7 @@ def test_an_exam_of_arms_known_by_their_joints_asks_nothing_that_needs_masses(
     with pytest.raises(RecordingError):
         ExaminerSimulator(exam, "0000", option("fit", "valve"), machine)
     # a program gets the machine as an option file
-    text = json.dumps(run_cases.describe_spec(known))
+    text = json.dumps(describe_spec(known))
     assert '"_target_": "brokk_rl.machine.Machine"' in text and '"body": null' in text
 
 

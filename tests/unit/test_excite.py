@@ -51,7 +51,7 @@ def test_start_poses_load_each_joint_from_both_sides_where_gravity_can(machine: 
 
 def test_a_machine_without_bodies_starts_anywhere_within_its_margins(machine: Machine) -> None:
     bare = by_joints_only(machine)
-    for name in ("levels", "holds", "ramps"):
+    for name in ("levels", "holds", "ramps", "work"):
         for segment in segments(name, bare, 300.0):
             margin = segment.stop_margin * (bare.upper - bare.lower)
             assert (segment.start >= bare.lower + margin).all() and (
@@ -164,7 +164,7 @@ def test_an_excitation_that_finds_no_room_says_so(machine: Machine) -> None:
             segments(name, machine, 5.0)
 
 
-@pytest.mark.parametrize("name", ["sine", "levels", "ramps", "staircase", "reversals"])
+@pytest.mark.parametrize("name", ["sine", "levels", "ramps", "staircase", "reversals", "work"])
 def test_another_seed_draws_others(name: str, machine: Machine) -> None:
     one, other = (segments(name, machine, 300.0, seed) for seed in (1, 2))
     assert any(
@@ -174,3 +174,17 @@ def test_another_seed_draws_others(name: str, machine: Machine) -> None:
         or (a.start != b.start).any()
         for a, b in zip(one, other, strict=False)
     )
+
+
+def test_a_person_at_work_ramps_few_levers_and_corrects_after_a_stroke(machine: Machine) -> None:
+    fields = {"ramp_s": 0.5, "level": (0.9, 0.9), "corrections": 3, "correction_level": (0.2, 0.3)}
+    played = segments("work", machine, 600.0, **fields)
+    u = np.concatenate([segment.u for segment in played])
+    moving = np.abs(u) > 0
+    assert moving.sum(1).max() == 2
+    exclusive = moving[:, machine.is_exclusive].any(1)
+    assert exclusive.any() and not moving[exclusive][:, ~machine.is_exclusive].any()
+    # A stroke of 0.9 takes 0.5 s to ramp, a correction of 0.3 half of its 0.2 s: no jump.
+    assert max(np.abs(np.diff(segment.u, axis=0)).max() for segment in played) < 0.31
+    turned = (u[:-1] * u[1:] < 0).sum() + ((u[:-2] * u[2:] < 0) & (u[1:-1] == 0)).sum()
+    assert turned > 50 and (moving.any(1)).mean() < 0.95
