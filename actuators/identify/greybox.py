@@ -1,7 +1,6 @@
 """Grey-box fits: physical parameters of an actuator model from free runs, with intervals."""
 
 import dataclasses
-import hashlib
 import logging
 import time
 from collections.abc import Sequence
@@ -23,7 +22,6 @@ from actuators.identify.gauss_newton import (
     take_step,
 )
 from actuators.identify.option_file import round_by_joint, write_option
-from actuators.models.checkpoint import ResumeFile
 from actuators.recordings.split import COMMANDED
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator
@@ -192,9 +190,6 @@ class GreyBoxFit:
 
         The files are `<name>.yaml` and `<name>.json`.
 
-        Resumes exactly where an interrupted fit with the same settings and recordings stopped
-        there.
-
         Raises:
             ConfigError: a bound makes no sense, or the actuator has no such number.
             RecordingError: too little data.
@@ -211,11 +206,8 @@ class GreyBoxFit:
             )
         judged = validation or train  # a fit to all recordings has none left to choose a start by
         held = self._free_runs(machine, judged, self.validation_windows, random, device)
-        left = ResumeFile(
-            folder / f"{self.name}.partial.safetensors", self._stamp(machine, runs, held, seed)
-        )
         search = _Search(self, runs)
-        x = search.choose(search.run(nominal, seed, left), held)
+        x = search.choose(search.run(nominal, seed), held)
         sure = estimate_uncertainty(runs, x, self.robust)
         found = self._rounded(machine, runs, x)
         fitted: Any = dataclasses.replace(self.actuator, **found)  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -228,13 +220,12 @@ class GreyBoxFit:
             "windows": len(runs.active),
             "horizon_s": self.horizon_s,
             "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
-            "seconds": round(search.before_s + time.monotonic() - began, 1),
+            "seconds": round(time.monotonic() - began, 1),
             "created": record.format_now(),
             "parameters": tabulate_parameters(found, runs, x, sure),
             "tangled": find_correlated_pairs(machine, runs, sure),
         }
         write_option(folder, self.name, fitted, describe_option(fitted, facts), facts)
-        left.remove()
         log_undetermined(facts)
         return fitted
 
@@ -295,56 +286,28 @@ class GreyBoxFit:
         rows = zip(runs.names, runs.values(x), strict=True)
         return {name: round_by_joint(machine, row) for name, row in rows}
 
-    def _stamp(
-        self, machine: Machine, runs: CandidateRuns, held: CandidateRuns, seed: int
-    ) -> dict[str, Any]:
-        """Return all that the result depends on."""
-        data = hashlib.sha256()
-        for part in (runs.cut, held.cut):
-            data.update(part.u.tobytes() + part.q.tobytes())
-        return {
-            "fit": dataclasses.asdict(self),  # pyright: ignore[reportArgumentType]
-            "machine": machine.fingerprint(),
-            "max_speed": machine.max_speed.tolist(),
-            "seed": seed,
-            "windows": data.hexdigest(),
-        }
-
 
 @dataclass
 class _Search:
-    """The search; each step is saved, and an interrupted fit goes on from there."""
+    """Search from several starts."""
 
     config: GreyBoxFit
     runs: CandidateRuns
-    before_s: float = 0.0
 
-    def run(self, nominal: np.ndarray, seed: int, left: ResumeFile) -> np.ndarray:
+    def run(self, nominal: np.ndarray, seed: int) -> np.ndarray:
         """Return where each start leads, `(S, P, J)`."""
-        config, began = self.config, time.monotonic()
-        found = torch.zeros((config.starts, *nominal.shape), dtype=torch.float64)
-        place = left.load({"x": found})
-        if place is None:
-            found.copy_(torch.from_numpy(self._starts(nominal, seed)))
-            place = {"start": 0, "iteration": 0, "seconds": 0.0}
-        self.before_s = place["seconds"]
+        config, found = self.config, []
         total = config.starts * config.iterations
         with ItemProgress(f"{config.name}: search", total) as progress:
-            while place["start"] < config.starts:
-                start, iteration = place["start"], place["iteration"] + 1
-                progress.reach(
-                    start * config.iterations + iteration - 1,
-                    f"{config.name}: start {start + 1} of {config.starts}, step {iteration}",
-                )
-                x, gain = take_step(self.runs, found[start].numpy(), config.robust)
-                found[start] = torch.from_numpy(x)
-                place["iteration"] = iteration
-                if gain < config.tolerance or iteration >= config.iterations:
-                    log.info("%s: start %d ended after %d steps", config.name, start + 1, iteration)
-                    place |= {"start": start + 1, "iteration": 0}
-                place["seconds"] = self.before_s + time.monotonic() - began
-                left.save({"x": found}, place)
-        return found.numpy()
+            for start, x in enumerate(self._starts(nominal, seed)):
+                for step in range(config.iterations):
+                    note = f"{config.name}: start {start + 1} of {config.starts}, step {step + 1}"
+                    progress.reach(start * config.iterations + step, note)
+                    x, gain = take_step(self.runs, x, config.robust)
+                    if gain < config.tolerance:
+                        break
+                found.append(x)
+        return np.stack(found)
 
     def choose(self, stacked: np.ndarray, held: CandidateRuns) -> np.ndarray:
         """Return the parameters `(P, J)` with the best validation runs, per joint if uncoupled."""

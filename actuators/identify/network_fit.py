@@ -7,7 +7,6 @@ far longer than they run.
 from __future__ import annotations
 
 import copy
-import dataclasses
 import logging
 import math
 import time
@@ -21,7 +20,6 @@ import torch
 from actuators.identify import training_data
 from actuators.identify.training_data import TrainingWindows, list_sources
 from actuators.models import checkpoint
-from actuators.models.checkpoint import ResumeFile, hash_recordings
 from actuators.models.machine_tensors import MachineTensors
 from actuators.models.network import JointNetworks, Mlp
 from actuators.recordings.split import COMMANDED
@@ -174,7 +172,6 @@ class NetworkFit:
         validate_every: Updates between two validations.
         validation_s: Horizon of the free run on which the weights are chosen.
         patience: Validations without improvement after which a horizon is given up.
-        save_every_s: Time between two savings from which an interrupted fit goes on.
     """
 
     name: str
@@ -192,7 +189,6 @@ class NetworkFit:
     validate_every: Count
     validation_s: float
     patience: Count
-    save_every_s: float
 
     def check(self) -> None:
         if self.loss == "rollout" and not self.horizons_s:
@@ -209,22 +205,15 @@ class NetworkFit:
     ) -> Mlp:
         """Fit to `train`, keep the best weights on `validation`, write `<name>.safetensors`.
 
-        A fit that was interrupted goes on from `<name>.partial.safetensors`, saved every
-        `save_every_s` seconds: on a CPU bit for bit as if it had never stopped.
-
         Raises:
             RecordingError: too little data.
-            CheckpointError: `folder` holds an interrupted fit with other settings or data.
             StorageError: a file could not be written.
         """
         training_data.check_enough(train, machine)
-        stamp = {
-            "fit": {**dataclasses.asdict(self), "save_every_s": None}, "machine": machine.fingerprint(), "seed": seed,
-            "device": device.type, "train": hash_recordings(train), "validation": hash_recordings(validation),
-        }  # fmt: skip
-        interruption = ResumeFile(folder / f"{self.name}.partial.safetensors", stamp)
         fitting = _NetworkFitting(self, machine, train, validation, seed, device)
-        seconds = fitting.run(interruption)
+        began = time.monotonic()
+        fitting.run()
+        seconds = time.monotonic() - began
         tensors, errors = fitting.result
         names = machine.joint_names
         commanded = training_data.measure_commanded_each_way_s(train).sum(0) / 60.0
@@ -247,18 +236,7 @@ class NetworkFit:
         }
         path = folder / f"{self.name}.safetensors"
         checkpoint.write_checkpoint(path, "mlp", machine, tensors, facts)
-        interruption.remove()
         return Mlp(checkpoint=str(path))
-
-
-@dataclasses.dataclass
-class _FitProgress:
-    """Progress of a fit: stage, updates in it, validations without improvement, time spent."""
-
-    stage: int = 0
-    update: int = 0
-    stale: int = 0
-    seconds: float = 0.0
 
 
 class _HorizonStage(NamedTuple):
@@ -298,17 +276,13 @@ class _NetworkFitting:
         for horizon_s in config.horizons_s if config.loss == "rollout" else ():
             self._stages.append(_HorizonStage(horizon_s, config.updates, config.batch))
 
-    def run(self, interruption: ResumeFile) -> float:
-        """Fit, going on from `interruption` if there is one; returns the time it took in all, s."""
-        found = interruption.load(self._state())
-        if found:
-            log.info("going on with the fit that was interrupted after %.0f s", found["seconds"])
-        place = _FitProgress(**(found or {}))
-        with ItemProgress("fit", sum(stage.updates for stage in self._stages)) as progress:
-            while place.stage < len(self._stages):
-                self._run_stage(place, interruption, progress)
-                place.stage, place.update, place.stale = place.stage + 1, 0, 0
-        return place.seconds
+    def run(self) -> None:
+        """Run all stages."""
+        before, total = 0, sum(stage.updates for stage in self._stages)
+        with ItemProgress("fit", total) as progress:
+            for stage in self._stages:
+                self._run_stage(stage, before, total, progress)
+                before += stage.updates
 
     @property
     def result(self) -> tuple[dict[str, torch.Tensor], list[float]]:
@@ -316,35 +290,27 @@ class _NetworkFitting:
         return {**self._descent.averaged.state_dict(), **self._kept}, self._best.tolist()
 
     def _run_stage(
-        self, place: _FitProgress, interruption: ResumeFile, progress: ItemProgress
+        self, stage: _HorizonStage, before: int, total: int, progress: ItemProgress
     ) -> None:
-        """Run the rest of the stage at `place`."""
-        config, stage = self._config, self._stages[place.stage]
+        """Run a stage, after `before` of `total` updates, until it gains nothing more."""
+        config, stale = self._config, 0
         steps = max(1, self._steps(stage.horizon_s))
         windows = TrainingWindows(self._train, self._machine, steps, self._device)
         update = self._descent.updater(windows, stage.batch, config.still_share)
-        before = sum(earlier.updates for earlier in self._stages[: place.stage])
-        total = sum(one.updates for one in self._stages)
-        began = saved = time.monotonic()
-        spent_s = place.seconds
-        while place.update < stage.updates and place.stale < config.patience:
-            number = before + place.update
+        for done in range(1, stage.updates + 1):
+            number = before + done - 1
             fall = 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total))
             average = min(config.average, (number + 1.0) / (number + 11.0))
             self._descent.steer(number, config.learning_rate * fall, average)
             update()
-            place.update += 1
-            if place.update % config.validate_every == 0 or place.update == stage.updates:
-                place.stale = 0 if self._validate() else place.stale + 1
+            if done % config.validate_every == 0 or done == stage.updates:
+                stale = 0 if self._validate() else stale + 1
                 error = self._best.mean().item()
                 note = f"free runs of {stage.horizon_s:g} s, error {error:.4f}"
                 progress.reach(number, note=note)
             progress.reach(number + 1)
-            now = time.monotonic()
-            place.seconds = spent_s + now - began
-            if now - saved > config.save_every_s:
-                interruption.save(self._state(), dataclasses.asdict(place))
-                saved = now
+            if stale >= config.patience:
+                break
 
     @torch.no_grad()
     def _validate(self) -> bool:
@@ -359,10 +325,6 @@ class _NetworkFitting:
         for name, value in averaged.named_parameters():
             self._kept[name].copy_(torch.where(better.view(-1, 1, 1), value, self._kept[name]))
         return bool(better.any())
-
-    def _state(self) -> dict[str, torch.Tensor]:
-        kept = {f"kept.{name}": value for name, value in self._kept.items()}
-        return self._descent.state() | kept | {"best": self._best}
 
     def _normalise(self, networks: JointNetworks) -> None:
         """Set the normalisation from training data and machine limits."""

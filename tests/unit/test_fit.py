@@ -13,10 +13,10 @@ import torch
 from composed import option
 from safetensors.torch import load_file
 
-from actuators.identify import network_fit, training_data
+from actuators.identify import training_data
 from actuators.identify.network_fit import NetworkFit
 from actuators.identify.training_data import TrainingWindows
-from brokk_rl.errors import CheckpointError, RecordingError
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -24,7 +24,7 @@ Runs = tuple[list[Recording], list[Recording]]
 CPU = torch.device("cpu")
 TINY: dict[str, Any] = {
     "one_step_updates": 30, "one_step_batch": 32, "horizons_s": (0.2, 0.4), "updates": 20, "batch": 8, "validate_every": 10,
-    "validation_s": 1.0, "save_every_s": 0.0, "width": 8,
+    "validation_s": 1.0, "width": 8,
 }  # fmt: skip
 
 
@@ -66,75 +66,12 @@ def runs(machine: Machine) -> Runs:
     return [recording(machine, seed) for seed in range(2)], [recording(machine, 9)]
 
 
-class KilledError(Exception):
-    """Stands for whatever ends a process in the middle of an update."""
-
-
-@pytest.mark.parametrize(("name", "after"), [("mlp", 17), ("mlp", 70)])
-def test_an_interrupted_fit_goes_on_as_if_it_had_not_stopped(
-    name: str,
-    after: int,
-    machine: Machine,
-    runs: Runs,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    config = tiny(name)
-    config.fit(machine, *runs, tmp_path / "whole", 3, CPU)
-    step, count = network_fit.FreeRunOptimizer._update, 0
-
-    def killed(self: Any, u: torch.Tensor, q: torch.Tensor) -> None:
-        nonlocal count
-        count += 1
-        if count == after:
-            self.networks.weight[0].data.fill_(7.0)  # half an update
-            raise KilledError
-        step(self, u, q)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(network_fit.FreeRunOptimizer, "_update", killed)
-        with pytest.raises(KilledError):
-            config.fit(machine, *runs, tmp_path / "part", 3, CPU)
-    assert [path.name for path in (tmp_path / "part").iterdir()] == [f"{name}.partial.safetensors"]
-    config.fit(machine, *runs, tmp_path / "part", 3, CPU)
-    assert [path.name for path in (tmp_path / "part").iterdir()] == [f"{name}.safetensors"]
-    first, second = weights(tmp_path / "whole", name), weights(tmp_path / "part", name)
-    assert first.keys() == second.keys()
-    for key, value in first.items():
-        assert torch.equal(value, second[key]), key
-
-
 def test_a_fit_repeats_with_its_seed(machine: Machine, runs: Runs, tmp_path: Path) -> None:
     for folder, seed in (("a", 1), ("b", 1), ("c", 2)):
-        tiny("mlp", save_every_s=60.0).fit(machine, *runs, tmp_path / folder, seed, CPU)
+        tiny("mlp").fit(machine, *runs, tmp_path / folder, seed, CPU)
     a, b, c = (weights(tmp_path / folder, "mlp") for folder in "abc")
     assert all(torch.equal(a[key], b[key]) for key in a)
     assert not torch.equal(a["weight.0"], c["weight.0"])
-
-
-def test_an_interrupted_fit_with_other_settings_or_data_says_what_differs(
-    machine: Machine, runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def killed(self: Any) -> bool:
-        raise KilledError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(network_fit._NetworkFitting, "_validate", killed)
-        with pytest.raises(KilledError):
-            tiny("mlp").fit(machine, *runs, tmp_path, 0, CPU)
-    partial = tmp_path / "mlp.partial.safetensors"
-    before = partial.read_bytes()
-    with pytest.raises(
-        CheckpointError,
-        match=r"these differ: fit\.batch \(was 8, is 9\); seed \(was 0, is 1\)\. Fit with",
-    ):
-        tiny("mlp", batch=9).fit(machine, *runs, tmp_path, 1, CPU)
-    with pytest.raises(CheckpointError, match=r"these differ: train \(was"):
-        tiny("mlp").fit(machine, runs[0][:1], runs[1], tmp_path, 0, CPU)
-    assert partial.read_bytes() == before
-    partial.write_bytes(before[:200])
-    with pytest.raises(CheckpointError, match=r"mlp\.partial\.safetensors: corrupt"):
-        tiny("mlp").fit(machine, *runs, tmp_path, 0, CPU)
 
 
 def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine: Machine) -> None:

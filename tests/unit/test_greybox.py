@@ -1,4 +1,4 @@
-"""Grey-box fits find numbers that are known, say how sure they are, and go on where they were interrupted."""
+"""Grey-box fits find numbers that are known, and say how sure they are."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ from actuators import open_loop
 from actuators.identify import greybox
 from actuators.identify.gauss_newton import CandidateRuns, estimate_uncertainty
 from actuators.identify.greybox import GreyBoxFit
-from actuators.models.checkpoint import ResumeFile
 from actuators.models.lag import FirstOrderLag
-from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -154,44 +153,6 @@ def test_known_numbers_of_the_plant_are_found(machine: Machine, tmp_path: Path) 
         assert fitted.overlap_extend[joint] == pytest.approx(0.13, abs=0.01)
         assert fitted.speed_scale[joint] == pytest.approx(0.8 if joint == "q3" else 0.9, abs=0.02)
     assert fitted.notch == shipped.notch
-
-
-def test_an_interrupted_fit_goes_on_exactly(
-    machine: Machine, runs: list[Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fit = quick("lag", iterations=3)
-    whole = fit.fit(machine, runs[:4], runs[4:], tmp_path / "whole", 0, CPU)
-    (tmp_path / "parts").mkdir()
-    steps = 0
-
-    def stopping(*given: Any) -> Any:
-        nonlocal steps
-        steps += 1
-        if steps % 3 == 0:
-            raise KeyboardInterrupt
-        return improve(*given)
-
-    improve = greybox.take_step
-    monkeypatch.setattr(greybox, "take_step", stopping)
-    for _ in range(2):
-        with pytest.raises(KeyboardInterrupt):
-            fit.fit(machine, runs[:4], runs[4:], tmp_path / "parts", 0, CPU)
-    assert fit.fit(machine, runs[:4], runs[4:], tmp_path / "parts", 0, CPU) == whole
-    assert steps == 3 * 2 + 2  # none was done twice, but for the two that were interrupted
-    assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == ["lag.json", "lag.yaml"]
-
-
-def test_what_was_left_by_other_settings_is_not_gone_on_from(
-    machine: Machine, runs: list[Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*given: Any) -> Any:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ResumeFile, "remove", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        quick("lag", iterations=1, starts=1).fit(machine, runs[:4], runs[4:], tmp_path, 0, CPU)
-    with pytest.raises(CheckpointError, match=r"fit\.iterations \(was 1, is 2\)"):
-        quick("lag", iterations=2, starts=1).fit(machine, runs[:4], runs[4:], tmp_path, 0, CPU)
 
 
 def test_what_the_recordings_do_not_show_is_said(
