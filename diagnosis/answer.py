@@ -204,19 +204,28 @@ def read_answer(path: Path) -> Answer:
     """
     try:
         found = json.loads(path.read_text())
-        if found["schema"] != SCHEMA:
-            raise RecordingError(f"{path}: schema {found['schema']}, expected {SCHEMA}")
-        return parse_answer(found)
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: cannot be read as a diagnosis ({error})") from error
+    return parse_answer(found, f"{path}")
+
+
+def parse_answer(found: Any, where: str) -> Answer:
+    """Return the answer in the content of a `diagnosis.json`; `where` names it in messages.
+
+    Raises:
+        RecordingError: it is of another schema, or no diagnosis.
+    """
+    try:
+        if found["schema"] != SCHEMA:
+            raise RecordingError(f"{where}: schema {found['schema']}, expected {SCHEMA}")
+        return _build_answer(found)
     except (KeyError, TypeError) as error:
         raise RecordingError(
-            f"{path}: no diagnosis: {error!r} is missing or of another kind"
+            f"{where}: no diagnosis: {error!r} is missing or of another kind"
         ) from error
 
 
-def parse_answer(found: dict[str, Any]) -> Answer:
-    """Return the answer in the content of a `diagnosis.json`."""
+def _build_answer(found: dict[str, Any]) -> Answer:
     joints, units = {}, {}
     for name, gap in found["where"]["joints"].items():
         units[name] = "m" if "rmse_m" in gap else "rad"

@@ -46,9 +46,13 @@ class GivenAnswer:
     content: Mapping[str, Any] | None
     left_out: tuple[str, ...] = ()
 
-    def parse(self) -> Answer | None:
-        """Return the answer."""
-        return None if self.content is None else parse_answer(dict(self.content))
+    def parse(self, where: str) -> Answer | None:
+        """Return the answer; `where` names it in messages.
+
+        Raises:
+            RecordingError: it is no diagnosis.
+        """
+        return None if self.content is None else parse_answer(self.content, where)
 
     @property
     def seconds(self) -> float | None:
@@ -64,17 +68,21 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
     Raises:
         RecordingError: there is no answer.
     """
-    found = {}
-    if path.is_file():
-        for line in path.read_text().splitlines():
-            row = json.loads(line)
-            left_out = tuple(row.get("left_out", ()))
-            found[row["case"]] = GivenAnswer(row["note"], row["answer"], left_out)
-    elif path.is_dir():
-        for place in filter(run_cases.is_begun, path.iterdir()):
-            file = place / ANSWER_FILE
-            content = json.loads(file.read_text()) if file.is_file() else None
-            found[place.name] = GivenAnswer(run_cases.read_note(place), content)
+    found: dict[str, GivenAnswer] = {}
+    try:
+        if path.is_file():
+            for row in map(json.loads, path.read_text().splitlines()):
+                left_out = tuple(row.get("left_out", ()))
+                found[row["case"]] = GivenAnswer(row["note"], row["answer"], left_out)
+        elif path.is_dir():
+            for place in filter(run_cases.is_begun, path.iterdir()):
+                file = place / ANSWER_FILE
+                content = json.loads(file.read_text()) if file.is_file() else None
+                found[place.name] = GivenAnswer(run_cases.read_note(place), content)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RecordingError(
+            f"exam.answers: {path}: expected {ANSWER_FILE} in a folder a case, or a line a case of a published file ({error!r})"
+        ) from error
     if all(one.content is None for one in found.values()):
         raise RecordingError(f"exam.answers: {path} holds no answer to any case")
     return found
@@ -124,7 +132,7 @@ class AnswerScoring:
             if case not in given:
                 continue
             one, examination = given[case], examined.get(case)
-            answer = one.parse()
+            answer = one.parse(f"answer to case {case}")
             found.append(
                 score.score_answer(
                     label, answer, self.classes, self.of_machine, one.seconds, examination

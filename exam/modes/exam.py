@@ -209,11 +209,9 @@ class Exam:
             "labels_sha256": facts["labels_sha256"],
             "candidate": repr(settings.candidate),
         }
-        if {"event": ledger.BEGUN, "run": run} not in map(
-            _drop_time, ledger.read_ledger(self._folder)
-        ):
-            hashes = {"labels_sha256": facts["labels_sha256"]}
-            ledger.append_entry(self._folder, ledger.BEGUN, {**hashes, "run": run})
+        if not any(one.get("run") == run for one in ledger.read_ledger(self._folder)):
+            entry = {"labels_sha256": facts["labels_sha256"], "run": run}
+            ledger.append_entry(self._folder, ledger.BEGUN, entry)
         write_json(self.session.folder / RUN_FILE, run)
         known = restrict_machine(self.machine, facts.get("known", "full"))
         with ItemProgress("cases answered", len(cases)) as progress:
@@ -277,7 +275,3 @@ class Exam:
         for sentence in facts["ledger"]:
             print_text(sentence)
         log.info("report: %s", out / report.REPORT_FILE)
-
-
-def _drop_time(entry: dict[str, Any]) -> dict[str, Any]:
-    return {key: entry[key] for key in ("event", "run") if key in entry}

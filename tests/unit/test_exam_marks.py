@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.errors import RecordingError
 from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
 from exam import metrics, report, score
 from exam.answer_scoring import AnswerScoring, GivenAnswer, publish_answers, read_answers
@@ -278,3 +279,20 @@ def test_every_metric_stands_on_the_page(tmp_path: Path) -> None:
     page = html.unescape((tmp_path / report.REPORT_FILE).read_text())
     for metric in metrics.METRICS.values():
         assert metric.title.strip() in page
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{}\n", "a line a case of a published file"),
+        ("not json\n", "a line a case of a published file"),
+        ('{"case": "0000", "note": {}, "answer": {"schema": 9}}\n', "case 0000: schema 9"),
+        ('{"case": "0000", "note": {}, "answer": {"schema": 1}}\n', "case 0000: no diagnosis"),
+    ],
+)
+def test_a_file_that_holds_no_answers_is_refused(text: str, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "answers.jsonl"
+    path.write_text(text)
+    scoring = AnswerScoring([label("one", ("lag", "q3", 1.0))], CLASSES, ())
+    with pytest.raises(RecordingError, match=told):
+        scoring.build_table(read_answers(path), {})
