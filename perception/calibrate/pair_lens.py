@@ -19,8 +19,9 @@ are fitted, and a view adds six."""
 LARGEST_PX = 1.0
 """Largest root mean square reprojection error; 0.25 px with 13 pictures of a hand-held chessboard by
 two cameras of 640 x 480 px (OpenCV's sample data)."""
-LARGEST_FOCAL = 0.01
-"""Largest relative standard deviation of a focal length: 2 cm at 2 m."""
+LARGEST_FOCAL, MOST_ASIDE = 0.01, 0.1
+"""Largest relative standard deviation of a focal length, 2 cm at 2 m; largest distance of the right
+camera up, down, before or behind the left one, over that beside it: more says that views are alike."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,12 @@ def calibrate_pair(pairs: Sequence[BoardPair], size_px: tuple[int, int]) -> dict
             f"lens=board: the corners miss by {error_px:.2f} px, expected {LARGEST_PX:g} or less; is the "
             "board flat, are both pictures of one moment, are its sizes those of board.columns, rows, "
             "square_m and marker_m?"
+        )
+    shift_m = np.ravel(found[5])
+    if np.hypot(shift_m[1], shift_m[2]) > MOST_ASIDE * abs(shift_m[0]):
+        raise FrameError(
+            f"lens=board: the right camera stands {shift_m.round(3).tolist()} m from the left one, "
+            "expected side by side; tilt the board by 30 degrees, to all sides, and fill the picture"
         )
     names = ("K1", "D1", "K2", "D2", "R", "T")
     content = {name: np.asarray(value).tolist() for name, value in zip(names, found, strict=False)}

@@ -105,9 +105,6 @@ class DepthPlane:
         max_tilt_rad: Largest angle between the face's normal and the line of sight.
         min_front: Least part of the surroundings behind a piece of a plane that also holds a piece
             larger than a face.
-        edge_px: Radius of the filter that moves the mask's edge onto the picture's edge, in px of
-            the small picture.
-        edge_contrast: Grey step, of 1, below which the picture does not move the mask's edge.
         seed: Of the trials; the same frame always gives the same mask.
     """
 
@@ -124,8 +121,6 @@ class DepthPlane:
     max_extent_m: float
     max_tilt_rad: float
     min_front: float
-    edge_px: Count
-    edge_contrast: Positive
     seed: int
 
     def check(self) -> None:
@@ -168,23 +163,11 @@ class PlaneSegmenter:
         for plane in self._planes(grid, inverse, known):
             face |= self._faces(plane, grid, inverse, known)
         mask = np.zeros((height, width), np.float32)
-        left, top, wide, high = cv2.boundingRect(face)
-        if wide:
-            rim = 3 * self._settings.edge_px + 1  # beyond, its edges move nothing
-            right, bottom = min(left + wide + rim, len(face[0])), min(top + high + rim, len(face))
-            left, top = max(0, left - rim), max(0, top - rim)
-            # The last cells may be smaller ones.
-            part = np.s_[top * step : bottom * step, left * step : right * step]
-            size = (min(right * step, width) - left * step, min(bottom * step, height) - top * step)
-            color = cv2.resize(
-                frame.color[part], (size[0] // 2, size[1] // 2), interpolation=cv2.INTER_AREA
-            )
-            gray, small = (
-                cv2.cvtColor(color, cv2.COLOR_RGB2GRAY),
-                face[top:bottom, left:right].astype(np.float32),
-            )
-            sharp = snap_to_edges(small, gray, self._settings.edge_px, self._settings.edge_contrast)
-            mask[part] = cv2.resize(sharp, size, interpolation=cv2.INTER_LINEAR)
+        # The last cells may be smaller ones.
+        size = (min(len(face[0]) * step, width), min(len(face) * step, height))
+        mask[: size[1], : size[0]] = cv2.resize(
+            face.astype(np.float32), size, interpolation=cv2.INTER_LINEAR
+        )
         return Masks(mask, None)
 
     def _planes(self, grid: SightGrid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
@@ -325,40 +308,6 @@ class PlaneSegmenter:
         before = np.count_nonzero(excess[ring] > self._tolerance)
         doubt = 0.05 * np.count_nonzero(ring) + 1.0
         return (behind + 0.5 * doubt) / (behind + before + doubt)
-
-
-def snap_to_edges(
-    mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: float
-) -> np.ndarray:
-    """Move the edges of a small mask onto those of a picture (fast guided filter, He and Sun 2015).
-
-    Args:
-        mask: `(h, w)` float32 in [0, 1].
-        gray: The same view, larger, uint8.
-        radius_px: Radius of the filter in px of the mask.
-        contrast: Grey step, of 1, below which the picture does not count.
-
-    Returns:
-        The mask in the size of `gray`, float32 in [0, 1].
-    """
-    height, width = mask.shape
-    guide = (
-        cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
-    )
-    size = (2 * radius_px + 1, 2 * radius_px + 1)
-    mean_guide, mean_mask = cv2.blur(guide, size), cv2.blur(mask, size)
-    slope = (cv2.blur(guide * mask, size) - mean_guide * mean_mask) / (
-        cv2.blur(guide * guide, size) - mean_guide**2 + contrast**2
-    )
-    offset = cv2.blur(mean_mask - slope * mean_guide, size)
-    full = (gray.shape[1], gray.shape[0])
-    slope = cv2.resize(cv2.blur(slope, size), full, interpolation=cv2.INTER_LINEAR)
-    return np.clip(
-        slope * (gray * np.float32(1 / 255))
-        + cv2.resize(offset, full, interpolation=cv2.INTER_LINEAR),
-        0.0,
-        1.0,
-    )
 
 
 def _shrink_depth(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:

@@ -22,7 +22,6 @@ from perception.render.frame_renderer import FrameRenderer
 from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.scene_sampler import compose_scene
 from perception.segment import network as segment_network
-from perception.segment.depth_plane import snap_to_edges
 from perception.segment.network import NetworkSegmenter
 from perception.segment.unet import UNet, read_checkpoint
 from perception.segment.window import Window, bound_block, center_window, cover_picture
@@ -43,7 +42,8 @@ def test_planes_before_their_surroundings_are_the_block(
     assert masks.block.shape == view.block.shape and masks.block.dtype == np.float32
     assert masks.block.min() >= 0.0 and masks.block.max() <= 1.0
     found = masks.block > 0.5
-    assert (found & view.block).sum() > 0.97 * found.sum()
+    # An edge is off by half a cell of 2 px; at 4 m the block has 150 px.
+    assert (found & view.block).sum() > 0.94 * found.sum()
     # A top seen at a grazing angle is thinner than a matcher's noise.
     front_and_side = 0.8 if distance_m < 3 else 0.7
     assert cuboid.overlap(found, view.block) > front_and_side
@@ -72,16 +72,6 @@ def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
     assert view.occluder.sum() > 1000
     assert (found & view.occluder).mean() < 0.1 * view.occluder.mean()
     assert (found & view.mouth).sum() > 0.9 * view.mouth.sum()
-
-
-def test_a_sloppy_edge_moves_onto_that_of_the_picture() -> None:
-    gray = np.full((180, 320), 60, np.uint8)
-    gray[:, 160:] = 180
-    sloppy = np.zeros((90, 160), np.float32)
-    sloppy[:, 78:] = 1.0  # two pixels, four of the picture, off
-    moved = snap_to_edges(sloppy, gray, 4, 0.04)
-    plain = np.abs(np.repeat(np.repeat(sloppy, 2, 0), 2, 1) - (gray > 100)).mean()
-    assert np.abs((moved > 0.5) - (gray > 100).astype(float)).mean() < 0.5 * plain
 
 
 @settings(deadline=None, max_examples=60)
