@@ -123,8 +123,11 @@ def from_arrays(
         log = Path(folder) / "arrays.npz"
         np.savez(log, **columns)  # pyright: ignore[reportArgumentType]
         draft = log_draft.make_draft([log], "arrays", given, None)
-        texts = {"machine": log_draft.format_machine(draft), "import": log_draft.format_map(draft)}
-        texts["machine"] = texts["machine"].replace(log_draft.QUOTED_MISSING, str(max_force))
+        texts = {
+            "machine": draft.format(log_draft.MACHINE_TEMPLATE),
+            "import": draft.format(log_draft.MAP_TEMPLATE),
+        }
+        texts["machine"] = texts["machine"].replace(f'"{log_draft.MISSING}"', str(max_force))
         for name, text in texts.items():
             (Path(folder) / f"{name}.yaml").write_text(text)
         machine, reader = (_load_option(name, Path(folder) / f"{name}.yaml") for name in texts)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from actuators.recordings.inspection import InspectionThresholds, inspect_recording
-from actuators.recordings.recording_checks import TEXTS, RecordingRemark, name_recording
+from actuators.recordings.recording_checks import REMARKS, RecordingRemark, name_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Ranked
@@ -90,9 +90,7 @@ def judge_recordings(
             coarse = find_coarse_sensors(field, machine)
             counted = [one for one in counted if one.joint not in coarse]
         worst = _find_worst_joint(counted, field)
-        text = (
-            f"'{name}' on {worst.joint} in {100 * worst.share:.0f} % of the time; {TEXTS[name][2]}"
-        )
+        text = f"'{name}' on {worst.joint} in {100 * worst.share:.0f} % of the time; {REMARKS[name].advice}"
         sound = f"'{name}' in {100 * worst.share:.1f} % of the time"
         passed = worst.share <= limit
         gates.append(

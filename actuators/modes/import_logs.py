@@ -164,8 +164,8 @@ class ImportLogs:
 
     def _write(self, draft: Draft, paths: list[Path]) -> None:
         folder, guesses = self.session.folder, draft.list_guesses()
-        write_text(folder / MAP_FILE, log_draft.format_map(draft))
-        write_text(folder / MACHINE_FILE, log_draft.format_machine(draft))
+        write_text(folder / MAP_FILE, draft.format(log_draft.MAP_TEMPLATE))
+        write_text(folder / MACHINE_FILE, draft.format(log_draft.MACHINE_TEMPLATE))
         unsure = [guess for guess in guesses if guess.sureness == "unsure"]
         write_json(
             folder / GUESS_FILE,

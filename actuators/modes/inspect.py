@@ -14,7 +14,7 @@ import numpy as np
 from actuators.identify import dead_time
 from actuators.recordings import inspection_picture, preview_report
 from actuators.recordings.inspection import (
-    KINDS,
+    FINDINGS,
     Inspection,
     InspectionThresholds,
     inspect_recording,
@@ -104,35 +104,31 @@ class Inspect:
         paths = record.find_files(self.inspect.recordings, "recording")
         inspected = [self._look(path) for path in track_items(paths, "inspecting")]
         folder = self.session.folder
+        sound = [one.recording for one in inspected if one.recording and not one.breaches]
         result = {
             "schema": 1,
             "machine": self.machine.name,
-            "delay_s": self._delays(
-                [one.recording for one in inspected if one.recording and not one.breaches]
-            ),
+            "delay_s": self._delays(sound),
             "joints": self._overall(inspected),
             "remarks": [*_list_resampled(inspected), *_check_clocks(inspected)],
             "recordings": [one.plain() for one in inspected],
         }
-        sound = [one.recording for one in inspected if one.recording and not one.breaches]
-        preview = self._preview(sound)
+        preview = None
+        if self.preview is not None and sound:
+            preview = preview_report.run_preview(self.preview, sound, self.machine, True)
         if preview:
             result["preview"] = preview.plain()
         write_json(folder / "inspection.json", result)
         pictures = {"overview": folder / "overview.png"}
-        inspection_picture.draw_overview(
-            pictures["overview"], {one.path.stem: _make_overview_row(one) for one in inspected}
-        )
+        rows = {one.path.stem: _make_overview_row(one) for one in inspected}
+        inspection_picture.draw_overview(pictures["overview"], rows)
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
             if one.recording and one.inspection:
-                pictures[one.path.name] = folder / f"{one.path.stem}.png"
+                path = folder / f"{one.path.stem}.png"
                 inspection_picture.draw_recording(
-                    pictures[one.path.name],
-                    one.recording,
-                    self.machine,
-                    one.inspection,
-                    one.breaches,
+                    path, one.recording, self.machine, one.inspection, one.breaches
                 )
+                pictures[one.path.name] = path
         self._page(result, inspected, pictures, preview).write(folder / "inspection.html")
         self._show(result, inspected)
         if preview:
@@ -144,85 +140,40 @@ class Inspect:
         if recording is None or recording.num_samples < 2:
             return InspectedFile(path, None, breaches, None)
         (viewed,) = view_recordings([recording], self.machine)
-        return InspectedFile(
-            path,
-            recording,
-            breaches,
-            inspect_recording(
-                viewed, self.machine, self.thresholds, find_targets(recording, self.machine)
-            ),
-        )
-
-    def _preview(self, recordings: Sequence[Recording]) -> PreviewResult | None:
-        """Return which effects these recordings could tell; `None` without a preview, or where none is long enough."""
-        if self.preview is None or not recordings:
-            return None
-        return preview_report.run_preview(self.preview, recordings, self.machine, True)
+        targets = find_targets(recording, self.machine)
+        found = inspect_recording(viewed, self.machine, self.thresholds, targets)
+        return InspectedFile(path, recording, breaches, found)
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
         """Return each joint's dead time from all sound recordings, `None` where unknown."""
+        generator = self.session.generator("delay")
         try:
-            found = dead_time.estimate_dead_times(
-                recordings, self.machine, self.session.generator("delay")
-            )
+            found = dead_time.estimate_dead_times(recordings, self.machine, generator)
         except RecordingError:
             return dict.fromkeys(self.machine.joint_names)
-        delays = {}
-        for name, delay in found.items():
-            delays[name] = (
-                None
-                if delay is None
-                else {
-                    "value": delay.value_s,
-                    "ci95": list(delay.ci95_s),
-                    "explained": delay.explained,
-                }
-            )
+        delays: dict[str, Any] = {}
+        for name, one in found.items():
+            delays[name] = one and {
+                "value": one.value_s, "ci95": list(one.ci95_s), "explained": one.explained
+            }  # fmt: skip
         return delays
 
     def _overall(self, inspected: Sequence[InspectedFile]) -> dict[str, dict[str, float | None]]:
-        """Return figures of each joint over all recordings: extremes and weighted means."""
+        """Return figures of each joint over all recordings: extremes, medians and weighted means."""
+        known = [one.inspection for one in inspected if one.inspection]
+        seconds = [max(one.timing["duration_s"] or 0.0, 1e-9) for one in known]
         table = {}
-        known = [one for one in inspected if one.inspection]
-        hours = np.array(
-            [one.inspection.timing["duration_s"] or 0.0 for one in known if one.inspection]
-        )
-        for name, lower, upper in zip(
-            self.machine.joint_names, self.machine.lower, self.machine.upper, strict=True
-        ):
-            rows = [one.inspection.joints[name] for one in known if one.inspection]
-            entry: dict[str, float | None] = {
-                "lower_limit": float(lower),
-                "upper_limit": float(upper),
-            }
+        for joint in self.machine.joints:
+            entry = {"lower_limit": joint.lower.value, "upper_limit": joint.upper.value}
+            rows = [one.joints[joint.name] for one in known]
             for key in rows[0] if rows else ():
-                values = np.array(
-                    [np.nan if row[key] is None else row[key] for row in rows], dtype=float
-                )
-                there = np.isfinite(values)
-                if not there.any():
-                    entry[key] = None
-                elif key in ("lowest", "highest", "fastest"):
-                    entry[key] = float(
-                        values[there].min() if key == "lowest" else values[there].max()
-                    )
-                elif key in ("noise", "step"):
-                    entry[key] = float(np.median(values[there]))
-                else:
-                    entry[key] = float(
-                        np.average(values[there], weights=np.maximum(hours[there], 1e-9))
-                    )
+                values = np.array([row[key] for row in rows], dtype=float)  # None becomes NaN
+                entry[key] = _combine(key, values, np.array(seconds))
             counts = Counter(
-                f.kind
-                for one in known
-                if one.inspection
-                for f in one.inspection.findings
-                if f.joint == name
+                one.kind for several in known for one in several.findings if one.joint == joint.name
             )
-            table[name] = {
-                **entry,
-                **{f"num_{kind.replace(' ', '_')}": counts[kind] for kind in KINDS},
-            }
+            entry |= {f"num_{kind.replace(' ', '_')}": counts[kind] for kind in FINDINGS}
+            table[joint.name] = entry
         return table
 
     def _figures(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -240,12 +191,12 @@ class Inspect:
         rows = []
         for joint in self.machine.joints:
             entry, delay = result["joints"][joint.name], result["delay_s"][joint.name]
+            low, high = (_format_number(entry.get(key), 2) for key in ("lowest", "highest"))
+            lower, upper = (_format_number(entry[key], 2) for key in ("lower_limit", "upper_limit"))
             rows.append([
-                joint.name,
-                f"{_format_number(entry.get('lowest'), 2)} … {_format_number(entry.get('highest'), 2)} {joint.unit}",
-                f"{_format_number(entry['lower_limit'], 2)} … {_format_number(entry['upper_limit'], 2)}",
-                *(_format_percent(entry.get(key)) for key in ("commanded", "at_limit")),
-                *(_format_number(entry.get(key), 2) for key in ("noise", "step")),
+                joint.name, f"{low} … {high} {joint.unit}", f"{lower} … {upper}",
+                _format_percent(entry.get("commanded")), _format_percent(entry.get("at_limit")),
+                _format_number(entry.get("noise"), 2), _format_number(entry.get("step"), 2),
                 "–" if delay is None else f"{delay['value']:.2f} s",
             ])  # fmt: skip
         return head, rows
@@ -256,8 +207,8 @@ class Inspect:
             (f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"]
         )
         names = [*self.machine.joint_names, None]
-        return ["joint", *KINDS], [
-            [name or "all at once", *(str(counts[name, kind] or "–") for kind in KINDS)]
+        return ["joint", *FINDINGS], [
+            [name or "all at once", *(str(counts[name, kind] or "–") for kind in FINDINGS)]
             for name in names
         ]
 
@@ -305,7 +256,7 @@ class Inspect:
             self._add_preview(page, preview)
         page.add_heading("Findings")
         page.add_table(*self._counts(result))
-        page.add_list([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
+        page.add_list([f"{name}: {kind.meaning}" for name, kind in FINDINGS.items()])
         page.add_heading("Recordings")
         page.add_table(FILES, [_format_file_row(one) for one in inspected])
         if result["remarks"]:
@@ -321,21 +272,11 @@ class Inspect:
             if one.inspection and one.inspection.findings:
                 rows = []
                 for f in one.inspection.findings:
-                    rows.append(
-                        [
-                            f.kind,
-                            f.joint or "all",
-                            str(f.row),
-                            str(f.num_rows),
-                            f"{f.t_s:.2f}",
-                            f"{f.duration_s:.2f}",
-                            f.text,
-                        ]
-                    )
+                    numbers = [str(f.row), str(f.num_rows), f"{f.t_s:.2f}", f"{f.duration_s:.2f}"]
+                    rows.append([f.kind, f.joint or "all", *numbers, f.text])
+                head = ["kind", "joint", "row", "rows", "from, s", "for, s", "what"]
                 with page.add_details(f"{len(rows)} findings"):
-                    page.add_table(
-                        ["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows
-                    )
+                    page.add_table(head, rows)
         return page
 
     def _add_preview(self, page: Report, preview: PreviewResult) -> None:
@@ -348,6 +289,21 @@ class Inspect:
                 *preview_report.describe_pairs(preview), "Effects that nothing here tells apart."
             )
         page.add_list(preview_report.list_remarks(preview))
+
+
+def _combine(key: str, values: np.ndarray, seconds: np.ndarray) -> float | None:
+    """Return a figure over recordings from that of each of them, `None` where all lack it."""
+    there = np.isfinite(values)
+    if not there.any():
+        return None
+    values = values[there]
+    if key in ("noise", "step"):
+        return float(np.median(values))
+    if key == "lowest":
+        return float(values.min())
+    if key in ("highest", "fastest"):
+        return float(values.max())
+    return float(np.average(values, weights=seconds[there]))
 
 
 def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
@@ -365,32 +321,25 @@ def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
 
 def _check_clocks(inspected: Sequence[InspectedFile]) -> list[str]:
     """Return remarks on start times that contradict the parts of a run."""
-    remarks, parts = [], {}
+    remarks, parts, num_without = [], dict[str, list[tuple[datetime, InspectedFile]]](), 0
     for one in inspected:
-        if one.recording:
-            parts.setdefault(one.recording.run, []).append(one)
-    without = [
-        one.path.name
-        for one in inspected
-        if one.recording and "created" not in one.recording.metadata
-    ]
-    if without:
+        if one.recording is None:
+            continue
+        try:
+            begin = datetime.fromisoformat(one.recording.metadata["created"])
+        except (KeyError, ValueError):
+            num_without += "created" not in one.recording.metadata
+            continue
+        parts.setdefault(one.recording.run, []).append((begin, one))
+    if num_without:
         remarks.append(
-            f"{len(without)} recordings do not say when they began (brokk.created): no warm-up can be read across files"
+            f"{num_without} recordings do not say when they began (brokk.created): no warm-up can be read across files"
         )
     for run, members in parts.items():
-        try:
-            starts = sorted(
-                (datetime.fromisoformat(one.recording.metadata["created"]), one) for one in members
-            )  # type: ignore[union-attr]
-        except (KeyError, ValueError, TypeError):
-            continue
-        for (begin, one), (following, other) in pairwise(starts):
-            overlap_s = (
-                one.recording.duration_s - (following - begin).total_seconds()
-                if one.recording
-                else 0.0
-            )
+        ordered = sorted(members, key=lambda member: member[0].timestamp())
+        for (begin, one), (following, other) in pairwise(ordered):
+            assert one.recording is not None
+            overlap_s = one.recording.duration_s - (following - begin).total_seconds()
             if overlap_s > 1.0:
                 remarks.append(
                     f"run {run}: {other.path.name} begins {overlap_s:.1f} s before {one.path.name} ends; look at the clock"

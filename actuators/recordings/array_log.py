@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -109,18 +110,15 @@ class ArrayLog(LogFile):
         tables = _read_matlab(path) if path.suffix.lower() == ".mat" else _read_npz(path)
         self._tables: dict[str, dict[str, np.ndarray]] = {}
         for table, arrays in tables.items():
-            lengths = [len(values) for values in arrays.values()]
-            length = max(lengths, key=lengths.count, default=0)
+            lengths = Counter(len(values) for values in arrays.values())
+            length = lengths.most_common(1)[0][0] if lengths else 0
             columns: dict[str, np.ndarray] = {}
             for name, values in arrays.items():
-                if len(values) != length:
-                    continue
-                if values.ndim == 1:
+                if len(values) == length and values.ndim == 1:
                     columns[name] = values.astype(float)
-                else:
-                    columns |= {
-                        f"{name}[{i}]": values[:, i].astype(float) for i in range(values.shape[1])
-                    }
+                elif len(values) == length:
+                    for item, column in enumerate(values.T.astype(float)):
+                        columns[f"{name}[{item}]"] = column
             self._tables[table] = columns
 
     def list_tables(self) -> dict[str, list[str]]:
@@ -141,26 +139,27 @@ def _read_npz(path: Path) -> dict[str, dict[str, np.ndarray]]:
     """Return the real vectors and matrices of a NumPy archive; pickled objects are never loaded."""
     found, member = {}, None
     try:
-        with zipfile.ZipFile(path) as archive:
-            for member in archive.namelist():
-                with archive.open(member) as file:
-                    version = np.lib.format.read_magic(file)
-                    read_head = (
-                        np.lib.format.read_array_header_1_0
-                        if version == (1, 0)
-                        else np.lib.format.read_array_header_2_0
-                    )
-                    shape, _, kind = read_head(file)
-                if kind.kind in "fiub" and len(shape) in (1, 2) and shape[0] > 1:
-                    with archive.open(member) as file:
-                        found[member.removesuffix(".npy")] = np.lib.format.read_array(
-                            file, allow_pickle=False
-                        )
+        with np.load(path, allow_pickle=False) as archive:
+            for member in archive.files:
+                if (values := _load_member(archive, member)) is not None:
+                    found[member] = values
     except NPZ_ERRORS as error:
         if member is None:
             raise RecordingError(f"{path}: cannot be read as a NumPy archive ({error})") from error
-        raise RecordingError(f"{path}: array '{member}' is damaged ({error})") from error
+        raise RecordingError(f"{path}: array '{member}.npy' is damaged ({error})") from error
     return {"": found}
+
+
+def _load_member(archive: Any, member: str) -> np.ndarray | None:
+    """Return an array of an archive, `None` for one that is no real vector or matrix of two rows or more."""
+    try:
+        values = archive[member]
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            return None
+        raise
+    is_signal = values.dtype.kind in "fiub" and values.ndim in (1, 2) and len(values) > 1
+    return values if is_signal else None
 
 
 def _read_matlab(path: Path) -> dict[str, dict[str, np.ndarray]]:
@@ -186,12 +185,14 @@ def _add_array(tables: dict[str, dict[str, np.ndarray]], name: str, value: Any) 
         signals = value["signals"]
         several = signals if isinstance(signals, (list, np.ndarray)) else [signals]
         for number, signal in enumerate(several):
-            label = str(signal.get("label") or signal.get("blockName") or f"{name}[{number}]")
-            _add_array(
-                {"": arrays},
-                label if label not in arrays else f"{label}[{number}]",
-                signal["values"],
-            )
+            given = [
+                signal.get("label"),
+                signal.get("blockName"),
+            ]  # an empty text is an empty array
+            own = name if len(several) == 1 else f"{name}[{number}]"
+            label = next((one for one in given if isinstance(one, str) and one), own)
+            unique = label if label not in arrays else f"{label}[{number}]"
+            _add_array({"": arrays}, unique, signal["values"])
     elif isinstance(value, Mapping):
         for field, inner in value.items():
             _add_array(tables, f"{name}.{field}", inner)
@@ -254,18 +255,15 @@ def _name_items(path: Path, labels: Mapping[str, list[str]]) -> dict[str, list[s
 
 
 def _is_number(kind: pa.DataType) -> bool:
-    return (
-        pa.types.is_floating(kind)
-        or pa.types.is_integer(kind)
-        or pa.types.is_boolean(kind)
-        or pa.types.is_timestamp(kind)
-    )
+    types = pa.types
+    tests = (types.is_floating, types.is_integer, types.is_boolean, types.is_timestamp)
+    return any(test(kind) for test in tests)
 
 
 def _is_list(kind: pa.DataType) -> bool:
-    return (
-        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-    )
+    types = pa.types
+    tests = (types.is_list, types.is_large_list, types.is_fixed_size_list)
+    return any(test(kind) for test in tests)
 
 
 def _read_parquet(

@@ -4,6 +4,7 @@ Axes: `T` time, `J` joints. Recordings may be broken: missing values are NaN and
 """
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -16,20 +17,75 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
 from brokk_rl.spec import Share, spec
 
-Kind = Literal[
-    "no motion", "not obeyed", "no command", "jump", "frozen", "repeated rows", "beyond limit", "exclusive"
-]  # fmt: skip
-KINDS: dict[Kind, str] = {
-    "no motion": "command without motion: interlock, dead-man, dead band, or a load too heavy",
-    "not obeyed": "stays away from its target: the drive is off, blocked or too weak",
-    "jump": "steps by more than a machine moves: a wrap, a sign bit, a reset or another source",
-    "no command": "motion without command: sinking, or moved by something that is not logged",
-    "frozen": "equal samples, then a jump, or equal samples of a sensor with noise: it did not measure",
-    "repeated rows": "all joints repeat the row before while one of them moves: lost frames",
-    "beyond limit": "measured beyond the limits of the machine's file",
-    "exclusive": "an exclusive joint is commanded together with others",
+Severity = Literal["note", "warn", "bad"]
+
+
+@dataclass(frozen=True)
+class FindingKind:
+    """What a kind of finding means.
+
+    Attributes:
+        severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`: good to know.
+        meaning: Possible causes.
+        advice: The remedy.
+    """
+
+    severity: Severity
+    meaning: str
+    advice: str
+
+
+FINDINGS = {
+    "command without motion": FindingKind(
+        "warn",
+        "a dead band wider than expected, an interlock or dead-man that is not logged, or a load too heavy",
+        "log the interlocks; leave these stretches out if the machine was not allowed to move",
+    ),
+    "does not obey": FindingKind(
+        "bad",
+        "the joint stays away from its target: its drive is off or blocked, or too weak for the load",
+        "leave these stretches out, or log the enable signal and use the parts in which the drive is on",
+    ),
+    "jumps": FindingKind(
+        "bad",
+        "the position steps by more than a machine moves: an angle or a counter that wraps, a sign bit, a reset, or two sources",
+        "import again with log.wraps, or leave the other source out; no model can follow these steps",
+    ),
+    "motion without command": FindingKind(
+        "warn",
+        "the load sinks (a leak), or the joint was moved by something that is not logged",
+        "log every input; a slow sinking towards the load is the effect 'creep'",
+    ),
+    "unlogged input": FindingKind(
+        "bad",
+        "the joint moves at a working speed without command: something moves it that is not logged",
+        "log every input that moves the machine: levers, a second operator, automatic functions",
+    ),
+    "frozen sensor": FindingKind(
+        "warn",
+        "equal samples, then a jump, or equal samples of a sensor with noise: it did not measure",
+        "check sensor and cable; the motion is real",
+    ),
+    "lost frames": FindingKind(
+        "note",
+        "all joints repeat the row before while one of them moves: positions were lost on their way",
+        "record frame counters; small rates are the effect 'frame_loss' or a slow sensor",
+    ),
+    "beyond limit": FindingKind(
+        "warn",
+        "measured beyond the limits of the machine's file",
+        "measure the end stops; correct the machine's file",
+    ),
+    "exclusive joint": FindingKind(
+        "bad",
+        "an exclusive joint is commanded together with others, which the machine forbids: one of both is not carried out",
+        "record what was really sent",
+    ),
 }
-"""Kinds of findings and what each of them means."""
+"""Findings in single recordings."""
+FAST_SHARE = 0.2
+"""Speed, of full speed, from which motion without command is no sinking load but an input that is
+not logged. The effect `creep` sinks at a few percent; chosen by hand."""
 CODE_REPEATS = 5
 """A value measured so often is a step of the sensor and no coincidence."""
 STEP_QUANTILE = 0.05
@@ -43,8 +99,9 @@ JUMP = 1.5
 
 FAR_SHARE = 0.1
 """Part of the travel from which on a joint stays away from its target; sag and play are below 0.05."""
-STILL_TRAVEL = 0.01
-"""Parts of the travel per s below which a joint stands, whatever the machine's top speed is said to be."""
+STILL_TRAVEL, STILL_TARGET = 0.01, 0.05
+"""A joint stands below so many parts of the travel per s, whatever the machine's top speed is said to be, and
+below such a part of the mean speed of its target: a slow machine moves by less."""
 JUMP_TRAVEL = 0.01
 """Part of the travel from which on a step is told; smaller ones hide in noise and coarse sensors."""
 LONGEST_LAG_S = 1.5
@@ -90,7 +147,7 @@ class RecordingFinding:
     """A stretch of a recording that needs an explanation.
 
     Attributes:
-        kind: One of `KINDS`.
+        kind: A key of `FINDINGS`.
         joint: Joint concerned, `None` where it is all of them.
         row: First row.
         num_rows: Rows on end.
@@ -99,7 +156,7 @@ class RecordingFinding:
         text: Description with its size.
     """
 
-    kind: Kind
+    kind: str
     joint: str | None
     row: int
     num_rows: int
@@ -139,20 +196,9 @@ def inspect_recording(
     """
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
-        look = _RecordingScan(recording, machine, thresholds, targets)
-        findings = [
-            *look.no_motion(),
-            *look.not_obeyed(),
-            *look.jumps(),
-            *look.no_command(),
-            *look.frozen(),
-            *look.repeated(),
-            *look.beyond(),
-            *look.exclusive(),
-        ]
-        return Inspection(
-            look.timing(), look.joints(), sorted(findings, key=lambda finding: finding.row)
-        )
+        scan = _RecordingScan(recording, machine, thresholds, targets)
+        findings = sorted(scan.find_all(), key=lambda finding: finding.row)
+        return Inspection(scan.timing(), scan.joints(), findings)
 
 
 class _RecordingScan:
@@ -182,7 +228,7 @@ class _RecordingScan:
         self._is_moving = np.abs(self._v) > thresholds.still * machine.max_speed
         self._lead = round((machine.dead_time_s + thresholds.settle_s) / self._period_s)
         least = HELD_TARGET if machine.interface == "position" else thresholds.commanded
-        self._idle = np.stack([_find_held(np.abs(u) < least, self._lead) for u in self._u.T], 1)
+        self._idle = np.stack([find_held(np.abs(u) < least, self._lead) for u in self._u.T], 1)
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
         self._step = np.array([estimate_step(q) for q in self._q.T])
         self._visible = thresholds.steps * np.fmax(
@@ -231,174 +277,131 @@ class _RecordingScan:
             }
         return found
 
-    def no_motion(self) -> list[RecordingFinding]:
-        """Find commands that should move a joint away from a stop and do not."""
-        found, margin = [], self._limits.at_limit * self._travel
-        for j, name in enumerate(self._machine.joint_names):
-            for sign in (1, -1):
-                driven = _find_held(sign * self._u[:, j] > self._limits.driving, self._lead)
-                stop = self._q[:, j] > self._machine.upper[j] - margin[j]
-                stop = stop if sign > 0 else self._q[:, j] < self._machine.lower[j] + margin[j]
-                for row, count in find_stretches(
-                    driven & ~self._is_moving[:, j] & ~stop & np.isfinite(self._v[:, j])
-                ):
-                    if count * self._period_s >= self._limits.unanswered_s:
-                        mean = self._u[row : row + count, j].mean()
-                        found.append(
-                            self._finding(
-                                "no motion",
-                                name,
-                                row,
-                                count,
-                                f"commanded {mean:+.2f}, does not move",
-                            )
-                        )
-        return found
-
-    def not_obeyed(self) -> list[RecordingFinding]:
-        """Find joints that stay away from where their target has been, or go further away."""
-        if self._targets is None:
-            return []
-        found, window = [], max(1, round(LONGEST_LAG_S / self._period_s))
-        for j, (name, unit) in enumerate(self._units()):
-            # the range of the targets that the joint may still be on its way to
-            past = np.concatenate([np.repeat(self._targets[:1, j], window), self._targets[:, j]])
-            recent = np.lib.stride_tricks.sliding_window_view(past, window + 1)
-            above, below = self._q[:, j] - recent.max(1), recent.min(1) - self._q[:, j]
-            away = np.fmax(np.fmax(above, below), 0.0)
-            coming = np.where(above > below, self._v[:, j] < 0, self._v[:, j] > 0)
-            is_coming = coming & self._is_moving[:, j]
-            far = (away > FAR_SHARE * self._travel[j]) & ~is_coming
-            for row, count in find_stretches(far):
-                if count * self._period_s >= self._limits.unanswered_s:
-                    most = away[row : row + count].max()
-                    text = f"stays up to {most:.2g} {unit} away from its target"
-                    found.append(self._finding("not obeyed", name, row, count, text))
-            is_still = np.abs(self._v[:, j]) < STILL_TRAVEL * self._travel[j]
-            for row, count in find_stretches(is_still & ~far):
-                moved = np.ptp(self._targets[row : row + max(1, count - self._lead), j])
-                is_long = count * self._period_s >= self._limits.unanswered_s
-                if is_long and moved > FAR_SHARE * self._travel[j]:
-                    text = f"stands while its target moves by {moved:.2g} {unit}"
-                    found.append(self._finding("not obeyed", name, row, count, text))
-        return found
-
-    def jumps(self) -> list[RecordingFinding]:
-        """Find steps of a position that no command causes."""
-        found = []
-        for j, (name, unit) in enumerate(self._units()):
-            q = self._q[:, j]
-            if not np.isfinite(q).all():
-                continue
-            cause = np.zeros(len(q)) if self._targets is None else self._targets[:, j]
-            wrap = find_wrap(q)
-            rows = find_jumps(self._t_s, q, cause, LONGEST_LAG_S) if wrap is None else wrap.rows
-            if wrap is None:
-                rows = np.union1d(rows, find_spikes(q) - 1)
-            for row in rows.astype(int).tolist():
-                size = q[row + 1] - q[row]
-                if abs(size) <= max(self._visible[j], JUMP_TRAVEL * self._travel[j]):
-                    continue
-                text = f"steps by {size:+.4g} {unit}" if wrap is None else wrap.explain()
-                found.append(self._finding("jump", name, row, 2, text))
-        return found
-
-    def no_command(self) -> list[RecordingFinding]:
-        """Find stretches without command over which a joint goes elsewhere."""
-        found = []
-        for j, (name, unit) in enumerate(self._units()):
-            for row, count in find_stretches(self._idle[:, j]):
-                ends = min(5, count)
-                moved = np.nanmedian(self._q[row + count - ends : row + count, j]) - np.nanmedian(
-                    self._q[row : row + ends, j]
-                )
-                if abs(moved) > max(self._limits.drift * self._travel[j], self._visible[j]):
-                    speed = moved / (count * self._period_s)
-                    text = f"moves {moved:+.3g} {unit} without command ({speed:+.2g} {unit}/s)"
-                    found.append(self._finding("no command", name, row, count, text))
-        return found
-
-    def frozen(self) -> list[RecordingFinding]:
-        """Find equal samples amid motion, and at rest where the sensor is otherwise never still."""
-        found = []
-        for j, (name, unit) in enumerate(self._units()):
-            equal = np.append(False, np.diff(self._q[:, j]) == 0)
-            is_noisy = equal.mean() < 0.05
-            for row, count in find_stretches(equal):
-                end = row + count  # first row with another value
-                jump = abs(self._q[end, j] - self._q[end - 1, j]) if end < len(equal) else 0.0
-                before, after = (
-                    abs(self._before[row - 1, j]),
-                    abs(self._after[min(end, len(equal) - 1), j]),
-                )
-                was_moving = before > self._limits.still * self._machine.max_speed[j]
-                if was_moving and jump > max(
-                    self._visible[j], JUMP * np.fmax(before, after) * self._period_s
-                ):
-                    text = f"{count + 1} equal samples, then a jump of {jump:.2g} {unit}"
-                elif is_noisy and count + 1 >= self._limits.equal_rows:
-                    text = f"{count + 1} equal samples of a sensor with noise"
-                else:
-                    continue
-                found.append(self._finding("frozen", name, row - 1, count + 1, text))
-        return found
-
-    def repeated(self) -> list[RecordingFinding]:
-        """Find rows that repeat the row before although a joint moves visibly."""
-        same = np.append(False, (np.diff(self._q, axis=0) == 0).all(1))
-        seen = (np.abs(self._v) * self._period_s > self._visible).any(1)
-        repeats = []
-        for row, count in find_stretches(same & seen):
-            repeats.append(
-                self._finding(
-                    "repeated rows", None, row, count, f"{count} rows repeat the one before"
-                )
-            )
-        return repeats
-
-    def beyond(self) -> list[RecordingFinding]:
-        """Find positions outside the limits, by more than the sensor's own noise and step."""
-        found = []
-        for j, (name, unit) in enumerate(self._units()):
-            over = np.fmax(
-                self._q[:, j] - self._machine.upper[j], self._machine.lower[j] - self._q[:, j]
-            )
+    def find_all(self) -> Iterator[RecordingFinding]:
+        """Yield all findings, kind by kind."""
+        for j, joint in enumerate(self._machine.joints):
+            yield from self._find_ignored_commands(j, joint.name)
+            yield from self._find_jumps(j, joint.name, joint.unit)
+            yield from self._find_uncommanded_motion(j, joint.name, joint.unit)
+            yield from self._find_frozen(j, joint.name, joint.unit)
+            over = np.fmax(self._q[:, j] - joint.upper.value, joint.lower.value - self._q[:, j])
             for row, count in find_stretches(over > self._visible[j]):
-                most = np.nanmax(over[row : row + count])
-                found.append(
-                    self._finding(
-                        "beyond limit",
-                        name,
-                        row,
-                        count,
-                        f"up to {most:.2g} {unit} beyond its limit",
-                    )
+                text = (
+                    f"up to {np.nanmax(over[row : row + count]):.2g} {joint.unit} beyond its limit"
                 )
-        return found
-
-    def exclusive(self) -> list[RecordingFinding]:
-        """Find commands to an exclusive joint together with others."""
-        commanded, mask = np.abs(self._u) > self._limits.commanded, self._machine.is_exclusive
-        found = []
-        for j in np.flatnonzero(mask):
+                yield self._finding("beyond limit", joint.name, row, count, text)
+            if self._targets is not None:
+                yield from self._find_disobedience(j, self._targets[:, j], joint.name, joint.unit)
+        same = np.append(False, (np.diff(self._q, axis=0) == 0).all(1))
+        is_seen = (np.abs(self._v) * self._period_s > self._visible).any(1)
+        for row, count in find_stretches(same & is_seen):
+            yield self._finding(
+                "lost frames", None, row, count, f"{count} rows repeat the one before"
+            )
+        commanded = np.abs(self._u) > self._limits.commanded
+        for j in np.flatnonzero(self._machine.is_exclusive):
             others = np.delete(commanded, j, axis=1).any(1)
             for row, count in find_stretches(commanded[:, j] & others):
-                name = self._machine.joint_names[j]
-                found.append(
-                    self._finding(
-                        "exclusive", name, row, count, "commanded together with another joint"
-                    )
-                )
-        return found
+                name, text = self._machine.joint_names[j], "commanded together with another joint"
+                yield self._finding("exclusive joint", name, row, count, text)
+
+    def _find_ignored_commands(self, j: int, name: str) -> Iterator[RecordingFinding]:
+        """Yield commands that should move a joint away from a stop and do not."""
+        joint, margin = self._machine.joints[j], self._limits.at_limit * self._travel[j]
+        for sign in (1, -1):
+            driven = find_held(sign * self._u[:, j] > self._limits.driving, self._lead)
+            low, high = joint.lower.value + margin, joint.upper.value - margin
+            stop = self._q[:, j] > high if sign > 0 else self._q[:, j] < low
+            is_ignored = driven & ~self._is_moving[:, j] & ~stop & np.isfinite(self._v[:, j])
+            for row, count in self._find_long(is_ignored):
+                text = f"commanded {self._u[row : row + count, j].mean():+.2f}, does not move"
+                yield self._finding("command without motion", name, row, count, text)
+
+    def _find_disobedience(
+        self, j: int, target: np.ndarray, name: str, unit: str
+    ) -> Iterator[RecordingFinding]:
+        """Yield stretches over which a joint stays away from where its target has been, or stands while it moves."""
+        window = max(1, round(LONGEST_LAG_S / self._period_s))
+        # the range of the targets that the joint may still be on its way to
+        past = np.concatenate([np.repeat(target[:1], window), target])
+        recent = np.lib.stride_tricks.sliding_window_view(past, window + 1)
+        above, below = self._q[:, j] - recent.max(1), recent.min(1) - self._q[:, j]
+        away = np.fmax(np.fmax(above, below), 0.0)
+        is_coming = np.where(above > below, self._v[:, j] < 0, self._v[:, j] > 0)
+        least = FAR_SHARE * self._travel[j]
+        far = (away > least) & ~(is_coming & self._is_moving[:, j])
+        for row, count in self._find_long(far):
+            text = f"stays up to {away[row : row + count].max():.2g} {unit} away from its target"
+            yield self._finding("does not obey", name, row, count, text)
+        target_speed = np.abs(np.diff(target)).mean() / self._period_s
+        still = min(STILL_TRAVEL * self._travel[j], STILL_TARGET * target_speed)
+        is_still = np.abs(self._v[:, j]) < still
+        for row, count in self._find_long(is_still & ~far):
+            moved = np.ptp(target[row : row + max(1, count - self._lead)])
+            if moved > least:
+                text = f"stands while its target moves by {moved:.2g} {unit}"
+                yield self._finding("does not obey", name, row, count, text)
+
+    def _find_jumps(self, j: int, name: str, unit: str) -> Iterator[RecordingFinding]:
+        """Yield steps of a position that no command causes."""
+        q = self._q[:, j]
+        if not np.isfinite(q).all():
+            return
+        wrap = find_wrap(q)
+        if wrap is None:
+            cause = np.zeros(len(q)) if self._targets is None else self._targets[:, j]
+            jumps = find_jumps(self._t_s, q, cause, LONGEST_LAG_S)
+            rows = np.union1d(jumps, find_spikes(q) - 1).astype(int)
+        else:
+            rows = wrap.rows
+        for row in rows.tolist():
+            size = q[row + 1] - q[row]
+            if abs(size) > max(self._visible[j], JUMP_TRAVEL * self._travel[j]):
+                text = f"steps by {size:+.4g} {unit}" if wrap is None else wrap.explain()
+                yield self._finding("jumps", name, row, 2, text)
+
+    def _find_uncommanded_motion(self, j: int, name: str, unit: str) -> Iterator[RecordingFinding]:
+        """Yield stretches without command over which a joint goes elsewhere."""
+        for row, count in find_stretches(self._idle[:, j]):
+            q, ends = self._q[row : row + count, j], min(5, count)
+            moved = np.nanmedian(q[-ends:]) - np.nanmedian(q[:ends])
+            if abs(moved) > max(self._limits.drift * self._travel[j], self._visible[j]):
+                speed = np.nanquantile(np.abs(self._v[row : row + count, j]), 0.9)
+                is_fast = speed > FAST_SHARE * self._machine.max_speed[j]
+                mean = moved / (count * self._period_s)
+                text = f"moves {moved:+.3g} {unit} without command ({mean:+.2g} {unit}/s)"
+                kind = "unlogged input" if is_fast else "motion without command"
+                yield self._finding(kind, name, row, count, text)
+
+    def _find_frozen(self, j: int, name: str, unit: str) -> Iterator[RecordingFinding]:
+        """Yield equal samples amid motion, and at rest where the sensor is otherwise never still."""
+        q = self._q[:, j]
+        equal = np.append(False, np.diff(q) == 0)
+        is_noisy = equal.mean() < 0.05
+        for row, count in find_stretches(equal):
+            end = row + count  # first row with another value
+            jump = abs(q[end] - q[end - 1]) if end < len(equal) else 0.0
+            before = abs(self._before[row - 1, j])
+            after = abs(self._after[min(end, len(equal) - 1), j])
+            was_moving = before > self._limits.still * self._machine.max_speed[j]
+            least = max(self._visible[j], JUMP * np.fmax(before, after) * self._period_s)
+            if was_moving and jump > least:
+                text = f"{count + 1} equal samples, then a jump of {jump:.2g} {unit}"
+                yield self._finding("frozen sensor", name, row - 1, count + 1, text)
+            elif is_noisy and count + 1 >= self._limits.equal_rows:
+                text = f"{count + 1} equal samples of a sensor with noise"
+                yield self._finding("frozen sensor", name, row - 1, count + 1, text)
+
+    def _find_long(self, condition: np.ndarray) -> list[tuple[int, int]]:
+        """Return the stretches of a condition that last long enough to be told."""
+        least = self._limits.unanswered_s / self._period_s
+        return [(row, count) for row, count in find_stretches(condition) if count >= least]
 
     def _finding(
-        self, kind: Kind, joint: str | None, row: int, count: int, text: str
+        self, kind: str, joint: str | None, row: int, count: int, text: str
     ) -> RecordingFinding:
         begin_s, end_s = float(self._t_s[row]), float(self._t_s[row + count - 1])
         return RecordingFinding(kind, joint, row, count, begin_s, end_s - begin_s, text)
-
-    def _units(self) -> list[tuple[str, str]]:
-        return [(joint.name, joint.unit) for joint in self._machine.joints]
 
     def _speed(self, ahead: int, behind: int) -> np.ndarray:
         """Return mean speeds from `behind` rows before to `ahead` after, `(T, J)`.
@@ -422,7 +425,7 @@ class _RecordingScan:
         return float(np.nanstd(change) / np.sqrt(2.0)) if len(change) > 20 else np.nan
 
 
-def _find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
+def find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
     """Return where `condition`, `(T,)`, has held for more than `num_rows` rows on end."""
     held = np.zeros(len(condition), dtype=bool)
     for row, count in find_stretches(condition):

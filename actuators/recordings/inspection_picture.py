@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from actuators.recordings.inspection import KINDS, Inspection, RecordingFinding
+from actuators.recordings.inspection import FINDINGS, Inspection, RecordingFinding
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure, save_figure
 from brokk_rl.record import Breach, Recording
@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # distinguishable by those who see no red or green (Okabe and Ito)
-HUES = ("#e69f00", "#f0e442", "#000000", "#cc79a7", "#56b4e9", "#0072b2", "#d55e00", "#009e73")
-COLOURS = dict(zip(KINDS, HUES, strict=True))
+HUES = (
+    "#e69f00", "#f0e442", "#000000", "#cc79a7", "#882255", "#56b4e9", "#0072b2", "#d55e00", "#009e73"
+)  # fmt: skip
+COLOURS = dict(zip(FINDINGS, HUES, strict=True))
 BREACH = "#b00020"
 THINNEST = 0.002
 """A finding is drawn at least this wide, as a part of the picture, so that a single row can be

@@ -56,7 +56,9 @@ def find_interlock(
     for recording, findings in inspected:
         mask, held = np.zeros((2, recording.num_samples), dtype=bool)
         mine = [
-            finding for finding in findings if finding.kind == "no motion" and finding.joint == name
+            finding
+            for finding in findings
+            if finding.kind == "command without motion" and finding.joint == name
         ]
         for finding in mine:
             mask[finding.row : finding.row + finding.num_rows] = True

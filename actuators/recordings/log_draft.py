@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from actuators.recordings.clocks import AlignedTime, RowTime
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
 from actuators.recordings.column_table import ColumnTable, JointGuess, read_columns
 from actuators.recordings.guess import Evidence, GivenColumns, Guess
 from actuators.recordings.log_files import Damaged, open_log
@@ -27,8 +29,9 @@ if TYPE_CHECKING:
 MAP = "actuators.recordings.column_map"
 MISSING = "???"
 """A value that a person must give; the configuration refuses to run without it."""
-QUOTED_MISSING = f'"{MISSING}"'
-"""The same within braces, where YAML takes a bare question mark for something else."""
+MAP_TEMPLATE, MACHINE_TEMPLATE = "column_map.yaml.jinja", "machine.yaml.jinja"
+LEAST_HISTORY = 13
+"""Least number of samples of the history of a policy."""
 SAMPLED_ROWS = 20000
 """Rows from the beginning of a log from which its columns are guessed: some minutes."""
 SAMPLED_LOGS = 12
@@ -96,14 +99,81 @@ class Draft:
         """True if all joints are commanded by position; a machine is commanded by one quantity."""
         return all(joint.kind == "position" for joint in self.joints)
 
+    @property
+    def period_s(self) -> float:
+        """Period of the machine."""
+        period_s = max(self.survey.period_s, 1.0 / HIGHEST_RATE_HZ)
+        return round(period_s, 3) if period_s >= 0.005 else period_s
+
+    @property
+    def dead_time_s(self) -> float:
+        """Median lag of the joints, at least a period."""
+        return round(max(float(np.median([one.lag_s for one in self.joints])), self.period_s), 3)
+
+    @property
+    def num_history(self) -> int:
+        """Samples of the history."""
+        return max(LEAST_HISTORY, math.ceil(4 * self.dead_time_s / self.period_s))
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Time between two rows from which on a log is split."""
+        return _round_up(GAP_PERIODS * self.survey.slowest_period_s)
+
+    @property
+    def shortest_s(self) -> float:
+        """Shortest piece; a log of seconds is one piece, and a slow one has some rows in each."""
+        return max(min(SHORTEST_S, 0.5 * self.survey.longest_s), 20.0 * self.survey.period_s)
+
+    def find_reach(self, joint: JointGuess) -> tuple[float, float]:
+        """Return the ends of the travel, rad or m: those of positions and targets, and some more."""
+        survey = self.survey.joints[joint.name]
+        ends = [joint.scale * survey.lowest, joint.scale * survey.highest]
+        if joint.kind == "position":
+            for target in (survey.lowest_command, survey.highest_command):
+                ends.append(joint.target_scale * target + joint.target_offset)
+        spare = SPARE * (max(ends) - min(ends))
+        low, high = min(ends) - spare, max(ends) + spare
+        return math.floor(1000 * low) / 1000, math.ceil(1000 * high) / 1000
+
+    def measure_full_speed(self, joint: JointGuess) -> float:
+        """Return the speed at full command, rad/s or m/s.
+
+        That of the command where its unit says it, else of the fastest motion. The fastest target says
+        nothing about a machine: a step of a target is infinitely fast.
+        """
+        if joint.kind == "velocity" and joint.speed_scale is not None:
+            full = self.scale_command(joint)
+            if full.neutral == 0.0:
+                largest = max(abs(full.full_plus or 0.0), abs(full.full_minus or 0.0))
+                return joint.speed_scale * largest
+        return _round_up(abs(joint.scale) * self.survey.joints[joint.name].top_speed)
+
+    def scale_command(self, joint: JointGuess) -> CommandDraft:
+        """Return neutral and full commands of a joint whose command sets its speed, or a force."""
+        return scale_command(joint, self.survey.joints[joint.name])
+
     def list_guesses(self) -> list[Guess]:
         """Return all guesses, those of the clocks first."""
         found = [time.guess for time in self.times.values()]
         for joint in self.joints:
             found += joint.guesses.values()
             if joint.kind != "position":
-                found.append(scale_command(joint, self.survey.joints[joint.name]).guess)
+                found.append(self.scale_command(joint).guess)
         return found
+
+    def format(self, template: str) -> str:
+        """Return the column map or the machine as YAML, by `MAP_TEMPLATE` or `MACHINE_TEMPLATE`."""
+        folder = FileSystemLoader(Path(__file__).parent)
+        environment = Environment(loader=folder, undefined=StrictUndefined)
+        environment.filters |= {"quote": _quote, "explain": _explain}
+        names = {
+            "map": MAP,
+            "missing": MISSING,
+            "gap_periods": GAP_PERIODS,
+            "spare": f"{SPARE:.0%}",
+        }
+        return environment.get_template(template).render(draft=self, **names)
 
 
 def make_draft(
@@ -216,200 +286,6 @@ def scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
     if joint.sign < 0:
         above, below = below, above
     return CommandDraft(neutral, above, below, guess)
-
-
-def format_map(draft: Draft) -> str:
-    """Return the column map as YAML."""
-    lines = [
-        "# @package reader",
-        f"# Logs of {draft.name}, as guessed from {draft.survey.num_runs} of them.",
-        f"# {MISSING} stands where the guess was unsure: fill it in. Used with machine=@machine.yaml.",
-        f"_target_: {MAP}.ColumnMap",
-        f"delimiter: {_quote(draft.signs[0])}   # of text files only",
-        f"decimal: {_quote(draft.signs[1])}",
-        "time:",
-    ]
-    for table, time in draft.times.items():
-        lines.append(f"  {_quote(table)}: {_format_time(time)}")
-    if list(draft.times) == [""]:
-        lines[-2:] = [f"time: {_format_time(draft.times[''])}"]
-    lines.append("joints:")
-    for joint in draft.joints:
-        lines += _format_joint(joint, draft.survey.joints[joint.name], draft.has_targets)
-    period_s = draft.survey.slowest_period_s
-    # a log of seconds is one piece, and a slow one has some rows in each
-    shortest_s = max(min(SHORTEST_S, 0.5 * draft.survey.longest_s), 20.0 * draft.survey.period_s)
-    lines += [
-        "optional: {}",
-        "overrun: 0.001        # of full command; rounding",
-        f"longest_gap_s: {_round_up(GAP_PERIODS * period_s):g}   # s; {GAP_PERIODS} periods of {period_s:.4g} s",
-        f"shortest_s: {shortest_s:.4g}         # s; shorter ones hold no free run worth judging",
-        f"damaged: {draft.damaged}       # skip: leave damaged rows, messages, chunks and frames out",
-    ]
-    if draft.dbc is not None:
-        head, body = lines[:3], [f"  {line}" for line in lines[3:]]
-        channel = "null" if draft.channel is None else draft.channel
-        lines = [
-            *head,
-            f"_target_: {MAP}.CanColumnMap",
-            f"dbc: {_quote(draft.dbc)}",
-            f"channel: {channel}",
-            "columns:",
-            *body,
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def _format_time(time: TimeGuess) -> str:
-    clock = time.time
-    if isinstance(clock, RowTime):
-        text = f"{{_target_: {MAP}.RowTime, rate_hz: {clock.rate_hz!r}}}"
-        return f"{text}   # {_explain(time.guess)}"
-    column = MISSING if time.guess.is_open else clock.column
-    if isinstance(clock, AlignedTime):
-        anchor = f"{{_target_: {MAP}.Column, column: {_quote(clock.anchor.column)}, scale: 1.0, offset: {clock.anchor.offset!r}}}"
-        text = f"{{_target_: {MAP}.AlignedTime, column: {_quote(column)}, scale: {clock.scale!r}, anchor: {anchor}}}"
-    else:
-        wraps = "" if clock.wraps is None else f", wraps: {clock.wraps!r}"
-        text = f"{{_target_: {MAP}.Column, column: {_quote(column)}, scale: {clock.scale!r}, offset: {clock.offset!r}{wraps}}}"
-    return f"{text}   # {_explain(time.guess)}"
-
-
-def _format_joint(joint: JointGuess, survey: JointSurvey, has_targets: bool) -> list[str]:
-    columns, kind, unit = (joint.guesses[key] for key in ("columns", "kind", "unit"))
-    command = MISSING if columns.is_open else joint.command
-    position = MISSING if columns.is_open else joint.position
-    scale = QUOTED_MISSING if unit.is_open else repr(joint.scale)
-    lines = [
-        f"  {joint.name}:   # {_explain(columns)}",
-        f"    _target_: {MAP}.JointColumns",
-        f"    # command: {_explain(kind)}",
-    ]
-    wraps = "" if joint.wraps is None else f", wraps: {joint.wraps!r}"
-    if kind.is_open:
-        lines.append(f"    command: {QUOTED_MISSING}")
-    elif joint.kind == "position":
-        target_scale = repr(joint.target_scale) if scale != QUOTED_MISSING else scale
-        target_wraps = "" if joint.target_wraps is None else f", wraps: {joint.target_wraps!r}"
-        offset, remark = "", f"{joint.unit} for one of the log; a target is the command itself"
-        if (target := joint.guesses.get("target")) is not None:
-            target_scale, offset = QUOTED_MISSING, f", offset: {QUOTED_MISSING}"
-            remark = f"{_explain(target)}"
-        speed = "null"
-        if not has_targets:
-            speed = (
-                f"{measure_full_speed(joint, survey):g}"
-                if target_scale != QUOTED_MISSING
-                else QUOTED_MISSING
-            )
-            remark += f"; full_speed in {joint.unit}/s is the fastest motion of the logs"
-        lines.append(
-            f"    command: {{_target_: {MAP}.TargetColumn, column: {_quote(command)}, scale: {target_scale}, "
-            f"full_speed: {speed}{offset}{target_wraps}}}   # {remark}"
-        )
-    else:
-        full = scale_command(joint, survey)
-        numbers = [QUOTED_MISSING] * 3
-        if not full.guess.is_open:
-            numbers = [
-                "null" if v is None else repr(v)
-                for v in (full.neutral, full.full_plus, full.full_minus)
-            ]
-        lines += [
-            f"    # {_explain(full.guess)}",
-            f"    command: {{_target_: {MAP}.CommandColumn, column: {_quote(command)}, neutral: {numbers[0]}, "
-            f"full_plus: {numbers[1]}, full_minus: {numbers[2]}}}",
-        ]
-    lines.append(
-        f"    position: {{_target_: {MAP}.Column, column: {_quote(position)}, scale: {scale}, offset: 0.0{wraps}}}"
-        f"   # {joint.unit} for one of the log; {_explain(unit)}"
-    )
-    return lines
-
-
-def measure_full_speed(joint: JointGuess, survey: JointSurvey) -> float:
-    """Return the speed at full command, rad/s or m/s: that of the command where its unit says it, else of the fastest motion.
-
-    The fastest target says nothing about a machine: a step of a target is infinitely fast.
-    """
-    if joint.kind == "velocity" and joint.speed_scale is not None:
-        full = scale_command(joint, survey)
-        if full.neutral == 0.0:
-            return joint.speed_scale * max(abs(full.full_plus or 0.0), abs(full.full_minus or 0.0))
-    return _round_up(abs(joint.scale) * survey.top_speed)
-
-
-def format_machine(draft: Draft) -> str:
-    """Return the machine as YAML: joints without bodies, limits and speeds as the logs show them."""
-    period_s = max(draft.survey.period_s, 1.0 / HIGHEST_RATE_HZ)
-    period_s = round(period_s, 3) if period_s >= 0.005 else period_s
-    lags_s = sorted(joint.lag_s for joint in draft.joints)
-    dead_time_s = round(max(lags_s[len(lags_s) // 2], period_s), 3)
-    num_history = max(13, math.ceil(4 * dead_time_s / period_s))
-    lines = [
-        f"# {draft.name}, as its logs show it: joints only.",
-        "# It can be recorded, identified and diagnosed, not simulated: bodies and tool are unknown.",
-        "_target_: brokk_rl.machine.Machine",
-        f"name: {draft.name}",
-        f"title: {_quote(f'{draft.name}, {len(draft.joints)} joints, drafted from {draft.survey.minutes:.1f} minutes of logs')}",
-        "mjcf: null",
-        f"period_s: {period_s:g}   # s; median of its logs is {draft.survey.period_s:.4g} s",
-        f"dead_time_s: {dead_time_s:g}   # s; median lag of the joints at the best correlation; mode=inspect estimates it",
-        f"num_history: {num_history}   # samples; four times the dead time, at least 13",
-        "exclusive: []",
-        "tool_m: null",
-        "levers: []",
-        "joints:",
-    ]
-    for joint in draft.joints:
-        lines += _format_machine_joint(joint, draft.survey.joints[joint.name], draft.has_targets)
-    return "\n".join(lines) + "\n"
-
-
-def _format_machine_joint(joint: JointGuess, survey: JointSurvey, has_targets: bool) -> list[str]:
-    ends = [joint.scale * survey.lowest, joint.scale * survey.highest]
-    if joint.kind == "position":
-        for target in (survey.lowest_command, survey.highest_command):
-            ends.append(joint.target_scale * target + joint.target_offset)
-    spare = SPARE * (max(ends) - min(ends))
-    low, high = min(ends) - spare, max(ends) + spare
-    speed: float | None = measure_full_speed(joint, survey)
-    is_known = not joint.guesses["unit"].is_open
-    home = f"{(low + high) / 2:.3f}" if is_known else QUOTED_MISSING
-    lower: float | None = math.floor(1000 * low) / 1000
-    upper: float | None = math.ceil(1000 * high) / 1000
-    if not is_known:
-        lower = upper = speed = None
-    reach = f"of its logs, {SPARE:.0%} of the travel further"
-    lines = [
-        f"  - name: {joint.name}",
-        "    part: null",
-        f"    kind: {'hinge' if joint.unit == 'rad' else 'slide'}",
-        f"    lower: {_format_dimension(lower, f'smallest position or target {reach}')}",
-        f"    upper: {_format_dimension(upper, f'largest position or target {reach}')}",
-        f"    home: {home}   # {joint.unit}; middle of the range",
-        f"    max_speed: {_format_dimension(speed, f'fastest motion in its logs, {joint.unit}/s')}",
-        "    body: null",
-    ]
-    if has_targets:
-        lines.append("    command: position   # full commands are the ends of the travel")
-    elif joint.kind == "velocity" and joint.speed_scale is not None:
-        lines.append("    command: velocity")
-    elif joint.kind == "torque":
-        full = scale_command(joint, survey).full_plus
-        force = "Nm" if joint.unit == "rad" else "N"
-        lines += [
-            "    command: torque",
-            f"    # {MISSING}: {force} at full command, which is {full:g} of '{joint.command}'",
-            f"    max_force: {{value: {QUOTED_MISSING}, "
-            'source: "given by hand", confidence: medium}',
-        ]
-    return lines
-
-
-def _format_dimension(value: float | None, source: str) -> str:
-    shown = QUOTED_MISSING if value is None else f"{value:g}"
-    return f"{{value: {shown}, source: {_quote(source)}, confidence: low}}"
 
 
 def _explain(guess: Guess) -> str:

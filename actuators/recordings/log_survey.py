@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,23 +44,23 @@ class JointSurvey:
     rest: float = np.nan
     rest_share: float = 0.0
 
-    def add(self, command: Signal, position: Signal, turn: float | None) -> None:
-        """Add a run; positions that begin again after a turn are put next to those before."""
+    def add(self, command: Signal, position: Signal, joint: JointGuess) -> None:
+        """Add a run; positions that begin again after a turn are put next to their targets, or to those before."""
         u, q, t_s = command.values, position.values, position.t_s
-        if turn is not None and turn > 0.0:
+        turn = joint.wraps or 0.0
+        if turn > 0.0:
             middle = (
-                (self.lowest + self.highest) / 2
-                if math.isfinite(self.lowest)
-                else float(np.median(q))
+                (self.lowest + self.highest) / 2 if self.lowest < np.inf else float(np.median(q))
             )
+            if joint.kind == "position" and joint.target_wraps is None:
+                target = joint.target_scale * float(np.median(u)) + joint.target_offset
+                middle = target / joint.scale
             q = q + turn * round((middle - float(np.median(q))) / turn)
-            u = u + turn * round(float(np.median(np.interp(command.t_s, t_s, q) - u)) / turn)
+            if joint.target_wraps is not None:
+                u = u + turn * round(float(np.median(np.interp(command.t_s, t_s, q) - u)) / turn)
         self.lowest_command = min(self.lowest_command, float(u.min()))
         self.highest_command = max(self.highest_command, float(u.max()))
-        self.lowest, self.highest = (
-            min(self.lowest, float(q.min())),
-            max(self.highest, float(q.max())),
-        )
+        self.lowest, self.highest = min(self.lowest, q.min()), max(self.highest, q.max())
         step = max(1, int(0.1 / float(np.median(np.diff(t_s)))))
         if len(q) <= step:
             return
@@ -143,38 +142,27 @@ def measure_logs(
         )
         position = Column(column=joint.position, scale=1.0, offset=0.0, wraps=joint.wraps)
         columns[joint.name] = JointColumns(command=command, position=position)
+    clocks = {table: one.time for table, one in times.items()}
     reader = ColumnMap(
-        delimiter=",",
-        decimal=".",
-        time={table: one.time for table, one in times.items()},
-        joints=columns,
-        optional={},
-        overrun=0.0,
-        longest_gap_s=1.0,
-        shortest_s=0.0,
-        damaged=damaged,
-    )
-    if list(times) == [""]:
-        reader = ColumnMap(**{**reader.__dict__, "time": times[""].time})
+        delimiter=",", decimal=".", time=clocks[""] if list(clocks) == [""] else clocks, joints=columns,
+        optional={}, overrun=0.0, longest_gap_s=1.0, shortest_s=0.0, damaged=damaged,
+    )  # fmt: skip
     survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
     for path in paths:
         opened = open_log(path, None, dbc, damaged, channel)
-        missing = [
-            name
-            for joint in joints
-            for name in (joint.command, joint.position)
-            if name not in index_columns(opened.list_tables())
-        ]
-        if missing:
-            raise RecordingError(
-                f"{path}: column '{missing[0]}' is missing, which {paths[0]} has; import logs of one kind at a time"
-            )
+        known = index_columns(opened.list_tables())
+        for joint in joints:
+            for name in (joint.command, joint.position):
+                if name not in known:
+                    raise RecordingError(
+                        f"{path}: column '{name}' is missing, which {paths[0]} has; import logs of one kind at a time"
+                    )
         for signals in reader.open_runs(opened, None):
-            clocks = []
+            read = []
             for joint in joints:
                 position = signals.read(joint.position, wraps=joint.wraps)
                 command = signals.read(joint.command, wraps=joint.target_wraps)
-                survey.joints[joint.name].add(command, position, joint.wraps)
-                clocks += [position, command]
-            survey.add_clocks(signals.run.where, clocks)
+                survey.joints[joint.name].add(command, position, joint)
+                read += [position, command]
+            survey.add_clocks(signals.run.where, read)
     return survey

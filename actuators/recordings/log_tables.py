@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,20 +30,27 @@ class Table:
         units: Units that the log itself states, by column.
         clock: Column whose values are seconds by the reader's own making; `None` without one.
         is_sparse: Rows need not have all columns: messages of one topic, pages of one CAN message.
+        find_line: Returns the number of the line of a row, and the text of its cells by column; `None`
+            for a file without lines.
     """
 
     columns: Mapping[str, np.ndarray]
     units: Mapping[str, str] = field(default_factory=dict)
     clock: str | None = None
     is_sparse: bool = False
+    find_line: Callable[[int], tuple[int, Mapping[str, str]]] | None = None
 
     def locate(self, row: int) -> str:
         """Return the place of a row in its file, for a message."""
-        return f"row {row}"
+        return (
+            f"row {row}" if self.find_line is None else f"line {self.find_line(row)[0]} (row {row})"
+        )
 
     def show_cell(self, row: int, column: str) -> str:
-        """Return the value of a cell as its file has it, for a message."""
-        return f"{self.columns[column][row]:g}"
+        """Return the value of a cell as its file has it, for a message; two quotes for an empty one."""
+        if self.find_line is None:
+            return f"{self.columns[column][row]:g}"
+        return self.find_line(row)[1][column] or "''"
 
 
 @dataclass(frozen=True)

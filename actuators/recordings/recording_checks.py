@@ -11,26 +11,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from actuators.recordings.inspection import (
+    FINDINGS,
+    FindingKind,
     InspectionThresholds,
     RecordingFinding,
+    Severity,
     inspect_recording,
 )
-from actuators.recordings.interlocks import SPEED_ROWS, Interlock, find_interlock
+from actuators.recordings.interlocks import Interlock, find_interlock
 from actuators.scales import choose_horizon_s
 from brokk_rl.commands import read_targets, view_recordings
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
 
-FAST_SHARE = 0.2
-"""Speed, of full speed, from which motion without command is no sinking load but an input that is
-not logged. The effect `creep` sinks at a few percent; chosen by hand."""
-
-Severity = Literal["note", "warn", "bad"]
 MAX_IRREGULAR_SHARE = 0.05
 """Share of periods further than 10 % from the median from which a clock is irregular; chosen by
 hand."""
@@ -82,131 +80,65 @@ class RecordingRemark:
         return asdict(self)
 
 
-TEXTS: dict[str, tuple[Severity, str, str]] = {
-    "command without motion": (
-        "warn",
-        "a dead band wider than expected, an interlock or dead-man that is not logged, or a load too heavy",
-        "log the interlocks; leave these stretches out if the machine was not allowed to move",
-    ),
-    "interlock": (
+REMARKS = FINDINGS | {
+    "interlock": FindingKind(
         "bad",
         "the joint ignores its command whenever that condition holds: a lock that is not logged",
         "log the lock as a command of 0, or leave these stretches out",
     ),
-    "does not obey": (
-        "bad",
-        "the joint stays away from its target: its drive is off or blocked, or too weak for the load",
-        "leave these stretches out, or log the enable signal and use the parts in which the drive is on",
-    ),
-    "jumps": (
-        "bad",
-        "the position steps by more than a machine moves: an angle or a counter that wraps, a sign bit, a reset, or two sources",
-        "import again with log.wraps, or leave the other source out; no model can follow these steps",
-    ),
-    "motion without command": (
-        "warn",
-        "the load sinks (a leak), or the joint was moved by something that is not logged",
-        "log every input; a slow sinking towards the load is the effect 'creep'",
-    ),
-    "unlogged input": (
-        "bad",
-        "the joint moves at a working speed without command: something moves it that is not logged",
-        "log every input that moves the machine: levers, a second operator, automatic functions",
-    ),
-    "frozen sensor": (
-        "warn",
-        "the sensor did not measure for a while, then jumped",
-        "check sensor and cable; the motion is real",
-    ),
-    "lost frames": (
-        "note",
-        "rows repeat the row before although the machine moves: positions were lost on their way",
-        "record frame counters; small rates are the effect 'frame_loss' or a slow sensor",
-    ),
-    "beyond limit": (
-        "warn",
-        "measured beyond the limits of the machine's file",
-        "measure the end stops; correct the machine's file",
-    ),
-    "exclusive joint": (
-        "bad",
-        "an exclusive joint is commanded together with others, which the machine forbids: one of both is not carried out",
-        "record what was really sent",
-    ),
-    "irregular clock": (
+    "irregular clock": FindingKind(
         "warn",
         "rows are not equally spaced in time",
         "stamp rows where they are measured, not where they are written",
     ),
-    "clock jumps": (
-        "warn",
-        "single periods are much longer than the others",
-        "record frame counters",
+    "clock jumps": FindingKind(
+        "warn", "single periods are much longer than the others", "record frame counters"
     ),
-    "clock rate": (
+    "clock rate": FindingKind(
         "note",
         "the clock runs faster or slower than the stated rate",
         "state the true rate, or discipline the clock",
     ),
-    "saturated sensor": (
+    "saturated sensor": FindingKind(
         "bad",
         "the sensor stays at one end of its range, away from the joint's stops: it cannot say more, or a stop is nearer than known",
         "check the sensor's range and the machine's limits",
     ),
-    "joint at rest": (
+    "joint at rest": FindingKind(
         "note",
         "hardly commanded here: nothing can be said about this joint",
         "record runs that move it",
     ),
 }
-"""Severity, meaning and advice of each remark."""
-FINDING_NAMES = {
-    "no motion": "command without motion",
-    "not obeyed": "does not obey",
-    "jump": "jumps",
-    "no command": "motion without command",
-    "frozen": "frozen sensor",
-    "repeated rows": "lost frames",
-    "beyond limit": "beyond limit",
-    "exclusive": "exclusive joint",
-}
-"""Name of a remark by kind of finding in `actuators.recordings.inspection`."""
+"""All remarks: findings in single recordings, and what only whole recordings show."""
 
 
 def examine_recordings(
     recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> list[RecordingRemark]:
     """Return all remarks about recordings of `machine`, the most severe first."""
-    inspected = [
-        (seen, inspect_recording(seen, machine, thresholds, find_targets(one, machine)).findings)
-        for one, seen in zip(recordings, view_recordings(recordings, machine), strict=True)
-    ]
+    inspected = []
+    for one, seen in zip(recordings, view_recordings(recordings, machine), strict=True):
+        targets = find_targets(one, machine)
+        inspected.append((seen, inspect_recording(seen, machine, thresholds, targets).findings))
     recordings = [recording for recording, _ in inspected]
-    locks = list(
-        filter(
-            None,
-            (find_interlock(inspected, machine, j, thresholds) for j in range(machine.num_joints)),
-        )
-    )
-    remarks = [remark for lock in locks for remark in _report_interlock(lock, recordings)]
-    locked = {lock.joint for lock in locks}
+    remarks: list[RecordingRemark] = []
+    locked = set()
+    for j, name in enumerate(machine.joint_names):
+        lock = find_interlock(inspected, machine, j, thresholds)
+        if lock is not None:
+            locked.add(name)
+            remarks += _report_interlock(lock, recordings)
     for recording, findings in inspected:
-        rest = [f for f in findings if not (f.kind == "no motion" and f.joint in locked)]
-        remarks += [
-            *_group_findings(recording, rest, machine),
-            *_check_clock(recording),
-            *_check_saturation(recording, machine, thresholds),
-        ]
+        left = [f for f in findings if f.kind != "command without motion" or f.joint not in locked]
+        remarks += _group_findings(recording, left, machine)
+        remarks += _check_clock(recording)
+        remarks += _check_saturation(recording, machine, thresholds)
     remarks += _check_excitation(recordings, machine, thresholds)
-    order = {"bad": 0, "warn": 1, "note": 2}
+    order = ("bad", "warn", "note")
     return sorted(
         remarks,
-        key=lambda remark: (
-            order[remark.severity],
-            remark.name,
-            remark.joint or "",
-            remark.recording,
-        ),
+        key=lambda one: (order.index(one.severity), one.name, one.joint or "", one.recording),
     )
 
 
@@ -231,35 +163,12 @@ def _make_remark(
     amount: str,
     share: float = 0.0,
 ) -> RecordingRemark:
-    severity, meaning, advice = TEXTS[name]
+    kind = REMARKS[name]
     where = recording if isinstance(recording, str) else name_recording(recording)
+    begin_s, end_s = map(float, span_s)
     return RecordingRemark(
-        name,
-        severity,
-        joint,
-        where,
-        float(span_s[0]),
-        float(span_s[1]),
-        count,
-        amount,
-        meaning,
-        advice,
-        share,
-    )
-
-
-def _name_finding(finding: RecordingFinding, recording: Recording, machine: Machine) -> str:
-    """Return the name of the remark about a finding; fast motion without command has one of its own."""
-    if finding.kind != "no command":
-        return FINDING_NAMES[finding.kind]
-    j = machine.joint_names.index(finding.joint or "")
-    q = recording.q[finding.row : finding.row + finding.num_rows, j]
-    ahead = 2 * SPEED_ROWS
-    if len(q) <= ahead:
-        return FINDING_NAMES[finding.kind]
-    speed = np.abs(q[ahead:] - q[:-ahead]) * recording.rate_hz / ahead
-    is_fast = np.quantile(speed, 0.9) > FAST_SHARE * machine.max_speed[j]
-    return "unlogged input" if is_fast else FINDING_NAMES[finding.kind]
+        name, kind.severity, joint, where, begin_s, end_s, count, amount, kind.meaning, kind.advice, share
+    )  # fmt: skip
 
 
 def _group_findings(
@@ -268,7 +177,7 @@ def _group_findings(
     """Yield one remark for all stretches of one kind and joint."""
 
     def key(finding: RecordingFinding) -> tuple[str, str]:
-        return _name_finding(finding, recording, machine), finding.joint or ""
+        return finding.kind, finding.joint or ""
 
     for (name, joint), group in groupby(sorted(findings, key=key), key):
         some = sorted(group, key=lambda finding: finding.row)
@@ -301,35 +210,24 @@ def _report_interlock(
 
 
 def _check_clock(recording: Recording) -> Iterator[RecordingRemark]:
-    period_s = np.diff(recording.t_s)
+    t_s, period_s = recording.t_s, np.diff(recording.t_s)
     median_s = float(np.median(period_s))
-    whole = recording.t_s[0], recording.t_s[-1]
-    odd = np.abs(period_s / median_s - 1.0)
-    if (odd > 0.1).mean() > MAX_IRREGULAR_SHARE:
+    is_odd = np.abs(period_s / median_s - 1.0) > 0.1
+    late = np.flatnonzero(period_s > JUMP_PERIODS * median_s)
+    if is_odd.mean() > MAX_IRREGULAR_SHARE:
         low, high = np.percentile(period_s, (5, 95)) * 1e3
         text = f"periods of {low:.1f} to {high:.1f} ms (5 to 95 %), median {median_s * 1e3:.1f} ms"
-        yield _make_remark("irregular clock", None, recording, whole, int((odd > 0.1).sum()), text)
-    elif len(late := np.flatnonzero(period_s > JUMP_PERIODS * median_s)):
+        span_s = t_s[0], t_s[-1]
+        yield _make_remark("irregular clock", None, recording, span_s, int(is_odd.sum()), text)
+    elif len(late):
         text = f"up to {period_s.max() * 1e3:.1f} ms, median {median_s * 1e3:.1f} ms"
-        yield _make_remark(
-            "clock jumps",
-            None,
-            recording,
-            (recording.t_s[late[0]], recording.t_s[late[-1] + 1]),
-            len(late),
-            text,
-        )
-    mean_s = (recording.t_s[-1] - recording.t_s[0]) / len(period_s)
+        span_s = t_s[late[0]], t_s[late[-1] + 1]
+        yield _make_remark("clock jumps", None, recording, span_s, len(late), text)
+    mean_s = (t_s[-1] - t_s[0]) / len(period_s)
     ppm = 1e6 * (mean_s * recording.rate_hz - 1.0)
     if abs(ppm) > MAX_CLOCK_PPM:
-        yield _make_remark(
-            "clock rate",
-            None,
-            recording,
-            whole,
-            1,
-            f"{ppm:+.0f} ppm: {1.0 / mean_s:.3f} Hz, stated {recording.rate_hz:g} Hz",
-        )
+        text = f"{ppm:+.0f} ppm: {1.0 / mean_s:.3f} Hz, stated {recording.rate_hz:g} Hz"
+        yield _make_remark("clock rate", None, recording, (t_s[0], t_s[-1]), 1, text)
 
 
 def _check_saturation(

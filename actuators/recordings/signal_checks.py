@@ -69,7 +69,10 @@ def find_wrap(values: np.ndarray) -> Wrap | None:
         return None
     steps, span = np.diff(values), float(np.ptp(values))
     typical = float(np.quantile(np.abs(steps), 0.9))
+    is_count = values.min() >= 0 and bool((values == np.round(values)).all())
     for modulus in MODULI:
+        if is_count and values.max() >= modulus:
+            continue  # a counter never reaches its modulus, a sign bit is above it
         if not 0.85 * modulus <= span <= 1.02 * modulus or typical > 0.2 * modulus:
             continue
         rows = np.flatnonzero(np.abs(steps) > 0.5 * modulus)

@@ -9,6 +9,8 @@ since 1970, a time of day seconds since midnight. pandas does the reading.
 from __future__ import annotations
 
 import csv
+import functools
+import itertools
 import logging
 import re
 from collections import Counter
@@ -32,30 +34,14 @@ SNIFFED_BYTES = 1 << 16
 DELIMITERS = (",", ";", "\t", " ", "|")
 COMMENT_MARKS = "#%;/!*"
 """Signs that begin a line of comment."""
-MISSING = (
-    "",
-    "nan",
-    "NaN",
-    "NAN",
-    "na",
-    "NA",
-    "N/A",
-    "n/a",
-    "null",
-    "NULL",
-    "None",
-    "none",
-    "-",
-    "--",
-)
+MISSING_WORDS = "nan NaN NAN na NA N/A n/a null NULL None none - --"
+MISSING = ("", *MISSING_WORDS.split())
 """Cells without a value."""
 FLAGS = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0}
 ISO_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[+-]\d\d:?\d\d)?")
 DAY_TIME = re.compile(r"\d\d?[./]\d\d?[./]\d{4}[T ]+\d\d?:\d\d(:\d\d([.,]\d+)?)?")
 """Day, month, year and time of day."""
 CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
-ITEM = re.compile(r"(.*)\[([^\]]*)\]")
-"""Name of an item of a list: column and label."""
 
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
@@ -82,29 +68,14 @@ class TextLayout:
     names: tuple[str, ...]
     samples: tuple[tuple[str, ...], ...]
 
-    def tell_kind(self, at: int) -> CellKind:
-        """Return the kind of column `at`: that of most of its cells."""
-        kinds: Counter[CellKind] = Counter(
-            tell_kind(row[at], self.decimal) for row in self.samples if row[at] not in MISSING
-        )
-        return kinds.most_common(1)[0][0] if kinds else "number"
-
-
-@dataclass(frozen=True)
-class TextTable(Table):
-    """Columns of a text log, whose lines are found again when a message names one."""
-
-    source: TextLog | None = None
-
-    def locate(self, row: int) -> str:
-        """Return line and row."""
-        assert self.source is not None
-        return f"line {self.source.find_line(row)[0]} (row {row})"
-
-    def show_cell(self, row: int, column: str) -> str:
-        """Return the text of a cell, two quotes for an empty one."""
-        assert self.source is not None
-        return self.source.find_line(row)[1][self.source.find_column(column)] or "''"
+    @functools.cached_property
+    def kinds(self) -> list[CellKind]:
+        """Kinds of the columns: each that of most of its cells."""
+        found: list[CellKind] = []
+        for cells in zip(*self.samples, strict=True):
+            counts = Counter(tell_kind(cell, self.decimal) for cell in cells if cell not in MISSING)
+            found.append(counts.most_common(1)[0][0] if counts else "number")
+        return found
 
 
 class TextLog(LogFile):
@@ -121,35 +92,20 @@ class TextLog(LogFile):
             labels: Names for the items of lists of this length, instead of numbers.
         """
         super().__init__(path)
-        self._labels = labels
         self.layout = detect_layout(path, signs)
-
-    def find_column(self, name: str) -> int:
-        """Return the place of a column, or of the list that an item belongs to."""
-        item = ITEM.fullmatch(name)
-        names = self.layout.names
-        return names.index(name if name in names or item is None else item[1])
-
-    def find_line(self, row: int) -> tuple[int, list[str]]:
-        """Return number, from 1, and cells of the line of a row of data."""
-        with self.path.open(encoding=self.layout.encoding, errors="replace") as file:
-            count = -1
-            for number, line in enumerate(file):
-                count += number >= self.layout.first_line and bool(line.strip())
-                if count == row:
-                    return number + 1, split_line(line, self.layout.delimiter)
-        raise RecordingError(f"{self.path}: has no row {row}")
+        self._places: dict[str, tuple[int, int]] = {}
+        for at, name in enumerate(self.layout.names):
+            kind = self.layout.kinds[at]
+            if kind == "list":
+                length = len(split_list(self.layout.samples[0][at]))
+                tags = labels if len(labels) == length else range(length)
+                self._places |= {f"{name}[{tag}]": (at, item) for item, tag in enumerate(tags)}
+            elif name and kind != "text":
+                self._places[name] = (at, 0)
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the columns whose cells are numbers, times, flags or lists."""
-        found: list[str] = []
-        for at, name in enumerate(self.layout.names):
-            kind = self.layout.tell_kind(at)
-            if kind == "list":
-                found += [f"{name}[{label}]" for label in self._label_items(at)]
-            elif name and kind != "text":
-                found.append(name)
-        return {"": found}
+        return {"": [*self._places]}
 
     def read_runs(
         self, wanted: Mapping[str, Collection[str]], max_rows: int | None
@@ -159,31 +115,36 @@ class TextLog(LogFile):
         Raises:
             RecordingError: A cell cannot be read, or the file is damaged; names line and column.
         """
-        places = {name: self.find_column(name) for name in wanted.get("", ())}
-        cells = self._read_cells(sorted(set(places.values())), max_rows)
-        columns = {}
-        for at, several in cells.items():
-            numbers = self._convert(several, at)
-            for name in (name for name, place in places.items() if place == at):
-                if numbers.ndim == 1:
-                    columns[name] = numbers
-                else:
-                    label = name.removeprefix(f"{self.layout.names[at]}[").removesuffix("]")
-                    columns[name] = numbers[:, self._label_items(at).index(label)]
-        ordered = {name: columns[name] for name in places}
-        yield LogRun(self.path.stem, str(self.path), {"": TextTable(ordered, source=self)})
+        places = {name: self._places[name] for name in wanted.get("", ())}
+        frame = self._read_cells(sorted({at for at, _ in places.values()}), max_rows)
+        numbers = {at: self._convert(cells, at) for at, cells in frame.items()}
+        columns = {name: numbers[at][:, item] for name, (at, item) in places.items()}
+        yield LogRun(self.path.stem, str(self.path), {"": Table(columns, find_line=self.find_line)})
+
+    def find_line(self, row: int) -> tuple[int, dict[str, str]]:
+        """Return number, from 1, and cells by column of the line of a row of data."""
+        number, cells, _ = next(itertools.islice(self._iterate_lines(), row, None))
+        cells += [""] * len(self.layout.names)  # a damaged line may have fewer
+        return number, {name: cells[at] for name, (at, _) in self._places.items()}
+
+    def _iterate_lines(self) -> Iterator[tuple[int, list[str], bool]]:
+        """Yield number, from 1, and cells of each line of data, and whether the line has its end."""
+        with self.path.open(encoding=self.layout.encoding, errors="replace") as file:
+            for number, line in enumerate(file, 1):
+                if number > self.layout.first_line and line.strip():
+                    cells = split_line(line, self.layout.delimiter)
+                    yield number, cells, line.endswith("\n")
 
     def _read_cells(self, places: list[int], max_rows: int | None) -> dict[int, Any]:
         """Return the cells of some columns; numbers are numbers already where all of them are."""
         layout, width = self.layout, len(self.layout.samples[0])
-        texts = {at: str for at in places if layout.tell_kind(at) != "number"}
         options: dict[str, Any] = {
             "sep": r"\s+" if layout.delimiter == " " else layout.delimiter,
             "decimal": layout.decimal,
             "header": None,
             "names": range(width),
             "usecols": sorted({*places, width - 1}),
-            "dtype": texts,
+            "dtype": {at: str for at in places if layout.kinds[at] != "number"},
             "na_values": MISSING,
             "keep_default_na": False,
             "encoding": layout.encoding,
@@ -197,7 +158,7 @@ class TextLog(LogFile):
         try:
             frame = pd.read_csv(self.path, on_bad_lines="error", **options)
         except pd.errors.ParserError as error:
-            self._find_bad_line(width, error)
+            self._report_bad_line(width, error)
             frame = pd.read_csv(self.path, on_bad_lines="skip", **options)
         except (OSError, UnicodeDecodeError, ValueError) as error:
             raise RecordingError(
@@ -209,68 +170,46 @@ class TextLog(LogFile):
             raise RecordingError(
                 f"{self.path}: {len(frame)} rows of data below the header; a log has at least 2"
             )
-        if frame[width - 1].isna().any() and layout.names[width - 1 : width] != ("",):
-            self._find_bad_line(width, None)
+        if frame[width - 1].isna().any() and layout.names[-1]:
+            self._report_bad_line(width, None)
         return {at: frame[at] for at in places}
 
-    def _find_bad_line(self, width: int, error: Exception | None) -> None:
+    def _report_bad_line(self, width: int, error: Exception | None) -> None:
         """Report the first line that has another number of cells than the others."""
-        with self.path.open(encoding=self.layout.encoding, errors="replace") as file:
-            row = -1
-            for number, line in enumerate(file):
-                if number < self.layout.first_line or not line.strip():
-                    continue
-                row += 1
-                count = len(split_line(line, self.layout.delimiter))
-                if count != width and line.endswith("\n"):
-                    num_names = len(self.layout.names)
-                    text = (
-                        f"line {number + 1} (row {row}): {count} cells, the header has {num_names}"
-                    )
-                    self.report_damage(text, error)
-                    return
+        for row, (number, cells, is_whole) in enumerate(self._iterate_lines()):
+            if len(cells) != width and is_whole:
+                text = f"{len(cells)} cells, the header has {len(self.layout.names)}"
+                self.report_damage(f"line {number} (row {row}): {text}", error)
+                return
 
     def _drop_cut_line(self, frame: pd.DataFrame, width: int) -> pd.DataFrame:
         """Leave out a last line that a crash cut off: a number may be cut off too, and still look like one."""
-        size = self.path.stat().st_size
         with self.path.open("rb") as file:
-            file.seek(-min(size, SNIFFED_BYTES), 2)
+            file.seek(-min(self.path.stat().st_size, SNIFFED_BYTES), 2)
             tail = file.read().decode(self.layout.encoding, errors="replace")
-        last = tail.rstrip("\r\n").rpartition("\n")[2]
-        cells = split_line(last, self.layout.delimiter)
-        is_whole = len(cells) >= width and tail.endswith(("\n", "\r"))
-        if is_whole or not len(frame):
+        cells = split_line(tail.rstrip("\r\n").rpartition("\n")[2], self.layout.delimiter)
+        if not len(frame) or (len(cells) >= width and tail.endswith(("\n", "\r"))):
             return frame
-        line = self.find_line(len(frame) - 1)[0]
-        log.warning(
-            "%s: the last line, %d, is cut off or lacks its end (%d of %d cells): left out",
-            self.path,
-            line,
-            len(cells),
-            width,
-        )
+        number = self.find_line(len(frame) - 1)[0] if len(cells) >= width else "of the file"
+        text = f"is cut off or lacks its end ({len(cells)} of {width} cells): left out"
+        log.warning("%s: the last line, %s, %s", self.path, number, text)
         return frame.iloc[:-1]
 
     def _convert(self, cells: pd.Series, at: int) -> np.ndarray:
-        """Return the numbers of a column, `(T,)`, or `(T, K)` for lists; NaN for an empty cell."""
-        kind = self.layout.tell_kind(at)
-        length = len(self._label_items(at)) if kind == "list" else 1
-        values = convert_cells(cells, kind, length, self.layout.decimal)
-        bad = np.isnan(values).reshape(len(cells), -1).any(1) & cells.notna().to_numpy()
+        """Return the numbers of a column, `(T, K)`, with one for each item of a list; NaN for an empty cell."""
+        kind = self.layout.kinds[at]
+        length = sum(place == at for place, _ in self._places.values())
+        values = convert_cells(cells, kind, length, self.layout.decimal).reshape(len(cells), -1)
+        bad = np.isnan(values).any(1) & cells.notna().to_numpy()
         if bad.any() and not self.keep_whole:
             row = int(np.argmax(bad))
             what = {"list": f"a list of {length} numbers", "time": "a time"}.get(kind, "a number")
-            line = self.find_line(row)[0]
+            number, _, _ = next(itertools.islice(self._iterate_lines(), row, None))
             raise RecordingError(
-                f"{self.path}: line {line} (row {row}), column '{self.layout.names[at]}': '{str(cells.iloc[row]).strip()}' is not "
-                f"{what}; {advise('damaged')}"
+                f"{self.path}: line {number} (row {row}), column '{self.layout.names[at]}': "
+                f"'{str(cells.iloc[row]).strip()}' is not {what}; {advise('damaged')}"
             )
         return values
-
-    def _label_items(self, at: int) -> list[str]:
-        """Return the names of the items of a list."""
-        length = len(split_list(self.layout.samples[0][at]))
-        return [*self._labels] if len(self._labels) == length else [str(i) for i in range(length)]
 
 
 def convert_cells(cells: Any, kind: CellKind, length: int, decimal: str) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from gaps import DELAY, recording
 
 from actuators.recordings.inspection import InspectionThresholds
-from actuators.recordings.recording_checks import TEXTS, RecordingRemark, examine_recordings
+from actuators.recordings.recording_checks import REMARKS, RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
 
 
@@ -131,7 +131,7 @@ def test_the_gravest_comes_first_and_all_of_it_is_plain(
     )
     for remark in remarks:
         assert (
-            remark.plain()["name"] in TEXTS
+            remark.plain()["name"] in REMARKS
             and remark.plain()["advice"]
             and remark.to_s >= remark.from_s
         )

@@ -94,7 +94,7 @@ def test_a_command_that_moves_nothing_is_found(
     u = whole.u.copy()
     u[200:280, 3] = 0.8  # the interlock was open
     (finding,) = found(changed(whole, u=u), machine, thresholds)
-    assert (finding.kind, finding.joint) == ("no motion", "q4")
+    assert (finding.kind, finding.joint) == ("command without motion", "q4")
     # told from where the joint should long have moved: dead time and 0.3 s later
     assert (finding.row, finding.row + finding.num_rows) == (200 + 17, 280)
     assert finding.t_s == pytest.approx(217 * PERIOD_S)
@@ -129,7 +129,7 @@ def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_
     assert found(follows, arm, thresholds) == []
     q[700:, 2] -= 0.05 * np.minimum(np.arange(300) / 20, 1.0)  # the arm is pushed away
     (finding,) = found(changed(follows, q=q.astype(np.float32)), arm, thresholds)
-    assert (finding.kind, finding.joint) == ("no command", "elbow")
+    assert (finding.kind, finding.joint) == ("motion without command", "elbow")
 
 
 def test_a_joint_that_sinks_is_found_with_its_speed(
@@ -139,7 +139,7 @@ def test_a_joint_that_sinks_is_found_with_its_speed(
     q = whole.q.copy()
     q[:, 1] += 0.002 * whole.t_s
     (finding,) = found(changed(whole, q=q), machine, thresholds)
-    assert (finding.kind, finding.joint) == ("no command", "q2")
+    assert (finding.kind, finding.joint) == ("motion without command", "q2")
     assert "+0.002 rad/s" in finding.text
     assert finding.duration_s == pytest.approx(60.0, abs=2.0)
 
@@ -152,9 +152,19 @@ def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(
     q[120:126, 2] = q[119, 2]  # q3 is moving
     q[500:520, 0] = q[499, 0]  # q1 rests, but its noise is gone
     moving, resting = found(changed(whole, q=q), machine, thresholds)
-    assert (moving.kind, moving.joint, moving.row, moving.num_rows) == ("frozen", "q3", 119, 7)
+    assert (moving.kind, moving.joint, moving.row, moving.num_rows) == (
+        "frozen sensor",
+        "q3",
+        119,
+        7,
+    )
     assert "7 equal samples, then a jump of 0.04" in moving.text  # 7 periods at 0.13 rad/s
-    assert (resting.kind, resting.joint, resting.row, resting.num_rows) == ("frozen", "q1", 499, 21)
+    assert (resting.kind, resting.joint, resting.row, resting.num_rows) == (
+        "frozen sensor",
+        "q1",
+        499,
+        21,
+    )
 
 
 def test_a_coarse_sensor_at_rest_between_motions_is_not_frozen(
@@ -174,9 +184,9 @@ def test_lost_frames_are_found(machine: Machine, thresholds: InspectionThreshold
         (finding.kind, finding.row, finding.num_rows)
         for finding in found(changed(whole, q=q), machine, thresholds)
     ]
-    assert [entry for entry in kinds if entry[0] == "repeated rows"] == [
-        ("repeated rows", 110, 2),
-        ("repeated rows", 130, 1),
+    assert [entry for entry in kinds if entry[0] == "lost frames"] == [
+        ("lost frames", 110, 2),
+        ("lost frames", 130, 1),
     ]
 
 
@@ -191,7 +201,7 @@ def test_positions_beyond_the_limits_and_exclusive_joints_in_company_are_found(
         found(changed(whole, u=u, q=q), machine, thresholds), key=lambda finding: str(finding.joint)
     )
     assert (exclusive.kind, exclusive.joint, exclusive.row, exclusive.num_rows) == (
-        "exclusive",
+        "exclusive joint",
         "q2",
         100,
         20,

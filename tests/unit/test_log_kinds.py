@@ -450,7 +450,7 @@ def test_a_joint_that_hangs_is_remarked_by_import_and_inspect(brokk: Callable[..
     done = brokk("mode=inspect", options[0], *inspected)
     assert done.code == 0, done.err
     found = json.loads(Path("seen/inspection.json").read_text())["recordings"][0]["findings"]
-    assert {one["kind"] for one in found if one["joint"] == "knee"} >= {"not obeyed", "jump"}
+    assert {one["kind"] for one in found if one["joint"] == "knee"} >= {"does not obey", "jumps"}
     assert not [one for one in found if one["joint"] == "hip"]
 
 
