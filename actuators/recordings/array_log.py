@@ -139,27 +139,27 @@ def _read_npz(path: Path) -> dict[str, dict[str, np.ndarray]]:
     """Return the real vectors and matrices of a NumPy archive; pickled objects are never loaded."""
     found, member = {}, None
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            for member in archive.files:
-                if (values := _load_member(archive, member)) is not None:
-                    found[member] = values
+        with zipfile.ZipFile(path) as archive:
+            for member in archive.namelist():
+                values = _read_member(archive, member)
+                if values.dtype.kind in "fiub" and values.ndim in (1, 2) and len(values) > 1:
+                    found[member.removesuffix(".npy")] = values
     except NPZ_ERRORS as error:
         if member is None:
             raise RecordingError(f"{path}: cannot be read as a NumPy archive ({error})") from error
-        raise RecordingError(f"{path}: array '{member}.npy' is damaged ({error})") from error
+        raise RecordingError(f"{path}: array '{member}' is damaged ({error})") from error
     return {"": found}
 
 
-def _load_member(archive: Any, member: str) -> np.ndarray | None:
-    """Return an array of an archive, `None` for one that is no real vector or matrix of two rows or more."""
-    try:
-        values = archive[member]
-    except ValueError as error:
-        if "allow_pickle" in str(error):
-            return None
-        raise
-    is_signal = values.dtype.kind in "fiub" and values.ndim in (1, 2) and len(values) > 1
-    return values if is_signal else None
+def _read_member(archive: zipfile.ZipFile, member: str) -> np.ndarray:
+    """Return an array of an archive, an empty one for objects."""
+    with archive.open(member) as file:
+        try:
+            return np.lib.format.read_array(file, allow_pickle=False)
+        except ValueError as error:
+            if "allow_pickle" in str(error):
+                return np.empty(0)
+            raise
 
 
 def _read_matlab(path: Path) -> dict[str, dict[str, np.ndarray]]:
@@ -197,9 +197,9 @@ def _add_array(tables: dict[str, dict[str, np.ndarray]], name: str, value: Any) 
         for field, inner in value.items():
             _add_array(tables, f"{name}.{field}", inner)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
-        plain = value.squeeze()
-        if plain.ndim == 3:  # Simulink keeps matrices over time as (rows, columns, T)
-            plain = plain.reshape(-1, plain.shape[-1]).T
+        # Simulink keeps matrices over time as (rows, columns, T)
+        is_over_time = value.ndim == 3
+        plain = (value.reshape(-1, value.shape[-1]).T if is_over_time else value).squeeze()
         if plain.ndim <= 2:
             tables[""][name] = plain
 

@@ -104,6 +104,8 @@ STILL_TRAVEL, STILL_TARGET = 0.01, 0.05
 below such a part of the mean speed of its target: a slow machine moves by less."""
 JUMP_TRAVEL = 0.01
 """Part of the travel from which on a step is told; smaller ones hide in noise and coarse sensors."""
+LEAST_ROWS = 5
+"""Least number of rows of a stretch: a slow log has one in seconds."""
 LONGEST_LAG_S = 1.5
 """Time within which a joint answers its target: more than twice the 0.55 s of the slowest machine known."""
 
@@ -394,7 +396,7 @@ class _RecordingScan:
 
     def _find_long(self, condition: np.ndarray) -> list[tuple[int, int]]:
         """Return the stretches of a condition that last long enough to be told."""
-        least = self._limits.unanswered_s / self._period_s
+        least = max(LEAST_ROWS, self._limits.unanswered_s / self._period_s)
         return [(row, count) for row, count in find_stretches(condition) if count >= least]
 
     def _finding(

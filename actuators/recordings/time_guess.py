@@ -155,13 +155,12 @@ def _judge_clock(
         return None
     wraps = _find_time_wrap(values) if is_named else None
     values = unwrap(values, wraps)
-    fault = find_fault(values, table, text) if np.isfinite(values).all() or skip else None
     later = is_later(values)
     if not later.all():
-        if not is_named and later.mean() < 0.9:
+        if later.mean() < (0.02 if is_named else 0.9) or not (skip or np.isfinite(values).all()):
             return None
-        if later.mean() < 0.02 or fault is None:
-            return None
+        fault = find_fault(values, table, text)
+        assert fault is not None
         if any(word in ("dt", "delta", "diff", "period") for word in words):
             rate_hz = 1.0 / max(float(np.mean(values)), 1e-9)
             return f"'{text}' holds the time since the row before; {advise('rate', rate_hz=float(f'{rate_hz:.3g}'))}"
