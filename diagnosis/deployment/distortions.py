@@ -1,7 +1,8 @@
 """Mistakes of deployment code, each as a change of the replay that reproduces it.
 
 A distortion has a kind (order, sign, scale, frame, rate, delay, stale, clip, default_pose, history,
-filter, network), the field where it acts, and at most one number.
+filter, network), the field where it acts, and at most one number. Mistakes that signals and commands
+share are listed once, for any `Place` on the way.
 Axes: `T` rows, `R` rows that are asked for, `H` samples (oldest first), `C` columns, `J` joints.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -19,12 +21,16 @@ from diagnosis.deployment.replay import Change, Transform
 from diagnosis.deployment.transforms import (
     arrange_columns,
     arrange_scaled,
+    clip_columns,
     delay_rows,
     freeze_columns,
     hold_rows,
     lay_out_by_column,
+    rotate_frame,
     scale_columns,
+    shift_column,
     shift_columns,
+    shift_command,
     smooth_rows,
 )
 
@@ -41,14 +47,23 @@ LEVELS = (0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 1.0, 1.5, 2.0, 3.0)
 """Bounds at which a search for a clip begins."""
 OFFSETS_STD = (-2.0, -1.0, -0.5, -0.2, -0.08, 0.08, 0.2, 0.5, 1.0, 2.0)
 """Offsets at which a search for a default pose begins, in standard deviations of the contract."""
+OFFSETS_COMMAND = (-0.3, -0.1, -0.03, 0.03, 0.1, 0.3)
+"""The same of commands, of full command."""
 SMOOTHING = (0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
 """Weights of the newest value at which a search for a low-pass begins."""
+ANGLES_RAD = tuple(np.deg2rad([*range(-165, 0, 15), -4, 4, *range(15, 181, 15)]))
+"""Angles at which a search for a turned frame begins."""
+SHIFTS_M = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
+"""Shifts, both ways, at which a search for another origin begins, m."""
 MAX_DELAY = 12
 """Longest delay that is tried, rows; half a second at 20 Hz is more than a history's dead time."""
 MAX_HOLD = 5
 """Largest number of rows for which a value is held that is tried."""
+DELAYS = tuple(float(number) for number in range(1, MAX_DELAY + 1))
 
 Build = Callable[[float], Change]
+Wrap = Callable[[Transform], Change]
+"""Makes the change at a place from a transform of its values."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +99,71 @@ class Distortion:
         return int(bool(self.parameter))
 
 
+def make_fixed(kind: str, field: str, text: str, change: Change) -> Distortion:
+    """Return a mistake without a number."""
+    return Distortion(kind, field, text, lambda _: change)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Columns on the way from log to valve that code may spoil.
+
+    Attributes:
+        name: `q`, `u`, `target` or `command`.
+        columns: Names of its columns.
+        wrap: Makes the change from a transform of its values, `(T, C)`.
+    """
+
+    name: str
+    columns: list[str]
+    wrap: Wrap
+
+    def list_groups(self) -> Iterator[tuple[list[int], str]]:
+        """Yield all columns together, then each, with the field that they are."""
+        yield list(range(len(self.columns))), self.name
+        if len(self.columns) > 1:
+            for column, name in enumerate(self.columns):
+                yield [column], f"{self.name}.{name}"
+
+    def fix(self, kind: str, field: str, text: str, transform: Transform) -> Distortion:
+        """Return a mistake without a number."""
+        return make_fixed(kind, field, text, self.wrap(transform))
+
+    def vary(
+        self,
+        kind: str,
+        field: str,
+        text: str,
+        make: Callable[[float], Transform],
+        values: tuple[float, ...],
+        parameter: str,
+        is_continuous: bool = True,
+    ) -> Distortion:
+        """Return a mistake with a number."""
+        build = lambda value: self.wrap(make(value))  # noqa: E731
+        return Distortion(kind, field, text, build, values, is_continuous, parameter)
+
+    def list_factors(self, columns: list[int], field: str) -> Iterator[Distortion]:
+        """Yield a wrong sign, a wrong scale and a missing value of some columns."""
+        yield self.fix("sign", field, f"{field} has the wrong sign", scale_columns(columns, -1.0))
+        text = f"{field} is multiplied by {{value}}"
+        yield self.vary("scale", field, text, partial(scale_columns, columns), FACTORS, "factor")
+        yield self.fix("stale", field, f"{field} is always zero", scale_columns(columns, 0.0))
+
+    def list_holds(self, text: str) -> Iterator[Distortion]:
+        """Yield values that are held for several periods; `{hold}` in the text is their number."""
+        for hold in range(2, MAX_HOLD + 1):
+            for phase in range(hold):
+                change = hold_rows(hold, phase)
+                yield self.fix("rate", self.name, text.format(hold=hold), change)
+
+
+def _watch_term(term: ObservationTerm) -> Place:
+    """Return the values of a term as a place."""
+    names = [_shorten(term, column) for column in term.columns]
+    return Place(term.name, names, lambda change: Change(signals={term.name: change}))
+
+
 def list_input_distortions(
     policy: LoadedPolicy, signals: Mapping[str, np.ndarray], rows: tuple[int, ...]
 ) -> list[Distortion]:
@@ -94,13 +174,15 @@ def list_input_distortions(
         signals: The log's values by term, `(T, C)`.
         rows: Rows at which something may have begun to be stale.
     """
-    contract, found = policy.contract, list[Distortion]()
-    for term in contract.terms:
-        names = [_shorten(term, column) for column in term.columns]
-        found += _list_scalings(term, names)
-        found += _list_timings(term, names, signals[term.name], rows)
-        if term.name != "target" and len(names) > 1:
-            found += _list_orders((term,), names)
+    found = list[Distortion]()
+    for term in policy.contract.terms:
+        place = _watch_term(term)
+        found += _list_scalings(term, place)
+        found += _list_normalisations(term)
+        found += _list_timings(term, place, signals[term.name], rows)
+        if term.name != "target" and len(place.columns) > 1:
+            for order in list_orders(place.columns):
+                found += make_orders((term,), place.columns, order)
         if term.samples > 1:
             found += _list_history_mistakes(term)
     found += _list_joint_mistakes(policy)
@@ -108,177 +190,64 @@ def list_input_distortions(
     return found
 
 
-def list_factors(
-    place: str, columns: list[int], make: Callable[[Callable[[float], Transform]], Build]
-) -> list[Distortion]:
-    """Return a wrong sign, a wrong scale and a missing value of some columns.
-
-    Args:
-        place: Field of the distortions.
-        columns: The columns.
-        make: Makes the change from a transform by its number.
-    """
-    turned = make(keep_fixed(scale_columns(columns, -1.0)))
-    missing = make(keep_fixed(scale_columns(columns, 0.0)))
-
-    def scale(value: float) -> Transform:
-        return scale_columns(columns, value)
-
-    multiplied = f"{place} is multiplied by {{value}}"
-    return [
-        Distortion("sign", place, f"{place} has the wrong sign", turned),
-        Distortion("scale", place, multiplied, make(scale), FACTORS, True, "factor"),
-        Distortion("stale", place, f"{place} is always zero", missing),
-    ]
-
-
-def _list_scalings(term: ObservationTerm, names: list[str]) -> list[Distortion]:
-    """Return wrong signs, scales, offsets and bounds of a term."""
-    found = []
-
-    def make(transform: Callable[[float], Transform]) -> Build:
-        return lambda value: Change(signals={term.name: transform(value)})
-
-    for columns, label in list_groups(names):
-        place = term.name + label
-        found += list_factors(place, columns, make)
+def _list_scalings(term: ObservationTerm, place: Place) -> Iterator[Distortion]:
+    """Yield wrong signs, scales, units and offsets of a term."""
+    for columns, field in place.list_groups():
+        yield from place.list_factors(columns, field)
         for unit, factor in UNIT_FACTORS.items():
-            found.append(
-                Distortion(
-                    "scale",
-                    place,
-                    f"{place} is in {unit}",
-                    make(keep_fixed(scale_columns(columns, factor))),
-                )
-            )
-        found.append(
-            Distortion(
-                "default_pose",
-                place,
-                f"{{value}} standard deviations are added to {place}",
-                make(lambda value, columns=columns: shift_columns(term, columns, value)),
-                OFFSETS_STD,
-                True,
-                "offset_std",
-            )
-        )
-    found += _list_normalisations(term)
-    return found
+            text = f"{field} is in {unit}"
+            yield place.fix("scale", field, text, scale_columns(columns, factor))
+        text = f"{{value}} standard deviations are added to {field}"
+        make = partial(shift_columns, term, columns)
+        yield place.vary("default_pose", field, text, make, OFFSETS_STD, "offset_std")
 
 
-def _list_normalisations(term: ObservationTerm) -> list[Distortion]:
-    """Return missing steps of the normalisation; clipped values."""
-    mean, std, found = term.mean, term.std, []
-    name = term.name
-    if np.abs(std - 1.0).max() > 0 or np.abs(mean).max() > 0:
-        raw = Change(windows={name: lambda x: x * std + mean})
-        found.append(Distortion("scale", name, f"{name} is not normalised", make_fixed(raw)))
-        found.append(
-            Distortion(
-                "stale",
-                name,
-                f"{name} is missing: zero after scaling",
-                lambda _: Change(windows={name: lambda x: np.broadcast_to(mean, x.shape)}),
-            )
-        )
-    if np.abs(mean).max() > 0:
-        shifted = Change(windows={name: lambda x: x + mean})
-        found.append(
-            Distortion(
-                "default_pose", name, f"the mean of {name} is not subtracted", make_fixed(shifted)
-            )
-        )
-    if np.abs(std - 1.0).max() > 0:
-        unscaled = Change(windows={name: lambda x: (x - mean) * std + mean})
-        found.append(
-            Distortion(
-                "scale",
-                name,
-                f"{name} is not divided by its standard deviation",
-                make_fixed(unscaled),
-            )
-        )
+def _list_normalisations(term: ObservationTerm) -> Iterator[Distortion]:
+    """Yield missing steps of the normalisation; clipped values."""
+    mean, std, name = term.mean, term.std, term.name
+    has_mean, has_std = np.abs(mean).max() > 0, np.abs(std - 1.0).max() > 0
+
+    def fix(kind: str, text: str, transform: Transform) -> Distortion:
+        return make_fixed(kind, name, text, Change(windows={name: transform}))
+
+    if has_mean or has_std:
+        yield fix("scale", f"{name} is not normalised", lambda x: x * std + mean)
+        zero = lambda x: np.broadcast_to(mean, x.shape)  # noqa: E731
+        yield fix("stale", f"{name} is missing: zero after scaling", zero)
+    if has_mean:
+        yield fix("default_pose", f"the mean of {name} is not subtracted", lambda x: x + mean)
+    if has_std:
+        text = f"{name} is not divided by its standard deviation"
+        yield fix("scale", text, lambda x: (x - mean) * std + mean)
 
     def clip(value: float) -> Change:
         return Change(windows={name: lambda x: ((x - mean) / std).clip(-value, value) * std + mean})
 
-    found.append(
-        Distortion(
-            "clip",
-            name,
-            f"{name} is clipped at ±{{value}} after scaling",
-            clip,
-            LEVELS,
-            True,
-            "bound",
-        )
-    )
-    return found
+    text = f"{name} is clipped at ±{{value}} after scaling"
+    yield Distortion("clip", name, text, clip, LEVELS, True, "bound")
 
 
 def _list_timings(
-    term: ObservationTerm, names: list[str], values: np.ndarray, rows: tuple[int, ...]
-) -> list[Distortion]:
-    """Return delays, held and stale values of a term."""
-    found = []
-
-    def make(transform: Callable[[float], Transform]) -> Build:
-        return lambda value: Change(signals={term.name: transform(value)})
-
-    delays = tuple(float(number) for number in range(1, MAX_DELAY + 1))
-    place = term.name
-    found.append(
-        Distortion(
-            "delay",
-            place,
-            f"{place} is {{value}} periods old",
-            make(delay_rows),
-            delays,
-            False,
-            "periods",
-        )
-    )
+    term: ObservationTerm, place: Place, values: np.ndarray, rows: tuple[int, ...]
+) -> Iterator[Distortion]:
+    """Yield delays, held and stale values of a term."""
+    name = term.name
+    text = f"{name} is {{value}} periods old"
+    yield place.vary("delay", name, text, delay_rows, DELAYS, "periods", False)
     if term.newest < 0:
-        ahead = make(keep_fixed(lambda x: np.concatenate([x[1:], x[-1:]])))
-        found.append(Distortion("delay", place, f"{place} is a period too new", ahead))
-    for hold in range(2, MAX_HOLD + 1):
-        for phase in range(hold):
-            text = f"{place} is refreshed every {hold} periods only"
-            found.append(Distortion("rate", place, text, make(keep_fixed(hold_rows(hold, phase)))))
-    for columns, label in list_groups(names):
-        if not np.ptp(values[:, columns], axis=0).any():
-            continue  # what never changes cannot be seen to be stale
-        frozen = tuple(float(row) for row in rows)
-        found.append(
-            Distortion(
-                "stale",
-                term.name + label,
-                f"{term.name}{label} is stale from row {{value}} on",
-                make(lambda row, columns=columns: freeze_columns(columns, int(row))),
-                frozen,
-                False,
-                "row",
-            )
-        )
-    found.append(
-        Distortion(
-            "filter",
-            place,
-            f"{place} is low-pass filtered, newest weighs {{value}}",
-            make(smooth_rows),
-            SMOOTHING,
-            True,
-            "weight",
-        )
-    )
-    return found
-
-
-def _list_orders(terms: Sequence[ObservationTerm], names: list[str]) -> list[Distortion]:
-    found = []
-    for order in list_orders(names):
-        found += make_orders(terms, names, order)
-    return found
+        ahead = lambda x: np.concatenate([x[1:], x[-1:]])  # noqa: E731
+        yield place.fix("delay", name, f"{name} is a period too new", ahead)
+    yield from place.list_holds(f"{name} is refreshed every {{hold}} periods only")
+    for columns, field in place.list_groups():
+        if np.ptp(
+            values[:, columns], axis=0
+        ).any():  # what never changes cannot be seen to be stale
+            text = f"{field} is stale from row {{value}} on"
+            make = partial(freeze_columns, columns)
+            begins = tuple(float(row) for row in rows)
+            yield place.vary("stale", field, text, make, begins, "row", False)
+    text = f"{name} is low-pass filtered, newest weighs {{value}}"
+    yield place.vary("filter", name, text, smooth_rows, SMOOTHING, "weight")
 
 
 def make_orders(
@@ -288,16 +257,15 @@ def make_orders(
 
     The mean that is subtracted may be in that order too, or in the one of the contract.
     """
-    listed = " and ".join(
-        filter(None, (", ".join(term.name for term in terms[:-1]), terms[-1].name))
-    )
-    verb, place = ("is", terms[0].name) if len(terms) == 1 else ("are", "joints")
+    *others, last = [term.name for term in terms]
+    listed = f"{', '.join(others)} and {last}" if others else last
+    verb, place = ("are", "joints") if others else ("is", last)
     text = f"{listed} {verb} in another order: {describe_order(names, order)}"
     raw = Change(signals={term.name: arrange_columns(order) for term in terms})
-    found = [Distortion("order", place, text, make_fixed(raw))]
+    found = [make_fixed("order", place, text, raw)]
     if any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms):
         scaled = Change(windows={term.name: arrange_scaled(term, order) for term in terms})
-        found.append(Distortion("order", place, text, make_fixed(scaled)))
+        found.append(make_fixed("order", place, text, scaled))
     return found
 
 
@@ -319,7 +287,7 @@ def list_matched_orders(
         block = observed[:, contract.term_slices[term.name]]
         seen = block.reshape(len(observed), term.samples, -1)[:, -1]
         known = signals[term.name][np.clip(np.arange(len(observed)) + term.newest, 0, None)]
-        names = [_shorten(term, column) for column in term.columns]
+        names = _watch_term(term).columns
         by_scaled = match_order((known - term.mean) / term.std, seen)
         by_raw = match_order(known, seen * term.std + term.mean)
         for order in dict.fromkeys(one for one in (by_scaled, by_raw) if one is not None):
@@ -332,135 +300,151 @@ def list_matched_orders(
     return found
 
 
-def _list_history_mistakes(term: ObservationTerm) -> list[Distortion]:
-    """Return histories that are turned round, sampled at another rate, or laid out otherwise."""
+def _slow_history(samples: int, step: int) -> Transform:
+    """Return the change of a history that is filled several times a period."""
+    index = np.maximum(samples - 1 - np.arange(samples)[::-1] // step, 0)
+    return lambda x: x[:, index]
+
+
+def _list_history_mistakes(term: ObservationTerm) -> Iterator[Distortion]:
+    """Yield histories that are turned round, sampled at another rate, or laid out otherwise."""
     name, samples = term.name, term.samples
-    found = [
-        Distortion(
-            "order",
-            name,
-            f"the history of {name} has the newest sample first",
-            lambda _: Change(windows={name: lambda x: x[:, ::-1]}),
-        ),
-        Distortion(
-            "order",
-            name,
-            f"{name} is laid out joint by joint, not sample by sample",
-            lambda _: Change(windows={name: lay_out_by_column}),
-        ),
+    mistakes: list[tuple[str, str, Transform]] = [
+        ("order", f"the history of {name} has the newest sample first", lambda x: x[:, ::-1]),
+        ("order", f"{name} is laid out joint by joint, not sample by sample", lay_out_by_column),
     ]
     for step in (2, 3):
-        index = np.maximum(samples - 1 - np.arange(samples)[::-1] // step, 0)
-        slow = Change(windows={name: lambda x, index=index: x[:, index]})
-        found.append(
-            Distortion(
-                "rate",
-                name,
-                f"the history of {name} is filled {step} times a period",
-                make_fixed(slow),
-            )
-        )
-    return found
+        text = f"the history of {name} is filled {step} times a period"
+        mistakes.append(("rate", text, _slow_history(samples, step)))
+    for kind, text, transform in mistakes:
+        yield make_fixed(kind, name, text, Change(windows={name: transform}))
 
 
-def _list_joint_mistakes(policy: LoadedPolicy) -> list[Distortion]:
-    """Return mistakes that positions and commands share, and those of the start."""
-    contract, found = policy.contract, list[Distortion]()
-    names, by_joint = list(contract.joints), list[ObservationTerm]()
-    for term in contract.terms:
-        if [_shorten(term, column) for column in term.columns] == names:
-            by_joint.append(term)
-    shared = [term.name for term in by_joint]
-    if len(shared) > 1:
-        found += _list_orders(by_joint, names)
-        for columns, label in list_groups(names):
-            change = Change(signals={name: scale_columns(columns, -1.0) for name in shared})
-            found.append(
-                Distortion(
-                    "sign",
-                    "joints" + label,
-                    f"joints{label} are observed with the wrong sign",
-                    make_fixed(change),
-                )
-            )
+def _list_joint_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
+    """Yield mistakes that positions and commands share, and those of the start."""
+    terms, names = policy.contract.terms, list(policy.contract.joints)
+    by_joint = [term for term in terms if _watch_term(term).columns == names]
+    if len(by_joint) > 1:
+        for order in list_orders(names):
+            yield from make_orders(by_joint, names, order)
+
+        def change_all(transform: Transform) -> Change:
+            return Change(signals={term.name: transform for term in by_joint})
+
+        joints = Place("joints", names, change_all)
+        for columns, field in joints.list_groups():
+            text = f"{field} are observed with the wrong sign"
+            yield joints.fix("sign", field, text, scale_columns(columns, -1.0))
         for step in (2, 3):
-            found.append(_make_slow_history(contract.terms, step))
-        delays = tuple(float(number) for number in range(1, MAX_DELAY + 1))
+            windows = {
+                term.name: _slow_history(term.samples, step) for term in terms if term.samples > 1
+            }
+            text = f"the history is filled {step} times a period: the loop runs at {step} times its rate"
+            yield make_fixed("rate", "observation", text, Change(windows=windows))
 
         def delay_all(value: float) -> Change:
-            return Change(signals={term.name: delay_rows(value) for term in contract.terms})
+            return Change(signals={term.name: delay_rows(value) for term in terms})
 
-        found.append(
-            Distortion(
-                "delay",
-                "observation",
-                "the whole observation is {value} periods old",
-                delay_all,
-                delays,
-                False,
-                "periods",
-            )
-        )
+        text = "the whole observation is {value} periods old"
+        yield Distortion("delay", "observation", text, delay_all, DELAYS, False, "periods")
     for before, text in (("zero", "zeros"), ("normalised", "zeros after scaling")):
         change = Change(before=before)
-        found.append(
-            Distortion(
-                "history", "observation", f"the history begins with {text}", make_fixed(change)
-            )
-        )
-    return found
+        yield make_fixed("history", "observation", f"the history begins with {text}", change)
 
 
-def _make_slow_history(terms: tuple[ObservationTerm, ...], step: int) -> Distortion:
-    windows: dict[str, Transform] = {}
-    for term in terms:
-        if term.samples > 1:
-            index = np.maximum(term.samples - 1 - np.arange(term.samples)[::-1] // step, 0)
-            windows[term.name] = lambda x, index=index: x[:, index]
-    change = Change(windows=windows)
-    text = f"the history is filled {step} times a period: the loop runs at {step} times its rate"
-    return Distortion("rate", "observation", text, make_fixed(change))
-
-
-def _list_vector_mistakes(policy: LoadedPolicy) -> list[Distortion]:
-    """Return wrong orders of the terms, and a clipped vector."""
-    slices, found = policy.contract.term_slices, list[Distortion]()
+def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
+    """Yield wrong orders of the terms, and a clipped vector."""
+    slices = policy.contract.term_slices
     for order in itertools.permutations(slices):
-        if list(order) == list(slices):
-            continue
-        index = np.concatenate([np.arange(slices[name].start, slices[name].stop) for name in order])
-        change = Change(vector=lambda x, index=index: x[:, index])
+        if list(order) != list(slices):
+            places = [np.arange(slices[name].start, slices[name].stop) for name in order]
+            index = np.concatenate(places)
+            change = Change(vector=lambda x, index=index: x[:, index])
+            text = f"the terms are in the order {', '.join(order)}"
+            yield make_fixed("order", "observation", text, change)
+
+    def clip(value: float) -> Change:
+        return Change(vector=lambda x: x.clip(-value, value))
+
+    text = "the observation is clipped at ±{value}"
+    yield Distortion("clip", "observation", text, clip, LEVELS, True, "bound")
+
+
+def list_frame_distortions(policy: LoadedPolicy) -> Iterator[Distortion]:
+    """Yield turned, swapped and shifted frames of the target."""
+    terms = {term.name: term for term in policy.contract.terms}
+    if "target" not in terms or len(terms["target"].columns) != 3:
+        return
+    target = _watch_term(terms["target"])
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            if order == (0, 1, 2) and sum(sign < 0 for sign in signs) < 2:
+                continue  # no change, or the wrong sign of one axis
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            letters = zip(signs, order, strict=True)
+            axes = " ".join(f"{'-' if sign < 0 else '+'}{'xyz'[axis]}" for sign, axis in letters)
+            kind, text = "frame", f"target is in a frame with the axes {axes}"
+            if min(signs) > 0:
+                kind, text = "order", f"target has its axes in the order {axes}"
+            yield target.fix(kind, "target", text, lambda x, turn=turn: x @ turn.T)
+    for axis, letter in enumerate("xyz"):
+
+        def turn_about(angle: float, axis: int = axis) -> Transform:
+            return lambda x: x @ rotate_frame(axis, angle).T
+
+        text = f"target is in a frame turned by {{value}} rad about {letter}"
+        yield target.vary("frame", "target", text, turn_about, ANGLES_RAD, "angle_rad")
+        text = f"target is in a frame shifted by {{value}} m along {letter}"
+        shifts = (*(-shift for shift in reversed(SHIFTS_M)), *SHIFTS_M)
+        make = partial(shift_column, axis)
+        yield target.vary("frame", f"target.{letter}", text, make, shifts, "shift_m")
+
+
+def make_command_order(names: list[str], order: Order) -> Distortion:
+    """Return the mistake that commands reach the joints in another order."""
+    text = "commands reach the joints in another order: " + describe_order(names, order)
+    return make_fixed("order", "command", text, Change(command=arrange_columns(order)))
+
+
+def list_command_distortions(policy: LoadedPolicy) -> list[Distortion]:
+    """Return mistakes between network and valve."""
+    names = list(policy.contract.joints)
+    found = [make_command_order(names, order) for order in list_orders(names)]
+    place = Place("command", names, lambda change: Change(command=change))
+    inside = tuple(level for level in LEVELS if level < 1.0)
+    for columns, field in place.list_groups():
+        found += place.list_factors(columns, field)
+        text = f"{field} is clipped at ±{{value}}"
         found.append(
-            Distortion(
-                "order",
-                "observation",
-                f"the terms are in the order {', '.join(order)}",
-                make_fixed(change),
-            )
+            place.vary("clip", field, text, partial(clip_columns, columns), inside, "bound")
         )
-    found.append(
-        Distortion(
-            "clip",
-            "observation",
-            "the observation is clipped at ±{value}",
-            lambda value: Change(vector=lambda x: x.clip(-value, value)),
-            LEVELS,
-            True,
-            "bound",
-        )
-    )
+        text = f"{{value}} is added to {field}"
+        make = partial(shift_command, columns)
+        found.append(place.vary("default_pose", field, text, make, OFFSETS_COMMAND, "offset"))
+    text = "the command is {value} periods late"
+    found.append(place.vary("delay", "command", text, delay_rows, DELAYS, "periods", False))
+    text = "a command is held for {hold} periods: the policy runs at 1/{hold} of its rate"
+    found += place.list_holds(text)
+    text = "the command is low-pass filtered, newest weighs {value}"
+    found.append(place.vary("filter", "command", text, smooth_rows, SMOOTHING, "weight"))
     return found
 
 
-def list_groups(names: list[str]) -> Iterator[tuple[list[int], str]]:
-    """Yield the columns of all names together, then of each, with the end of the field's name."""
-    yield list(range(len(names))), ""
-    if len(names) > 1:
-        for column, name in enumerate(names):
-            yield [column], f".{name}"
+def list_network_distortions(
+    policy: LoadedPolicy, others: Mapping[str, LoadedPolicy]
+) -> list[Distortion]:
+    """Return the mistake of having deployed each of the other policies, where it would run at all."""
+    found = []
+    for name, other in others.items():
+        if other.contract.size == policy.contract.size:
+            change = Change(network=other.network)
+            text = f"the network is that of {name}"
+            found.append(make_fixed("network", "network", text, change))
+    return found
 
 
-def describe_order(names: list[str], order: tuple[int, ...]) -> str:
+def describe_order(names: list[str], order: Order) -> str:
     """Return an order in words."""
     return ", ".join(names[column] for column in order)
 
@@ -474,13 +458,3 @@ def _shorten(term: ObservationTerm, column: str) -> str:
     for unit in ("_rad", "_m"):
         column = column.removesuffix(unit)
     return column
-
-
-def make_fixed(change: Change) -> Build:
-    """Return the maker of a change without a number."""
-    return lambda _: change
-
-
-def keep_fixed(transform: Transform) -> Callable[[float], Transform]:
-    """Return the maker of a transform without a number."""
-    return lambda _: transform

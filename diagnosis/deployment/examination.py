@@ -16,7 +16,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.deployment import command_distortions, distortions, frame_distortions
+from diagnosis.deployment import distortions
 from diagnosis.deployment.contract import LoadedPolicy, PolicyContract
 from diagnosis.deployment.distortions import Distortion
 from diagnosis.deployment.fault_search import (
@@ -206,8 +206,8 @@ def _list_stages(
         commanded = log.in_force
     replay = PolicyReplay(policy, log, generator) if log.is_complete else None
     start = contract.num_samples
-    after = command_distortions.list_command_distortions(policy)
-    networks = command_distortions.list_network_distortions(policy, others)
+    after = distortions.list_command_distortions(policy)
+    networks = distortions.list_network_distortions(policy, others)
     if replay is not None and log.observed is not None:
         floor = VECTOR_TOLERANCE + SPREAD_FACTOR * replay.vector_spread
         labels = [name for term in contract.terms for name in term.list_numbers()]
@@ -215,7 +215,7 @@ def _list_stages(
         known = _Known(encoded, replay)
         rows = _find_first_departure(encoded, log.observed, floor)
         inputs = [
-            *frame_distortions.list_frame_distortions(policy),
+            *distortions.list_frame_distortions(policy),
             *distortions.list_input_distortions(policy, log.signals, rows),
             *distortions.list_matched_orders(policy, log.signals, log.observed),
         ]
@@ -233,7 +233,7 @@ def _list_stages(
         floor = TOLERANCE + SPREAD_FACTOR * replay.command_spread
         rows = _find_first_departure(replay.nominal, commanded, floor)
         inputs = [
-            *frame_distortions.list_frame_distortions(policy),
+            *distortions.list_frame_distortions(policy),
             *distortions.list_input_distortions(policy, log.signals, rows),
         ]
         known = _Known(None, replay)
@@ -259,7 +259,7 @@ def _match_commands(
     """Return the order of the joints, whatever it is, in which commands come out as they were logged."""
     order = match_order(known, seen)
     names = list(contract.joints)
-    return [] if order is None else [command_distortions.make_command_order(names, order)]
+    return [] if order is None else [distortions.make_command_order(names, order)]
 
 
 @dataclass(frozen=True)

@@ -8,59 +8,40 @@ from diagnosis.deployment.contract import ObservationTerm
 from diagnosis.deployment.replay import Transform
 
 
-def scale_columns(columns: list[int], factor: float) -> Transform:
-    """Return the change that multiplies columns by a factor."""
+def change_columns(columns: list[int], change: Transform) -> Transform:
+    """Return the change of some columns by a function of their values."""
 
     def transform(values: np.ndarray) -> np.ndarray:
         changed = values.copy()
-        changed[:, columns] *= factor
+        changed[:, columns] = change(changed[:, columns])
         return changed
 
     return transform
+
+
+def scale_columns(columns: list[int], factor: float) -> Transform:
+    """Return the change that multiplies columns by a factor."""
+    return change_columns(columns, lambda x: x * factor)
 
 
 def clip_columns(columns: list[int], bound: float) -> Transform:
     """Return the change that clips columns at plus and minus a bound."""
-
-    def transform(values: np.ndarray) -> np.ndarray:
-        changed = values.copy()
-        changed[:, columns] = changed[:, columns].clip(-bound, bound)
-        return changed
-
-    return transform
+    return change_columns(columns, lambda x: x.clip(-bound, bound))
 
 
 def shift_columns(term: ObservationTerm, columns: list[int], offset_std: float) -> Transform:
     """Return the change that adds so many of a term's standard deviations to columns."""
-
-    def transform(values: np.ndarray) -> np.ndarray:
-        changed = values.copy()
-        changed[:, columns] += offset_std * term.std[columns]
-        return changed
-
-    return transform
+    return change_columns(columns, lambda x: x + offset_std * term.std[columns])
 
 
 def shift_column(column: int, offset: float) -> Transform:
     """Return the change that adds an offset to a column."""
-
-    def transform(values: np.ndarray) -> np.ndarray:
-        changed = values.copy()
-        changed[:, column] += offset
-        return changed
-
-    return transform
+    return change_columns([column], lambda x: x + offset)
 
 
 def shift_command(columns: list[int], offset: float) -> Transform:
     """Return the change that adds an offset to commands, within full command."""
-
-    def transform(values: np.ndarray) -> np.ndarray:
-        changed = values.copy()
-        changed[:, columns] = (changed[:, columns] + offset).clip(-1.0, 1.0)
-        return changed
-
-    return transform
+    return change_columns(columns, lambda x: (x + offset).clip(-1.0, 1.0))
 
 
 def arrange_columns(order: tuple[int, ...]) -> Transform:
@@ -94,12 +75,13 @@ def hold_rows(every: int, phase: int) -> Transform:
     return transform
 
 
-def freeze_columns(columns: list[int], row: int) -> Transform:
+def freeze_columns(columns: list[int], row: float) -> Transform:
     """Return the change that keeps the values of columns from a row on."""
+    first = int(row)
 
     def transform(values: np.ndarray) -> np.ndarray:
         changed = values.copy()
-        changed[row:, columns] = values[row, columns]
+        changed[first:, columns] = values[first, columns]
         return changed
 
     return transform
