@@ -25,6 +25,8 @@ from brokk_rl.errors import RecordingError
 
 EPISODE = "episode_index"
 """Column of a LeRobotDataset that says which episode a row belongs to."""
+MOST_COLUMNS = 256
+"""Widest matrix that is taken for joints; wider ones are pictures."""
 BATCH_ROWS = 65536
 PARQUET_ERRORS = (OSError, pa.ArrowException, ValueError)
 """Errors of pyarrow on a damaged file; a name that is no text is a `ValueError`."""
@@ -110,14 +112,16 @@ class ArrayLog(LogFile):
         tables = _read_matlab(path) if path.suffix.lower() == ".mat" else _read_npz(path)
         self._tables: dict[str, dict[str, np.ndarray]] = {}
         for table, arrays in tables.items():
-            lengths = Counter(len(values) for values in arrays.values())
-            length = lengths.most_common(1)[0][0] if lengths else 0
+            sizes = Counter(size for values in arrays.values() for size in {*values.shape})
+            length = max(sizes, key=lambda size: (sizes[size], size), default=0)
             columns: dict[str, np.ndarray] = {}
             for name, values in arrays.items():
-                if len(values) == length and values.ndim == 1:
-                    columns[name] = values.astype(float)
-                elif len(values) == length:
-                    for item, column in enumerate(values.T.astype(float)):
+                is_turned = len(values) != length and values.shape[-1] == length
+                plain = values.T if is_turned else values
+                if len(plain) == length and plain.ndim == 1:
+                    columns[name] = plain.astype(float)
+                elif len(plain) == length and plain.shape[1] <= MOST_COLUMNS:
+                    for item, column in enumerate(plain.T.astype(float)):
                         columns[f"{name}[{item}]"] = column
             self._tables[table] = columns
 
@@ -197,9 +201,9 @@ def _add_array(tables: dict[str, dict[str, np.ndarray]], name: str, value: Any) 
         for field, inner in value.items():
             _add_array(tables, f"{name}.{field}", inner)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
-        # Simulink keeps matrices over time as (rows, columns, T)
-        is_over_time = value.ndim == 3
-        plain = (value.reshape(-1, value.shape[-1]).T if is_over_time else value).squeeze()
+        plain = value.squeeze()
+        if plain.ndim == 3:  # Simulink keeps matrices over time as (rows, columns, T)
+            plain = plain.reshape(-1, plain.shape[-1]).T
         if plain.ndim <= 2:
             tables[""][name] = plain
 

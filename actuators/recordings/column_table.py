@@ -329,9 +329,9 @@ class _JointFinder:
             evidence.append(Evidence("its name says otherwise", -0.5))
         elif r[chosen] < CLEAR_CORRELATION:
             evidence.append(Evidence("", -1.0))
-        return chosen, Guess(
-            f"{name}: command", KIND_TEXTS[chosen], tuple(evidence), (), given is not None
-        )
+        subject, text = f"{name}: command", KIND_TEXTS[chosen]
+        guess = Guess(subject, text, tuple(evidence), (), given is not None)
+        return chosen, guess.advise(advise("command"))
 
     def _compare_rivals(
         self, matrix: Correlations, at: int, kind: CommandKind, is_given: bool

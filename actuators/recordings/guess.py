@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 Sureness = Literal["sure", "likely", "unsure"]
@@ -70,6 +70,11 @@ class Guess:
     def is_open(self) -> bool:
         """True where a person has to fill in the value."""
         return self.sureness == "unsure" and not self.is_given
+
+    def advise(self, text: str) -> Guess:
+        """Return it with a remedy beside the evidence, where a person has to fill in the value."""
+        remedy = Evidence(text, 0.0)
+        return replace(self, evidence=(*self.evidence, remedy)) if self.is_open else self
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain JSON data."""

@@ -86,7 +86,8 @@ def guess_time(name: str, table: Table, given: GivenColumns, skip: bool) -> Time
         return faults
     best = max(candidates, key=lambda one: one.guess.probability)
     others = tuple(one.guess.value for one in candidates if one is not best)
-    return replace(best, guess=replace(best.guess, others=others))
+    remedy = advise("time", columns=best.guess.value)
+    return replace(best, guess=replace(best.guess, others=others).advise(remedy))
 
 
 def _guess_own_clock(subject: str, table: Table) -> TimeGuess:

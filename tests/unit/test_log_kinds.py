@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import scipy.io
 from conftest import Done
 from mcap.writer import Writer
 
+from actuators.recordings.advice import ADVICE
 from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
 from brokk_rl.errors import RecordingError
 from diagnosis import api
@@ -114,23 +116,6 @@ def test_every_layout_of_text_gives_both_joints(
     check_joints(recordings)
 
 
-def test_text_without_a_header_is_refused_with_the_pairs_that_its_numbers_show(
-    brokk: Callable[..., Done],
-) -> None:
-    Path("a.dat").write_text("\n".join(PLAIN) + "\n")
-    done, _ = run_both(brokk, "log.input=a.dat")
-    assert done.code == 2
-    advised = follow_advice(done.err)
-    assert '["column_2", "column_3"]' in advised
-    done, recordings = run_both(brokk, "log.input=a.dat", advised)
-    assert done.code == 0, done.err
-    expected = make_rows()
-    pairs = dict(re.findall(r'(joint_\d): \["\w+", "column_(\d)"\]', advised))
-    for joint, column in pairs.items():
-        found = recordings[0][f"q_{joint}_rad"]
-        np.testing.assert_allclose(found, expected[: len(found), int(column) - 1], atol=2e-3)
-
-
 def test_a_comma_that_is_delimiter_and_decimal_sign_is_named(brokk: Callable[..., Done]) -> None:
     lines = [",".join(f"{v:.4f}".replace(".", ",") for v in row) for row in make_rows()]
     Path("a.csv").write_text("\n".join([",".join(NAMES), *lines]) + "\n")
@@ -153,29 +138,6 @@ def leave_time_out(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
 
 def take_differences(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     return np.column_stack([np.full(len(rows), 0.02), rows[:, 1:]]), ("dt_s", *NAMES[1:])
-
-
-@pytest.mark.parametrize("spoil", [repeat_rows, coarsen_clock, leave_time_out, take_differences])
-def test_advice_about_a_clock_reads_the_log(
-    brokk: Callable[..., Done], spoil: Callable[[np.ndarray], Any]
-) -> None:
-    write_text("a.csv", *spoil(make_rows()))
-    done, _ = run_both(brokk, "log.input=a.csv")
-    assert done.code == 2
-    done, recordings = run_both(brokk, "log.input=a.csv", follow_advice(done.err))
-    assert done.code == 0, done.err
-    check_joints(recordings)
-
-
-def test_a_clock_that_is_set_back_splits_the_log(brokk: Callable[..., Done]) -> None:
-    rows = make_rows(1200)
-    rows[600:, 0] -= 3600.0
-    write_text("a.csv", rows)
-    done, _ = run_both(brokk, "log.input=a.csv")
-    assert done.code == 2 and "the clock is set back 1 times, by 3600 s" in done.err
-    done, recordings = run_both(brokk, "log.input=a.csv", follow_advice(done.err))
-    assert done.code == 0, done.err
-    assert [len(one["t_s"]) for one in recordings] == [600, 600]
 
 
 @pytest.mark.parametrize("kind", ["pair", "counter", "epoch"])
@@ -359,21 +321,128 @@ def test_pages_and_kinds_of_identifiers_are_sources_of_their_own(
     assert np.abs(found["q_knee_rad"] - expected).max() < 0.01
 
 
-def test_a_message_on_two_channels_is_refused_with_the_key_that_chooses_one(
-    brokk: Callable[..., Done],
-) -> None:
+def write_bus(num_channels: int) -> None:
     Path("a.dbc").write_text(DBC)
     with can.Logger("a.blf") as logger:
         for frame in list_frames(foreign=False):
-            logger.on_message_received(frame)
-            frame.channel = 1
-            frame.timestamp += 0.0004
-            logger.on_message_received(frame)
-    done, _ = run_both(brokk, "log.input=a.blf", "log.dbc=a.dbc")
-    assert done.code == 2 and "comes on the channels 0, 1" in done.err
-    done, recordings = run_both(brokk, "log.input=a.blf", "log.dbc=a.dbc", follow_advice(done.err))
+            for channel in range(num_channels):
+                frame.channel = channel
+                frame.timestamp += 0.0004 * channel
+                logger.on_message_received(frame)
+
+
+def write_structures(rows: np.ndarray, apart_s: float) -> None:
+    """Writes targets and positions, each on a clock of its own."""
+    sides = {}
+    for name, first, begin_s in (("target_rad", 1, 0.0), ("position_rad", 2, apart_s)):
+        signals = {"values": rows[:, first::2], "label": ""}
+        sides[name] = {"time": rows[:, :1] + begin_s, "signals": signals}
+    scipy.io.savemat("a.mat", sides)
+
+
+def write_advised(case: str) -> list[str]:
+    """Writes a log about which a key is advised; returns the options of its import."""
+    rows, names = make_rows(), list(NAMES)
+    if case in ("channel", "dbc"):
+        write_bus(num_channels=2 if case == "channel" else 1)
+        return ["log.input=a.blf", *(["log.dbc=a.dbc"] if case == "channel" else [])]
+    if case == "offset":
+        write_structures(rows, 5000.0)
+        return ["log.input=a.mat"]
+    if case == "headerless":
+        Path("a.dat").write_text("\n".join(PLAIN) + "\n")
+        return ["log.input=a.dat"]
+    if case == "set back":
+        rows = make_rows(1200)
+        rows[600:, 0] -= 3600.0
+    elif case in ("repeat_rows", "coarsen_clock", "leave_time_out", "take_differences"):
+        rows, names = globals()[case](rows)
+    elif case == "repeated names":
+        names = ["time_s", "target", "position", "target", "position"]
+    elif case == "wraps":
+        rows[:, 1:] = np.mod(np.round(rows[:, 1:] * 652.0), 4096.0)
+        names = ["time_s", "hip_target_rad", "hip_pos_rad", "knee_target_rad", "knee_pos_rad"]
+    elif case == "unit":
+        rows[:, 1:] = np.round(2000.0 + rows[:, 1:] * 652.0)
+        names = ["time_s", "hip_target", "hip_pos", "knee_target", "knee_pos"]
+    elif case == "command":
+        wave = np.sin(2.0 * np.pi * rows[:, :1] / 4.0)
+        rows = np.column_stack([rows[:, 0], 3.0 * wave, delay(wave)])
+        names = ["time_s", "hip_action", "hip_pos_rad"]
+    elif case == "time":
+        rows[:, 0] = 2.0 * np.arange(len(rows))
+        names[0] = "x"
+    write_text("a.csv", rows, tuple(names))
+    return ["log.input=a.csv"]
+
+
+ADVISED = {
+    "repeat_rows": "damaged",
+    "set back": "damaged",
+    "coarsen_clock": "rate",
+    "leave_time_out": "rate",
+    "take_differences": "rate",
+    "time": "time",
+    "headerless": "joints",
+    "repeated names": "joints",
+    "channel": "channel",
+    "offset": "offset",
+    "dbc": "dbc",
+    "wraps": "wraps",
+    "unit": "unit",
+    "command": "command",
+}
+"""Key that is advised about each log."""
+
+
+@pytest.mark.parametrize("case", ADVISED)
+def test_advice_that_is_followed_to_the_letter_reads_the_log(
+    brokk: Callable[..., Done], case: str
+) -> None:
+    options = write_advised(case)
+    key = ADVISED[case]
+    first = brokk("mode=import", "log.name=leg", "session.out=first", *options)
+    text = first.err
+    if first.code == 0:
+        guesses = json.loads(Path("first/import.json").read_text())["guesses"]
+        text = " ".join(guess["reason"] for guess in guesses)
+    begin = re.split(r"\{\w+.*?\}", ADVICE[key])[0]
+    assert begin in text, text
+    advised = follow_advice(text[text.index(begin) :]).replace("<file>", "a.dbc")
+    done, recordings = run_both(brokk, *options, advised)
     assert done.code == 0, done.err
-    assert len(recordings) == 1
+    assert "fill in ???" not in done.out
+    expected = make_rows(1200)
+    for name in recordings[0]:
+        if name == "q_hip_rad" and case not in ("wraps", "unit", "command"):
+            q = recordings[0][name]
+            np.testing.assert_allclose(q, expected[: len(q), 2], atol=2e-3)
+    if case == "set back":
+        assert [len(one["t_s"]) for one in recordings] == [600, 600]
+
+
+def test_each_advice_is_followed_by_a_test() -> None:
+    assert set(ADVISED.values()) == set(ADVICE)
+
+
+@pytest.mark.parametrize("page", ["docs/commands.md", "docs/tutorials/your_simulator.md"])
+def test_commands_for_logs_that_a_page_prints_run_as_they_stand(
+    brokk: Callable[..., Done], page: str
+) -> None:
+    rows = make_rows()
+    Path("raw").mkdir()
+    text = (Path(__file__).parents[2] / page).read_text()
+    commands = re.findall(r"^brokk (mode=import log.input=raw .*)$", text, re.MULTILINE)
+    assert len(commands) >= 2
+    for command in commands:
+        given = re.search(r"\[(\w+), (\w+)\]", command)
+        names = ("t", given[1], given[2], "a", "b") if given else NAMES
+        write_text("raw/a.csv", rows, names)
+        for folder in ("draft", "read"):
+            if f"session.out={folder}" in command:
+                shutil.rmtree(folder, ignore_errors=True)
+        done = brokk(*shlex.split(command))
+        assert done.code == 0, done.err
 
 
 def write_messages(path: str, messages: list[tuple[float, str, dict[str, Any]]]) -> None:
