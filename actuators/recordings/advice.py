@@ -15,7 +15,7 @@ ADVICE = {
     "dbc": "log.dbc=<file>, or a column map that names it",
     "wraps": "log.wraps={modulus:g} unwraps it, a negative number reads that sign bit, log.wraps=0 takes it as it is",
     "unit": "give it, log.position_unit=deg, mm or, for a count of an encoder, '0.00153 rad'",
-    "command": "give it, log.command=position, velocity or torque",
+    "command": "give it, log.command=velocity, position or torque",
 }
 """Texts by the key that they advise; numbers and names are filled in."""
 

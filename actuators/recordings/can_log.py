@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, fields
+from datetime import datetime
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,7 @@ EXTENDED = 1 << 31
 TICKS_OF_10_US = 1
 """Time unit of 10 µs; others are of 1 ns."""
 PRINTED_LINE = re.compile(
-    r"^\s*(\(\d+\.\d+\))\s+(\S+)\s+([0-9A-Fa-f]+)\s+\[\d+\]((?:\s+[0-9A-Fa-f]{2})*).*$"
+    r"^\s*\(([-\d:. ]+)\)\s+(\S+)\s+([0-9A-Fa-f]+)\s+\[\d+\]((?:\s+[0-9A-Fa-f]{2})*).*$"
 )
 
 
@@ -294,8 +295,14 @@ def read_candump(path: Path) -> str:
     for line in path.read_text(errors="replace").splitlines():
         printed = PRINTED_LINE.match(line)
         if printed:
+            is_date = "-" in printed[1]  # candump -t A
+            stamp_s = (
+                datetime.fromisoformat(f"{printed[1]}+00:00").timestamp()
+                if is_date
+                else float(printed[1])
+            )
             data = "".join(printed[4].split())
-            lines.append(f"{printed[1]} {printed[2]} {printed[3]}#{data}")
+            lines.append(f"({stamp_s:.6f}) {printed[2]} {printed[3]}#{data}")
         elif line.lstrip().startswith("("):
             lines.append(line.strip())
     return "\n".join(lines) + "\n"

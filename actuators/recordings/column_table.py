@@ -357,7 +357,8 @@ class _JointFinder:
         q, t_s = position.values, position.signal.t_s
         cause = np.zeros(len(q))
         if is_target:
-            cause = matrix.fit_target(at)[0] * np.interp(t_s, command.signal.t_s, command.values)
+            slope, offset = matrix.fit_target(at)
+            cause = slope * np.interp(t_s, command.signal.t_s, command.values) + offset
         if position.wrap is None and (wrap := find_wrap(q)) is not None:
             return [Evidence(f"{wrap.explain()}, and is taken as it is", -6.0)]
         spikes = find_spikes(q)

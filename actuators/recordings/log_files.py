@@ -30,7 +30,7 @@ SIGNATURES = {
     b"MATLAB 5.0": (".mat", "a MATLAB file"),
 }
 """First bytes of files, with the ending and the name of their kind."""
-CANDUMP_LINE = re.compile(rb"^\s*\(\d+\.\d+\)\s+\S+\s+[0-9A-Fa-f]+(#|\s+\[\d+\])", re.MULTILINE)
+CANDUMP_LINE = re.compile(rb"^\s*\([-\d:. ]+\)\s+\S+\s+[0-9A-Fa-f]+(#|\s+\[\d+\])", re.MULTILINE)
 """A line of candump, as a file (`candump -l`) or as printed on a terminal (`candump -t a`)."""
 Damaged = Literal["refuse", "skip"]
 JOINT_LIST = "joint_list.txt"

@@ -144,6 +144,8 @@ def find_jumps(
         begin = int(np.searchsorted(t_s, t_s[row] - longest_lag_s))
         # only a step causes a step; a target that moves slowly does not
         largest = np.abs(np.diff(cause[begin : row + 2])).max(initial=0.0)
+        if begin == 0 and cause.any():  # a target may have stepped before the log began
+            largest = max(largest, abs(cause[0] - q[0]))
         if largest < CAUSE_SHARE * size[row]:
             found.append(row)
     return np.array(found, dtype=int)

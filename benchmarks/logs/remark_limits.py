@@ -32,7 +32,7 @@ def simulate(machine: Machine, rng: np.random.Generator, off: float, is_reset: b
     num, period_s = round(60.0 / machine.period_s), machine.period_s
     half = (machine.upper - machine.lower) / 2.0
     goals = rng.uniform(-0.7, 0.7, (num // 30 + 1, machine.num_joints)).repeat(30, 0)[:num]
-    u, q, at = np.zeros_like(goals), np.zeros_like(goals), np.zeros(machine.num_joints)
+    u, q, at = np.zeros_like(goals), np.zeros_like(goals), goals[0]
     lag_s, sag, play = rng.uniform(0.02, 0.4), rng.uniform(0.0, 0.03), rng.uniform(0.0, 0.02)
     speed = rng.uniform(0.5, 3.0) * period_s
     is_off = np.zeros(num, dtype=bool)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from actuators.recordings.recording_checks import RecordingRemark
 from brokk_rl.errors import RecordingError
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
@@ -117,13 +118,14 @@ def test_an_answer_without_effects_has_a_report(
         next_experiment=None,
         reason="Few data.",
     )
-    bare = replace(
-        answer,
-        more={key: value for key, value in answer.more.items() if key not in ("evidence", "tip")},
-    )
+    more = {key: value for key, value in answer.more.items() if key not in ("evidence", "tip")}
+    remark = RecordingRemark("jumps", "bad", "q4", "run", 0.0, 1.0, 1, "one", "a wrap", "unwrap it")
+    bare = replace(answer, more=more | {"sanity": [remark.plain()] * 30})
     assert report.write_headline(bare)[1] == ("good" if verdict == "none" else "warn")
     report.write_report(Outcome(bare, seen[0].before, None, None), tmp_path, machine)
-    assert "12.0 mrad before; the floor is 10.0 mrad" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "12.0 mrad before; the floor is 10.0 mrad" in page
+    assert f"{30 - report.MAX_LISTED} more" in page
 
 
 def test_an_answer_that_cannot_tell_says_why(

@@ -132,6 +132,33 @@ def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_
     assert (finding.kind, finding.joint) == ("motion without command", "elbow")
 
 
+@pytest.mark.parametrize(
+    ("period_s", "kept", "is_found"), [(0.02, 1.0, False), (5.0, 1.0, False), (0.02, 0.0, True)]
+)
+def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
+    thresholds: InspectionThresholds, period_s: float, kept: float, is_found: bool
+) -> None:
+    arm = option("machine", "so101")
+    t_s = period_s * np.arange(1500)
+    travel = arm.upper[2] - arm.lower[2]
+    # targets that wander, with steps; the joint sags by 0.15 of its travel and answers late
+    wave = 0.3 * np.sin(0.01 * np.arange(1500)) + 0.1 * np.sign(np.sin(0.03 * np.arange(1500)))
+    late = np.convolve(wave, np.ones(3) / 3.0)[: len(wave)]
+    late[500:1000] = kept * late[500:1000] + (1.0 - kept) * late[500]
+    targets = np.tile(arm.home, (len(t_s), 1))
+    q = targets.copy()
+    targets[:, 2], q[:, 2] = arm.home[2] + travel * wave, arm.home[2] + travel * (late - 0.15)
+    q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
+    log = Recording(
+        machine="so101", joints=arm.joint_names, units=("rad",) * 5, rate_hz=1.0 / period_s, t_s=t_s,
+        u=np.zeros_like(q, dtype=np.float32), q=q.astype(np.float32),
+    )  # fmt: skip
+    findings = inspect_recording(log, arm, thresholds, targets).findings
+    named = [one for one in findings if one.kind == "does not obey"]
+    assert bool(named) == is_found
+    assert all(one.joint == "elbow" and one.row >= 495 for one in named)
+
+
 def test_a_joint_that_sinks_is_found_with_its_speed(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
