@@ -186,15 +186,21 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
             "effort" if quantity == "unknown" and unit in ("nm", "n", "a", "v", "bar") else quantity
         )
         unit = None
-    roles = COMMAND_WORDS | MEASURED_WORDS | set().union(*QUANTITY_WORDS.values())
+    roles = (
+        COMMAND_WORDS
+        | MEASURED_WORDS
+        | ({"d"} if "q" in words else set())
+        | set().union(*QUANTITY_WORDS.values())
+    )
     known = roles | FILLER_WORDS | set(UNITS)
     left = [word for word in words if word not in known]
     return ColumnName(table, column, role, quantity, unit, "_".join(left), speed_unit)
 
 
 def _find_role(words: list[str]) -> Role | None:
-    """Return the role; a word for commands counts more: `target q` is a command."""
-    if any(word in COMMAND_WORDS for word in words):
+    """Return the role; a word for commands counts more: `target q` and libfranka's `q_d` are commands."""
+    is_desired = "d" in words and any(word in ("q", "dq", "tau") for word in words)
+    if is_desired or any(word in COMMAND_WORDS for word in words):
         return "command"
     return "measured" if any(word in MEASURED_WORDS for word in words) else None
 

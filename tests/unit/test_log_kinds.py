@@ -187,7 +187,7 @@ def test_wraps_are_taken_out_and_said(
         wrapped[:, 0] = turned[:, 0]
     names = ("time_s", "hip_target", "hip_pos")
     write_text("a.csv", np.column_stack([rows[:, 0], np.round(wrapped, 0 if half == 0.0 else 6)]), names)  # fmt: skip
-    unit = "rad" if kind == "angle" else "0.00153398 rad"
+    unit = "0.00153398 rad" if kind == "counter" else "rad"
     done, recordings = run_both(brokk, "log.input=a.csv", f"log.position_unit={unit}")
     assert done.code == 0, done.err
     assert "hip: wraps" in done.out
