@@ -85,6 +85,8 @@ FILLER_WORDS = _split("""
     controller controllers dof forward servo servos
 """)
 """Words that name no joint."""
+ROLE_WORDS = COMMAND_WORDS | MEASURED_WORDS | frozenset().union(*QUANTITY_WORDS.values())
+"""Words of role and quantity."""
 UNIT_SUFFIX = re.compile(r"^(.*?)\s*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
 """A name with a unit in brackets behind it."""
 
@@ -168,8 +170,9 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     plain, stated = split_unit(column)
     unit = (unit or stated or "").lower() or None
     outer, words = split_words(table), split_words(plain)
-    if len(words) == 1 and (numbered := re.fullmatch(r"([a-z]+)(\d+)", words[0])):
-        words = [numbered[1], numbered[2]]  # `u1` and `q1` are of joint 1
+    numbered = re.fullmatch(r"([a-z]+)(\d+)", words[0]) if words else None
+    if numbered and (len(words) == 1 or numbered[1] in ROLE_WORDS):
+        words = [numbered[1], numbered[2], *words[1:]]  # `u1` and `q1` are of joint 1
     role = _find_role(words) or _find_role(outer)
     quantity = _find_quantity(words)
     if quantity == "unknown":
@@ -186,13 +189,8 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
             "effort" if quantity == "unknown" and unit in ("nm", "n", "a", "v", "bar") else quantity
         )
         unit = None
-    roles = (
-        COMMAND_WORDS
-        | MEASURED_WORDS
-        | ({"d"} if "q" in words else set())
-        | set().union(*QUANTITY_WORDS.values())
-    )
-    known = roles | FILLER_WORDS | set(UNITS)
+    desired = {"d"} if "q" in words else set()
+    known = ROLE_WORDS | FILLER_WORDS | set(UNITS) | desired
     left = [word for word in words if word not in known]
     return ColumnName(table, column, role, quantity, unit, "_".join(left), speed_unit)
 

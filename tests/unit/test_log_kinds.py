@@ -448,7 +448,7 @@ def test_each_advice_is_followed_by_a_test() -> None:
     assert set(ADVISED.values()) == set(ADVICE)
 
 
-@pytest.mark.parametrize("page", ["docs/commands.md", "docs/tutorials/your_simulator.md"])
+@pytest.mark.parametrize("page", ["docs/logs.md", "docs/tutorials/your_simulator.md"])
 def test_commands_for_logs_that_a_page_prints_run_as_they_stand(
     brokk: Callable[..., Done], page: str
 ) -> None:
