@@ -22,7 +22,7 @@ Severity = Literal["note", "warn", "bad"]
 
 @dataclass(frozen=True)
 class FindingKind:
-    """What a kind of finding means.
+    """Severity, meaning and remedy of a kind of finding.
 
     Attributes:
         severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`: good to know.
