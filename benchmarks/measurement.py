@@ -15,7 +15,6 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks/results"
-Cell = str | float | int | None
 Table = list[dict[str, Any]]
 
 
@@ -94,6 +93,7 @@ def read_evaluation(path: Path, head: dict[str, Any]) -> Table:
             "policy": policy,
             "strict success": round(strict, 3),
             "95 %": f"{low:.3f} to {high:.3f}",
+            "inserted": round(one.get("success_reached", {"mean": strict})["mean"], 3),
             "paper's criterion": round(one["success_paper"]["mean"], 3),
             "median time, s": round(one["time_to_insert_s"]["median"], 1),
             "peak force, kN": round(one["peak_force_n"] / 1000.0, 1),

@@ -24,7 +24,6 @@ import cv2
 import hydra
 import numpy as np
 from hydra.utils import instantiate
-from rich.console import Console
 from rich.progress import track
 
 from brokk_rl.contracts.vision import FrameDetections
@@ -78,7 +77,6 @@ def main() -> None:
         "ms_steered": (whole + (every - 1) * followed) / every,
     }
     given.out.write_text(json.dumps(told, indent=1) + "\n")
-    Console().print(told)
 
 
 def look(find: Callable[[], FrameDetections]) -> tuple[FrameDetections, dict[str, float]]:
