@@ -75,9 +75,9 @@ def calibrate_pair(pairs: Sequence[BoardPair], size_px: tuple[int, int]) -> dict
             f"got {len(pairs)}; hold it nearer, still, and in the light"
         )
     boards = [one.board_m for one in pairs]
-    sides = [one.left_px for one in pairs], [one.right_px for one in pairs]
+    left_px, right_px = [one.left_px for one in pairs], [one.right_px for one in pairs]
     lenses = []
-    for side, pixels in zip(("left", "right"), sides, strict=True):
+    for side, pixels in (("left", left_px), ("right", right_px)):
         _, matrix, bent, _, _, std, *_ = cv2.calibrateCameraExtended(
             boards, pixels, size_px, np.eye(3), np.zeros(5)
         )
@@ -87,10 +87,12 @@ def calibrate_pair(pairs: Sequence[BoardPair], size_px: tuple[int, int]) -> dict
                 f"lens=board: the focal length of the {side} camera is known to {doubt:.1%}, expected "
                 f"{LARGEST_FOCAL:.0%}; tilt the board by 30 degrees, to all sides, and fill the picture"
             )
-        lenses += [matrix, bent]
+        lenses.append((matrix, bent))
+    (one, bent), (other, other_bent) = lenses
     error_px, *found = cv2.stereoCalibrate(
-        boards, *sides, *lenses, size_px, flags=cv2.CALIB_USE_INTRINSIC_GUESS
-    )
+        boards, left_px, right_px, one, bent, other, other_bent, size_px,
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+    )  # fmt: skip
     if error_px > LARGEST_PX:
         raise FrameError(
             f"lens=board: the corners miss by {error_px:.2f} px, expected {LARGEST_PX:g} or less; is the "

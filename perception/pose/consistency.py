@@ -110,10 +110,12 @@ def measure_stretch(
     """
     ray = np.linalg.solve(chart.camera_matrix, np.array([row[0], row[1], 1.0]))
     cosine = float(face.normal @ ray) / float(np.linalg.norm(ray))
+    if 1.0 / cosine**2 - 1.0 < LEAST_SLOPE:
+        return None
     # A rim that is not round departs from its circle by a part of its size.
     reach_px = max(rim.NARROW_PX, REACH * float(np.sqrt(row[2] * row[3])))
     profiles = rim.find_profile_edges(light, row, reach_px, chart)
-    if 1.0 / cosine**2 - 1.0 < LEAST_SLOPE or profiles is None:
+    if profiles is None:
         return None
     known = np.isfinite(profiles.edges[..., 0])
     rows = np.flatnonzero(known.any(1))
