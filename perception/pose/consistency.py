@@ -51,9 +51,9 @@ from which its seven numbers are determined."""
 REACH = 0.1
 """Departure from a circle within which its edges are looked for, in radii: a focal length that is
 wrong by a fifth on a face at 45 degrees."""
-NEARBY, MOST_LOG, NUM_TRIALS = 0.05, 0.7, 71
-"""Logarithm of the factor up to which a rim's shape is linear in it, largest one that is tried, and
-number of trials."""
+NEARBY, MOST_LOG, NUM_TRIALS, AS_ROUND = 0.05, 0.7, 71, 0.3
+"""Logarithm of the factor up to which a rim's shape is linear in it, largest one that is tried,
+number of trials, and largest part of the oval that the best of them may leave."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which occluders of its rim are searched."""
 
@@ -134,7 +134,11 @@ def measure_stretch(
         # Two tilts show the same length along the slope; only one shows a circle.
         trials = np.linspace(-MOST_LOG, MOST_LOG, NUM_TRIALS)
         ovals = [_measure_oval(*outline, float(trial))[0] for trial in trials]
-        logarithm = float(trials[np.argmin(np.linalg.norm(ovals, axis=1))])
+        sizes = np.linalg.norm(ovals, axis=1)
+        # Edges of something else are round with no focal length.
+        if sizes.min() > AS_ROUND * np.linalg.norm(oval):
+            return None
+        logarithm = float(trials[np.argmin(sizes)])
     # Neighbouring edges share their error.
     pixel_m = float(np.median(profiles.pixel_m))
     alike_m = rim.ALIKE_PX * pixel_m + rim.ALIKE_M

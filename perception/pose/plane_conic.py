@@ -31,9 +31,9 @@ holes at most 0.01."""
 FORGIVEN, AT_FIRST = 0.55, 1.4
 """Least visible part of a circle whose ellipse was too small or too long; and factor on the limits
 for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
-LARGELY, WHOLE = 0.7, 0.85
-"""Visible part of a circle from which its own edges tell how round it is, and of an ellipse whose
-edges do in its place: on a wrong face hardly any circle is seen."""
+HALF, WHOLE, AS_MUCH = 0.5, 0.85, 0.8
+"""Visible part of a circle, and of an ellipse, from which edges tell how round a rim is; part of the
+ellipse's edges that the circle must show to be asked: on a wrong face hardly any circle is seen."""
 BROKEN_SEEN = 0.6
 """Least part of a broken rim with edges: its pieces may lie at any depth, so texture has some too."""
 
@@ -253,8 +253,8 @@ class PlaneConicEstimator:
         ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
         chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
         told = None
-        if seen > LARGELY or ellipse.coverage > WHOLE:
-            outline = row if seen > LARGELY else as_row(ellipse)
+        if seen > HALF or ellipse.coverage > WHOLE:
+            outline = row if seen > AS_MUCH * ellipse.coverage else as_row(ellipse)
             told = consistency.measure_stretch(light, chart, face, outline)
         if told is not None and abs(np.log(told[0])) > np.log(s.stretch) + 3.0 * told[1]:
             return Rejection("pose", consistency.STRETCH, told[0], 1.0, ellipse)
