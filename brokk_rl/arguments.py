@@ -74,6 +74,10 @@ def _split(words: Sequence[str], groups: Mapping[str, list[str]]) -> tuple[list[
         name, given, _ = word.partition("=")
         if name not in SWITCHES | SETTINGS:
             raise ConfigError(_explain_option(word, groups))
+        if name in SWITCHES and given:
+            raise ConfigError(
+                f"{word}: {name} takes no value; leave '={word.partition('=')[2]}' out"
+            )
         options.append(word)
         if name in SETTINGS and not given:
             if not rest:
@@ -142,9 +146,20 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
             reason = str(error).partition("while evaluating ")[2].splitlines()
             raise ConfigError(f"{word}: {reason[0] if reason else 'cannot be read'}") from error
         raise ConfigError(_explain_characters(key, value)) from error
+    is_single = key in groups and not _is_list_group(key)
     if override.is_sweep_override() and not sweep:
-        raise ConfigError(_explain_several(key, value, key in groups))
+        raise ConfigError(_explain_several(key, value, key in groups, is_single))
+    if is_single and value.startswith("["):
+        raise ConfigError(_explain_several(key, value.strip("[]"), True, is_single))
     return word
+
+
+def _is_list_group(group: str) -> bool:
+    """Return whether several options of a group may be chosen: each has a place of its own."""
+    for option in registry.list_options(group):
+        if re.search(rf"^# @package {group}\.", option.path.read_text(), re.MULTILINE):
+            return True
+    return False
 
 
 def explain_robot(path: str) -> str:
@@ -155,14 +170,16 @@ def explain_robot(path: str) -> str:
     )
 
 
-def _explain_several(key: str, value: str, is_group: bool) -> str:
+def _explain_several(key: str, value: str, is_group: bool, is_single: bool) -> str:
     """Explain a value with commas, which is a sweep where one was meant."""
     ways = []
     if re.fullmatch(r"-?\d+,\d+", value):
         ways.append(f"one number: {key}={value.replace(',', '.')}")
+    elif is_single:
+        ways.append(f"one option: {key}={value.split(',')[0]}")
     elif not is_group:
         ways.append(f"one text: {_show(key, _quote(value))}")
-    if "(" not in value:
+    if "(" not in value and not is_single:
         ways.append(f"a list: {_show(key, f'[{value}]')}")
     ways.append(f"one run for each: brokk -m … {_show(key, value)}")
     return f"{key}={value} holds several values. If you mean {'; '.join(ways)}"

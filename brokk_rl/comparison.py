@@ -259,12 +259,12 @@ def compare_to_baseline(
     methods = distinct.to_dict("records")
     baseline = _choose_baseline(methods, wanted)
     found = []
-    for _, group in groups.iterrows():
-        own = _select_scores(table, group[["policy", *columns]])
-        other = group[["policy", *columns]]
-        other[keys] = pd.Series(baseline)
-        by_seed: Any = (own - _select_scores(table, other)).dropna()
-        if group[keys].to_dict() == baseline:
+    settings: Any = groups[["policy", *columns]]
+    for setting in settings.to_dict("records"):
+        opponent = setting | baseline
+        own = _select_scores(table, setting)
+        by_seed: Any = (own - _select_scores(table, opponent)).dropna()
+        if opponent == setting:
             by_seed = by_seed.iloc[:0]
         low, high = compute_student_interval(by_seed.tolist()) or (None, None)
         row = {"by_seed": by_seed.to_dict(), DIFFERENCE: by_seed.mean()}
@@ -272,9 +272,9 @@ def compare_to_baseline(
     return groups.join(pd.DataFrame(found, index=groups.index))
 
 
-def _select_scores(table: pd.DataFrame, values: pd.Series) -> pd.Series:
+def _select_scores(table: pd.DataFrame, setting: Mapping[str, Any]) -> Any:
     """Return strict success by seed of the rows with these values."""
-    own = table[(table[list(values.index)] == values).all(axis=1)]
+    own = table[(table[list(setting)] == pd.Series(setting)).all(axis=1)]
     return own.groupby("seed", sort=False)[SUCCESS_RATE].last()
 
 

@@ -28,9 +28,11 @@ from brokk_rl import registry
 from brokk_rl.arguments import ROBOT_FILES, explain_robot
 from brokk_rl.errors import BrokkError, list_choices
 
-CLOSE = 0.8
+CLOSE = 0.85
 """Likeness of two names from which one is taken for the other misspelt. Chosen by hand: `recording`
-is close to `recordings`, `out` is not to `output`."""
+is close to `recordings`, `max_iterations` is not to `iterations`."""
+BLOCKED = (errno.EEXIST, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS)
+"""Errors of a path at which nothing can be written."""
 MISSING_SKIPPED = RunMode.MULTIRUN
 """Mode in which Hydra leaves out groups that must be given: the jobs of a sweep bring them."""
 
@@ -49,6 +51,8 @@ def explain(error: BaseException) -> str | None:
         return f"the memory of the GPU is full: use fewer environments, or session.device=cpu ({error})"
     if ours:
         return str(ours)
+    if blocked := next((e for e in chain if isinstance(e, OSError) and e.errno in BLOCKED), None):
+        return f"cannot use {blocked.filename}: {blocked.strerror}. Choose session.out=<folder>."
     if missing:
         return explain_missing_value(str(missing.full_key or missing))
     lacking = next((e for e in chain if isinstance(e, ModuleNotFoundError) and e.name), None)
@@ -171,7 +175,7 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
     # The mode itself may not compose; the message is then shorter.
     with contextlib.suppress(Exception):
         cfg = compose_choices()
-        return f"{source} '{key}', but {_explain_absence(cfg, key, _find_value(key), text)}"
+        return f"{source} '{key}', but {_explain_absence(cfg, key, _find_value(key))}"
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --help` lists what it has"
 
 
@@ -186,7 +190,7 @@ def _list_options(group: str, name: str, offered: Sequence[str]) -> str:
     return list_choices(name, offered) + path * (group == "policy")
 
 
-def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
+def _explain_absence(cfg: DictConfig, key: str, value: str) -> str:
     """Return what a configuration has in the place of a key that it does not have."""
     mode = f"mode={cfg.hydra.runtime.choices['mode']}"
     if isinstance(table := OmegaConf.select(cfg, key, default=None), DictConfig):
@@ -209,6 +213,8 @@ def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
             return f"'{key}' is an option: {option.group}={key}"
     if value.endswith(ROBOT_FILES):
         return f"{mode} has no '{leaf}'; {explain_robot(value)}"
+    if leaf in groups:
+        return f"'{leaf}' is a group, whose options are chosen by {leaf}=<option>"
     here = names if parent else list({*names, *groups})
     if not get_close_matches(leaf, here) and (keys := _find_keys(cfg, _guess_name(cfg, leaf))):
         return f"'{parent or mode}' has no '{leaf}'; {_suggest(keys, value)}"

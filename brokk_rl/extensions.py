@@ -226,11 +226,11 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
 def _drop_parts(node: dict[Any, Any]) -> None:
     """Take the names of classes from the parts of an option: its annotations name them.
 
-    A part has its class in the module of the option's own class.
+    A part has its class in the module of the option's own class, and is no option itself.
     """
     from brokk_rl.build import drop_targets
 
-    own, kept = str(node.get("_target_")).rpartition(".")[0], set()
+    own, kept = str(node.get("_target_")).rpartition(".")[0], set(registry.list_targets())
     for place, target in registry.iterate_leaves(node):
         if place[-1] == "_target_" and str(target).rpartition(".")[0] != own:
             kept.add(target)

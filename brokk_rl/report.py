@@ -21,7 +21,6 @@ from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
@@ -93,10 +92,6 @@ class Report:
     def add_list(self, texts: Sequence[str]) -> None:
         """Add a list of short texts."""
         self._add("list", texts=texts)
-
-    def add_links(self, files: Mapping[str, str]) -> None:
-        """Add links to files beside the page: text and path, relative to the page's folder."""
-        self._add("links", links={text: quote(path) for text, path in files.items()})
 
     def add_code(self, text: str) -> None:
         """Add commands or a file unchanged."""

@@ -277,6 +277,8 @@ def _strip(hint: Any) -> Any:
 def _describe_problem(problem: Any, hint: Any) -> str:
     value = problem["input"]
     end = ""
+    if problem["type"] == "members" and isinstance(value, (str, int, float, list)):
+        return f"expected an option of its group (a {describe_hint(hint)}), got {_show(value)}"
     if problem["type"] == "members":
         end = f" without {problem['ctx']['lacking']}"
     near = get_close_matches(str(value), _list_words(hint), n=1)

@@ -141,7 +141,7 @@ def _print_groups(
     print_table(headings, table.astype(object).where(table.notna(), None).to_numpy().tolist())
 
 
-def _format_difference(group: pd.Series) -> str | None:
+def _format_difference(group: Any) -> str | None:
     """Return the difference of a group to the baseline with its interval, as text."""
     if pd.isna(group[DIFFERENCE]):
         return None

@@ -38,6 +38,11 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=train", "--cfg", "jobs"): ("there is no --cfg jobs", "'job'"),
     ("-m",): ("a sweep needs values", "session.seed=0,1,2"),
     ("mode=train", "mode=evaluate"): ("expected one mode",),
+    ("-m", "session.seed=0,1", "session.out=arm.xml"): (
+        "cannot use arm.xml",
+        "session.out=<folder>",
+    ),
+    ("mode=train", "--help=rl"): ("--help takes no value",),
     ("-sc",): ("-sc install=bash",),
     ("arm.urdf",): ("brokk mode=check subject.model=arm.urdf",),
     ("mode=trian", "--help"): ("there is no mode=trian", "'train'"),
@@ -52,6 +57,9 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=list", "session.seed=1"): ("'mode=list' has no 'session'",),
     (*COMPARE, "session=other"): ("session.<name>=", "seed"),
     ("effect=backlash,lag",): ("a list: 'effect=[backlash,lag]'",),
+    ("policy=[shipped,classical]",): ("one option: policy=shipped;", "brokk -m"),
+    ("mode=import", "import.x=1"): ("'import' is a group",),
+    ("mode=evaluate", "policy=shipped", "task=goal_pose"): ("was trained for task=",),
     ("tracking=wandb,",): ("Write tracking=wandb",),
     ("wandb=true",): ("tracking=wandb",),
     # keys
