@@ -19,6 +19,8 @@ from brokk_rl.errors import RecordingError, StorageError, list_choices
 from brokk_rl.machine import Machine
 
 SCHEMA = "1"
+DAMAGE = "damage"
+"""Metadata that says in words what was lost of the log."""
 RATE_TOLERANCE = 0.2
 """Largest relative deviation of a period from the stated rate."""
 COMMAND_TOLERANCE = 1e-6

@@ -31,8 +31,10 @@ class Convert:
         """Write `recordings/<log>_<piece>.parquet`; nothing if any log cannot be used.
 
         Raises:
-            RecordingError: no log matches, one of them cannot be used, or two have the same name.
+            RecordingError: no log matches, one of them cannot be used, two have the same name, or,
+                at the end, something of one is lost.
             StorageError: a file could not be written.
         """
         pieces = conversion.read_logs(self.convert.input, self.reader, self.machine)
         conversion.write_recordings(pieces, self.session.folder / conversion.FOLDER)
+        conversion.check_damage(pieces)

@@ -11,7 +11,7 @@ from actuators.recordings.log_reader import LogReader
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
+from brokk_rl.record import DAMAGE, Recording
 
 log = logging.getLogger(__name__)
 
@@ -62,3 +62,19 @@ def write_recordings(pieces: Mapping[Path, Sequence[Recording]], folder: Path) -
         log.info("%s: %d recordings, %.1f minutes", path, len(recordings), minutes)
     count = sum(map(len, pieces.values()))
     log.info("%d recordings of %d logs in %s", count, len(pieces), folder)
+
+
+def check_damage(pieces: Mapping[Path, Sequence[Recording]]) -> None:
+    """Refuse to end well where a log was damaged; its recordings hold the rest.
+
+    Raises:
+        RecordingError: Something of a log is lost.
+    """
+    found = []
+    for path, recordings in pieces.items():
+        if recordings and DAMAGE in recordings[0].metadata:
+            found.append(f"{path}: {recordings[0].metadata[DAMAGE]}")
+    if found:
+        raise RecordingError(
+            f"the recordings hold the rest, but something is lost of {'; '.join(found)}"
+        )

@@ -1,1 +1,1 @@
-"""Modes of the machine's computer: `deploy`, `twin`, `bringup`, `recover`, `page`."""
+"""Modes of the machine's computer: `deploy`, `twin`, `bringup`, `page`."""

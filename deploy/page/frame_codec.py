@@ -80,12 +80,3 @@ def encode_depth_planes(depth_m: np.ndarray) -> np.ndarray:
     signed = units.view("<i2")
     outwards = ((signed << 1) ^ (signed >> 15)).astype("<i2")
     return np.moveaxis(outwards.view(np.uint8).reshape(*units.shape, 2), -1, 0).copy()
-
-
-def decode_depth_m(data: bytes, width: int, height: int) -> np.ndarray:
-    """Return the depths that `data` holds, `(h, w)` float32 in m, NaN where unknown."""
-    planes = np.frombuffer(zlib.decompress(data), np.uint8)
-    low, high = planes.reshape(2, height, width).astype(np.uint16)
-    outwards = low | high << 8
-    units = ((outwards >> 1) ^ -(outwards & 1)).cumsum(1, dtype=np.uint16).astype(np.float32)
-    return np.where(units > 0, units * np.float32(M_PER_UNIT), np.float32(np.nan))

@@ -1,4 +1,4 @@
-"""Reads and recovers captures, whole or cut off by a crash; those up to where they end."""
+"""Reads captures, whole, damaged or cut off by a crash; those up to where they end."""
 
 from __future__ import annotations
 
@@ -15,29 +15,14 @@ from mmap import PROT_READ
 from pathlib import Path
 from typing import Any, overload
 
-import can
 import numpy as np
 import zstandard
-from can.io.blf import BLFReader
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    Channel,
-    Chunk,
-    Message,
-    MessageIndex,
-    Metadata,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Chunk, Message, MessageIndex, Metadata, Schema, Statistics
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
-from mcap.writer import CompressionType, Writer
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.progress import track_items
-from brokk_rl.record import find_files
-from brokk_rl.spec import spec
-from deploy.recorder.capture import FACTS, DurableBlfWriter
+from deploy.recorder.capture import FACTS
 from deploy.recorder.topics import PACKAGE, TIME, decode_message, load_message_class
 
 log = logging.getLogger(__name__)
@@ -216,77 +201,6 @@ def list_definitions(path: Path) -> list[Any]:
     return [record for record in scan if isinstance(record, (Schema, Channel))]
 
 
-def recover_mcap(path: Path, out: Path) -> tuple[int, int]:
-    """Write the readable part of a capture as a whole one.
-
-    Returns:
-        Its number of messages, and of places where something is lost.
-
-    Raises:
-        RecordingError: nothing can be read.
-    """
-    count, scan = 0, CaptureScan(path)
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    given: dict[int, int] = {}
-    part = out.with_name(f".{out.name}.part")
-    with part.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start(profile="brokk", library="brokk-rl")
-        for record in (*list_definitions(path), *scan):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message) and record.channel_id in channels:
-                channel = channels[record.channel_id]
-                if channel.id not in given:
-                    schema = schemas[channel.schema_id]
-                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    encoding = channel.message_encoding
-                    given[channel.id] = writer.register_channel(channel.topic, encoding, number)
-                times_ns = record.log_time, record.publish_time
-                number = given[channel.id]
-                writer.add_message(number, times_ns[0], record.data, times_ns[1], record.sequence)
-                count += 1
-            elif isinstance(record, Metadata):
-                writer.add_metadata(record.name, dict(record.metadata))
-            elif isinstance(record, Attachment):
-                kind, data = record.media_type, record.data
-                writer.add_attachment(record.create_time, record.log_time, record.name, kind, data)
-        writer.finish()
-    if not count:
-        part.unlink()
-        raise RecordingError(f"{path}: not a single message can be read")
-    part.replace(out)
-    return count, scan.num_damaged
-
-
-def recover_blf(path: Path, out: Path) -> tuple[int, int]:
-    """Write the readable part of a cut-off BLF as a whole one; return as `recover_mcap`."""
-    part, count = out.with_name(f".{out.name}.part"), 0
-    writer = DurableBlfWriter(part)
-    try:
-        for message in iterate_blf_frames(path):
-            writer.on_message_received(message)
-            count += 1
-    finally:
-        writer.stop()
-    part.replace(out)
-    return count, 0
-
-
-def iterate_blf_frames(path: Path) -> Iterator[can.Message]:
-    """Yield the frames of a BLF as far as it can be read."""
-    try:
-        with BLFReader(path) as reader:
-            yield from reader
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: no such log") from error
-    except Exception as error:  # a container that was cut off fails in zlib, struct or the parser
-        log.warning("%s: ends before its end (%s)", path, error)
-
-
 class CaptureScan:
     """Records of a capture, chunk by chunk; what is damaged is left out and counted.
 
@@ -421,47 +335,3 @@ def _find_mark(data: mmap.mmap, at: int, mark: bytes, offset: int, opcode: int) 
         if data[begin] == opcode and _is_record_start(data, begin):
             return begin
     return len(data)
-
-
-KINDS = {".mcap": recover_mcap, ".blf": recover_blf}
-
-
-@spec
-class CaptureRecovery:
-    """Captures to recover.
-
-    Attributes:
-        input: Glob, or list of globs, of `.mcap` and `.blf` files; others are left out.
-    """
-
-    input: str | tuple[str, ...]
-
-    def run(self, folder: Path) -> None:
-        """Write each recovered file under its own name, led by that of its folder, into `folder`.
-
-        Raises:
-            RecordingError: nothing matches, two would have the same name, nothing can be read of one,
-                or, at the end, something of one is lost.
-        """
-        candidates = find_files(self.input, "capture")
-        paths = [path for path in candidates if path.suffix in KINDS]
-        if not paths:
-            raise RecordingError(
-                f"recover.input: {candidates[0]} is neither .mcap nor .blf, nor is anything else that matches"
-            )
-        names = [f"{path.resolve().parent.name}_{path.name}" for path in paths]
-        if len(set(names)) < len(names):
-            raise RecordingError(
-                "recover.input: two captures lie in folders of the same name; recover one after the other"
-            )
-        damaged = []
-        for path, name in track_items(list(zip(paths, names, strict=True)), "recovering"):
-            count, num_damaged = KINDS[path.suffix](path, folder / name)
-            log.info("%s: %d messages recovered into %s", path, count, folder / name)
-            if num_damaged:
-                damaged.append(str(path))
-        if damaged:
-            raise RecordingError(
-                f"recover: the rest is in {folder}, but something is lost of {', '.join(damaged)}; "
-                "its lines above say how much"
-            )

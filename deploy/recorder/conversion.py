@@ -17,7 +17,7 @@ import numpy as np
 from brokk_rl import record
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
+from brokk_rl.record import DAMAGE, Recording
 from brokk_rl.spec import spec
 from deploy.recorder import capture_reader
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages
@@ -117,6 +117,16 @@ class CaptureLogReader:
         for name in machine.joint_names:
             columns_u.append(_average_over_periods(flow[name], grid_s, machine.period_s))
             columns_q.append(np.interp(grid_s, *q[name]))
+        metadata = {
+            "source": f"capture: {contents.facts.get('source', path.name)}",
+            "fingerprint": record.format_fingerprint(machine),
+            "run": f"{path.resolve().parent.name}/{path.stem}",
+            "created": created.isoformat(timespec="milliseconds"),
+        }
+        if contents.num_damaged:
+            metadata[DAMAGE] = (
+                f"{contents.num_lost} messages or more are lost in {contents.num_damaged} places"
+            )
         return Recording(
             machine=machine.name,
             joints=machine.joint_names,
@@ -126,12 +136,9 @@ class CaptureLogReader:
             u=np.stack(columns_u, 1).astype(np.float32),
             q=np.stack(columns_q, 1).astype(np.float32),
             extra=_build_extra_columns(contents, grid_s, machine),
-            metadata={
-                "source": f"capture: {contents.facts.get('source', path.name)}", "fingerprint": record.format_fingerprint(machine),
-                "run": f"{path.resolve().parent.name}/{path.stem}", "created": created.isoformat(timespec="milliseconds"),
-            },
+            metadata=metadata,
             path=None,
-        )  # fmt: skip
+        )
 
 
 def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import queue
-import threading
 import time
 from collections.abc import Iterator, Sequence
+from logging.handlers import QueueHandler, QueueListener
 
 MOST_RECORDS = 1000
 """Records that wait. Chosen by hand: hours of a calm loop."""
@@ -22,7 +22,7 @@ POLL_S = 0.01
 """Between looks at the end whether they are written."""
 
 
-class DetachedHandler(logging.Handler):
+class DetachedHandler(QueueHandler):
     """Hands records to other handlers in a thread of its own.
 
     Args:
@@ -33,14 +33,14 @@ class DetachedHandler(logging.Handler):
     """
 
     def __init__(self, handlers: Sequence[logging.Handler]) -> None:
-        super().__init__()
-        self._handlers = tuple(handlers)
         self._records: queue.Queue[logging.LogRecord] = queue.Queue(MOST_RECORDS)
+        super().__init__(self._records)
         self.dropped = 0
-        # A daemon: a process must be able to end while its terminal is frozen.
-        threading.Thread(target=self._write, daemon=True, name="log").start()
+        # Never stopped: its thread is a daemon, so that a process can end while its terminal is
+        # frozen.
+        QueueListener(self._records, *handlers, respect_handler_level=True).start()
 
-    def emit(self, record: logging.LogRecord) -> None:
+    def enqueue(self, record: logging.LogRecord) -> None:
         """Queue a record."""
         try:
             self._records.put_nowait(record)
@@ -52,15 +52,6 @@ class DetachedHandler(logging.Handler):
         until_s = time.monotonic() + LAST_WORDS_S
         while self._records.unfinished_tasks and time.monotonic() < until_s:
             time.sleep(POLL_S)
-
-    def _write(self) -> None:
-        while True:
-            record = self._records.get()
-            for handler in self._handlers:
-                # As `Logger.callHandlers` does: each handler has a level of its own.
-                if record.levelno >= handler.level:
-                    handler.handle(record)
-            self._records.task_done()
 
 
 @contextlib.contextmanager

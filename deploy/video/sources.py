@@ -83,28 +83,13 @@ class TestPattern:
 def draw_time_code(picture: np.ndarray, t_s: float) -> None:
     """Draw a time as dark and light blocks into the upper left of a grey picture, `(h, w)` uint8."""
     side = picture.shape[0] // CODE_PARTS // 2
-    for place, bit in enumerate(_list_code_bits(round(t_s / TICK_S) % (1 << CODE_BITS))):
+    for place, bit in enumerate(list_code_bits(round(t_s / TICK_S) % (1 << CODE_BITS))):
         row, column = divmod(place, CODE_COLUMNS)
         block = picture[side * row : side * (row + 1), side * column : side * (column + 1)]
         block[:] = LIGHT if bit else DARK
 
 
-def read_time_code(picture: np.ndarray) -> float | None:
-    """Return the time in s, modulo 2^32 ms, that a grey picture carries; `None`: it is unreadable."""
-    side = picture.shape[0] // CODE_PARTS // 2
-    value = 0
-    for place in range(CODE_BITS + CODE_CHECK):
-        row, column = divmod(place, CODE_COLUMNS)
-        block = picture[side * row : side * (row + 1), side * column : side * (column + 1)]
-        # The middle of a block: its edge is blurred by the coder.
-        inner = block[side // 4 : -(side // 4), side // 4 : -(side // 4)]
-        value = value << 1 | int(inner.mean() > (DARK + LIGHT) / 2)
-    num_ticks = value >> CODE_CHECK
-    bits = _list_code_bits(num_ticks)
-    return num_ticks * TICK_S if value == int("".join(map(str, bits)), 2) else None
-
-
-def _list_code_bits(num_ticks: int) -> list[int]:
+def list_code_bits(num_ticks: int) -> list[int]:
     """Return the bits of a time and of its check, the sum of its bytes inverted."""
     check = ~sum(num_ticks.to_bytes(CODE_BITS // 8, "big")) & (1 << CODE_CHECK) - 1
     value = num_ticks << CODE_CHECK | check

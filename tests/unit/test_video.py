@@ -21,7 +21,17 @@ from websockets.exceptions import ConnectionClosed
 from deploy.page.video_relay import VideoRelay
 from deploy.runtime.process import ChildProcess
 from deploy.video.settings import SOCKET, VideoProcessConfig
-from deploy.video.sources import draw_time_code, read_time_code
+from deploy.video.sources import (
+    CODE_BITS,
+    CODE_CHECK,
+    CODE_COLUMNS,
+    CODE_PARTS,
+    DARK,
+    LIGHT,
+    TICK_S,
+    draw_time_code,
+    list_code_bits,
+)
 
 READ_CODE = """name => {
     const camera = window.measured.video.cameras.find(one => one.name === name), { video } = camera;
@@ -46,6 +56,21 @@ def eventually(claim: Any, seconds: float = 30.0) -> None:
     while not claim():
         assert time.monotonic() < end_s, "it did not come true"
         time.sleep(0.05)
+
+
+def read_time_code(picture: np.ndarray) -> float | None:
+    """Return the time in s, modulo 2^32 ms, that a grey picture carries; `None`: it is unreadable."""
+    side = picture.shape[0] // CODE_PARTS // 2
+    value = 0
+    for place in range(CODE_BITS + CODE_CHECK):
+        row, column = divmod(place, CODE_COLUMNS)
+        block = picture[side * row : side * (row + 1), side * column : side * (column + 1)]
+        # The middle of a block: its edge is blurred by the coder.
+        inner = block[side // 4 : -(side // 4), side // 4 : -(side // 4)]
+        value = value << 1 | int(inner.mean() > (DARK + LIGHT) / 2)
+    num_ticks = value >> CODE_CHECK
+    bits = list_code_bits(num_ticks)
+    return num_ticks * TICK_S if value == int("".join(map(str, bits)), 2) else None
 
 
 @pytest.mark.parametrize("t_s", [0.0, 0.001, 86400.5, 4294967.295])
