@@ -121,8 +121,8 @@ def find_pushes(
     for row, following in zip(began, ends, strict=True):
         end = min(following, int(np.searchsorted(t_s, t_s[row] + LONGEST_S)))
         driven = np.flatnonzero(is_flowing[row:end].any(0))
-        before = t_s[: row + 1] > t_s[row] - REST_S
-        is_moving = np.ptp(q[: row + 1][before], axis=0) > MOVED * travel / 2
+        rest = int(np.searchsorted(t_s, t_s[row] - REST_S, side="right"))
+        is_moving = np.ptp(q[rest : row + 1], axis=0) > MOVED * travel / 2
         # What several valves move, or what moved before, answers more than one question.
         if end == len(t_s) or len(driven) != 1 or is_moving.any():
             continue

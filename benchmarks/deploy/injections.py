@@ -70,8 +70,7 @@ def send_foreign_commands(stage: Stage, trial: int) -> None:
 def stop_beside_hung_supervisor(stage: Stage, trial: int) -> None:
     """The page's STOP while the supervisor hangs."""
     stage.supervised = False
-    if hasattr(stage.memory, "stop"):
-        stage.stop()
+    stage.stop()
 
 
 def hang_supervisor(stage: Stage, trial: int) -> None:
