@@ -18,14 +18,13 @@ from composed import option
 from desk import DBC, free_port
 
 from actuators.excite.player import NominalMachine
-from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from deploy.bringup import BringupResult, JointResponse, _StateChecks, describe_joint, find_pushes
+from deploy.bringup import JointResponse, _StateChecks, describe_joint, find_pushes
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
-from deploy.modes.bringup import BringupMode
 from deploy.runtime.process import ChildProcess
 from deploy.twin.faults import ActiveFaults, request_fault
 from deploy.twin.rehearsal import CHECKS, SENSORS, RehearsalBench, ScriptedPerson
@@ -198,42 +197,6 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
     assert findings["joints"]["values"]["q1"]["dead_time_s"] == pytest.approx(
         machine.dead_time_s, abs=0.1
     )
-
-
-@pytest.mark.parametrize("passed", [True, False])
-def test_a_check_that_fails_is_an_error_of_the_command(tmp_path: Path, passed: bool) -> None:
-    results = [
-        BringupResult("bus", True, "fine", {}),
-        BringupResult("dead-man", passed, "not seen", {}),
-    ]
-
-    class Checklist:
-        def run(self, machine: Any, session: Any, say: Any, companions: Any) -> list[BringupResult]:
-            return results
-
-    mode = object.__new__(BringupMode)
-    for name, value in (
-        ("session", Session(out=str(tmp_path), seed=0, device="cpu")),
-        ("machine", None),
-        ("bringup", Checklist()),
-        ("bench", None),
-    ):
-        object.__setattr__(mode, name, value)
-    if passed:
-        assert mode.run() == 0.0
-        return
-    with pytest.raises(LinkError, match=r"1 of 2 checks failed: dead-man"):
-        mode.run()
-
-
-@pytest.mark.slow
-def test_a_twin_says_what_it_does(brokk: Callable[..., Any], tmp_path: Path) -> None:
-    port = free_port()
-    done = brokk(
-        "mode=twin", "link=nominal", f"bus.port={port}", "twin.seconds=0.2", "twin.realtime=false",
-        "session.out=twin",
-    )  # fmt: skip
-    assert done.code == 0 and "twin of brokk170 on udp_multicast" in done.err
 
 
 def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:

@@ -20,18 +20,9 @@ from websockets.exceptions import ConnectionClosed
 
 from deploy.page.video_relay import VideoRelay
 from deploy.runtime.process import ChildProcess
+from deploy.video import sources
 from deploy.video.settings import SOCKET, VideoProcessConfig
-from deploy.video.sources import (
-    CODE_BITS,
-    CODE_CHECK,
-    CODE_COLUMNS,
-    CODE_PARTS,
-    DARK,
-    LIGHT,
-    TICK_S,
-    draw_time_code,
-    list_code_bits,
-)
+from deploy.video.sources import draw_time_code
 
 READ_CODE = """name => {
     const camera = window.measured.video.cameras.find(one => one.name === name), { video } = camera;
@@ -60,17 +51,17 @@ def eventually(claim: Any, seconds: float = 30.0) -> None:
 
 def read_time_code(picture: np.ndarray) -> float | None:
     """Return the time in s, modulo 2^32 ms, that a grey picture carries; `None`: it is unreadable."""
-    side = picture.shape[0] // CODE_PARTS // 2
+    side = picture.shape[0] // sources.CODE_PARTS // 2
     value = 0
-    for place in range(CODE_BITS + CODE_CHECK):
-        row, column = divmod(place, CODE_COLUMNS)
+    for place in range(sources.CODE_BITS + sources.CODE_CHECK):
+        row, column = divmod(place, sources.CODE_COLUMNS)
         block = picture[side * row : side * (row + 1), side * column : side * (column + 1)]
         # The middle of a block: its edge is blurred by the coder.
         inner = block[side // 4 : -(side // 4), side // 4 : -(side // 4)]
-        value = value << 1 | int(inner.mean() > (DARK + LIGHT) / 2)
-    num_ticks = value >> CODE_CHECK
-    bits = list_code_bits(num_ticks)
-    return num_ticks * TICK_S if value == int("".join(map(str, bits)), 2) else None
+        value = value << 1 | int(inner.mean() > (sources.DARK + sources.LIGHT) / 2)
+    num_ticks = value >> sources.CODE_CHECK
+    bits = sources.list_code_bits(num_ticks)
+    return num_ticks * sources.TICK_S if value == int("".join(map(str, bits)), 2) else None
 
 
 @pytest.mark.parametrize("t_s", [0.0, 0.001, 86400.5, 4294967.295])
