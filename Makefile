@@ -16,7 +16,7 @@ PRESET ?= $(shell nvidia-smi -L >/dev/null 2>&1 && echo preset=gpu || echo prese
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
-train: setup            ## install, train the main task and leave a run folder; PRESET= for the defaults, 13 minutes
+train: setup            ## install, train the main task and leave a run folder; PRESET= for the defaults, a correction of the controller, 13 minutes
 	$(BIN)/brokk mode=train $(PRESET)
 
 play: setup             ## install, and watch the shipped policy in a browser

@@ -44,6 +44,8 @@ SHIPPED, UNTRAINED = f"{PLACE}.ShippedPolicy", f"{PLACE}.UntrainedPolicy"
 TRAIN = "brokk_rl.modes.train.Train"
 OLD_KEYS = ("policy.folder", "checkpoint", "start_from", "doctor.policy", "resume")
 """Names that `policy` had in one mode or another. Other modes than training still have `resume`."""
+RIVALS_OWN = ("classical", "advice")
+"""Fields of a task that the classical controller keeps beside a policy."""
 WHOLE = ("--config-name", "-cn")
 """Arguments of a command whose configuration is given whole, as `resolved.yaml` is."""
 
@@ -285,8 +287,8 @@ def _insert_behaviour(
 ) -> int:
     """Put the behaviour of the policy into the task; return how many values changed.
 
-    The classical controller as a rival keeps the numbers that were composed: a policy may rest on
-    those of an earlier version, which are no honest opponent.
+    The classical controller as a rival keeps the numbers that were composed, and what it knows of a
+    person: a policy may rest on those of an earlier version, which are no honest opponent.
     """
     before: Any = OmegaConf.to_container(cfg.task, resolve=True)
     after = own.apply_to(before)
@@ -304,9 +306,16 @@ def _insert_behaviour(
         )
     if changes:
         cfg.task = after
+        own_values = {key: before[key] for key in RIVALS_OWN if key in before}
         for node in (cfg.get("rivals") or {}).values():
-            if node[TARGET] == CLASSICAL and "classical" in before:
-                node.task = after | {"classical": before["classical"]}
+            if node[TARGET] == CLASSICAL and own_values:
+                node.task = after | own_values
+        if before.get("advice") and not after.get("advice"):
+            log.warning(
+                "the policy in %s was trained without a person at the levers and proposes as if it moved "
+                "them itself; the classical controller beside it knows of the person",
+                stored.name,
+            )
     return len(changes)
 
 

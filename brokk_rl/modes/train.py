@@ -211,11 +211,14 @@ class Train(SimulatedPlant):
             "untrained": UntrainedPolicy(training=self.rl),
         }
         results = evaluate_policies(self, self.evaluation, self.session, policies)
-        line = None
+        line, words = None, loop.task.figures
         if controller := results["policies"].get("classical"):
             line = controller[SUCCESS]["mean"]
-            log.info("%s", describe_gain(results["policies"]["trained"], controller))
-        picture, words = folder / "learning_curves.png", loop.task.figures
+            for name, figure in words.items():
+                if figure.unit == "share":
+                    gain = describe_gain(results["policies"]["trained"], controller, name)
+                    log.info("%s %s", figure.title, gain)
+        picture = folder / "learning_curves.png"
         draw_curves(folder / PROGRESS, picture, words, book.first_episodes, line)
         task = self.task.build(self.machine, 1, torch.device("cpu"))
         if "deployable" in task.offers:
@@ -234,18 +237,18 @@ def _log_success(logger: TrainingLogger) -> None:
         log.info("success of %.2f while learning: %s", level, text)
 
 
-def describe_gain(trained: Mapping[str, Any], controller: Mapping[str, Any]) -> str:
-    """Return whether training has gained over the controller, by Fisher's exact test."""
+def describe_gain(trained: Mapping[str, Any], controller: Mapping[str, Any], share: str) -> str:
+    """Return whether training has gained a share over the controller, by Fisher's exact test."""
     table = []
     for row in (trained, controller):
-        successes = round(row["episodes"] * row[SUCCESS]["mean"])
+        successes = round(row["episodes"] * row[share]["mean"])
         table.append([successes, row["episodes"] - successes])
-    own, other = trained[SUCCESS]["mean"], controller[SUCCESS]["mean"]
+    own, other = trained[share]["mean"], controller[share]["mean"]
     verdict = "no gain shown"
     test: Any = stats.fisher_exact(table, alternative="greater")
     if test.pvalue < 1.0 - CONFIDENCE:
         verdict = f"better than the controller by {own - other:.3f}"
-    return f"success {own:.3f} against the controller's {other:.3f}: {verdict}"
+    return f"{own:.3f} against the controller's {other:.3f}: {verdict}"
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

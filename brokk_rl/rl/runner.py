@@ -19,7 +19,7 @@ from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy, scale_output
 from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
-from brokk_rl.rl.settings import TrainingConfig
+from brokk_rl.rl.settings import REFUSED_CLASSES, TrainingConfig
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +64,9 @@ class TrainingRunner(OnPolicyRunner):
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, config, log_dir=None, device=str(env.device))
         log.debug(printed.getvalue())
+        if self.alg.actor.is_recurrent or self.alg.critic.is_recurrent:  # a subclass of RNNModel
+            reason = REFUSED_CLASSES["RNNModel"]
+            raise ConfigError(f"rl.runner: expected networks without memory, got {reason}")
         self.logger = TrainingLogger(folder, env, training, self.group)
         if training.output_gain != 1.0:
             scale_output(self.alg.actor, training.output_gain)

@@ -76,6 +76,8 @@ REFUSED_CLASSES = {
     "StudentTeacher": "train with PPO",
 }
 """Classes of rsl-rl that would fail after the whole budget, and the reason or another way."""
+PRIVILEGED = "privileged"
+"""Observation group of what only a simulator knows."""
 REFUSED_PARTS = {
     "rnd_cfg": "random network distillation is not supported; more exploration comes from "
     "rl.runner.actor.distribution_cfg.std_range",
@@ -248,6 +250,11 @@ class TrainingConfig:
                 raise ConfigError(
                     f"runner.{name}.class_name: {class_name} of rsl-rl is not supported: {reason}"
                 )
+        if PRIVILEGED in (self._read_runner("obs_groups.actor") or ()):
+            raise ConfigError(
+                f"runner.obs_groups.actor: the machine does not know the group {PRIVILEGED}, so such a "
+                "policy cannot be exported; give it to the critic alone"
+            )
         for name, reason in REFUSED_PARTS.items():
             if self._read_runner(f"algorithm.{name}") is not None:
                 raise ConfigError(f"runner.algorithm.{name}: {reason}")

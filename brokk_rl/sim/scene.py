@@ -219,6 +219,8 @@ def find_site(scene: str | None, sim: Simulator) -> Path | None:
 def add_site(spec: mujoco.MjSpec, path: Path | None) -> None:
     """Add what stands beside the block; tool and arm meet its geoms.
 
+    A geom with the name of one of the machine's gives that one its shape: another tool.
+
     Raises:
         ConfigError: MuJoCo cannot read the file, or something in it moves.
     """
@@ -232,8 +234,12 @@ def add_site(spec: mujoco.MjSpec, path: Path | None) -> None:
         raise ConfigError(
             f"task.scene: what {path} holds must stand still; take its joints and actuators out"
         )
-    for geom in site.geoms:
-        if geom.contype or geom.conaffinity:
+    for geom in list(site.geoms):
+        if own := spec.geom(geom.name) if geom.name else None:
+            own.type, own.size = geom.type, geom.size
+            own.fromto, own.pos, own.quat = geom.fromto, geom.pos, geom.quat
+            site.delete(geom)
+        elif geom.contype or geom.conaffinity:
             geom.contype, geom.conaffinity = 0, _TOOL | _ARM
             geom.group = SOLID_GROUP
     spec.attach(site, prefix="site/", frame=spec.worldbody.add_frame())

@@ -30,6 +30,7 @@ BAD = {
     ("rl.runner.actor.distribution_cfg.std_range=[1.0,0.1]",): "distribution_cfg.std_range",
     ("rl.runner.actor.class_name=RNNModel",): "task.memory gives a history",
     ("rl.runner.algorithm.class_name=Distillation",): "train with PPO",
+    ("rl.runner.obs_groups.actor=[policy,privileged]",): "give it to the critic alone",
     ("+rl.runner.algorithm.rnd_cfg={weight:1}",): "rl.runner.algorithm.rnd_cfg",
     ("evaluation.episodes=0",): "evaluation.episodes",
     ("evaluation.seed=-1",): "evaluation.seed",

@@ -14,12 +14,16 @@ import training as runs
 from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from omegaconf import OmegaConf
 
 from actuators.person import HumanFollower
+from brokk_rl.build import describe_spec
 from brokk_rl.checks import check_follower
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
+from brokk_rl.policy_choice import CLASSICAL, _insert_behaviour
+from brokk_rl.policy_folder import find_policy
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
@@ -413,3 +417,19 @@ def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_p
     assert (tmp_path / "one" / "evaluation.json").read_text() == (
         tmp_path / "other" / "evaluation.json"
     ).read_text()
+
+
+def test_the_controller_beside_a_policy_without_advice_keeps_its_own(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    task = describe_spec(option("task", "borehole_insertion"))
+    advice = {"delay_s": 0.3, "lag_s": 0.1, "dead_zone": 0.0, "joints_at_once": 2}
+    advice |= {"hold_s": 0.65, "settle_s": 0.5}
+    classical = {"_target_": CLASSICAL, "task": None}
+    cfg = OmegaConf.create({"task": task | {"advice": advice}, "rivals": {"classical": classical}})
+    stored = find_policy("tasks:policies/borehole_insertion")
+    assert stored.task is not None
+    _insert_behaviour(cfg, stored.task, set(), stored)
+    assert cfg.task.advice is None
+    assert cfg.rivals.classical.task.advice == advice
+    assert "without a person" in caplog.text

@@ -43,4 +43,4 @@ def test_a_gain_over_the_controller_is_said_only_where_it_is_shown(
     trained, controller = (
         {"episodes": 1024, "success_strict": {"mean": count / 1024}} for count in (successes, 973)
     )
-    assert describe_gain(trained, controller).endswith(verdict)
+    assert describe_gain(trained, controller, "success_strict").endswith(verdict)

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 import training as runs
+from rsl_rl.models import RNNModel
 
 from brokk_rl.errors import (
     CheckpointError,
@@ -41,6 +42,20 @@ def test_a_budget_that_is_no_multiple_of_an_iteration_is_filled_up(
 ) -> None:
     runs.train(machine, tmp_path, runs.small(max_env_steps=2 * ITERATION + 1, save_interval=50))
     assert float(runs.progress(tmp_path)[-1]["env_steps"]) == 3 * ITERATION
+
+
+class Remembering(RNNModel):
+    """A recurrent network under a name of its own."""
+
+
+def test_a_network_with_a_memory_is_refused_before_the_first_step_whatever_its_name(
+    machine: Machine, tmp_path: Path
+) -> None:
+    training = runs.small(max_env_steps=ITERATION)
+    actor = training.runner["actor"] | {"class_name": f"{__name__}:Remembering"}
+    training = replace(training, runner=training.runner | {"actor": actor})
+    with pytest.raises(ConfigError, match=r"without memory.*task\.memory gives a history"):
+        runs.make(machine, tmp_path, training)
 
 
 def test_the_budget_of_seconds_ends_training(machine: Machine, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from brokk_rl.policy_folder import describe_task
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session
+from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import find_site, make_nominal_scenes
 from brokk_rl.spec import spec
 from deploy.policy.bundle import PolicyBundle
@@ -270,6 +271,15 @@ def test_a_task_without_a_classical_controller_is_evaluated_in_its_own_words(
     assert {one["title"] for one in found["figures"].values()} == {"turned", "turning"}
     told = capsys.readouterr().out
     assert "turned" in told and "paper" not in told and "valve" not in told
+
+
+def test_a_geom_of_the_scene_gives_that_of_the_machine_its_shape(machine: Machine) -> None:
+    site = find_site(option("task", "flat").scene, option("sim", "native"))
+    rounded, flat = (compile_model(machine, 0.01, site=one).geom("chisel") for one in (None, site))
+    assert (rounded.type.item(), flat.type.item()) == (3, 5)  # a capsule, a cylinder
+    ends_m = [float(one.pos[0] + one.size[1]) for one in (rounded, flat)]
+    assert ends_m == pytest.approx([machine.tip_m[0] - 0.04, machine.tip_m[0]])
+    assert flat.contype == rounded.contype and flat.conaffinity == rounded.conaffinity
 
 
 SITE = """<mujoco><worldbody><geom type="box" pos="{0} {1} {2}" size=".5 .05 .3"/>{3}</worldbody></mujoco>"""
