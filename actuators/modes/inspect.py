@@ -164,7 +164,10 @@ class Inspect:
         seconds = [max(one.timing["duration_s"] or 0.0, 1e-9) for one in known]
         table = {}
         for joint in self.machine.joints:
-            entry = {"lower_limit": joint.lower.value, "upper_limit": joint.upper.value}
+            entry: dict[str, float | None] = {
+                "lower_limit": joint.lower.value,
+                "upper_limit": joint.upper.value,
+            }
             rows = [one.joints[joint.name] for one in known]
             for key in rows[0] if rows else ():
                 values = np.array([row[key] for row in rows], dtype=float)  # None becomes NaN

@@ -73,7 +73,8 @@ class TextLayout:
         """Kinds of the columns: each that of most of its cells."""
         found: list[CellKind] = []
         for cells in zip(*self.samples, strict=True):
-            counts = Counter(tell_kind(cell, self.decimal) for cell in cells if cell not in MISSING)
+            filled = [cell for cell in cells if cell not in MISSING]
+            counts = Counter[CellKind](tell_kind(cell, self.decimal) for cell in filled)
             found.append(counts.most_common(1)[0][0] if counts else "number")
         return found
 
