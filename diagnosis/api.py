@@ -294,6 +294,5 @@ def _build_mode(
             workers=workers,
             prices=extensions.load_part("prices"),
             certainty=_load_option("certainty", "default"),
-            servo_certainty=_load_option("certainty", "servo"),
         ),
     )

@@ -88,7 +88,7 @@ def judge_recordings(
     gates = []
     for name, limit in MAX_REMARK_SHARES.items():
         counted = [one for one in remarks if one.name == name]
-        if name == "frozen sensor":
+        if name in ("frozen sensor", "jumps"):
             coarse = find_coarse_sensors(field, machine)
             counted = [one for one in counted if one.joint not in coarse]
         worst = _find_worst_joint(counted, field)

@@ -24,17 +24,20 @@ from diagnosis.closure import Gap, Gate, RivalError
 from diagnosis.engine.decide import Decider, EffectFinding
 from diagnosis.engine.holds import hold_commands
 from diagnosis.engine.proof import Floor, Windows, list_windows, run_free
-from diagnosis.engine.rows import Row, change_numbers
+from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
+from diagnosis.gates import MAX_RIVAL_RATIO
 from diagnosis.rivals import measure_rivals
 
 BLOCK_WINDOWS = 4
 """Windows in a row that belong to one half of the field."""
 NOISE_FACTOR = 3.0
 """An error within so many deviations of the sensor's noise is none."""
+SURE_QUANTILE = 0.95
+"""An error grew for sure where it did so in this share of the bootstraps."""
 LEAST_GAP = 0.02
 """Least gap over the error, so that its share can be told where the floor nearly reaches it."""
 
@@ -110,7 +113,14 @@ class RepairProof:
             if used is None:
                 self.sizes[finding.effect] = size_finding(finding, joints)
             found[finding.effect] = fit_rows(finding, joints)
-            numbers = _apply(numbers, found[finding.effect])
+            numbers = self._apply(numbers, found[finding.effect])
+        return found
+
+    def _apply(self, numbers: Sequence[np.ndarray], rows: Mapping[int, Row]) -> list[np.ndarray]:
+        """Return the numbers of all joints with an effect."""
+        found = list(numbers)
+        for j, row in rows.items():
+            found[j] = self._field.model.change(found[j], [row])[0]
         return found
 
     def run(self, effects: frozenset[str]) -> np.ndarray:
@@ -124,7 +134,7 @@ class RepairProof:
             for sizes in self._halves:
                 numbers = list(self._healthy)
                 for name in effects:
-                    numbers = _apply(numbers, sizes[name])
+                    numbers = self._apply(numbers, sizes[name])
                 runs.append(run_free(side, self.windows, numbers))
             chosen = self.half[:, None, None] == 0
             self._runs[effects] = np.where(chosen, runs[0], runs[1])
@@ -143,18 +153,18 @@ class RepairProof:
         """Mean squares at the floor in each draw, `(1 + B, J)`."""
         numbers, side = list(self._healthy), self._field
         for finding in self._findings:
-            numbers = _apply(numbers, self._rows[finding.effect])
+            numbers = self._apply(numbers, self._rows[finding.effect])
             if finding.hold is not None:
                 side = hold_commands(side, finding.hold.delays)
         joints = self._decider.evidence.view_field(numbers, side)
         return self.weights @ self.floor.foresee(self.windows, joints)
 
-    def measure_gap(self) -> Gap:
-        """Return the errors and the share that is closed."""
+    def measure_gap(self, is_named: bool) -> Gap:
+        """Return the errors and the share that is closed; 0 where only effects beside the motion are named."""
         before, after = self.measure_errors(self.before), self.measure_errors(self.after)
         floor = combine_joints(self.floor_squares, self.machine)
         closed, reason = None, "no effect is named"
-        if self._findings:
+        if is_named:
             closed = summarise_draws(self._share(before - after))
             reason = ""
         joints = describe_joints(
@@ -229,7 +239,31 @@ class RepairProof:
             passed = bool(after[j] <= max(still[name], NOISE_FACTOR * noise[j]))
             text = f"{name}: {after[j]:.3g} with the effects, {still[name]:.3g} standing still"
             found.append(Gate(f"beats_hold_{name}", passed, float(after[j]), still[name], text))
+        if any(one.rows or one.hold for one in self._findings):
+            found.append(self._judge_reduction())
+            found += self._judge_beside_arx()
         return found
+
+    def _judge_reduction(self) -> Gate:
+        """Return whether the repaired simulator may err less than the one as it was."""
+        before, after = self.measure_errors(self.before), self.measure_errors(self.after)
+        most = float(np.quantile(before - after, SURE_QUANTILE))
+        text = f"the error is {after[0]:.3g} with the effects, {before[0]:.3g} without"
+        return Gate("reduces_error", most > 0.0, float(after[0]), float(before[0]), text)
+
+    def _judge_beside_arx(self) -> list[Gate]:
+        """Return whether the repaired simulator keeps up with a linear ARX that was fitted to the field."""
+        least = self.rivals["arx"].rmse
+        if least is None:
+            return []
+        after = float(self.measure_errors(self.after)[0])
+        noise = np.square(sensors.estimate_sensor_noise(self._case.reference))
+        ratio = after / max(least, 1e-12)
+        # What errs by its sensors only cannot be improved.
+        is_noise = after <= NOISE_FACTOR * float(combine_joints(noise, self.machine))
+        text = f"the error with the effects is {ratio:.2f} times that of an ARX fitted to the field"
+        passed = is_noise or ratio <= MAX_RIVAL_RATIO
+        return [Gate("near_arx", passed, ratio, MAX_RIVAL_RATIO, text)]
 
     def view(self, paths: np.ndarray) -> WindowedRuns:
         """Return free runs beside the recordings of the field."""
@@ -242,14 +276,6 @@ class RepairProof:
         measured = reference.q[windows.rows]
         paths = (measured - self.floor.errors) * measure_units(self.machine)
         return _view_runs(self._case.reference, reference, windows, paths)
-
-
-def _apply(numbers: Sequence[np.ndarray], rows: Mapping[int, Row]) -> list[np.ndarray]:
-    """Return the numbers of all joints with an effect."""
-    found = list(numbers)
-    for j, row in rows.items():
-        found[j] = change_numbers(found[j], [row])[0]
-    return found
 
 
 def _view_runs(

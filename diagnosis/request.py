@@ -6,7 +6,6 @@ from dataclasses import field
 from pathlib import Path
 
 from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
 OUTSIDE_SIGNS = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
@@ -109,8 +108,6 @@ class DiagnosisSubject:
         workers: Processes that share the work; 1 where the system has no safe fork.
         prices: Penalties of effects.
         certainty: Calibration of the probabilities.
-        servo_certainty: The same for joints that are commanded by position and a simulator that was
-            fitted to a reference: it was learned from such cases, and their errors look different.
     """
 
     case: str | None
@@ -120,12 +117,6 @@ class DiagnosisSubject:
     workers: int
     prices: Penalties
     certainty: ProbabilityModel
-    servo_certainty: ProbabilityModel
-
-    def choose_certainty(self, machine: Machine, is_fitted: bool) -> ProbabilityModel:
-        """Return the calibration for a machine and a simulator that was fitted to a reference, or was not."""
-        is_servo = machine.interface == "position" and is_fitted
-        return self.servo_certainty if is_servo else self.certainty
 
     def check(self) -> None:
         if self.workers < 1:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.engine import joint_model
 from diagnosis.engine.measure import (
     PLAIN,
     IncrementMeasure,
     Motion,
     Scale,
+    fit_kept,
     fit_memory,
     fit_variance,
     measure_motion,
@@ -26,13 +26,6 @@ from diagnosis.engine.side import Side
 NUM_PARTS = 4
 """Parts of the reference that are left out in turn."""
 FIRST_DELAYS_S = np.arange(0.0, 0.9, 0.05)
-FITTED = np.flatnonzero(joint_model.FITTED)
-MEAN = joint_model.list_values("mean")
-DEVIATION = joint_model.list_values("deviation")[FITTED]
-STEP = joint_model.list_values("step")[FITTED]
-LOWER = joint_model.list_values("lower")
-UPPER = joint_model.list_values("upper")
-PLACE = joint_model.PLACE
 POOLED = 0.15
 """Share of the mean of all joints in the variance of each."""
 ENOUGH = 2e-4
@@ -73,10 +66,11 @@ def linearise(
     side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the increments of the simulated joint `(N,)` and their slopes over the fitted numbers `(F, N)`."""
-    varied = np.repeat(numbers[None], 1 + len(FITTED), 0)
-    fits = numbers[FITTED] + STEP <= UPPER[FITTED]
-    steps = np.where(fits, STEP, -STEP)
-    varied[1 + np.arange(len(FITTED)), FITTED] += steps
+    fitted, step = side.model.fitted, side.model.list_fitted("step")
+    varied = np.repeat(numbers[None], 1 + len(fitted), 0)
+    fits = numbers[fitted] + step <= side.model.list_fitted("upper")
+    steps = np.where(fits, step, -step)
+    varied[1 + np.arange(len(fitted)), fitted] += steps
     found = measure(side.simulate(joint, varied)).astype(float)
     return found[0], (found[1:] - found[0]) / steps[:, None]
 
@@ -90,13 +84,16 @@ def fit_numbers(
     fixed: Sequence[str] = (),
 ) -> np.ndarray:
     """Return the numbers of a joint after some rounds of Levenberg's and Marquardt's method, `(P,)`."""
+    model = side.model
     target = measure(side.q[:, joint]).astype(float)
-    names = np.array(joint_model.NAMES)[FITTED]
-    rows = np.flatnonzero(~np.isin(names, fixed))
-    free = FITTED[rows]
+    mean, deviation = model.list_fitted("mean"), model.list_fitted("deviation")
+    lower, upper = model.list_values("lower"), model.list_values("upper")
+    names = np.array(model.names)[model.fitted]
+    rows = np.flatnonzero(~np.isin(names, list(fixed)))
+    free = model.fitted[rows]
 
     def compute_cost(tried: np.ndarray, increments: np.ndarray) -> float:
-        off = (tried[FITTED] - MEAN[FITTED]) / DEVIATION
+        off = (tried[model.fitted] - mean) / deviation
         return float(np.square(target - increments).sum() + np.square(off).sum())
 
     damping = 1e-3
@@ -104,15 +101,15 @@ def fit_numbers(
         base, slopes = linearise(side, joint, numbers, measure)
         before = compute_cost(numbers, base)
         slopes = slopes[rows]
-        precision = 1.0 / DEVIATION[rows] ** 2
+        precision = 1.0 / deviation[rows] ** 2
         normal = slopes @ slopes.T + np.diag(precision)
-        downhill = slopes @ (target - base) - (numbers[free] - MEAN[free]) * precision
+        downhill = slopes @ (target - base) - (numbers[free] - mean[rows]) * precision
         # All dampings are simulated at once: a step costs one call of the kernel.
         trials = np.repeat(numbers[None], 4, 0)
         for k, trial in enumerate(trials):
             damped = normal + damping * 8.0**k * np.diag(np.diag(normal))
             trial[free] += np.linalg.solve(damped, downhill)
-        trials = np.clip(trials, LOWER, UPPER)
+        trials = np.clip(trials, lower, upper)
         tried = measure(side.simulate(joint, trials)).astype(float)
         costs = [compute_cost(one, row) for one, row in zip(trials, tried, strict=True)]
         best = int(np.argmin(costs))
@@ -126,19 +123,25 @@ def fit_numbers(
 
 
 def guess_numbers(side: Side, joint: int) -> np.ndarray:
-    """Return numbers to begin with: the delay and the speed that fit best, `(P,)`."""
+    """Return numbers to begin with: the delay, and the speed of a joint that takes speeds, that fit best, `(P,)`."""
+    model = side.model
     measure = IncrementMeasure(side, PLAIN)
-    trials = np.repeat(MEAN[None], len(FIRST_DELAYS_S), 0)
-    trials[:, PLACE["delay_s"]] = FIRST_DELAYS_S
-    trials[:, PLACE["pump_load"]] = 0.0
+    mean = model.list_values("mean")
+    trials = np.repeat(mean[None], len(FIRST_DELAYS_S), 0)
+    trials[:, model.place["delay_s"]] = FIRST_DELAYS_S
+    for name, value in model.late.items():
+        trials[:, model.place[name]] = value
     found = measure(side.simulate(joint, trials)).astype(float)
     target = measure(side.q[:, joint]).astype(float)
+    if not model.integrates:
+        errors = np.square(target - found).sum(1)
+        return trials[int(np.argmin(errors))]
     gains = found @ target / np.maximum(np.square(found).sum(1), 1e-9)
     errors = np.square(target - gains[:, None] * found).sum(1)
     best = int(np.argmin(errors))
     numbers = trials[best]
-    speed = np.clip(MEAN[PLACE["speed_out"]] * gains[best], 0.02, 2.0)
-    numbers[[PLACE["speed_out"], PLACE["speed_in"]]] = speed
+    speed = np.clip(mean[model.place["speed_out"]] * gains[best], 0.02, 2.0)
+    numbers[[model.place["speed_out"], model.place["speed_in"]]] = speed
     return numbers
 
 
@@ -157,12 +160,13 @@ def fit_reference(side: Side) -> list[JointBaseline]:
     """Return the baseline of every joint; the demand of `side` is set on the way."""
     joints = range(side.num_joints)
     plain = IncrementMeasure(side, PLAIN)
-    shared = ("droop", "pump_load")
+    model = side.model
     every = [guess_numbers(side, j) for j in joints]
-    every = [fit_numbers(side, j, every[j], plain, 4, shared) for j in joints]
+    every = [fit_numbers(side, j, every[j], plain, 4, tuple(model.late)) for j in joints]
     side.ask_others(every)
+    places = [model.place[name] for name in model.late]
     for numbers in every:
-        numbers[PLACE["pump_load"]] = MEAN[PLACE["pump_load"]]
+        numbers[places] = model.list_values("mean")[places]
     every = [fit_numbers(side, j, every[j], plain, 6) for j in joints]
     side.ask_others(every)
     first = [_leave_out(side, j, every[j], PLAIN, None) for j in joints]
@@ -173,22 +177,14 @@ def fit_reference(side: Side) -> list[JointBaseline]:
         motion = measure_motion(side, side.simulate(j, every[j])[0])
         measure = IncrementMeasure(side, scales[j], motion)
         numbers = fit_numbers(side, j, every[j], measure, 5)
-        found.append(_leave_out(side, j, numbers, scales[j], motion).baseline)
+        found.append(_leave_out(side, j, numbers, scales[j], motion))
     side.ask_others([one.numbers for one in found])
     return found
 
 
-@dataclass
-class _LeftOut:
-    """A baseline with the errors of its parts in units, `(N,)` over an interval."""
-
-    baseline: JointBaseline
-    increments: np.ndarray
-
-
 def _leave_out(
     side: Side, joint: int, numbers: np.ndarray, scale: Scale, motion: Motion | None
-) -> _LeftOut:
+) -> JointBaseline:
     """Fit the numbers without each part by one step of Gauss and Newton, and keep what each part then errs by."""
     measure = IncrementMeasure(side, scale, motion)
     base, slopes = linearise(side, joint, numbers, measure)
@@ -196,26 +192,28 @@ def _leave_out(
     residual = target - base
     every = split_parts(side)
     part = every[: len(residual)]
-    precision = 1.0 / DEVIATION**2
+    model, fitted = side.model, side.model.fitted
+    precision = 1.0 / model.list_fitted("deviation") ** 2
+    most = 6.0 * model.list_fitted("step")
     normal = slopes @ slopes.T + np.diag(precision)
-    downhill = slopes @ residual - (numbers[FITTED] - MEAN[FITTED]) * precision
+    downhill = slopes @ residual - (numbers[fitted] - model.list_fitted("mean")) * precision
     trials = np.repeat(numbers[None], NUM_PARTS, 0)
     for k, trial in enumerate(trials):
         own = part == k
         without = normal - slopes[:, own] @ slopes[:, own].T
         step = np.linalg.solve(without, downhill - slopes[:, own] @ residual[own])
-        trial[FITTED] += np.clip(step, -6.0 * STEP, 6.0 * STEP)
-    paths = side.simulate(joint, np.clip(trials, LOWER, UPPER))
+        trial[fitted] += np.clip(step, -most, most)
+    paths = side.simulate(
+        joint, np.clip(trials, model.list_values("lower"), model.list_values("upper"))
+    )
     errors = side.q[:, joint] - paths
-    h = measure.interval
     rows = np.arange(len(residual))
     left_out = (target - measure(paths))[part, rows]
-    increments = (errors[:, h:] - errors[:, :-h])[part, rows]
     frames = (errors[:, 1:] - errors[:, :-1])[part, rows]
     spread = float(np.square(np.clip(left_out, -3.0, 3.0)).sum() / measure.count)
     if motion is None:
         motion = measure_motion(side, side.simulate(joint, numbers)[0])
-    baseline = JointBaseline(
+    return JointBaseline(
         numbers=numbers,
         scale=scale,
         measure=measure,
@@ -227,21 +225,24 @@ def _leave_out(
         frame_variance=fit_variance(frames, motion, measure.valid),
         error=errors[every, np.arange(side.num_samples)],
     )
-    return _LeftOut(baseline, increments)
 
 
-def _fit_scales(side: Side, parts: Sequence[_LeftOut]) -> list[Scale]:
+def _fit_scales(side: Side, bases: Sequence[JointBaseline]) -> list[Scale]:
     """Return variance and memory of each joint, the variance partly pooled over joints."""
-    own = []
-    for one in parts:
-        valid = one.baseline.measure.valid
-        own.append(fit_variance(one.increments, one.baseline.motion, valid))
-    pooled = np.mean(own, 0)
+    part = split_parts(side)
+    rows = []
+    for base in bases:
+        h = base.measure.interval
+        # The parts were fitted apart, so that errors jump where one ends.
+        valid = base.measure.valid & (part[h:] == part[:-h])
+        kept = 1.0 if side.model.integrates else fit_kept(base.error, h, valid)
+        increments = base.error[h:] - kept * base.error[:-h]
+        rows.append((valid, kept, increments, fit_variance(increments, base.motion, valid)))
+    pooled = np.mean([variance for *_, variance in rows], 0)
     found = []
-    for one, coefficients in zip(parts, own, strict=True):
-        mixed = Scale((1.0 - POOLED) * coefficients + POOLED * pooled)
-        measure = IncrementMeasure(side, mixed, one.baseline.motion)
-        scaled = one.increments * measure.weight
-        memory = fit_memory(scaled, measure.interval, measure.valid)
-        found.append(Scale(mixed.coefficients, memory))
+    for base, (valid, kept, increments, variance) in zip(bases, rows, strict=True):
+        mixed = Scale((1.0 - POOLED) * variance + POOLED * pooled, (), kept)
+        measure = IncrementMeasure(side, mixed, base.motion)
+        memory = fit_memory(increments * measure.weight, measure.interval, valid)
+        found.append(Scale(mixed.coefficients, memory, kept))
     return found

@@ -19,7 +19,7 @@ from diagnosis.engine.direct import find_step, weigh_stalls
 from diagnosis.engine.evidence import FieldJoint, JointRow, RowEvidence
 from diagnosis.engine.generic import GenericCauses
 from diagnosis.engine.holds import HeldCommands, HeldCourse, hold_commands
-from diagnosis.engine.rows import OUTSIDE, SHARED, Row, change_numbers
+from diagnosis.engine.rows import SHARED, Row
 from diagnosis.engine.side import Side
 
 LEAST_NATS = 22.0
@@ -129,6 +129,7 @@ class Decider:
         self.generic = GenericCauses(self.evidence)
         self.holds = HeldCommands(self.evidence)
         self.num_joints = reference.num_joints
+        self.outside = frozenset(row.effect for row in self.evidence.outside)
 
     def decide(self) -> Decision:
         """Return the decision."""
@@ -140,8 +141,8 @@ class Decider:
         stalled = self._find_stalled(table, coarse)
         skip = frozenset(stalled)
         rivals = self._list_findings(joints, table, skip)
-        outside = [one for one in rivals if one.effect in OUTSIDE]
-        library = [one for one in rivals if one.effect not in OUTSIDE]
+        outside = [one for one in rivals if one.effect in self.outside]
+        library = [one for one in rivals if one.effect not in self.outside]
         groups = self._weigh_generic(joints, skip)
         direct = []
         if coarse:
@@ -168,8 +169,8 @@ class Decider:
                 if one.effect != best.effect and {one.name, best.name} != {"thermal_drift"}
             ]
             left = self._weigh_generic(joints, skip)[1]
-            left = max([left, *(one.nats for one in seconds if one.effect in OUTSIDE)])
-            seconds = [one for one in seconds if one.effect not in OUTSIDE]
+            left = max([left, *(one.nats for one in seconds if one.effect in self.outside)])
+            seconds = [one for one in seconds if one.effect not in self.outside]
             if len(named) < 2 and seconds and self._is_second(best, seconds[0], named):
                 named.append(seconds[0])
                 numbers = [joint.numbers for joint in joints]
@@ -216,6 +217,8 @@ class Decider:
     ) -> list[int]:
         """Return the joints that stick and slip; one that rings as well is compliant."""
         found = []
+        if "stiction" not in table:
+            return found
         ringing = table["compliance"]
         for j in range(self.num_joints):
             is_rough = j in coarse or self.evidence.noises[j] > 0.0
@@ -227,7 +230,7 @@ class Decider:
             # A joint that another effect stops, such as a wider dead band, does not stick.
             own = [rows[j] for name, rows in table.items() if j in rows and name != "stiction"]
             best = max(own, key=lambda one: one.gain)
-            changed = change_numbers(numbers, [best.row])[0]
+            changed = self.evidence.field.model.change(numbers, [best.row])[0]
             if best.gain < nats or weigh_stalls(self.evidence, j, changed) >= STALL_NATS:
                 found.append(j)
         return found if len(found) <= MAX_STALLED else []
@@ -240,8 +243,9 @@ class Decider:
     ) -> list[EffectFinding]:
         """Return all effects with what they earn, the best first."""
         found = [_add_up(effect, rows, skip) for effect, rows in table.items()]
-        common = self.evidence.weigh_common("thermal_drift", joints)
-        found.append(_add_up("thermal_all", common, skip))
+        if "thermal_drift" in table:
+            common = self.evidence.weigh_common("thermal_drift", joints)
+            found.append(_add_up("thermal_all", common, skip))
         if not any(joint.side is not self.evidence.field for joint in joints):
             holds = self.holds.find(joints)
             found += [_weigh_hold(hold, self.num_joints) for hold in _choose_hold(holds)]
@@ -251,10 +255,10 @@ class Decider:
         self, numbers: Sequence[np.ndarray], finding: EffectFinding, field: Side | None = None
     ) -> list[FieldJoint]:
         """Return the joints of the field with an effect."""
-        changed = []
+        model, changed = self.evidence.field.model, []
         for j, values in enumerate(numbers):
             row = finding.rows.get(j)
-            changed.append(values if row is None else change_numbers(values, [row])[0])
+            changed.append(values if row is None else model.change(values, [row])[0])
         side = self.evidence.field if field is None else field
         if finding.hold is not None:
             side = hold_commands(side, finding.hold.delays)
@@ -283,6 +287,8 @@ class Decider:
             for name, nats in self.generic.weigh(joint).items():
                 total[name] = total.get(name, 0.0) + max(nats - JOINT_NATS, 0.0)
         some = {name: nats for name, nats in total.items() if only in ("", name)}
+        if not some:
+            return only, 0.0
         best = max(some, key=some.__getitem__)
         return best, some[best]
 

@@ -6,16 +6,15 @@ Axes: `C` rows, `J` joints, `N` increments, `P` numbers.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from diagnosis.engine import rows as row_tables
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, fit_reference, linearise
-from diagnosis.engine.measure import IncrementMeasure, Scale, measure_motion
+from diagnosis.engine.measure import IncrementMeasure, measure_motion
 from diagnosis.engine.nuisance import JointNuisance, compute_gain, count_part, estimate_nuisance
-from diagnosis.engine.rows import SHARED, Row, change_numbers
+from diagnosis.engine.rows import SHARED, Row
 from diagnosis.engine.side import Side
 
 FIRST_FACTORS = (0.78, 0.86, 0.93, 1.0, 1.08, 1.17, 1.28)
@@ -77,11 +76,14 @@ class FieldJoint:
         healthy = side.simulate(joint, base.numbers)[0].astype(float)
         scale = base.scale
         if step or noise:
-            scale = Scale(scale.coefficients, () if step else scale.memory, step, noise)
+            memory = () if step else scale.memory
+            scale = replace(scale, memory=memory, step=step, noise=noise)
         self.measure = IncrementMeasure(side, scale, measure_motion(side, healthy), used)
         self.increments, slopes = linearise(side, joint, numbers, self.measure)
         self.path = side.simulate(joint, numbers)[0].astype(float)
-        self.projection = nuisance.project(side, self.path, slopes, self.measure, base.spread)
+        self.projection = nuisance.project(
+            side, joint, self.path, slopes, self.measure, base.spread
+        )
         self.residual = self.measure(side.q[:, joint]).astype(float) - self.increments
         self.squares = float(self.projection.measure_squares(self.residual)[0])
         self.count = self.measure.count
@@ -93,11 +95,13 @@ class FieldJoint:
 
     def explain_nuisance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the wander, `(T,)`."""
-        return self.nuisance.explain(self.side, self.path, self.projection, self.residual)
+        return self.nuisance.explain(
+            self.side, self.joint, self.path, self.projection, self.residual
+        )
 
     def simulate(self, tried: Sequence[Row]) -> np.ndarray:
         """Return the increments that rows add to the simulated joint, `(C, N)`."""
-        paths = self.side.simulate(self.joint, change_numbers(self.numbers, tried))
+        paths = self.side.simulate(self.joint, self.side.model.change(self.numbers, tried))
         return self.measure(paths) - self.increments.astype(np.float32)
 
     def score(self, tried: Sequence[Row]) -> np.ndarray:
@@ -133,8 +137,8 @@ class RowEvidence:
         self.field = field
         self.bases = fit_reference(reference)
         field.ask_others([base.numbers for base in self.bases])
-        self.rows = row_tables.list_effect_rows()
-        self.outside = row_tables.list_outside_rows(reference.num_joints)
+        self.rows = reference.model.rows
+        self.outside = reference.model.list_outside(reference.num_joints)
         self.every = [*self.rows, *self.outside]
         self.names = np.array([row.effect for row in self.every])
         joints = range(reference.num_joints)
@@ -166,7 +170,7 @@ class RowEvidence:
                 tried[np.flatnonzero(self.names == name)[1::2]] = False
         places = np.flatnonzero(tried)
         some = [self.every[place] for place in places]
-        paths = side.simulate(joint, change_numbers(base.numbers, some))
+        paths = side.simulate(joint, side.model.change(base.numbers, some))
         healthy = side.simulate(joint, base.numbers)
         added = base.measure(paths) - base.measure(healthy)
         found = np.full((NUM_PARTS, len(self.every)), -9.0)

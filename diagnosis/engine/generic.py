@@ -12,12 +12,12 @@ import numpy as np
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
 from diagnosis.engine.evidence import FieldJoint, RowEvidence
-from diagnosis.engine.joint_model import PLACE
 from diagnosis.engine.nuisance import (
     Projection,
     compute_gain,
     count_part,
     draw_hats,
+    find_direction,
     simulate_speed,
 )
 from diagnosis.engine.side import MAX_DEMAND, Side
@@ -31,15 +31,21 @@ HISTORY_S = (-0.3, -0.15, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2)
 RISING_S = (-0.15, 0.15, 0.35, 0.7)
 """Shifts of the simulated speed: at any time, and while it rises."""
 SMOOTHING_S = 0.25
+TARGET_HISTORY_S = (-0.1, 0.02, 0.06, 0.15, 0.3)
+"""Shifts of the simulated path of a servo."""
+CHANGE_S = 20.0
+"""Distance of the knots between which a servo changes with time."""
 
 
 def list_groups(
     side: Side, joint: int, base: JointBaseline, path: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the columns of each group as paths `(K, T)`, from the simulated path `(T,)`."""
+    if not side.model.integrates:
+        return _list_target_groups(side, joint, path)
     speed = simulate_speed(side, path)
-    numbers = base.numbers
-    top = 0.5 * (numbers[PLACE["speed_out"]] + numbers[PLACE["speed_in"]]) * side.period_s
+    out, back = (base.numbers[side.model.place[name]] for name in ("speed_out", "speed_in"))
+    top = 0.5 * (out + back) * side.period_s
     forward, backward = np.maximum(speed, 0.0), np.minimum(speed, 0.0)
     place = side.poses[joint][:, 0]
     by_pose = draw_hats(place, np.linspace(-1.0, 1.0, NUM_POSES))
@@ -56,6 +62,27 @@ def list_groups(
     return {name: np.cumsum(columns, -1) - columns for name, columns in groups.items()}
 
 
+def _list_target_groups(side: Side, joint: int, path: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the same for a joint that follows a target: columns are parts of its error."""
+    direction = find_direction(side, path)
+    speed = simulate_speed(side, path) / side.period_s
+    by_pose = draw_hats(side.poses[joint][:, 0], np.linspace(-1.0, 1.0, NUM_POSES))
+    top = max(float(np.quantile(np.abs(speed), 0.99)), 1e-6)
+    by_level = draw_hats(np.abs(speed) / top, LEVELS)
+    sides = [np.maximum(direction, 0.0) * by_level, np.minimum(direction, 0.0) * by_level]
+    late = np.stack([_shift(path, _count(side, s)) - path for s in TARGET_HISTORY_S])
+    late[:, : side.count(side.model.settling_s)] = 0.0
+    knots = np.arange(0.0, side.time_s.max() + CHANGE_S, CHANGE_S)
+    by_time = draw_hats(side.time_s, knots)
+    changing = [0.02 * direction * by_time, 0.5 * late[2] * by_time]
+    return {
+        "place": 0.02 * np.concatenate([direction * by_pose, by_pose]),
+        "level": 0.02 * np.concatenate(sides),
+        "history": 0.3 * late,
+        "time": np.concatenate(changing),
+    }
+
+
 def _count(side: Side, seconds: float) -> int:
     return round(seconds / side.period_s)
 
@@ -66,7 +93,7 @@ def _view_others(
     """Return the measured speeds and the delayed commands of the other joints, and their demand."""
     width = side.count(SMOOTHING_S)
     kernel = np.ones(width) / width
-    delay = _count(side, base.numbers[PLACE["delay_s"]])
+    delay = _count(side, base.numbers[side.model.place["delay_s"]])
     moving, asked = [], []
     for other in range(side.num_joints):
         if other != joint:

@@ -12,20 +12,29 @@ Axes: `T` samples, `K` delays, `M` models of the course.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
+from scipy.ndimage import uniform_filter1d
 
 from diagnosis.engine.baseline import JointBaseline
 from diagnosis.engine.evidence import FieldJoint, RowEvidence
-from diagnosis.engine.joint_model import PLACE
+from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Scale, measure_motion
 from diagnosis.engine.nuisance import Projection, compute_gain
 from diagnosis.engine.side import DEVICE, Side
 
 LONGEST_S = 0.9
-"""Longest delay that a course reaches."""
+LONGEST_TARGET_S = 0.2
+"""Longest delay that a course reaches, and the same of targets, which come at a higher rate."""
+SLOW_S = 0.5
+"""What changes more slowly is no held target."""
+PULSE_S = 0.6
+"""Time after which a servo has answered."""
+PULSE_UNITS = 0.01
+TARGET_ROUNDS = 2
+"""Rounds in which the course is sought again beside what it explains already."""
 MAX_SQUARE = 16.0
 LATENT_UNITS_S = 0.004
 """Speed that no joint shows: its step is below the noise of the encoder."""
@@ -34,37 +43,6 @@ TEMPERS = (1.0, 0.5)
 NEIGHBOUR = 0.45
 """Chance that a jumping delay changes by one sample only, up and down each."""
 LEAST_NATS = 5.0
-
-
-@dataclass(frozen=True)
-class Course:
-    """Law by which a delay comes and goes.
-
-    Attributes:
-        effect: `frame_loss`: it grows with each lost frame and ends at once; `delay_jitter`: it
-            jumps.
-        begins: Chance a sample that a delay begins.
-        lasts: Chance a sample that it goes on.
-    """
-
-    effect: str
-    begins: float
-    lasts: float
-
-    @property
-    def is_loss(self) -> bool:
-        """True for frames that are lost."""
-        return self.effect == "frame_loss"
-
-
-COURSES = (
-    Course("frame_loss", 0.01, 0.6),
-    Course("frame_loss", 0.04, 0.85),
-    Course("frame_loss", 0.02, 0.94),
-    Course("delay_jitter", 0.02, 0.9),
-    Course("delay_jitter", 0.1, 0.9),
-    Course("delay_jitter", 0.3, 0.6),
-)
 
 
 @dataclass(frozen=True)
@@ -183,9 +161,29 @@ def find_courses(
         state = back[m, k, state]
 
 
-def _search_courses(bank: np.ndarray, side: Side) -> list[tuple[Course, np.ndarray]]:
-    """Return the likeliest course under each model and temper from log likelihoods `(T, K)`."""
-    models = [(course, temper) for course in COURSES for temper in TEMPERS]
+def _search_courses(
+    side: Side, bases: Sequence[JointBaseline], numbers: Sequence[np.ndarray]
+) -> list[tuple[Course, np.ndarray, int]]:
+    """Return the likeliest course under each law and temper, in samples, and its number of delays."""
+    found = []
+    for parts in sorted({course.parts for course in side.model.courses}):
+        courses = [course for course in side.model.courses if course.parts == parts]
+        bank = _build_bank(side, bases, numbers, parts)
+        for course, states in _follow_courses(bank, courses, side):
+            delays = states / parts
+            for _ in range(0 if side.model.integrates else TARGET_ROUNDS):
+                bank = _build_target_bank(side, bases, numbers, parts, delays)
+                (_, states), *_ = _follow_courses(bank, [course], side)
+                delays = states / parts
+            found.append((course, delays, bank.shape[1]))
+    return found
+
+
+def _follow_courses(
+    bank: np.ndarray, courses: Sequence[Course], side: Side
+) -> list[tuple[Course, np.ndarray]]:
+    """Return the likeliest states of courses from log likelihoods `(T, K)`."""
+    models = [(course, temper) for course in courses for temper in TEMPERS]
     num_samples, num_delays = bank.shape
     is_first = np.zeros(num_samples, dtype=np.int32)
     is_first[side.starts] = 1
@@ -206,14 +204,20 @@ def _search_courses(bank: np.ndarray, side: Side) -> list[tuple[Course, np.ndarr
 
 
 def _build_bank(
-    side: Side, bases: Sequence[JointBaseline], numbers: Sequence[np.ndarray]
+    side: Side, bases: Sequence[JointBaseline], numbers: Sequence[np.ndarray], parts: int
 ) -> np.ndarray:
-    """Return the log likelihood of each additional delay at each sample of the command, `(T, K)`."""
+    """Return the log likelihood of each additional delay at each sample of the command, `(T, K)`.
+
+    The delays are multiples of a sample divided by `parts`.
+    """
+    model = side.model
+    if not model.integrates:
+        return _build_target_bank(side, bases, numbers, parts, np.zeros(side.num_samples))
     num_delays = side.count(LONGEST_S)
     bank = np.zeros((side.num_samples, num_delays))
     for j, (base, row) in enumerate(zip(bases, numbers, strict=True)):
         tried = np.repeat(row[None], num_delays, 0)
-        tried[:, PLACE["delay_s"]] += np.arange(num_delays) * side.period_s
+        tried[:, model.place["delay_s"]] += np.arange(num_delays) * side.period_s
         paths = side.simulate(j, tried).astype(float)
         motion = measure_motion(side, paths[0])
         variance = Scale(base.frame_variance).variance(motion)
@@ -222,8 +226,7 @@ def _build_bank(
         error = np.diff(side.q[:, j], append=side.q[-1, j]) - steps
         error[:, side.ends - 1] = 0.0
         likelihood = -0.5 * np.minimum(error**2 / variance, MAX_SQUARE)
-        lags = ("delay_s", "pilot_lag_s", "spool_lag_s", "motion_lag_s")
-        late_s = sum(row[PLACE[name]] for name in (*lags, "command_lag_s", "speed_lag_s"))
+        late_s = sum(row[model.place[name]] for name in ("delay_s", *model.lags))
         late = int(late_s / side.period_s)
         share = late_s / side.period_s - late
         mixed = (1.0 - share) * likelihood[:, late:-1] + share * likelihood[:, late + 1 :]
@@ -233,15 +236,91 @@ def _build_bank(
     return bank
 
 
+def _build_target_bank(
+    side: Side,
+    bases: Sequence[JointBaseline],
+    numbers: Sequence[np.ndarray],
+    parts: int,
+    delays: np.ndarray,
+) -> np.ndarray:
+    """Return the same for targets, from a course `delays` on: what is missing of them shows in the error.
+
+    Wiener's filter takes the joint's answer to a pulse out of the error. What it leaves of the
+    errors of the reference is the noise of that estimate.
+    """
+    held = hold_commands(side, delays)
+    num_delays = parts * side.count(LONGEST_TARGET_S)
+    bank = np.zeros((side.num_samples, num_delays))
+    for j, (base, row) in enumerate(zip(bases, numbers, strict=True)):
+        pulse = _simulate_pulse(side, j, row)
+        known = _drop_slow(base.error, side)
+        noise = float(np.mean(np.clip(known, *np.quantile(known, (0.01, 0.99))) ** 2))
+        steps = side.u[1:, j] - side.u[:-1, j]
+        ratio = noise / max(float(np.mean(steps**2)), 1e-12)
+        error = _drop_slow(side.q[:, j] - held.simulate(j, row)[0], side)
+        lost = side.u[:, j] - held.u[:, j] - _undo_pulse(error, pulse, ratio)
+        left = _undo_pulse(known, pulse, ratio)
+        variance = float(np.mean(np.clip(left, *np.quantile(left, (0.01, 0.99))) ** 2))
+        for d in range(1, num_delays):
+            missing = side.u[:, j] - delay_commands(side.u[:, j], np.full(len(bank), d / parts))
+            bank[:, d] += (lost * missing - 0.5 * missing**2) / variance
+    for begin in side.starts:
+        bank[begin : begin + side.count(side.model.settling_s)] = 0.0
+    return bank
+
+
+def _drop_slow(error: np.ndarray, side: Side) -> np.ndarray:
+    """Return an error `(T,)` without what changes slowly."""
+    return error - uniform_filter1d(error, side.count(SLOW_S))
+
+
+def _undo_pulse(error: np.ndarray, pulse: np.ndarray, ratio: float) -> np.ndarray:
+    """Return what a filter with the answer `pulse` made an error `(T,)` of; `ratio`: noise over signal."""
+    size = len(error) + len(pulse)
+    answer = np.fft.rfft(pulse, size)
+    shares = answer.conj() / (np.abs(answer) ** 2 + ratio)
+    return np.fft.irfft(shares * np.fft.rfft(error, size), size)[: len(error)]
+
+
+def _simulate_pulse(side: Side, joint: int, numbers: np.ndarray) -> np.ndarray:
+    """Return how a servo without friction answers to a target that is 1 for one sample, from that sample on."""
+    count = side.count(PULSE_S)
+    u = np.zeros_like(side.u[: 2 * count])
+    u[count, joint] = PULSE_UNITS
+    zeros = np.zeros_like(u)
+    smooth = numbers.copy()
+    for name in ("dry", "load_dry", "hysteresis", "shortage"):
+        smooth[side.model.place[name]] = 0.0
+    short = replace(
+        side,
+        u=u,
+        q=side.q[:1] + zeros,
+        begins=np.zeros(len(u), dtype=int),
+        time_s=np.zeros(len(u)),
+        poses=side.poses[:, :1].repeat(len(u), 1),
+    )
+    path = short.simulate(joint, smooth)[0].astype(float)
+    without = replace(short, u=zeros).simulate(joint, smooth)[0]
+    return (path - without)[count:] / PULSE_UNITS
+
+
+def delay_commands(u: np.ndarray, delays: np.ndarray) -> np.ndarray:
+    """Return commands `(T, …)`, each later by `delays` samples `(T,)`; the mean of two within a part of one."""
+    whole = np.floor(delays).astype(int)
+    rows = np.arange(len(u)) - whole
+    share = (delays - whole).reshape(-1, *[1] * (u.ndim - 1))
+    return (1.0 - share) * u[np.maximum(rows, 0)] + share * u[np.maximum(rows - 1, 0)]
+
+
 def hold_commands(side: Side, delays: np.ndarray) -> Side:
     """Return the side under the commands that were in force, each later by `delays` samples `(T,)`."""
-    rows = np.arange(side.num_samples) - delays
-    return side.with_commands(side.u[np.maximum(rows, 0)])
+    return side.with_commands(delay_commands(side.u, delays))
 
 
 def _price_course(delays: np.ndarray, course: Course, num_delays: int) -> np.ndarray:
     """Return the log prior of each step of a course, against no delay at all, `(T,)`."""
-    now, then = delays[:-1], delays[1:]
+    states = np.rint(delays * course.parts)
+    now, then = states[:-1], states[1:]
     is_off, is_same = now == 0, now == then
     off = np.log(1.0 - course.begins)
     begin, last = np.log(course.begins), np.log(course.lasts)
@@ -272,9 +351,7 @@ class HeldCommands:
         """Return the best course of each effect beside the numbers of the joints, where one earns anything."""
         side, evidence = joints[0].side, self._evidence
         numbers = [joint.numbers for joint in joints]
-        bank = _build_bank(side, evidence.bases, numbers)
         rising = _find_rising(side, joints)
-        price_prior = bank.shape[1]
 
         def judge(delays: np.ndarray) -> np.ndarray:
             held = hold_commands(side, delays)
@@ -287,10 +364,10 @@ class HeldCommands:
             return total
 
         found: dict[str, HeldCourse] = {}
-        for course, delays in _search_courses(bank, side):
+        for course, delays, num_delays in _search_courses(side, evidence.bases, numbers):
             if not delays.any():
                 continue
-            gain, delays, gains = _drop_worthless(side, delays, course, price_prior, judge)
+            gain, delays, gains = _drop_worthless(side, delays, course, num_delays, judge)
             if gain < LEAST_NATS:
                 continue
             price = max(self._price(course), 0.0) * side.num_samples
@@ -310,9 +387,8 @@ class HeldCommands:
     def _search_reference(self) -> None:
         evidence, side = self._evidence, self._evidence.reference
         bases, nuisances = evidence.bases, evidence.nuisances
-        self._on_reference = dict.fromkeys(COURSES, 0.0)
+        self._on_reference = dict.fromkeys(side.model.courses, 0.0)
         numbers = [base.numbers for base in bases]
-        bank = _build_bank(side, bases, numbers)
         healthy = [side.simulate(j, row)[0] for j, row in enumerate(numbers)]
 
         def judge(delays: np.ndarray) -> np.ndarray:
@@ -330,9 +406,9 @@ class HeldCommands:
                     total[own] += 0.5 * (before / root * first - left / root * second)
             return total
 
-        for course, delays in _search_courses(bank, side):
+        for course, delays, num_delays in _search_courses(side, bases, numbers):
             if delays.any():
-                gain = _drop_worthless(side, delays, course, bank.shape[1], judge)[0]
+                gain = _drop_worthless(side, delays, course, num_delays, judge)[0]
                 self._on_reference[course] = max(self._on_reference[course], gain)
 
 
@@ -355,8 +431,8 @@ def _find_rising(side: Side, joints: Sequence[FieldJoint]) -> np.ndarray:
     """Return at which samples the arm speeds up, `(T,)` bool."""
     speed = np.zeros(side.num_samples)
     for joint in joints:
-        top = joint.numbers[PLACE["speed_out"]]
-        speed += np.abs(np.gradient(joint.path)) / top
+        step = np.abs(np.gradient(joint.path))
+        speed += step / max(float(step.max()), 1e-9)
     ahead, behind = side.count(0.5), side.count(0.2)
     later = np.concatenate([speed[ahead:], np.zeros(ahead)])
     earlier = np.concatenate([np.zeros(behind), speed[:-behind]])
@@ -386,7 +462,7 @@ def _drop_worthless(
         last = side.num_samples
         earned = np.concatenate([[0.0], np.cumsum(gains)])
         priced = np.concatenate([[0.0], np.cumsum(prior)])
-        following = np.append(begin[1:] + side.count(0.4), last)
+        following = np.minimum(np.append(begin[1:] + side.count(0.4), last), last)
         until = np.minimum(end + side.count(1.75), following)
         until = np.maximum(until, np.minimum(end, last))
         since = np.minimum(begin + side.count(0.2), last)

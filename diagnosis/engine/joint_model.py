@@ -1,17 +1,19 @@
-"""The model of a valve-driven joint: a table of numbers, one row each, with prior, ageing and bounds.
+"""A joint model as data: a table of numbers, one row each, with prior, ageing and bounds.
 
-A joint takes commands and measured poses and gives its speed, integrated to a path. It never takes
-its own measured speed. The joints therefore decouple, and a poor model cannot run away. An effect is
-a change of some numbers; those that a healthy machine does not need are 0.
-Priors and ageing were chosen on practice plants of two makes; docs/diagnosis.md has the figures.
+A joint takes commands and measured poses and gives its path. It never takes its own measured motion.
+The joints therefore decouple, and a poor model cannot run away. An effect is a change of some
+numbers; those that a healthy machine does not need are 0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
+
+from diagnosis.engine.rows import Row, list_cross_talk
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class JointNumber:
         ageing: Standard deviation of its change between reference and field.
         lower: Smallest value.
         upper: Largest value.
+        is_relative: Its ageing is in proportion to its value.
     """
 
     name: str
@@ -35,81 +38,128 @@ class JointNumber:
     ageing: float = 0.0
     lower: float = -np.inf
     upper: float = np.inf
+    is_relative: bool = False
 
 
-def _repeat(name: str, count: int, *values: float) -> list[JointNumber]:
+def repeat_number(name: str, count: int, *values: float) -> list[JointNumber]:
+    """Return `count` numbers with the same values, named in turn."""
     return [JointNumber(f"{name}_{i}", *values) for i in range(1, count + 1)]
 
 
-NUMBERS = (
-    JointNumber("delay_s", 0.35, 0.3, 0.002, 0.007, 0.0, 1.2),
-    JointNumber("pilot_lag_s", 0.06, 0.06, 0.003, 0.007, 0.001, 0.6),
-    JointNumber("spool_lag_s", 0.03, 0.04, 0.003, 0.007, 0.001, 0.4),
-    JointNumber("band_out", 0.06, 0.05, 0.002, 0.004, 0.0, 0.4),
-    JointNumber("band_in", 0.06, 0.05, 0.002, 0.004, 0.0, 0.4),
-    JointNumber("speed_out", 0.3, 0.3, 0.004, 0.004, 0.01, 3.0),
-    JointNumber("speed_in", 0.3, 0.3, 0.004, 0.004, 0.01, 3.0),
-    JointNumber("curve_out", 0.0, 0.3, 0.02, 0.02, -1.5, 1.5),
-    JointNumber("bend_out", 0.0, 0.25, 0.02, 0.02, -3.0, 3.0),
-    JointNumber("curve_in", 0.0, 0.3, 0.02, 0.02, -1.5, 1.5),
-    JointNumber("bend_in", 0.0, 0.25, 0.02, 0.02, -3.0, 3.0),
-    JointNumber("pose_1", 0.0, 0.15, 0.01, 0.01, -2.0, 2.0),
-    JointNumber("pose_2", 0.0, 0.12, 0.01, 0.01, -2.0, 2.0),
-    JointNumber("pose_3", 0.0, 0.08, 0.01, 0.01, -2.0, 2.0),
-    JointNumber("pose_4", 0.0, 0.08, 0.01, 0.01, -2.0, 2.0),
-    *_repeat("load_out", 4, 0.0, 0.04, 0.01, 0.01, -0.5, 0.5),
-    *_repeat("load_in", 4, 0.0, 0.04, 0.01, 0.01, -0.5, 0.5),
-    JointNumber("motion_lag_s", 0.03, 0.04, 0.003, 0.005, 0.001, 0.4),
-    JointNumber("droop", 0.0, 0.03, 0.005, 0.005, -0.2, 0.3),
-    JointNumber("pump_load", 0.25, 0.1, 0.01, 0.01, 0.0, 1.5),
-    JointNumber("hysteresis", 0.003, 0.006, 0.001, 0.002, 0.0, 0.3),
-    JointNumber("play", 0.002, 0.004, 0.001, 0.001, 0.0, 0.2),
-    JointNumber("drift", 0.0, 0.03, 0.005, 0.015, -0.3, 0.3),
-    JointNumber("creep", 0.0, 0.002, 2e-4, 3e-4, -0.05, 0.05),
-    JointNumber("log_closing_ratio", 0.0, 0.3, 0.02, 0.05, -1.0, 1.0),
-    JointNumber("slope_time_s", 0.1, 0.15, 0.01, 0.02, 0.02, 4.0),
-    # Numbers that only effects set.
-    JointNumber("command_lag_s"),
-    JointNumber("speed_lag_s"),
-    JointNumber("stroke"),
-    JointNumber("top_share"),
-    JointNumber("start_command"),
-    JointNumber("stop_ratio"),
-    JointNumber("break_away"),
-    JointNumber("catch_up"),
-    JointNumber("same_way_share"),
-    JointNumber("load_opposing"),
-    JointNumber("load_both"),
-    JointNumber("load_alone"),
-    JointNumber("load_root"),
-    JointNumber("load_constant"),
-    JointNumber("creep_by_load"),
-    JointNumber("omega_rad_s"),
-    JointNumber("damping"),
-    JointNumber("sag"),
-    JointNumber("thermal_share"),
-    JointNumber("thermal_s"),
-    JointNumber("thermal_grows"),
-    JointNumber("demand_limit"),
-    JointNumber("pose_pull"),
-    JointNumber("crosstalk"),
-    JointNumber("crosstalk_joint"),
-    JointNumber("closing_lag_s"),
-    JointNumber("slip"),
-    JointNumber("slip_above"),
-    JointNumber("pump_lag_s"),
-    JointNumber("play_slip"),
+COMMAND_NAMES = (
+    "delay_s",
+    "slope_time_s",
+    "command_lag_s",
+    "pilot_lag_s",
+    "log_closing_ratio",
+    "closing_lag_s",
+    "spool_lag_s",
+    "hysteresis",
+    "crosstalk",
+    "crosstalk_joint",
 )
-
-NAMES = tuple(number.name for number in NUMBERS)
-PLACE = {name: place for place, name in enumerate(NAMES)}
-"""Place of each number in a vector of all."""
-Place = IntEnum("Place", [(name.upper(), place) for name, place in PLACE.items()])
-"""The same as constants of the kernel."""
-FITTED = np.array([number.deviation > 0.0 for number in NUMBERS])
-NUM_FITTED = int(FITTED.sum())
+"""Numbers on the way of the command; every model begins with them."""
 
 
-def list_values(field: str) -> np.ndarray:
-    """Return one field of all numbers, `(P,)`."""
-    return np.array([getattr(number, field) for number in NUMBERS])
+@dataclass(frozen=True)
+class Course:
+    """Law by which a delay comes and goes.
+
+    Attributes:
+        effect: `frame_loss`: it grows with each lost frame and ends at once; `delay_jitter`: it
+            jumps.
+        begins: Chance a sample that a delay begins.
+        lasts: Chance a sample that it goes on.
+        parts: Into how many steps a sample is divided; a frame that comes late by a part of it leaves
+            the mean of two targets.
+    """
+
+    effect: str
+    begins: float
+    lasts: float
+    parts: int = 1
+
+    @property
+    def is_loss(self) -> bool:
+        """True for frames that are lost."""
+        return self.effect == "frame_loss"
+
+
+@dataclass(frozen=True)
+class JointModel:
+    """Numbers of a kind of joint, and how its recordings are read.
+
+    Attributes:
+        numbers: Those of `COMMAND_NAMES` first.
+        rows: Effects of the library in each form and size.
+        outside_rows: Causes outside the library.
+        plain_forms: Numbers of the rows that are effects of the registry as they stand.
+        lags: Numbers that delay the motion behind a command.
+        courses: Laws by which commands are held.
+        late: Numbers that are known better once all joints are fitted, with the values before.
+        substep_s: Longest step of the simulation.
+        interval_s: Time of an increment of the measure.
+        settling_s: At the beginning of a recording the commands before it are unknown.
+        integrates: A command is a speed: errors of the speed add up. Otherwise it is a target, and the
+            level of the error says something too.
+    """
+
+    numbers: tuple[JointNumber, ...]
+    rows: tuple[Row, ...]
+    outside_rows: tuple[Row, ...]
+    plain_forms: frozenset[tuple[str, ...]]
+    lags: tuple[str, ...]
+    courses: tuple[Course, ...]
+    late: Mapping[str, float]
+    substep_s: float
+    interval_s: float
+    settling_s: float
+    integrates: bool
+    names: tuple[str, ...] = field(init=False)
+    place: dict[str, int] = field(init=False)
+    fitted: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        names = tuple(number.name for number in self.numbers)
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "place", {name: place for place, name in enumerate(names)})
+        fitted = [number.deviation > 0.0 for number in self.numbers]
+        object.__setattr__(self, "fitted", np.flatnonzero(fitted))
+
+    def list_values(self, name: str) -> np.ndarray:
+        """Return one field of all numbers, `(P,)`."""
+        return np.array([getattr(number, name) for number in self.numbers])
+
+    def list_fitted(self, name: str) -> np.ndarray:
+        """Return one field of the fitted numbers, `(F,)`."""
+        return self.list_values(name)[self.fitted]
+
+    def list_ageing(self, numbers: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of the ageing of the fitted numbers of a joint `(P,)`, `(F,)`."""
+        is_relative = self.list_fitted("is_relative")
+        return self.list_fitted("ageing") * np.where(is_relative, numbers[self.fitted], 1.0)
+
+    def list_outside(self, num_joints: int) -> list[Row]:
+        """Return the rows of all causes outside the library."""
+        return [*self.outside_rows, *list_cross_talk(num_joints)]
+
+    def change(self, numbers: np.ndarray, rows: Sequence[Row]) -> np.ndarray:
+        """Return the numbers `(P,)` changed by each row, `(C, P)`."""
+        found = np.repeat(numbers[None], len(rows), 0)
+        for values, row in zip(found, rows, strict=True):
+            for name, how, value in row.changes:
+                place = self.place[name]
+                if how == "add":
+                    values[place] += value
+                elif how == "scale":
+                    values[place] *= 1.0 + value
+                elif how == "set":
+                    values[place] = value
+                else:
+                    values[place] = max(values[place], value)
+        return found
+
+
+def list_places(numbers: Sequence[JointNumber]) -> type[IntEnum]:
+    """Return the place of each number as a constant of the kernels."""
+    return IntEnum("Place", [(one.name.upper(), place) for place, one in enumerate(numbers)])

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from diagnosis.engine.joint_model import Place
+from diagnosis.engine.servo import ServoPlace
+from diagnosis.engine.valve import ValvePlace as Place
 
 wp.config.log_level = wp.LOG_ERROR  # that a kernel is compiled or read is no news to people
 
@@ -23,20 +24,6 @@ NUM_LOAD = 4
 
 DRIFT_SPAN_S = wp.constant(wp.float64(600.0))
 """The drift is the change of speed over ten minutes, so that its prior is that of a working day."""
-
-COMMAND_NUMBERS = (
-    "delay_s",
-    "slope_time_s",
-    "command_lag_s",
-    "pilot_lag_s",
-    "log_closing_ratio",
-    "closing_lag_s",
-    "spool_lag_s",
-    "hysteresis",
-    "crosstalk",
-    "crosstalk_joint",
-)
-"""Numbers between the command and the spool."""
 
 
 @wp.func
@@ -49,13 +36,18 @@ def _approach(step_s: wp.float64, time_s: wp.float64) -> wp.float64:
 
 @wp.func
 def _read_command(
-    commands: wp.array2d[wp.float64], joint: int, begin: int, at: wp.float64, step: wp.float64
+    commands: wp.array2d[wp.float64],
+    joint: int,
+    begin: int,
+    before: wp.float64,
+    at: wp.float64,
+    step: wp.float64,
 ) -> wp.float64:
-    """Return the mean command from time `at` on over one sub-step, in samples; 0 before the recording."""
+    """Return the mean command from time `at` on over one sub-step, in samples; `before` before the recording."""
     first = int(wp.floor(at))
     second = int(wp.floor(at + step))
-    a = wp.float64(0.0)
-    b = wp.float64(0.0)
+    a = before
+    b = before
     if first >= begin:
         a = commands[first, joint]
     if second >= begin:
@@ -73,10 +65,11 @@ def simulate_spool(
     joint: int,
     period_s: wp.float64,
     substeps: int,
+    integrates: int,
     numbers: wp.array2d[wp.float64],
     spool: wp.array2d[wp.float32],
 ):
-    """Simulate the spool of each command path, `(D, T S)`."""
+    """Simulate the spool of each command path, `(D, T S)`; a target was there before the recording."""
     d = wp.tid()
     one = wp.float64(1.0)
     zero = wp.float64(0.0)
@@ -97,6 +90,8 @@ def simulate_spool(
     width = wp.max(numbers[d, Place.HYSTERESIS], zero)
     crosstalk = numbers[d, Place.CROSSTALK]
     other = int(numbers[d, Place.CROSSTALK_JOINT])
+    before = zero
+    other_before = zero
     limited = zero
     lagged = zero
     pilot = zero
@@ -106,16 +101,20 @@ def simulate_spool(
     for k in range(commands.shape[0]):
         if begins[k] != begin or k == 0:
             begin = begins[k]
-            limited = zero
-            lagged = zero
-            pilot = zero
-            follower = zero
-            held = zero
+            if integrates == 0:
+                before = commands[begin, joint]
+                other_before = commands[begin, other]
+            limited = before + crosstalk * (other_before - before * wp.float64(1 - integrates))
+            lagged = limited
+            pilot = limited
+            follower = limited
+            held = limited
         for i in range(substeps):
             at = wp.float64(k) + wp.float64(i) * step - delay
-            command = _read_command(commands, joint, begin, at, step)
+            command = _read_command(commands, joint, begin, before, at, step)
             if crosstalk != zero:
-                command += crosstalk * _read_command(commands, other, begin, at, step)
+                leaked = _read_command(commands, other, begin, other_before, at, step)
+                command += crosstalk * (leaked - command * wp.float64(1 - integrates))
             limited += wp.clamp(command - limited, -slope, slope)
             lagged += lagging * (limited - lagged)
             rate = opening
@@ -333,3 +332,99 @@ def simulate_path(
             else:
                 out = driven
         flow[c, k] = wp.float32(asked)
+
+
+@wp.kernel(enable_backward=False)
+def simulate_servo(
+    spool: wp.array2d[wp.float32],
+    which: wp.array[wp.int32],
+    begins: wp.array[wp.int32],
+    poses: wp.array2d[wp.float64],
+    position: wp.array[wp.float64],
+    middle: wp.float64,
+    time_s: wp.array[wp.float64],
+    period_s: wp.float64,
+    substeps: int,
+    numbers: wp.array2d[wp.float64],
+    path: wp.array2d[wp.float32],
+):
+    """Follow the target `which` of each candidate from the recorded `position` on, `(C, T)`."""
+    c = wp.tid()
+    one = wp.float64(1.0)
+    zero = wp.float64(0.0)
+    step_s = period_s / wp.float64(substeps)
+    source = which[c]
+    w = one / numbers[c, ServoPlace.RESPONSE_S]
+    damping = numbers[c, ServoPlace.DAMPING]
+    inside = numbers[c, ServoPlace.FIRMWARE_DAMPING]
+    brake_s = wp.float64(2.0) * inside * damping / w
+    push = step_s * w * w
+    fade = step_s * wp.float64(2.0) * damping * w
+    outside_fade = fade * (one - inside)
+    # An error of 5 % of the travel is a tenth of half of it.
+    limit = wp.float64(0.1) / wp.max(numbers[c, ServoPlace.SHORTAGE], wp.float64(1e-3))
+    lead = numbers[c, ServoPlace.LEAD_S] / step_s
+    heating = wp.float64(0.0)
+    if numbers[c, ServoPlace.HEAT_S] > zero:
+        heating = step_s / numbers[c, ServoPlace.HEAT_S]
+    q = zero
+    speed = zero
+    wound = zero
+    hot = zero
+    begin = wp.int32(-1)
+    before = zero
+    for k in range(position.shape[0]):
+        if begins[k] != begin:
+            begin = begins[k]
+            q = position[k] - middle
+            speed = zero
+            wound = zero
+            hot = zero
+            before = wp.float64(spool[source, k * substeps])
+        path[c, k] = wp.float32(q + middle)
+        sag = numbers[c, ServoPlace.SAG]
+        for i in range(4):
+            sag += numbers[c, ServoPlace.SAG_POSE_1 + i] * poses[k, i]
+        dry = numbers[c, ServoPlace.DRY]
+        if numbers[c, ServoPlace.SECTOR] != zero:
+            off = (poses[k, 0] - numbers[c, ServoPlace.SECTOR_PLACE]) / wp.float64(0.2)
+            dry += numbers[c, ServoPlace.SECTOR] * wp.exp(-off * off)
+        for i in range(substeps):
+            target = wp.float64(spool[source, k * substeps + i])
+            held = target + lead * (target - before)
+            before = target
+            if numbers[c, ServoPlace.WOUND] > zero:
+                most = numbers[c, ServoPlace.WOUND]
+                wound += step_s / numbers[c, ServoPlace.WIND_S] * (target - q)
+                wound = wp.clamp(wound, -most, most)
+                held += wound
+            upper = limit
+            lower = limit
+            if numbers[c, ServoPlace.WEAK_OUT] > zero:
+                upper *= one - numbers[c, ServoPlace.WEAK_OUT]
+            else:
+                lower *= one + numbers[c, ServoPlace.WEAK_OUT]
+            cold = one - numbers[c, ServoPlace.HEAT] * hot
+            upper *= cold
+            lower *= cold
+            after = (speed + push * (held - q - sag)) / (one + fade)
+            pull = held - q - brake_s * after
+            if pull > upper:
+                pull = upper
+                after = (speed + push * (upper - sag)) / (one + outside_fade)
+            elif pull < -lower:
+                pull = -lower
+                after = (speed - push * (lower + sag)) / (one + outside_fade)
+            friction = dry + numbers[c, ServoPlace.LOAD_DRY] * wp.abs(pull)
+            if speed == zero:
+                friction *= one + numbers[c, ServoPlace.STATIC_RATIO]
+            lost = push * friction / (one + outside_fade)
+            if after > lost:
+                after -= lost
+            elif after < -lost:
+                after += lost
+            else:
+                after = zero
+            hot += heating * (wp.min(wp.abs(pull) / (wp.float64(0.15) * limit), one) - hot)
+            speed = after
+            q += step_s * speed

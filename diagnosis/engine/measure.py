@@ -1,4 +1,4 @@
-"""The measure of an error: increments over a quarter of a second, over their scale, less their own past.
+"""The measure of an error: increments over a short interval, over their scale, less their own past.
 
 The scale follows how much the simulated joint moves and how much its speed changes. The recorded
 motion would grow where an effect acts, and hide it.
@@ -15,10 +15,6 @@ from scipy.optimize import nnls
 
 from diagnosis.engine.side import Side
 
-INTERVAL_S = 0.25
-"""Time of an increment. Chosen by hand: of 0.1, 0.25 and 0.5 s each named 9 of 12 small effects."""
-SETTLING_S = 1.5
-"""At the beginning of a recording the commands before it are unknown."""
 NUM_LAGS = 3
 """Increments of the past that whiten an increment."""
 MAX_MOTION = 0.5
@@ -59,12 +55,14 @@ class Scale:
     Attributes:
         coefficients: `(5,)`.
         memory: Share of earlier increments in the next, `(NUM_LAGS,)` or empty.
+        kept: Share of an error that is still there an interval later; 1 where errors of the speed add up.
         step: Step of a coarse sensor, units; 0: none.
         noise: Standard deviation of noise that a sensor adds, units.
     """
 
     coefficients: np.ndarray
     memory: tuple[float, ...] = ()
+    kept: float = 1.0
     step: float = 0.0
     noise: float = 0.0
 
@@ -93,7 +91,7 @@ class IncrementMeasure:
     def __init__(
         self, side: Side, scale: Scale, motion: Motion | None = None, used: np.ndarray | None = None
     ) -> None:
-        self.interval = side.count(INTERVAL_S)
+        self.interval = side.count(side.model.interval_s)
         self.scale = scale
         valid = find_valid(side)
         if used is not None:
@@ -108,7 +106,8 @@ class IncrementMeasure:
     def __call__(self, path: np.ndarray) -> np.ndarray:
         """Return the increments of paths `(…, T)`, `(…, N)`."""
         h = self.interval
-        scaled = (path[..., h:] - path[..., :-h]) * self.weight
+        kept = np.float32(self.scale.kept)
+        scaled = (path[..., h:] - kept * path[..., :-h]) * self.weight
         found = scaled.copy()
         for i, share in enumerate(self.scale.memory):
             lag = (i + 1) * h
@@ -118,7 +117,8 @@ class IncrementMeasure:
 
 def find_valid(side: Side) -> np.ndarray:
     """Return at which samples an increment begins that lies in one recording, settled, `(T,)` bool."""
-    h, settling = side.count(INTERVAL_S), side.count(SETTLING_S)
+    model = side.model
+    h, settling = side.count(model.interval_s), side.count(model.settling_s)
     valid = np.ones(side.num_samples, dtype=bool)
     for begin, end in zip(side.starts, side.ends, strict=True):
         valid[begin : begin + settling] = False
@@ -128,7 +128,7 @@ def find_valid(side: Side) -> np.ndarray:
 
 def measure_motion(side: Side, path: np.ndarray) -> Motion:
     """Return the motion of a simulated joint, `path` `(T,)`, the largest within a few samples."""
-    h = side.count(INTERVAL_S)
+    h = side.count(side.model.interval_s)
     travelled = np.zeros(side.num_samples)
     changed = np.zeros(side.num_samples)
     step = np.abs(path[h:] - path[:-h])
@@ -165,6 +165,13 @@ def fit_variance(increments: np.ndarray, motion: Motion, valid: np.ndarray) -> n
     floor = np.zeros(len(size))
     floor[0] = LEAST_VARIANCE
     return np.maximum(coefficients / size, floor)
+
+
+def fit_kept(error: np.ndarray, interval: int, valid: np.ndarray) -> float:
+    """Return which share of an error `(T,)` is still there an interval later."""
+    now, later = error[:-interval][valid], error[interval:][valid]
+    share = float(now @ later) / max(float(now @ now), LEAST_VARIANCE * len(now))
+    return float(np.clip(share, 0.0, 1.0))
 
 
 def fit_memory(scaled: np.ndarray, interval: int, valid: np.ndarray) -> tuple[float, ...]:

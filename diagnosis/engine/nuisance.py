@@ -11,17 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diagnosis.engine import joint_model
-from diagnosis.engine.baseline import FITTED, NUM_PARTS, JointBaseline, linearise
+from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, linearise
 from diagnosis.engine.measure import IncrementMeasure
 from diagnosis.engine.side import Side
 
-AGEING = joint_model.list_values("ageing")[FITTED]
-SPEEDS = np.isin(np.array(joint_model.NAMES)[FITTED], ("speed_out", "speed_in"))
-SPEED_AGEING = 0.012
-"""Ageing of a top speed over its value; a part of the nominal speed would hide small effects."""
 WANDER_S = 12.0
-"""Distance of the knots between which the speed wanders."""
+"""Distance of the knots between which the speed, or the friction of a servo, wanders."""
+FRICTION_UNITS = 0.02
+"""Friction of a servo over its stiffness, of which the wander is a part, half travels."""
+WEIGHT_UNITS = 0.2
+"""Sag over the turn of another joint, of which the wander is a part."""
+STILL_UNITS_S = 0.02
+"""Speed about which the direction of a servo changes, half travels a second."""
 WANDER_SIZES = (0.02, 0.04, 0.07, 0.12)
 """Standard deviations of the wander that are tried on the reference, over the speed."""
 
@@ -82,12 +83,21 @@ def simulate_speed(side: Side, path: np.ndarray) -> np.ndarray:
     return step
 
 
-def list_wander(side: Side, path: np.ndarray) -> np.ndarray:
-    """Return paths of a slow wander of the speed, as large as the speed, `(K, T)`."""
+def find_direction(side: Side, path: np.ndarray) -> np.ndarray:
+    """Return the smoothed sign of the motion of a path `(T,)`, `(T,)`."""
+    return np.tanh(simulate_speed(side, path) / (STILL_UNITS_S * side.period_s))
+
+
+def list_wander(side: Side, joint: int, path: np.ndarray) -> np.ndarray:
+    """Return paths of a slow wander, `(K, T)`: of the speed, as large as it, or of a servo's friction and weight."""
     at_s = np.arange(side.num_samples) * side.period_s
     knots = np.arange(0.0, at_s[-1] + WANDER_S, WANDER_S)
-    step = simulate_speed(side, path)
-    return np.cumsum(step * draw_hats(at_s, knots), -1)
+    hats = draw_hats(at_s, knots)
+    if not side.model.integrates:
+        friction = FRICTION_UNITS * find_direction(side, path) * hats
+        others = np.delete(side.q, joint, 1).T
+        return np.concatenate([friction, WEIGHT_UNITS * (others - others.mean(1)[:, None])])
+    return np.cumsum(simulate_speed(side, path) * hats, -1)
 
 
 @dataclass
@@ -107,22 +117,24 @@ class JointNuisance:
     def project(
         self,
         side: Side,
+        joint: int,
         path: np.ndarray,
         slopes: np.ndarray,
         measure: IncrementMeasure,
         spread: float,
     ) -> Projection:
         """Return the projection of a joint on a side, from its simulated path and slopes."""
-        wander = measure(list_wander(side, path)).astype(float)
+        wander = measure(list_wander(side, joint, path)).astype(float)
         return Projection(np.concatenate([self.mix @ slopes, self.wander * wander]), spread)
 
     def explain(
-        self, side: Side, path: np.ndarray, projection: Projection, residual: np.ndarray
+        self, side: Side, joint: int, path: np.ndarray, projection: Projection, residual: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the wander, `(T,)`.
 
         Args:
             side: The recordings.
+            joint: Place of the joint.
             path: Simulated path, `(T,)`.
             projection: Made by `project` from the same path.
             residual: Increments of the error, `(N,)`.
@@ -130,18 +142,18 @@ class JointNuisance:
         scaled = residual / np.sqrt(projection.spread)
         shares = projection.inverse @ (projection.columns @ scaled)
         size = len(self.mix)
-        wander = self.wander * (shares[size:] @ list_wander(side, path))
+        wander = self.wander * (shares[size:] @ list_wander(side, joint, path))
         return shares[:size] @ self.mix, wander
 
 
 def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisance:
     """Return ageing and wander of a joint; the wander is the one that makes the left-out parts likeliest."""
-    ageing = np.where(SPEEDS, SPEED_AGEING * base.numbers[FITTED], AGEING)
+    ageing = side.model.list_ageing(base.numbers)
     mix = np.linalg.cholesky(base.covariance + np.diag(ageing**2)).T
     _, slopes = linearise(side, joint, base.numbers, base.measure)
     aged = mix @ slopes
     path = side.simulate(joint, base.numbers)[0].astype(float)
-    wander = base.measure(list_wander(side, path)).astype(float)
+    wander = base.measure(list_wander(side, joint, path)).astype(float)
     best = None
     for size in WANDER_SIZES:
         columns = np.concatenate([aged, size * wander])

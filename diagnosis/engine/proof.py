@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from diagnosis.engine.baseline import FITTED, LOWER, UPPER, JointBaseline
+from diagnosis.engine.baseline import JointBaseline
 from diagnosis.engine.evidence import FieldJoint
-from diagnosis.engine.measure import SETTLING_S
 from diagnosis.engine.side import Side, measure_units
 
 POSE_ROUNDS = 2
@@ -31,10 +30,12 @@ class Windows:
     Attributes:
         first: Row of the measured position at which each begins, `(W,)`.
         steps: Number of simulated positions, `K`.
+        restarts: Paths begin at the measured position, as those of joints that take speeds do.
     """
 
     first: np.ndarray
     steps: int
+    restarts: bool
 
     @property
     def rows(self) -> np.ndarray:
@@ -42,8 +43,9 @@ class Windows:
         return self.first[:, None] + 1 + np.arange(self.steps)
 
     def cut(self, path: np.ndarray) -> np.ndarray:
-        """Return a path `(…, T)` less its value at the beginning of each window, `(…, W, K)`."""
-        return path[..., self.rows] - path[..., self.first, None]
+        """Return a path `(…, T)` in each window, less its value at the beginning where it restarts, `(…, W, K)`."""
+        found = path[..., self.rows]
+        return found - path[..., self.first, None] if self.restarts else found
 
 
 def list_windows(side: Side, horizon_s: float) -> Windows:
@@ -51,8 +53,8 @@ def list_windows(side: Side, horizon_s: float) -> Windows:
     steps = side.count(horizon_s)
     first = []
     for begin, end in zip(side.starts, side.ends, strict=True):
-        first += range(begin + side.count(SETTLING_S), end - steps, steps)
-    return Windows(np.array(first, dtype=int), steps)
+        first += range(begin + side.count(side.model.settling_s), end - steps, steps)
+    return Windows(np.array(first, dtype=int), steps, side.model.integrates)
 
 
 def run_free(side: Side, windows: Windows, numbers: Sequence[np.ndarray]) -> np.ndarray:
@@ -62,8 +64,10 @@ def run_free(side: Side, windows: Windows, numbers: Sequence[np.ndarray]) -> np.
     positions = side.q[windows.rows]
     for _ in range(1 + POSE_ROUNDS):
         now.ask_others(numbers)
-        moved = [windows.cut(now.simulate(j, row)[0]) for j, row in enumerate(numbers)]
-        positions = begun[:, None] + np.stack(moved, 2)
+        paths = np.stack([now.simulate(j, row)[0] for j, row in enumerate(numbers)], 1)
+        positions = paths[windows.rows]
+        if windows.restarts:
+            positions = positions + (begun - paths[windows.first])[:, None]
         q = side.q.copy()
         q[windows.rows] = positions
         now = side.with_positions(q)
@@ -107,9 +111,10 @@ class Floor:
         found = []
         for joint, law in zip(joints, self._laws, strict=True):
             ageing, wander = joint.explain_nuisance()
-            aged = joint.numbers.copy()
-            aged[FITTED] += ageing
-            path = joint.side.simulate(joint.joint, np.clip(aged, LOWER, UPPER))[0]
+            model, aged = joint.side.model, joint.numbers.copy()
+            aged[model.fitted] += ageing
+            aged = np.clip(aged, model.list_values("lower"), model.list_values("upper"))
+            path = joint.side.simulate(joint.joint, aged)[0]
             moved = windows.cut(path - joint.path + wander)
             motion = _describe_motion(joint.path, windows)
             found.append(motion @ law + np.square(moved).mean(1))

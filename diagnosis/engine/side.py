@@ -1,7 +1,8 @@
 """One side of a case, reference or field, as the engine reads it: all recordings on end, at one rate.
 
-Positions are counted in units of the joint: 1 is what it covers in `UNIT_S` at its nominal speed. The
-numbers of `joint_model` then hold for fast and slow, turning and sliding joints.
+Positions are counted in units of the joint, so that the numbers of its model hold for fast and slow,
+turning and sliding joints: half its travel where a command is a target, otherwise what it covers in
+`UNIT_S` at its nominal speed.
 Axes: `T` samples of all recordings, `J` joints, `C` candidates, `P` numbers.
 """
 
@@ -19,12 +20,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.case import estimate_running_s
 from diagnosis.engine import kernel
-from diagnosis.engine.joint_model import PLACE
+from diagnosis.engine.joint_model import COMMAND_NAMES, JointModel
+from diagnosis.engine.servo import SERVO
+from diagnosis.engine.valve import VALVE
 
 UNIT_S = 1.0 / 0.3
-"""The numbers of `joint_model` were chosen on joints of about 0.3 rad/s; there the unit is 1 rad."""
-SUBSTEP_S = 0.025
-"""Longest step of the simulation: half a period of the machine's 20 Hz."""
+"""The numbers of `valve` were chosen on joints of about 0.3 rad/s; there the unit is 1 rad."""
+MODELS = {"speed": VALVE, "position": SERVO}
+"""Model of the joints of each command interface."""
 FASTEST_HZ = 50.0
 """Recordings of a higher rate are thinned out: hydraulic joints do nothing faster."""
 STOP_UNITS = 0.006
@@ -38,6 +41,8 @@ MAX_DEMAND = 1.5
 
 def measure_units(machine: Machine) -> np.ndarray:
     """Return the position unit of each joint, `(J,)`, rad or m."""
+    if machine.interface == "position":
+        return 0.5 * (machine.upper - machine.lower)
     return machine.max_speed * UNIT_S
 
 
@@ -87,7 +92,12 @@ class Side:
     @property
     def substeps(self) -> int:
         """Steps of the simulation in one period."""
-        return max(1, int(np.ceil(self.period_s / SUBSTEP_S - 1e-9)))
+        return max(1, int(np.ceil(self.period_s / self.model.substep_s - 1e-9)))
+
+    @property
+    def model(self) -> JointModel:
+        """Model of its joints."""
+        return MODELS[self.machine.interface]
 
     @cached_property
     def starts(self) -> np.ndarray:
@@ -115,8 +125,8 @@ class Side:
     def simulate_flow(self, joint: int, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return paths and asked flow of candidates with numbers `(C, P)`, `(C, T)` each."""
         numbers = np.ascontiguousarray(np.atleast_2d(numbers))
-        places = [PLACE[name] for name in kernel.COMMAND_NUMBERS]
-        distinct, which = np.unique(numbers[:, places], axis=0, return_inverse=True)
+        commands_only = numbers[:, : len(COMMAND_NAMES)]
+        distinct, which = np.unique(commands_only, axis=0, return_inverse=True)
         first = np.zeros(len(distinct), dtype=int)
         first[which] = np.arange(len(numbers))
         shape = (len(distinct), self.num_samples * self.substeps)
@@ -125,19 +135,50 @@ class Side:
         wp.launch(
             kernel.simulate_spool,
             dim=len(distinct),
-            inputs=[commands, begins, joint, self.period_s, self.substeps, _send(numbers[first])],
+            inputs=[
+                commands,
+                begins,
+                joint,
+                self.period_s,
+                self.substeps,
+                int(self.model.integrates),
+                _send(numbers[first]),
+            ],
             outputs=[spool],
             device=DEVICE,
         )
         path = wp.empty((len(numbers), self.num_samples), dtype=float, device=DEVICE)
-        flow = wp.empty((len(numbers), self.num_samples), dtype=float, device=DEVICE)
         poses, loads, load, stops, time_s = self._own[joint]
+        chosen = wp.array(which.astype(np.int32), dtype=wp.int32, device=DEVICE)
+        if not self.model.integrates:
+            middle = 0.5 * (self.machine.upper + self.machine.lower)[joint]
+            wp.launch(
+                kernel.simulate_servo,
+                dim=len(numbers),
+                inputs=[
+                    spool,
+                    chosen,
+                    begins,
+                    poses,
+                    _send(self.q[:, joint]),
+                    middle / measure_units(self.machine)[joint],
+                    time_s,
+                    self.period_s,
+                    self.substeps,
+                    _send(numbers),
+                ],
+                outputs=[path],
+                device=DEVICE,
+            )
+            found = path.numpy()
+            return found, np.zeros_like(found)
+        flow = wp.empty((len(numbers), self.num_samples), dtype=float, device=DEVICE)
         wp.launch(
             kernel.simulate_path,
             dim=len(numbers),
             inputs=[
                 spool,
-                wp.array(which.astype(np.int32), dtype=wp.int32, device=DEVICE),
+                chosen,
                 begins,
                 poses,
                 loads,

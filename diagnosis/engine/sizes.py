@@ -18,34 +18,10 @@ from diagnosis.effect_library import EffectType
 from diagnosis.engine.decide import EffectFinding
 from diagnosis.engine.evidence import FieldJoint
 from diagnosis.engine.holds import HeldCourse
-from diagnosis.engine.rows import Row, list_effect_rows
+from diagnosis.engine.joint_model import JointModel
+from diagnosis.engine.rows import Row
 from diagnosis.engine.side import measure_full_loads, measure_units
 
-PLAIN_FORMS = frozenset(
-    {
-        ("delay_s",),
-        ("band_out", "band_in"),
-        ("speed_out", "speed_in"),
-        ("speed_out",),
-        ("speed_in",),
-        ("stroke",),
-        ("top_share",),
-        ("command_lag_s",),
-        ("speed_lag_s",),
-        ("play",),
-        ("slope_time_s",),
-        ("start_command", "stop_ratio"),
-        ("load_both",),
-        ("load_opposing",),
-        ("creep_by_load",),
-        ("creep",),
-        ("omega_rad_s", "damping"),
-        ("thermal_share", "thermal_s"),
-        ("thermal_share", "thermal_s", "thermal_grows"),
-        ("demand_limit",),
-    }
-)
-"""Numbers of the rows that are effects of the registry as they stand."""
 SIZE_STEPS = np.array([0.8, 0.88, 0.94, 1.0, 1.06, 1.14, 1.25])
 """Multiples of a size at which its likelihood is read."""
 FORM_ERROR = 0.1
@@ -68,7 +44,8 @@ class SizedRow:
 
 def size_finding(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, SizedRow]:
     """Return the rows of an effect in the registry's form, by joint, from the joints without it."""
-    plain = [row for row in list_effect_rows() if row.effect == finding.name and is_plain(row)]
+    model = joints[0].side.model
+    plain = [row for row in model.rows if row.effect == finding.name and is_plain(row, model)]
     found = {}
     for j in finding.joints:
         some = [row for row in plain if is_possible(row, joints[j])]
@@ -86,7 +63,7 @@ def fit_rows(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, 
     for j in finding.joints:
         row = finding.rows.get(j)
         if row is None:
-            some = [one for one in list_effect_rows() if one.effect == finding.name]
+            some = [one for one in joints[j].side.model.rows if one.effect == finding.name]
             if not some:
                 continue
             row = some[int(np.argmax(joints[j].score(some)))]
@@ -94,9 +71,9 @@ def fit_rows(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, 
     return found
 
 
-def is_plain(row: Row) -> bool:
+def is_plain(row: Row, model: JointModel) -> bool:
     """Return whether a row has a form of the registry."""
-    return tuple(name for name, _, _ in row.changes) in PLAIN_FORMS
+    return tuple(name for name, _, _ in row.changes) in model.plain_forms
 
 
 def is_possible(row: Row, joint: FieldJoint) -> bool:
@@ -162,9 +139,16 @@ def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
     if effect == "saturation":
         return {"level": next(iter(values.values()))}
     if effect == "lag":
-        return {"time_constant_s": next(iter(values.values()))}
+        stages = [values[name] for name in values if name.endswith("_lag_s")]
+        return {"time_constant_s": sum(stages)}
     if effect == "backlash":
-        return {"gap_rad": values["play"] * unit}
+        # Friction holds a target on either side.
+        width = 2.0 * values["dry"] if "dry" in values else next(iter(values.values()))
+        return {"gap_rad": width * unit}
+    if effect == "sag":
+        return {"sag_rad": values["sag"] * unit, "sag_slope": values.get("sag_pose_1", 0.0)}
+    if effect == "torque_limit":
+        return {name: values[name] for name in ("shortage", "firmware_damping")}
     if effect == "rate_limit":
         return {"stroke_s": values["slope_time_s"]}
     if effect == "stiction":

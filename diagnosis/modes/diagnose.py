@@ -36,6 +36,7 @@ from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
 from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import EffectType
+from diagnosis.engine.side import MODELS
 from diagnosis.own_simulator import OwnSimulator
 from diagnosis.pipeline import DiagnosisPipeline
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
@@ -123,20 +124,16 @@ class Diagnose:
                 progress.reach(done, doing)
 
             generator = self.session.generator("diagnosis")
-            if given.reference and self.machine.interface == "speed" and not given.doubts():
+            if given.reference and self.machine.interface in MODELS and not given.doubts():
                 work = ReferenceDiagnosis(given, self._kinds, self.thresholds, generator)
                 return work.run(tell)
             base = self._base(given, self._kinds, tell)
-            prices, certainty = (
-                self.diagnosis.prices,
-                self.diagnosis.choose_certainty(self.machine, bool(given.reference)),
-            )
             work = DiagnosisPipeline(
                 given,
                 base,
                 self._kinds,
-                prices,
-                certainty,
+                self.diagnosis.prices,
+                self.diagnosis.certainty,
                 self.thresholds,
                 self.excitation,
                 self.curve_fit,

@@ -18,10 +18,11 @@ from diagnosis import effect_library
 from diagnosis.case import GapCase
 from diagnosis.engine import holds
 from diagnosis.engine.decide import Decider
-from diagnosis.engine.joint_model import PLACE, list_values
+from diagnosis.engine.joint_model import Course
 from diagnosis.engine.nuisance import Projection
-from diagnosis.engine.rows import Row, change_numbers
+from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_units, stack_side
+from diagnosis.engine.valve import VALVE
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from diagnosis.repair_proof import RepairProof
 
@@ -106,10 +107,9 @@ def make_side(machine: Machine, u: np.ndarray) -> Side:
 
 def pure_numbers(**values: float) -> np.ndarray:
     """Return numbers of a joint that follows its command at once, but for `values`."""
-    numbers = np.zeros(len(PLACE))
-    numbers[[PLACE["speed_out"], PLACE["speed_in"]]] = 1.0
-    for name, value in values.items():
-        numbers[PLACE[name]] = value
+    numbers = np.zeros(len(VALVE.numbers))
+    for name, value in ({"speed_out": 1.0, "speed_in": 1.0} | values).items():
+        numbers[VALVE.place[name]] = value
     return numbers
 
 
@@ -130,15 +130,15 @@ def test_a_delayed_lag_is_that_of_scipy(two_joints: Machine) -> None:
 
 def test_rows_do_not_depend_on_those_simulated_beside_them(two_joints: Machine) -> None:
     side = make_side(two_joints, make_commands(20.0, 1))
-    base = list_values("mean")
+    base = VALVE.list_values("mean")
     rows = [
         Row("dead_time", (("delay_s", "add", 0.2),)),
         Row("backlash", (("play", "add", 0.02),)),
         Row("lag", (("command_lag_s", "add", 0.2),)),
     ]
-    together = side.simulate(1, change_numbers(base, rows))
+    together = side.simulate(1, VALVE.change(base, rows))
     for row, path in zip(rows, together, strict=True):
-        alone = side.simulate(1, change_numbers(base, [row]))[0]
+        alone = side.simulate(1, VALVE.change(base, [row]))[0]
         assert np.array_equal(path, alone)
 
 
@@ -160,7 +160,7 @@ def test_courses_are_the_likeliest_of_all(effect: str) -> None:
     generator = np.random.default_rng(3)
     samples, delays = 6, 3
     likelihood = generator.normal(0.0, 2.0, (samples, delays))
-    course = holds.Course(effect, 0.1, 0.7)
+    course = Course(effect, 0.1, 0.7)
     found = wp.zeros((1, samples), dtype=wp.int32)
     wp.launch(
         holds.find_courses,

@@ -1,0 +1,238 @@
+"""The valve-driven joint: a command is a speed.
+
+The command passes a delay, pilot and spool; behind its dead band the spool gives a speed, which pose, load
+and the demand of the other joints change. Priors and ageing were chosen on practice plants of two makes;
+docs/diagnosis.md has the figures.
+"""
+
+from __future__ import annotations
+
+from diagnosis.engine.joint_model import Course, JointModel, JointNumber, list_places, repeat_number
+from diagnosis.engine.rows import Row, mirror_sizes, spread_sizes
+
+NUMBERS = (
+    JointNumber("delay_s", 0.35, 0.3, 0.002, 0.007, 0.0, 1.2),
+    JointNumber("slope_time_s", 0.1, 0.15, 0.01, 0.02, 0.02, 4.0),
+    JointNumber("command_lag_s"),
+    JointNumber("pilot_lag_s", 0.06, 0.06, 0.003, 0.007, 0.001, 0.6),
+    JointNumber("log_closing_ratio", 0.0, 0.3, 0.02, 0.05, -1.0, 1.0),
+    JointNumber("closing_lag_s"),
+    JointNumber("spool_lag_s", 0.03, 0.04, 0.003, 0.007, 0.001, 0.4),
+    JointNumber("hysteresis", 0.003, 0.006, 0.001, 0.002, 0.0, 0.3),
+    JointNumber("crosstalk"),
+    JointNumber("crosstalk_joint"),
+    JointNumber("band_out", 0.06, 0.05, 0.002, 0.004, 0.0, 0.4),
+    JointNumber("band_in", 0.06, 0.05, 0.002, 0.004, 0.0, 0.4),
+    JointNumber("speed_out", 0.3, 0.3, 0.004, 0.012, 0.01, 3.0, is_relative=True),
+    JointNumber("speed_in", 0.3, 0.3, 0.004, 0.012, 0.01, 3.0, is_relative=True),
+    JointNumber("curve_out", 0.0, 0.3, 0.02, 0.02, -1.5, 1.5),
+    JointNumber("bend_out", 0.0, 0.25, 0.02, 0.02, -3.0, 3.0),
+    JointNumber("curve_in", 0.0, 0.3, 0.02, 0.02, -1.5, 1.5),
+    JointNumber("bend_in", 0.0, 0.25, 0.02, 0.02, -3.0, 3.0),
+    JointNumber("pose_1", 0.0, 0.15, 0.01, 0.01, -2.0, 2.0),
+    JointNumber("pose_2", 0.0, 0.12, 0.01, 0.01, -2.0, 2.0),
+    JointNumber("pose_3", 0.0, 0.08, 0.01, 0.01, -2.0, 2.0),
+    JointNumber("pose_4", 0.0, 0.08, 0.01, 0.01, -2.0, 2.0),
+    *repeat_number("load_out", 4, 0.0, 0.04, 0.01, 0.01, -0.5, 0.5),
+    *repeat_number("load_in", 4, 0.0, 0.04, 0.01, 0.01, -0.5, 0.5),
+    JointNumber("motion_lag_s", 0.03, 0.04, 0.003, 0.005, 0.001, 0.4),
+    JointNumber("droop", 0.0, 0.03, 0.005, 0.005, -0.2, 0.3),
+    JointNumber("pump_load", 0.25, 0.1, 0.01, 0.01, 0.0, 1.5),
+    JointNumber("play", 0.002, 0.004, 0.001, 0.001, 0.0, 0.2),
+    JointNumber("drift", 0.0, 0.03, 0.005, 0.015, -0.3, 0.3),
+    JointNumber("creep", 0.0, 0.002, 2e-4, 3e-4, -0.05, 0.05),
+    # Numbers that only effects set.
+    JointNumber("speed_lag_s"),
+    JointNumber("stroke"),
+    JointNumber("top_share"),
+    JointNumber("start_command"),
+    JointNumber("stop_ratio"),
+    JointNumber("break_away"),
+    JointNumber("catch_up"),
+    JointNumber("same_way_share"),
+    JointNumber("load_opposing"),
+    JointNumber("load_both"),
+    JointNumber("load_alone"),
+    JointNumber("load_root"),
+    JointNumber("load_constant"),
+    JointNumber("creep_by_load"),
+    JointNumber("omega_rad_s"),
+    JointNumber("damping"),
+    JointNumber("sag"),
+    JointNumber("thermal_share"),
+    JointNumber("thermal_s"),
+    JointNumber("thermal_grows"),
+    JointNumber("demand_limit"),
+    JointNumber("pose_pull"),
+    JointNumber("slip"),
+    JointNumber("slip_above"),
+    JointNumber("pump_lag_s"),
+    JointNumber("play_slip"),
+)
+
+ValvePlace = list_places(NUMBERS)
+"""Place of each number as a constant of the kernels."""
+
+GAINS = mirror_sizes((0.06, 0.1, 0.15, 0.2, 0.25, 0.32, 0.4, 0.5))
+LOADS = mirror_sizes((0.06, 0.1, 0.17, 0.25, 0.35, 0.5, 0.7))
+THERMAL = mirror_sizes((0.08, 0.15, 0.25, 0.35, 0.5))
+
+
+def _list_effect_rows() -> list[Row]:
+    """Return the rows of the library."""
+    rows = []
+    for s in spread_sizes(0.03, 0.65, 12):
+        rows.append(Row("dead_time", (("delay_s", "add", s),)))
+    for s in spread_sizes(0.015, 0.25, 9):
+        rows.append(Row("dead_band", (("band_out", "add", s), ("band_in", "add", s)), (0, 1)))
+    for s in GAINS:
+        both = (("speed_out", "scale", s), ("speed_in", "scale", s))
+        rows.append(Row("flow_gain", both, (0, 1)))
+        rows.append(Row("asymmetry", both[:1]))
+        rows.append(Row("asymmetry", both[1:]))
+    for s in spread_sizes(0.25, 0.95, 12):
+        rows.append(Row("saturation", (("stroke", "add", s),)))
+    for s in spread_sizes(0.25, 0.95, 10):
+        rows.append(Row("saturation", (("top_share", "add", s),)))
+    for s in spread_sizes(0.04, 1.0, 11):
+        rows.append(Row("lag", (("command_lag_s", "add", s),)))
+    for s in spread_sizes(0.04, 0.8, 9):
+        rows.append(Row("lag", (("speed_lag_s", "add", s),)))
+    for s in spread_sizes(0.005, 0.14, 10):
+        rows.append(Row("backlash", (("play", "add", s),)))
+    for s in spread_sizes(0.01, 0.14, 8):
+        for slip in (0.008, 0.03):
+            rows.append(Row("backlash", (("play", "add", s), ("play_slip", "add", slip))))
+    for s in spread_sizes(0.25, 4.0, 11):
+        rows.append(Row("rate_limit", (("slope_time_s", "least", 1.0 / s),)))
+    for s in spread_sizes(0.06, 0.6, 9):
+        for ratio in (0.3, 0.6, 0.85):
+            changes = (("start_command", "add", s), ("stop_ratio", "add", ratio))
+            rows.append(Row("stiction", changes))
+    for s in spread_sizes(0.004, 0.12, 8):
+        for catch_up in (0.0, 0.5, 1.0):
+            for share in (1.0, 0.4):
+                changes = (
+                    ("break_away", "add", s),
+                    ("catch_up", "add", catch_up),
+                    ("same_way_share", "add", share),
+                )
+                rows.append(Row("stiction", changes))
+    rows += _list_load_rows()
+    for s in mirror_sizes(spread_sizes(0.0008, 0.03, 9)):
+        rows.append(Row("creep", (("creep", "add", s),)))
+    for s in mirror_sizes(spread_sizes(0.0008, 0.05, 9)):
+        rows.append(Row("creep", (("creep_by_load", "add", s),)))
+    for omega in spread_sizes(1.5, 14.0, 30):
+        for damping in (0.06, 0.15, 0.35):
+            rows.append(
+                Row("compliance", (("omega_rad_s", "add", omega), ("damping", "add", damping)))
+            )
+    for omega in spread_sizes(1.5, 14.0, 20):
+        for damping in (0.1, 0.3):
+            for sag in (1.0, 4.0):
+                changes = (
+                    ("omega_rad_s", "add", omega),
+                    ("damping", "add", damping),
+                    ("sag", "add", sag / omega**2),
+                )
+                rows.append(Row("compliance", changes))
+    for s in THERMAL:
+        for time_s in (40.0, 90.0, 200.0, 400.0):
+            changes = (("thermal_share", "add", s), ("thermal_s", "add", time_s))
+            rows.append(Row("thermal_drift", changes))
+        for time_s in (60.0, 150.0, 350.0):
+            changes = (
+                ("thermal_share", "add", s),
+                ("thermal_s", "add", time_s),
+                ("thermal_grows", "add", 1.0),
+            )
+            rows.append(Row("thermal_drift", changes))
+    for s in spread_sizes(0.3, 2.4, 14):
+        rows.append(Row("flow_sharing", (("demand_limit", "add", s),)))
+    return rows
+
+
+def _list_load_rows() -> list[Row]:
+    rows = []
+    for s in LOADS:
+        rows.append(Row("load_dependence", (("load_both", "add", s),)))
+    for s in (-0.7, -0.5, -0.35, -0.2, -0.1, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9):
+        rows.append(Row("load_dependence", (("load_opposing", "add", s),)))
+    for s in (-0.7, -0.4, -0.2, 0.1, 0.2, 0.4, 0.7):
+        changes = (("load_both", "add", s), ("load_alone", "add", 3.0))
+        rows.append(Row("load_dependence", changes))
+    for s in (0.2, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7):
+        for alone in (0.0, 3.0):
+            for constant in (0.0, 0.5, 0.8):
+                changes = (
+                    ("load_root", "add", s),
+                    ("load_alone", "add", alone),
+                    ("load_constant", "add", constant),
+                )
+                rows.append(Row("load_dependence", changes))
+    return rows
+
+
+def _list_outside_rows() -> list[Row]:
+    """Return the rows of causes outside the library."""
+    rows = []
+    for s in spread_sizes(0.015, 0.2, 8):
+        rows.append(Row("hysteresis", (("hysteresis", "add", s),)))
+    for s in mirror_sizes((0.03, 0.07, 0.12, 0.2, 0.3)):
+        rows.append(Row("pose_pull", (("pose_pull", "add", s),)))
+    for s in spread_sizes(0.04, 1.2, 9):
+        rows.append(Row("slow_centring", (("closing_lag_s", "add", s),)))
+    for s in (0.1, 0.2, 0.35, 0.5):
+        for above in (0.05, 0.1, 0.15):
+            rows.append(Row("slip", (("slip", "add", s), ("slip_above", "add", above))))
+    for s in spread_sizes(0.06, 0.9, 9):
+        rows.append(Row("pump_lag", (("pump_lag_s", "add", s),)))
+    return rows
+
+
+PLAIN_FORMS = frozenset(
+    {
+        ("delay_s",),
+        ("band_out", "band_in"),
+        ("speed_out", "speed_in"),
+        ("speed_out",),
+        ("speed_in",),
+        ("stroke",),
+        ("top_share",),
+        ("command_lag_s",),
+        ("speed_lag_s",),
+        ("play",),
+        ("slope_time_s",),
+        ("start_command", "stop_ratio"),
+        ("load_both",),
+        ("load_opposing",),
+        ("creep_by_load",),
+        ("creep",),
+        ("omega_rad_s", "damping"),
+        ("thermal_share", "thermal_s"),
+        ("thermal_share", "thermal_s", "thermal_grows"),
+        ("demand_limit",),
+    }
+)
+
+VALVE = JointModel(
+    numbers=NUMBERS,
+    rows=tuple(_list_effect_rows()),
+    outside_rows=tuple(_list_outside_rows()),
+    plain_forms=PLAIN_FORMS,
+    lags=("pilot_lag_s", "spool_lag_s", "motion_lag_s", "command_lag_s", "speed_lag_s"),
+    late={"droop": 0.0, "pump_load": 0.0},
+    courses=(
+        Course("frame_loss", 0.01, 0.6),
+        Course("frame_loss", 0.04, 0.85),
+        Course("frame_loss", 0.02, 0.94),
+        Course("delay_jitter", 0.02, 0.9),
+        Course("delay_jitter", 0.1, 0.9),
+        Course("delay_jitter", 0.3, 0.6),
+    ),
+    substep_s=0.025,  # half a period of the reference machine's 20 Hz
+    interval_s=0.25,  # chosen by hand: of 0.1, 0.25 and 0.5 s each named 9 of 12 small effects
+    settling_s=1.5,
+    integrates=True,
+)

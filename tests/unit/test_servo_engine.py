@@ -1,0 +1,146 @@
+"""The servo model of the engine against SciPy and worked numbers, and diagnoses of arms written apart from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from composed import option
+from scipy.signal import lsim
+from servos import record_arm
+
+from brokk_rl import extensions
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis import effect_library
+from diagnosis.answer import Answer
+from diagnosis.case import GapCase
+from diagnosis.engine.servo import SERVO
+from diagnosis.engine.side import Side, stack_side
+from diagnosis.reference_diagnosis import ReferenceDiagnosis
+
+RESPONSE_S, DAMPING, DELAY_S = 0.05, 0.7, 0.06
+
+
+@pytest.fixture(scope="module")
+def pair() -> Machine:
+    """Two servos of a tabletop arm."""
+    arm = option("machine", "so101")
+    return replace(arm, joints=arm.joints[:2], name="pair")
+
+
+def diagnose(case: GapCase) -> Answer:
+    """Return the answer of the engine."""
+    thresholds = extensions.load_part("thresholds")
+    kinds = effect_library.load_effects(case.machine)
+    work = ReferenceDiagnosis(case, kinds, thresholds, np.random.default_rng(0))
+    return work.run(lambda *_: None).answer
+
+
+def cut_joints(recording: Recording, machine: Machine) -> Recording:
+    """Return a recording of the first joints only."""
+    count = machine.num_joints
+    return replace(
+        recording,
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=recording.units[:count],
+        u=recording.u[:, :count],
+        q=recording.q[:, :count],
+    )
+
+
+def simulate(machine: Machine, u: np.ndarray, **values: float) -> np.ndarray:
+    """Return the path of the first joint under targets `(T,)`, half travels from the middle."""
+    numbers = np.zeros(len(SERVO.numbers))
+    plain = {"response_s": RESPONSE_S, "damping": DAMPING, "firmware_damping": 0.5}
+    for name, value in (plain | values).items():
+        numbers[SERVO.place[name]] = value
+    middle = 0.5 * (machine.upper + machine.lower)
+    rows = np.stack([u, np.zeros_like(u)], 1).astype(np.float32)
+    recording = Recording(
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=("rad", "rad"),
+        rate_hz=1.0 / machine.period_s,
+        t_s=machine.period_s * np.arange(len(u)),
+        u=rows,
+        q=np.repeat((middle + 0.0 * machine.lower)[None], len(u), 0).astype(np.float32),
+    )
+    side: Side = stack_side([recording], machine)
+    unit = 0.5 * (machine.upper - machine.lower)[0]
+    return side.simulate(0, numbers)[0].astype(float) - middle[0] / unit
+
+
+def test_a_loop_without_friction_is_that_of_scipy(pair: Machine) -> None:
+    u = np.zeros(200)
+    u[20:90] = 0.4
+    u[90:] = -0.3
+    path = simulate(pair, u, delay_s=DELAY_S)
+    fine, late = 20, round(DELAY_S / pair.period_s)
+    held = np.repeat(np.concatenate([np.zeros(late), u[:-late]]), fine)
+    w = 1.0 / RESPONSE_S
+    system = ([[0.0, 1.0], [-w * w, -2.0 * DAMPING * w]], [[0.0], [w * w]], [[1.0, 0.0]], [[0.0]])
+    _, expected, _ = lsim(system, held, pair.period_s / fine * np.arange(len(held)), interp=False)
+    # Four explicit steps a period of 20 ms.
+    assert np.abs(path - expected[::fine]).max() < 0.03
+
+
+def test_dry_friction_holds_a_joint_beside_its_target(pair: Machine) -> None:
+    up = np.linspace(0.0, 0.4, 150)
+    u = np.concatenate([up, up[::-1], np.zeros(50)])
+    path = simulate(pair, u, dry=0.05)
+    # On the way back the joint is late by twice the friction over the stiffness.
+    forth, back = np.interp(0.2, up, path[:150]), np.interp(0.2, up, path[299:149:-1])
+    lag = 2.0 * 2.0 * DAMPING * RESPONSE_S * 0.4 / (149 * pair.period_s)
+    assert back - forth == pytest.approx(2.0 * 0.05 + lag, abs=0.01)
+
+
+def test_a_limited_pull_reaches_the_speed_at_which_its_damping_takes_it_all(pair: Machine) -> None:
+    u = np.full(100, 0.9)
+    u[0] = 0.0
+    shortage, inside = 4.0, 0.5
+    path = simulate(pair, u, shortage=shortage, firmware_damping=inside)
+    speed = np.diff(path)[18:26].max() / pair.period_s
+    outside_s = 2.0 * (1.0 - inside) * DAMPING * RESPONSE_S
+    assert speed == pytest.approx(0.1 / shortage / outside_s, rel=0.03)
+
+
+def test_a_joint_falls_where_the_limit_is_below_its_weight(pair: Machine) -> None:
+    held = simulate(pair, np.zeros(100), sag=0.03, shortage=2.0)
+    falls = simulate(pair, np.zeros(100), sag=0.06, shortage=2.0)
+    assert held[-1] == pytest.approx(-0.03, abs=1e-3)
+    assert falls[-1] < -0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lost", "late_s", "named"),
+    [(0.0, 0.0, []), (0.2, 0.0, ["frame_loss"]), (0.0, 0.08, ["delay_jitter"])],
+)
+def test_late_and_lost_frames_of_servos_are_named(
+    pair: Machine, lost: float, late_s: float, named: list[str]
+) -> None:
+    arm = option("machine", "so101")
+    reference = [cut_joints(record_arm(arm, seed, 0.0, 0.0), pair) for seed in (1, 2, 3)]
+    field = [cut_joints(record_arm(arm, seed, lost, late_s), pair) for seed in (4, 5)]
+    answer = diagnose(GapCase(pair, reference, field))
+    assert [one.effect for one in answer.selected][:1] == named
+
+
+def test_a_late_servo_is_named_with_its_delay(pair: Machine) -> None:
+    arm = option("machine", "so101")
+    reference = [cut_joints(record_arm(arm, seed, 0.0, 0.0), pair) for seed in (1, 2, 3)]
+    field = []
+    for seed in (4, 5):
+        one = cut_joints(record_arm(arm, seed, 0.0, 0.0), pair)
+        q = one.q.copy()
+        q[3:, 1] = one.q[:-3, 1]
+        field.append(replace(one, q=q))
+    answer = diagnose(GapCase(pair, reference, field))
+    assert [(one.effect, one.joints) for one in answer.selected] == [
+        ("dead_time", (pair.joint_names[1],))
+    ]
+    estimate = answer.selected[0].parameters["dead_time_s"][pair.joint_names[1]]
+    assert estimate.mean == pytest.approx(3 * pair.period_s, rel=0.1)
