@@ -8,8 +8,9 @@ numbers; those that a healthy machine does not need are 0.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +42,9 @@ class JointNumber:
     is_relative: bool = False
 
 
-def repeat_number(name: str, count: int, *values: float) -> list[JointNumber]:
-    """Return `count` numbers with the same values, named in turn."""
-    return [JointNumber(f"{name}_{i}", *values) for i in range(1, count + 1)]
+def repeat_number(count: int, number: JointNumber) -> list[JointNumber]:
+    """Return a number `count` times, named in turn."""
+    return [replace(number, name=f"{number.name}_{i}") for i in range(1, count + 1)]
 
 
 COMMAND_NAMES = (
@@ -160,6 +161,6 @@ class JointModel:
         return found
 
 
-def list_places(numbers: Sequence[JointNumber]) -> type[IntEnum]:
+def list_places(numbers: Sequence[JointNumber]) -> Any:
     """Return the place of each number as a constant of the kernels."""
     return IntEnum("Place", [(one.name.upper(), place) for place, one in enumerate(numbers)])
