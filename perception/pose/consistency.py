@@ -51,9 +51,9 @@ from which its seven numbers are determined."""
 REACH = 0.1
 """Departure from a circle within which its edges are looked for, in radii: a focal length that is
 wrong by a fifth on a face at 45 degrees."""
-NEARBY, MOST_LOG, NUM_TRIALS, AS_ROUND = 0.05, 0.7, 71, 0.3
-"""Logarithm of the factor up to which a rim's shape is linear in it, largest one that is tried,
-number of trials, and largest part of the oval that the best of them may leave."""
+NEARBY, TRIALS, AS_ROUND = 0.05, ((0.7, 0.1), (0.08, 0.02)), 0.3
+"""Logarithm of the factor up to which a rim's shape is linear in it; reach and step of the factors
+that are tried beyond; largest part of the oval that the best of them may leave."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which occluders of its rim are searched."""
 
@@ -130,21 +130,25 @@ def measure_stretch(
     if not abs(rise) > 1e-3:
         return None
     logarithm = -oval[0] / rise
-    if abs(logarithm) > NEARBY:
-        # Two tilts show the same length along the slope; only one shows a circle.
-        trials = np.linspace(-MOST_LOG, MOST_LOG, NUM_TRIALS)
-        ovals = [_measure_oval(*outline, float(trial))[0] for trial in trials]
-        sizes = np.linalg.norm(ovals, axis=1)
-        # Edges of something else are round with no focal length.
-        if sizes.min() > AS_ROUND * np.linalg.norm(oval):
-            return None
-        logarithm = float(trials[np.argmin(sizes)])
     # Neighbouring edges share their error.
     pixel_m = float(np.median(profiles.pixel_m))
     alike_m = rim.ALIKE_PX * pixel_m + rim.ALIKE_M
     perimeter_m = conic.compute_perimeter(row[2], row[3]) * pixel_m
     num_alike = max(alike_m * len(profiles.pixel_m) / perimeter_m, 1.0)
-    return float(np.exp(logarithm)), float(std * np.sqrt(num_alike) / abs(rise))
+    std *= float(np.sqrt(num_alike) / abs(rise))
+    # Beyond, two tilts show the same length along the slope; only one shows a circle.
+    if abs(logarithm) > NEARBY + 3.0 * std:
+        logarithm, least = 0.0, np.inf
+        for reach, step in TRIALS:
+            sizes = {}
+            for trial in logarithm + np.arange(-reach, reach + step / 2, step):
+                sizes[float(trial)] = float(np.linalg.norm(_measure_oval(*outline, trial)[0]))
+            logarithm = min(sizes, key=sizes.__getitem__)
+            least = sizes[logarithm]
+        # Edges of something else are round with no focal length.
+        if least > AS_ROUND * np.linalg.norm(oval):
+            return None
+    return float(np.exp(logarithm)), std
 
 
 def _measure_oval(
@@ -167,7 +171,8 @@ def _measure_oval(
     for number in (1, 2, 3):
         waves += [np.cos(number * angle), np.sin(number * angle)]
     distance_m = np.linalg.norm(away, axis=1)
-    solution, cov = fit_linear(np.column_stack(waves), distance_m, 1e-3 * np.median(distance_m))
+    floor_m = 1e-3 * float(np.median(distance_m))
+    solution, cov = fit_linear(np.column_stack(waves), distance_m, floor_m)
     return solution[3:5] / solution[0], float(np.sqrt(cov[3, 3]) / solution[0])
 
 
