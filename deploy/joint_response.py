@@ -114,7 +114,7 @@ def find_pushes(
     """
     # Flow marks the beginning of a response: levers move earlier, valves answer later.
     is_flowing = np.abs(flow) >= SMALLEST_FLOW
-    is_any = is_flowing.any(1)
+    is_any: np.ndarray = np.any(is_flowing, axis=1)
     began = np.flatnonzero(is_any[1:] & ~is_any[:-1]) + 1
     travel, pushes = machine.upper - machine.lower, []
     ends = np.append(began, len(t_s))[1:]
