@@ -207,7 +207,8 @@ class StartSearch:
         ready, good = self._bring_into_range(part["q"], part["target_m"])
         near, reached = self._find_pose(ready, part, up_m[:, 0])
         moved = near + back * (part["q"] - near)
-        good = good & reached & self._is_clear(moved, moved, part)
+        at_target = back[:, 0] == 0.0
+        good = good & reached & (at_target | self._is_clear(moved, moved, part))
         q = start["q"].clone()
         q[:count] = torch.where(good[:, None], moved, part["q"])
         return start | {"q": q}

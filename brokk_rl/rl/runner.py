@@ -73,10 +73,8 @@ class TrainingRunner(OnPolicyRunner):
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
             if training.teacher:
-                folder = training.teacher.folder
-                kind = (
-                    TrainedPolicy(path=folder, task=None) if folder else ClassicalPolicy(task=None)
-                )
+                path = training.teacher.folder
+                kind = TrainedPolicy(path=path, task=None) if path else ClassicalPolicy(task=None)
                 self.alg.follow(kind.build(env, seed=0))
 
     def run(self) -> None:
