@@ -206,6 +206,9 @@ class StartSearch:
         back = way[0] + (way[1] - way[0]) * back
         ready, good = self._bring_into_range(part["q"], part["target_m"])
         near, reached = self._find_pose(ready, part, up_m[:, 0])
+        middle = torch.where(self._exclusive, ready, self._middle)
+        other, also = self._find_pose(middle, part, up_m[:, 0])
+        near, reached = torch.where(reached[:, None], near, other), reached | also
         moved = near + back * (part["q"] - near)
         at_target = back[:, 0] == 0.0
         good = good & reached & (at_target | self._is_clear(moved, moved, part))
