@@ -24,7 +24,6 @@ def check_frames(model: mujoco.MjModel, machine: Machine) -> None:
     """
     chain, data = LinkChain(machine.joints), mujoco.MjData(model)
     poses = np.random.default_rng(0).uniform(machine.lower, machine.upper, (NUM_POSES, model.nq))
-    expected = chain.place(poses)
     tips_m = compute_tool_kinematics(machine, poses).tip_in_base_m
     names = [*machine.joint_names, "tip"]
     found_m = np.zeros((NUM_POSES, len(names), 3))
@@ -34,7 +33,7 @@ def check_frames(model: mujoco.MjModel, machine: Machine) -> None:
         for column, name in enumerate(machine.joint_names):
             found_m[row, column] = data.xpos[model.joint(name).bodyid[0]]
         found_m[row, -1] = data.site("tip").xpos
-    expected_m = np.concatenate((expected.place_m, tips_m[:, None]), 1)
+    expected_m = np.concatenate((chain.place(poses).place_m, tips_m[:, None]), 1)
     away_m = np.linalg.norm(found_m - expected_m, axis=-1).max(0)
     if (away_m <= FRAME_TOLERANCE_M).all():
         return
