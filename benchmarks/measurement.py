@@ -89,13 +89,14 @@ def read_evaluation(path: Path, head: dict[str, Any]) -> Table:
     rows: Table = []
     for policy, one in load_json(path)["policies"].items():
         strict, (low, high) = one["success_strict"]["mean"], one["success_strict"]["ci95"]
+        time_s = one["time_to_insert_s"]["median"]
         row = head | {
             "policy": policy,
             "strict success": round(strict, 3),
             "95 %": f"{low:.3f} to {high:.3f}",
             "inserted": round(one.get("success_reached", {"mean": strict})["mean"], 3),
             "paper's criterion": round(one["success_paper"]["mean"], 3),
-            "median time, s": round(one["time_to_insert_s"]["median"], 1),
+            "median time, s": None if time_s is None else round(time_s, 1),
             "peak force, kN": round(one["peak_force_n"] / 1000.0, 1),
             "valve travel, 1/s": round(one["valve_travel"], 1),
             "episodes": one["episodes"],
