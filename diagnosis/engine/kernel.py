@@ -340,6 +340,7 @@ def simulate_servo(
     which: wp.array[wp.int32],
     begins: wp.array[wp.int32],
     poses: wp.array2d[wp.float64],
+    load: wp.array[wp.float64],
     position: wp.array[wp.float64],
     middle: wp.float64,
     time_s: wp.array[wp.float64],
@@ -382,7 +383,7 @@ def simulate_servo(
             hot = zero
             before = wp.float64(spool[source, k * substeps])
         path[c, k] = wp.float32(q + middle)
-        sag = numbers[c, ServoPlace.SAG]
+        sag = numbers[c, ServoPlace.SAG] - numbers[c, ServoPlace.SAG_LOAD] * load[k]
         for i in range(4):
             sag += numbers[c, ServoPlace.SAG_POSE_1 + i] * poses[k, i]
         dry = numbers[c, ServoPlace.DRY]

@@ -31,6 +31,7 @@ NUMBERS = (
     JointNumber("shortage", 0.4, 0.4, 0.03, 0.03, 0.0, 30.0),
     JointNumber("firmware_damping", 0.6, 0.2, 0.05, 0.03, 0.0, 1.0),
     # Numbers that only effects set.
+    JointNumber("sag_load"),
     JointNumber("lead_s"),
     JointNumber("weak_out"),
     JointNumber("wind_s"),
@@ -61,6 +62,8 @@ def _list_effect_rows() -> list[Row]:
         rows.append(Row("backlash", (("hysteresis", "add", s),)))
     for s in mirror_sizes(spread_sizes(0.003, 0.3, 14)):
         rows.append(Row("sag", (("sag", "add", s),)))
+    for s in spread_sizes(0.005, 0.4, 12):
+        rows.append(Row("sag", (("sag_load", "add", s),)))
     for s in mirror_sizes(spread_sizes(0.01, 0.2, 6)):
         rows.append(Row("sag", (("sag", "add", s), ("sag_pose_1", "add", s)), (0, 1)))
         rows.append(Row("sag", (("sag", "add", s), ("sag_pose_1", "add", -s)), (0, 1)))
@@ -103,6 +106,7 @@ SERVO = JointModel(
             ("dry",),
             ("hysteresis",),
             ("sag",),
+            ("sag_load",),
             ("sag", "sag_pose_1"),
             ("shortage", "firmware_damping"),
         }

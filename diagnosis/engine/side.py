@@ -160,6 +160,7 @@ class Side:
                     chosen,
                     begins,
                     poses,
+                    load,
                     _send(self.q[:, joint]),
                     middle / measure_units(self.machine)[joint],
                     time_s,

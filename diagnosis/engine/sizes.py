@@ -82,7 +82,9 @@ def is_possible(row: Row, joint: FieldJoint) -> bool:
     is_loaded = bool(np.abs(joint.side.loads[joint.joint]).max() > 1e-3)
     if "creep" in names:
         return not is_loaded
-    if names & {"creep_by_load", "load_both", "load_opposing"}:
+    if "sag" in names:
+        return not is_loaded
+    if names & {"creep_by_load", "load_both", "load_opposing", "sag_load"}:
         return is_loaded
     return True
 
@@ -145,7 +147,7 @@ def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
         # Friction holds a target on either side.
         width = 2.0 * values["dry"] if "dry" in values else next(iter(values.values()))
         return {"gap_rad": width * unit}
-    if effect == "sag":
+    if effect == "sag" and "sag" in values:
         return {"sag_rad": values["sag"] * unit, "sag_slope": values.get("sag_pose_1", 0.0)}
     if effect == "torque_limit":
         return {name: values[name] for name in ("shortage", "firmware_damping")}
@@ -166,6 +168,8 @@ def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
         return {"drift_rad_s": values["creep"] * unit}
     # Weight over the yield force, at the stretched arm.
     share = _measure_stretched_share(joint, machine)
+    if effect == "sag":
+        return {"load_rad": values["sag_load"] * unit / share}
     if effect == "creep":
         return {"sink_rad_s": abs(values["creep_by_load"]) * unit / share}
     # To first order the square root of the registry halves the sensitivity.

@@ -16,8 +16,10 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import Answer
 from diagnosis.case import GapCase
+from diagnosis.engine.rows import Row
 from diagnosis.engine.servo import SERVO
 from diagnosis.engine.side import Side, stack_side
+from diagnosis.engine.sizes import is_plain, translate
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 
 RESPONSE_S, DAMPING, DELAY_S = 0.05, 0.7, 0.06
@@ -112,6 +114,45 @@ def test_a_joint_falls_where_the_limit_is_below_its_weight(pair: Machine) -> Non
     falls = simulate(pair, np.zeros(100), sag=0.06, shortage=2.0)
     assert held[-1] == pytest.approx(-0.03, abs=1e-3)
     assert falls[-1] < -0.3
+
+
+@pytest.mark.parametrize("name", ["so101", "brokk170"])
+def test_every_row_has_the_numbers_of_its_effect(name: str) -> None:
+    known = option("machine", name)
+    joints = [replace(joint, command="position") for joint in known.joints]
+    machine = replace(known, joints=tuple(joints), levers=())
+    kinds = {kind.name: kind for kind in effect_library.load_effects(machine)}
+    loaded = {"sag_load"} if machine.has_bodies else {"sag", "sag_pose_1"}
+    for row in SERVO.rows:
+        changed = {number for number, *_ in row.changes}
+        if is_plain(row, SERVO) and (row.effect != "sag" or changed <= loaded):
+            assert set(translate(row, 0, machine)) <= set(kinds[row.effect].numbers)
+
+
+def test_weight_pulls_a_joint_from_its_target() -> None:
+    known = option("machine", "brokk170")
+    joints = [replace(joint, command="position") for joint in known.joints]
+    machine = replace(known, joints=tuple(joints), levers=())
+    rows = np.zeros((100, machine.num_joints), dtype=np.float32)
+    middle = 0.5 * (machine.upper + machine.lower)
+    recording = Recording(
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=tuple(joint.unit for joint in machine.joints),
+        rate_hz=1.0 / machine.period_s,
+        t_s=machine.period_s * np.arange(len(rows)),
+        u=rows,
+        q=(rows + middle).astype(np.float32),
+    )
+    side = stack_side([recording], machine)
+    joint = int(np.abs(side.load[:, 0]).argmax())
+    numbers = SERVO.list_values("mean")
+    for name in ("dry", "load_dry"):
+        numbers[SERVO.place[name]] = 0.0
+    row = Row("sag", (("sag_load", "add", 0.05),))
+    pulled = side.simulate(joint, SERVO.change(numbers, [row]))[0]
+    off = pulled[-1] - side.q[-1, joint]
+    assert off == pytest.approx(0.05 * side.load[joint, -1], rel=1e-2)
 
 
 @pytest.mark.slow
