@@ -149,7 +149,7 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     is_single = key in groups and not _is_list_group(key)
     if override.is_sweep_override() and not sweep:
         raise ConfigError(_explain_several(key, value, key in groups, is_single))
-    if is_single and value.startswith("["):
+    if is_single and value.startswith("[") and "," in value:
         raise ConfigError(_explain_several(key, value.strip("[]"), True, is_single))
     return word
 

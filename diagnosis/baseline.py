@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -204,18 +204,12 @@ def compare_simulator(
 
 
 def fit_baseline(
-    case: GapCase,
-    fit: ActuatorFit,
-    folder: Path,
-    seed: int,
-    device: torch.device,
-    refined: Callable[[Baseline], Baseline] = lambda base: base,
+    case: GapCase, fit: ActuatorFit, folder: Path, seed: int, device: torch.device
 ) -> Baseline:
     """Return a simulator fitted to the reference, and fits that leave a part of it out.
 
     A fit with `refit` is fitted again without each fold. Any other fit is slow, so it is fitted
-    once, without the last fold. `refined` may change the simulator before its discrepancy is
-    learned; see `diagnosis.reference_effects`.
+    once, without the last fold.
 
     Raises:
         RecordingError: too little reference.
@@ -240,7 +234,7 @@ def fit_baseline(
     field = replace(
         field, residuals=replace(field.residuals, valid_mask=_find_known_windows(case, field))
     )
-    return learn_errors(refined(Baseline(actuator, field, left_out)), machine)
+    return learn_errors(Baseline(actuator, field, left_out), machine)
 
 
 def learn_errors(base: Baseline, machine: Machine) -> Baseline:

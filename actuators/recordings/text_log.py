@@ -191,9 +191,8 @@ class TextLog(LogFile):
         cells = split_line(tail.rstrip("\r\n").rpartition("\n")[2], self.layout.delimiter)
         if not len(frame) or (len(cells) >= width and tail.endswith(("\n", "\r"))):
             return frame
-        number = self.find_line(len(frame) - 1)[0] if len(cells) >= width else "of the file"
         text = f"is cut off or lacks its end ({len(cells)} of {width} cells): left out"
-        log.warning("%s: the last line, %s, %s", self.path, number, text)
+        log.warning("%s: the last line %s", self.path, text)
         return frame.iloc[:-1]
 
     def _convert(self, cells: pd.Series, at: int) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -21,20 +20,10 @@ from brokk_rl.parallel import use_workers
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import (
-    answer,
-    baseline,
-    case,
-    effect_library,
-    effects_file,
-    reference_effects,
-    report,
-    report_checks,
-)
+from diagnosis import answer, baseline, case, effect_library, effects_file, report, report_checks
 from diagnosis.answer import Answer, Outcome
 from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
-from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import EffectType
 from diagnosis.engine.side import MODELS
 from diagnosis.own_simulator import OwnSimulator
@@ -127,7 +116,7 @@ class Diagnose:
             if given.reference and self.machine.interface in MODELS and not given.doubts():
                 work = ReferenceDiagnosis(given, self._kinds, self.thresholds, generator)
                 return work.run(tell)
-            base = self._base(given, self._kinds, tell)
+            base = self._base(given)
             work = DiagnosisPipeline(
                 given,
                 base,
@@ -170,21 +159,11 @@ class Diagnose:
             )
         return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine), unseen)
 
-    def _base(
-        self, given: GapCase, kinds: Sequence[EffectType], tell: ProgressCallback
-    ) -> Baseline:
-        seed, device, folder = (
-            self.session.stream("base"),
-            self.session.torch_device(),
-            self.session.folder,
-        )
-
-        def refine(base: Baseline) -> Baseline:
-            tell("what the reference shows", 0.15)
-            return reference_effects.add_reference_effects(base, kinds, self.machine)
-
+    def _base(self, given: GapCase) -> Baseline:
+        seed, device = self.session.stream("base"), self.session.torch_device()
+        folder = self.session.folder
         if given.reference:
-            return baseline.fit_baseline(given, self.fit, folder / "base", seed, device, refine)
+            return baseline.fit_baseline(given, self.fit, folder / "base", seed, device)
         simulator = self.base
         if simulator is None:
             raise ConfigError(

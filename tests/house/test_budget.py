@@ -36,13 +36,13 @@ class Room:
 
 # The bound is the size at the last change of this table. It only falls, until it is the budget.
 ROOMS = (
-    Room(("brokk_rl", "tasks", "conf"), bound=14_588, budget=10_500),
-    Room(("actuators", "diagnosis", "exam"), bound=31_646, budget=16_500),
-    Room(("perception",), bound=13_240, budget=9_500),
-    Room(("deploy",), bound=8_561, budget=7_500),
+    Room(("brokk_rl", "tasks", "conf"), bound=14_583, budget=10_500),
+    Room(("actuators", "diagnosis", "exam"), bound=30_984, budget=16_500),
+    Room(("perception",), bound=13_194, budget=9_500),
+    Room(("deploy",), bound=8_554, budget=7_500),
     Room(("study",), bound=3_169, budget=1_800),
     Room(("tests",), bound=37_135, budget=25_000),
-    Room(("benchmarks",), bound=7_442, budget=2_000),
+    Room(("benchmarks",), bound=2_087, budget=2_000),
 )
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,11 @@ import torch
 from axis import driven, make_axis
 from composed import option
 
-from actuators.effects.command import DeadBand
-from actuators.effects.speed import Compliance, FlowGain
 from brokk_rl import record
-from brokk_rl.contracts.actuator import Effect
 from brokk_rl.errors import RecordingError
-from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import answer, baseline, case, effect_library, effects_file, reference_effects
+from diagnosis import answer, baseline, case, effect_library, effects_file
 from diagnosis.answer import (
     Answer,
     Estimate,
@@ -36,9 +31,7 @@ from diagnosis.answer import (
     Where,
 )
 from diagnosis.case import GapCase
-from diagnosis.pipeline import DiagnosisPipeline
 from diagnosis.request import Penalties
-from diagnosis.residuals import build_rays
 
 CPU = torch.device("cpu")
 PRICES = Penalties(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06)
@@ -52,106 +45,6 @@ def axis(machine: Machine) -> Machine:
 @pytest.fixture(scope="module")
 def reference(axis: Machine) -> list[Recording]:
     return driven(axis, {}, 3, 120.0, 1)
-
-
-def diagnosed(
-    axis: Machine, reference: Sequence[Recording], effects: dict[str, Effect], folder: Path
-) -> Answer:
-    given = GapCase(axis, reference, driven(axis, effects, 2, 100.0, 2))
-    base = baseline.fit_baseline(given, option("fit", "valve"), folder, 0, CPU)
-    thresholds, generator = load_part("thresholds"), np.random.default_rng(0)
-    excitations = {"levels": option("excitation", "levels")}
-    certainty = option("certainty", "default")
-    work = DiagnosisPipeline(
-        given,
-        base,
-        effect_library.load_effects(axis),
-        PRICES,
-        certainty,
-        thresholds,
-        excitations,
-        load_part("curve_fit"),
-        generator,
-    )
-    outcome = work.run(lambda doing, done: None)
-    outcome.save(folder)
-    return answer.read_answer(folder / answer.ANSWER_FILE)
-
-
-def test_a_speed_that_changed_is_found_on_a_single_axis_without_geometry(
-    axis: Machine, reference: list[Recording], tmp_path: Path
-) -> None:
-    found = diagnosed(axis, reference, {"flow_gain": FlowGain(joints="all", gain=0.8)}, tmp_path)
-    assert found.verdict == "effects"
-    one = found.selected[0]
-    assert {one.effect, *one.same_as} >= {"flow_gain"} and len(found.selected) == 1
-    # 0.87: the choice was learned on machines that change between two days, where 0.8 is small
-    assert one.probability > 0.8 and one.joints == ("q3",)
-    if one.effect == "flow_gain":
-        assert one.parameters["gain"]["q3"].mean == pytest.approx(0.8, abs=0.02)
-    assert found.gap and found.gap.closed and found.gap.after < 0.6 * found.gap.before
-    assert found.gap.closed.mean > 0.8
-
-
-def test_nothing_is_found_where_nothing_was_changed(
-    axis: Machine, reference: list[Recording], tmp_path: Path
-) -> None:
-    found = diagnosed(axis, reference, {}, tmp_path)
-    assert found.verdict == "none" and not found.selected
-    assert found.ranking[0].effect == "none"
-
-
-def test_what_the_reference_shows_already_is_put_around_the_simulator(
-    axis: Machine, tmp_path: Path
-) -> None:
-    soft = driven(
-        axis, {"compliance": Compliance(joints="all", ringing_s=0.3, damping=0.12)}, 3, 120.0, 4
-    )
-    kinds, fit = (
-        effect_library.load_effects(axis, ("compliance", "dead_band", "lag")),
-        option("fit", "valve"),
-    )
-    given = GapCase(axis, soft, soft[:1])
-    after = baseline.fit_baseline(
-        given,
-        fit,
-        tmp_path,
-        0,
-        CPU,
-        lambda base: reference_effects.add_reference_effects(base, kinds, axis),
-    )
-    ((kind, values),) = after.field.residuals.simulator.fixed
-    assert kind.name == "compliance" and values["ringing_s"][0, 0] == pytest.approx(0.3, abs=0.1)
-
-
-def test_an_effect_that_only_mends_a_fault_of_the_simulator_is_not_put_around_it(
-    axis: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A lag and a response that is too short compensate each other; the simulator keeps its response."""
-    (kind,) = effect_library.load_effects(axis, ("lag",))
-    rays = build_rays(kind, reference_effects.REFERENCE_SIZES)
-    slow, error = 8.0 * np.sin(np.arange(400) / 7.0), 2.0 * np.cos(np.arange(400) / 11.0)
-    change = np.array(rays[0].sizes)[:, None] * slow  # of the lag, at each size
-
-    def found_with(z: np.ndarray) -> list[Any]:
-        part: Any = SimpleNamespace(z=z[None], faults=(error - slow)[None, None])
-        responses = {"lag": [[change[None]] for _ in rays]}
-        monkeypatch.setattr(reference_effects, "simulate_trials", lambda parts, ways: responses)
-        return reference_effects._find_effects([part], {"lag": rays}, axis.joint_names)
-
-    assert not found_with(error)  # the lag and the fault explain it together only
-    assert [kind.name for kind, _ in found_with(0.6 * slow)] == ["lag"]
-
-
-@pytest.mark.slow
-def test_a_dead_band_is_not_taken_for_a_speed(
-    axis: Machine, reference: list[Recording], tmp_path: Path
-) -> None:
-    found = diagnosed(
-        axis, reference, {"dead_band": DeadBand(joints="all", extend=0.08, retract=0.08)}, tmp_path
-    )
-    assert [one.effect for one in found.selected] == ["dead_band"]
-    assert found.selected[0].parameters["extend"]["q3"].mean == pytest.approx(0.08, abs=0.02)
 
 
 @pytest.mark.parametrize(

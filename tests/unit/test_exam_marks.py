@@ -247,12 +247,12 @@ def test_published_answers_have_the_published_score(monkeypatch: pytest.MonkeyPa
     result = json.loads((RESULTS / "exam_servos.json").read_text())
     published = {row[""]: row for row in result["rows"]}
     for key, title in {
-        "top1": "one effect: the right name first",
-        "top1_equivalent": "the same, equivalents that the answer lists count too",
+        "top1": "one effect: named first",
+        "top1_equivalent": "… or a listed equivalent",
         "exact_set": "two or three effects: exact set",
         "joints": "joints right, where the effect is",
-        "false_alarms_none": "unchanged machines: given a cause or called unknown",
-        "unknown_recall": "causes outside the library: called unknown",
+        "false_alarms_none": "unchanged machines: an effect or `unknown`",
+        "unknown_recall": "causes outside the library: said unknown",
         "cover_90": "90 % intervals that hold the true size",
     }.items():
         row, (low, high) = published[title], found[key]["ci95"]

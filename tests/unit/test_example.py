@@ -94,7 +94,7 @@ def test_it_ends_where_the_task_does(example: Any, machine: Machine) -> None:
             "target_pitch_rad": torch.zeros(1),
         }
         tip = torch.tensor(tip_m, dtype=torch.float32)[None]
-        expected = bool(task.judge(tip, torch.zeros(1), start).success)
+        expected = bool(task.judge(tip, torch.zeros(1), torch.zeros(1), start).reached)
         assert (policy.find_end(target_m, q, 0.0) == "success") == expected
         outcomes.add(expected)
     assert outcomes == {True, False}

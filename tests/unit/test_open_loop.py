@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from actuators import open_loop
-from actuators.identify.scores import FreeRunScores, classify_seconds, score_regimes
+from actuators.identify.scores import FreeRunScores
 from actuators.models.lag import FirstOrderLag
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
@@ -146,35 +146,3 @@ def test_a_small_difference_that_every_run_shows_is_certain_although_intervals_o
     for row in found.against("mine", "rival", 1.0):
         assert row["reduction_percent"] == pytest.approx(5.0) and row["ci95"][1] < 0
         assert row["reduction_ci95"] == pytest.approx([5.0, 5.0])
-
-
-def test_seconds_belong_to_regimes_by_the_commands_that_act_in_them(machine: Machine) -> None:
-    """q1 at 0.5 from 2 s on, -0.9 from 4 s on, at rest from 5 s on; q3 at 0.1 from 3 s on; nothing delayed."""
-    u = np.zeros((140, 5))
-    u[40:80, 0], u[80:100, 0], u[60:, 2] = 0.5, -0.9, 0.1
-    q = np.tile(0.5 * (machine.lower + machine.upper), (140, 1))
-    q[100:, 0] = machine.upper[0]
-    # From 1.65 s on: 33 samples before.
-    cut = open_loop.cut_windows([recording(u, q, "a")], machine, 5.0, 100.0)
-    drift = np.linspace(0.05, 5.0, 100)[None, :, None] * np.array([0.1, 0.0, 0.2, 0.0, 0.0])
-    found = scores(cut, machine, model=cut.measured + drift)
-    members = {name: inside[0] for name, inside in classify_seconds(found, np.zeros(5)).items()}
-    # q1 acts from sample 40 on: seconds are samples 32-51, 52-71, 72-91, 92-111, 112-131
-    assert members["at rest"][:, 0].tolist() == [False, False, False, False, True]
-    assert members["alone"][:, 0].tolist() == [True, False, False, False, False]
-    assert members["with others"][:, 0].tolist() == [False, True, True, True, False]
-    assert members["after a reversal"][:, 0].tolist() == [False, False, True, False, False]
-    assert members["medium commands"][:, 0].tolist() == [True, True, False, False, False]
-    assert members["large commands"][:, 0].tolist() == [False, False, True, True, False]
-    assert members["near a stop"][:, 0].tolist() == [False, False, False, True, False]
-    assert members["small commands"][:, 2].tolist() == [False, True, True, True, True]
-    delayed = classify_seconds(found, np.full(5, 1.0))["alone"][0]
-    assert delayed[:, 0].tolist() == [False, True, False, False, False]
-    table = score_regimes(found, np.zeros(5))
-    for regime in ("with others", "at rest"):
-        assert table["q1"][regime]["models"]["model"]["drift_per_s"] == pytest.approx(0.1, rel=1e-5)
-    assert table["q1"]["with others"]["time"] == pytest.approx(0.6)
-    assert table["q1"]["with others"]["models"]["model"]["share"] == pytest.approx(0.6, rel=1e-5)
-    assert table["q3"]["small commands"]["models"]["model"]["drift_per_s"] == pytest.approx(
-        0.2, rel=1e-5
-    )

@@ -82,7 +82,8 @@ def test_the_controller_inserts_and_the_ending_is_counted(made: Callable) -> Non
     run(session, 380)
     state = session.read()
     assert state.successes >= 1
-    assert state.endings["success"] == state.successes
+    # A strict success bounds force and tilt too.
+    assert state.endings["success"] >= state.successes
 
 
 def test_a_reset_begins_one_episode_anew_and_is_no_ending(made: Callable) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -93,7 +94,7 @@ def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(
 
 def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None:
     for iteration in (100, 9, 20):
-        (tmp_path / f"model_{iteration}.pt").touch()
+        zipfile.ZipFile(tmp_path / f"model_{iteration}.pt", "w").close()
     assert [path.name for path in list_checkpoints(tmp_path)] == [
         "model_9.pt",
         "model_20.pt",
@@ -195,6 +196,7 @@ def test_weights_that_are_no_numbers_are_refused_by_name(
 def test_a_checkpoint_of_another_machine_names_what_differs(
     checkpoint: Path, machine: Machine
 ) -> None:
+    assert machine.tool_m is not None
     longer = replace(machine, tool_m=(replace(machine.tool_m[0], value=1.3), *machine.tool_m[1:]))
     with pytest.raises(CheckpointError, match="made for another machine: geometry differ"):
         loading(longer, checkpoint)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from composed import option
-from scipy.signal import lsim
-from servos import record_arm
+from scipy.signal import cont2discrete, lsim
 
 from brokk_rl import extensions
 from brokk_rl.machine import Machine
@@ -23,6 +23,50 @@ from diagnosis.engine.sizes import is_plain, translate
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 
 RESPONSE_S, DAMPING, DELAY_S = 0.05, 0.7, 0.06
+ARM_RESPONSE_S, ARM_DAMPING = 0.03, 0.8
+SUBSTEPS = 10
+"""Steps of the plant in a control period."""
+
+
+def record_arm(arm: Machine, seed: int, lost: float, late_s: float) -> Recording:
+    """Returns a minute and a half of ramps to and fro, followed by a loop of second order.
+
+    A frame is lost with the chance `lost`, else late by up to `late_s`; none overtakes another.
+    """
+    random = np.random.default_rng(seed)
+    count, size = 4500, (5,)
+    slopes = random.uniform(0.3, 1.2, (count // 45, 5)) * arm.period_s
+    slopes[1::2] *= -1.0
+    u = np.cumsum(np.repeat(slopes, 45, 0), 0)
+    u = np.clip(u - u.mean(0), -0.9, 0.9)
+    come_s = arm.period_s * np.arange(count) + random.uniform(0.0, 1.0, count) * late_s
+    arrives = random.random(count) >= lost
+    come_s = np.maximum.accumulate(come_s[arrives])
+    fine_s = arm.period_s / SUBSTEPS * np.arange(count * SUBSTEPS)
+    sent = u[arrives][np.maximum(np.searchsorted(come_s, fine_s, "right") - 1, 0)]
+    middle, half = (arm.upper + arm.lower) / 2, (arm.upper - arm.lower) / 2
+    loop = np.array([[0.0, 1.0], [-(ARM_RESPONSE_S**-2), -2.0 * ARM_DAMPING / ARM_RESPONSE_S]])
+    drive = np.array([[0.0], [ARM_RESPONSE_S**-2]])
+    continuous = (loop, drive, np.eye(2), 0.0 * drive)
+    discrete: Any = cont2discrete(continuous, arm.period_s / SUBSTEPS)
+    a, b = discrete[:2]
+    state, q = np.stack([middle + half * u[0], np.zeros(size)]), []
+    for k, command in enumerate(sent):
+        if k % SUBSTEPS == 0:
+            q.append(state[0].copy())
+        state = a @ state + b * (middle + half * command)
+    noise = 3e-4 * random.standard_normal((count, 5))
+    return Recording(
+        machine=arm.name,
+        joints=arm.joint_names,
+        units=tuple(joint.unit for joint in arm.joints),
+        rate_hz=1.0 / arm.period_s,
+        t_s=arm.period_s * np.arange(count),
+        u=u.astype(np.float32),
+        q=(np.array(q) + noise).astype(np.float32),
+        extra={},
+        metadata={"run": f"{seed}"},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,24 +97,29 @@ def cut_joints(recording: Recording, machine: Machine) -> Recording:
     )
 
 
+def stand_still(machine: Machine, u: np.ndarray) -> Side:
+    """Return a side whose joints stand in the middle of their travel under targets `(T, J)`."""
+    middle = 0.5 * (machine.upper + machine.lower)
+    recording = Recording(
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=tuple(joint.unit for joint in machine.joints),
+        rate_hz=1.0 / machine.period_s,
+        t_s=machine.period_s * np.arange(len(u)),
+        u=u.astype(np.float32),
+        q=np.repeat(middle[None], len(u), 0).astype(np.float32),
+    )
+    return stack_side([recording], machine)
+
+
 def simulate(machine: Machine, u: np.ndarray, **values: float) -> np.ndarray:
     """Return the path of the first joint under targets `(T,)`, half travels from the middle."""
     numbers = np.zeros(len(SERVO.numbers))
     plain = {"response_s": RESPONSE_S, "damping": DAMPING, "firmware_damping": 0.5}
     for name, value in (plain | values).items():
         numbers[SERVO.place[name]] = value
+    side = stand_still(machine, np.stack([u, np.zeros_like(u)], 1))
     middle = 0.5 * (machine.upper + machine.lower)
-    rows = np.stack([u, np.zeros_like(u)], 1).astype(np.float32)
-    recording = Recording(
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=("rad", "rad"),
-        rate_hz=1.0 / machine.period_s,
-        t_s=machine.period_s * np.arange(len(u)),
-        u=rows,
-        q=np.repeat((middle + 0.0 * machine.lower)[None], len(u), 0).astype(np.float32),
-    )
-    side: Side = stack_side([recording], machine)
     unit = 0.5 * (machine.upper - machine.lower)[0]
     return side.simulate(0, numbers)[0].astype(float) - middle[0] / unit
 
@@ -133,18 +182,7 @@ def test_weight_pulls_a_joint_from_its_target() -> None:
     known = option("machine", "brokk170")
     joints = [replace(joint, command="position") for joint in known.joints]
     machine = replace(known, joints=tuple(joints), levers=())
-    rows = np.zeros((100, machine.num_joints), dtype=np.float32)
-    middle = 0.5 * (machine.upper + machine.lower)
-    recording = Recording(
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=tuple(joint.unit for joint in machine.joints),
-        rate_hz=1.0 / machine.period_s,
-        t_s=machine.period_s * np.arange(len(rows)),
-        u=rows,
-        q=(rows + middle).astype(np.float32),
-    )
-    side = stack_side([recording], machine)
+    side = stand_still(machine, np.zeros((100, machine.num_joints)))
     joint = int(np.abs(side.load[:, 0]).argmax())
     numbers = SERVO.list_values("mean")
     for name in ("dry", "load_dry"):

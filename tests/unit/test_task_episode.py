@@ -558,8 +558,6 @@ def test_terms_of_ones_own_extend_what_the_critic_sees(machine: Machine) -> None
     pitch_rad = Kinematics(machine).pose(stage.start["q"]).pitch_rad
     assert seen.shape[1] == plain.shape[1] + 2
     torch.testing.assert_close(seen[:, -1], (pitch_rad - 1.0) / 0.5)
-    with pytest.raises(ConfigError, match=r"no mirror image.*task\.privileged"):
-        stage.process.mirror()
 
 
 def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
