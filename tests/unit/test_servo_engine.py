@@ -34,7 +34,7 @@ def record_arm(arm: Machine, seed: int, lost: float, late_s: float) -> Recording
     A frame is lost with the chance `lost`, else late by up to `late_s`; none overtakes another.
     """
     random = np.random.default_rng(seed)
-    count, size = 4500, (5,)
+    count = 4500
     slopes = random.uniform(0.3, 1.2, (count // 45, 5)) * arm.period_s
     slopes[1::2] *= -1.0
     u = np.cumsum(np.repeat(slopes, 45, 0), 0)
@@ -50,7 +50,7 @@ def record_arm(arm: Machine, seed: int, lost: float, late_s: float) -> Recording
     continuous = (loop, drive, np.eye(2), 0.0 * drive)
     discrete: Any = cont2discrete(continuous, arm.period_s / SUBSTEPS)
     a, b = discrete[:2]
-    state, q = np.stack([middle + half * u[0], np.zeros(size)]), []
+    state, q = np.stack([middle + half * u[0], np.zeros(5)]), []
     for k, command in enumerate(sent):
         if k % SUBSTEPS == 0:
             q.append(state[0].copy())
@@ -64,8 +64,6 @@ def record_arm(arm: Machine, seed: int, lost: float, late_s: float) -> Recording
         t_s=arm.period_s * np.arange(count),
         u=u.astype(np.float32),
         q=(np.array(q) + noise).astype(np.float32),
-        extra={},
-        metadata={"run": f"{seed}"},
     )
 
 
