@@ -52,14 +52,14 @@ CONDITIONS = (
     "pose within the joint limits",
     "path clear of block and ground",
 )
-"""What a start must fulfil, one condition after the other."""
+"""Conditions that a start fulfils, in the order in which they are checked."""
 CURES = (
     "task.arms, joint limits",
     "task.switch.reach_m",
     "the ranges of the target, joint limits",
     "the ranges of the target, task.arms",
 )
-"""What changes the share of each condition."""
+"""Advice for each condition that drops too many starts."""
 
 
 class DrawTally:

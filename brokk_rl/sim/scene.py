@@ -29,7 +29,7 @@ SIZE = len(COLUMNS)
 HALF_LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 0.5, 0.4, 0.75
 """Nominal block: 1.0 x 0.8 m and 0.75 m high; it goes into the ground where the rim is lower."""
 OUTER_RADIUS_M = math.hypot(HALF_LENGTH_M, HALF_WIDTH_M)
-"""Of the circle around the nominal block."""
+"""Radius of the circle around the nominal block."""
 NOMINAL_DISTANCE_M = 2.6
 """Distance of the nominal hole from the slew axis, within the task's range of 2.3 to 3.5 m."""
 HOLE_RADIUS_M = 0.05

@@ -39,6 +39,8 @@ SAME_JOINT_SHARE = 0.5
 HELD_NATS = 60.0
 """Least gain of held commands, which follow whatever is left."""
 BESIDE_STALLS_NATS = 60.0
+SHOWN_NATS = 1e3
+"""Coarse sensors and stalls that show by themselves come before all that is simulated."""
 COARSE_NATS = 30.0
 """Evidence of a coarse sensor beyond twice that of the reference."""
 STALL_NATS = 20.0
@@ -144,11 +146,12 @@ class Decider:
         outside = [one for one in rivals if one.effect in self.outside]
         library = [one for one in rivals if one.effect not in self.outside]
         groups = self._weigh_generic(joints, skip)
+        strongest = _find_strongest(groups)
         direct = []
         if coarse:
-            direct.append(EffectFinding("quantisation", tuple(coarse), 1e3))
+            direct.append(EffectFinding("quantisation", tuple(coarse), SHOWN_NATS))
         if stalled:
-            direct.append(EffectFinding("stiction", tuple(stalled), 500.0))
+            direct.append(EffectFinding("stiction", tuple(stalled), SHOWN_NATS))
         named = list(direct)
         best = library[0]
         needed = HELD_NATS if best.effect in HELD else LEAST_NATS
@@ -168,7 +171,7 @@ class Decider:
                 for one in self._list_findings(joints, table, skip)
                 if one.effect != best.effect and {one.name, best.name} != {"thermal_drift"}
             ]
-            left = self._weigh_generic(joints, skip)[1]
+            left = _find_strongest(self._weigh_generic(joints, skip))[1]
             left = max([left, *(one.nats for one in seconds if one.effect in self.outside)])
             seconds = [one for one in seconds if one.effect not in self.outside]
             if len(named) < 2 and seconds and self._is_second(best, seconds[0], named):
@@ -176,14 +179,14 @@ class Decider:
                 numbers = [joint.numbers for joint in joints]
                 field = joints[0].side
                 after = self._apply(numbers, seconds[0], field)
-                left = self._weigh_generic(after, skip)[1]
+                left = _find_strongest(self._weigh_generic(after, skip))[1]
         verdict = "none"
         earned = sum(one.nats for one in named if one not in direct)
-        hunting = self._weigh_generic(evidence.view_field(healthy), skip, "hunting")[1]
+        hunting = groups.get("hunting", 0.0)
         most = max(best.nats, 0.0)
         pump = max([one.nats for one in outside if one.effect == "pump_lag"], default=0.0)
         is_odd = outside[0].nats > most + OUTSIDE_NATS
-        is_odd |= groups[1] > most + GENERIC_NATS
+        is_odd |= strongest[1] > most + GENERIC_NATS
         is_odd |= left > LEFT_SHARE * earned + LEFT_NATS
         is_odd |= best.effect in HELD and pump > 0.5 * most
         if (is_odd and not direct) or hunting > HUNTING_FACTOR * most + HUNTING_NATS:
@@ -197,7 +200,7 @@ class Decider:
             tuple(library),
             tuple(seconds),
             outside[0] if outside else None,
-            groups,
+            strongest,
             left,
         )
 
@@ -277,20 +280,24 @@ class Decider:
         return is_new and second.nats >= max(needed, LEAST_NATS)
 
     def _weigh_generic(
-        self, joints: Sequence[FieldJoint], skip: frozenset[int], only: str = ""
-    ) -> tuple[str, float]:
-        """Return the group that earns most on all joints, and how much, nats."""
+        self, joints: Sequence[FieldJoint], skip: frozenset[int]
+    ) -> dict[str, float]:
+        """Return what each group earns on all joints, nats."""
         total: dict[str, float] = {}
         for joint in joints:
             if joint.joint in skip:
                 continue
             for name, nats in self.generic.weigh(joint).items():
                 total[name] = total.get(name, 0.0) + max(nats - JOINT_NATS, 0.0)
-        some = {name: nats for name, nats in total.items() if only in ("", name)}
-        if not some:
-            return only, 0.0
-        best = max(some, key=some.__getitem__)
-        return best, some[best]
+        return total
+
+
+def _find_strongest(groups: Mapping[str, float]) -> tuple[str, float]:
+    """Return the group that earns most, and how much, nats; nothing where no joint was asked."""
+    if not groups:
+        return "", 0.0
+    name = max(groups, key=groups.__getitem__)
+    return name, groups[name]
 
 
 def _add_up(effect: str, rows: Mapping[int, JointRow], skip: frozenset[int]) -> EffectFinding:

@@ -29,7 +29,7 @@ LONGEST_S = 0.9
 LONGEST_TARGET_S = 0.2
 """Longest delay that a course reaches, and the same of targets, which come at a higher rate."""
 SLOW_S = 0.5
-"""What changes more slowly is no held target."""
+"""Errors that change over a longer time than this come from no held target."""
 PULSE_S = 0.6
 """Time after which a servo has answered."""
 PULSE_UNITS = 0.01

@@ -343,7 +343,6 @@ def simulate_servo(
     load: wp.array[wp.float64],
     position: wp.array[wp.float64],
     middle: wp.float64,
-    time_s: wp.array[wp.float64],
     period_s: wp.float64,
     substeps: int,
     numbers: wp.array2d[wp.float64],

@@ -163,7 +163,6 @@ class Side:
                     load,
                     _send(self.q[:, joint]),
                     middle / measure_units(self.machine)[joint],
-                    time_s,
                     self.period_s,
                     self.substeps,
                     _send(numbers),

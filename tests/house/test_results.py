@@ -27,7 +27,7 @@ def benchmarks() -> Iterator[Any]:
 
 
 def test_the_page_shows_the_files(benchmarks: Any) -> None:
-    """Whether a figure is older than its code changes with each commit, so it is left out here."""
+    """The page is rendered from the results. The mark of old figures is left out: it changes with commits."""
     page = (ROOT / "docs/results.md").read_text()
     assert AGE.sub("", page) == AGE.sub("", benchmarks.render_page()), "make results"
 
