@@ -86,7 +86,7 @@ MEASUREMENTS = (
         name="levels",
         title="Levels of the task",
         conditions="The shipped policy, one that `make train` learned from nothing, and the classical controller, which is the baseline, from the same 256 "
-        "starts of each level (`direct` where it was evaluated). `flat`: the chisel ends flat and 10 kN end an episode. `gentle`: 5 kN end it. `tight`: the hole has 8.4 cm. No policy was trained for them.",
+        "starts of each level. `flat`: the chisel ends flat and 10 kN end an episode. `gentle`: 5 kN end it. `tight`: the hole has 8.4 cm. No policy was trained for them.",
         commands=(
             "brokk mode=train preset=laptop evaluation.video=false session.out={out}/own/train",
             *(
