@@ -249,7 +249,7 @@ class Decider:
         if "thermal_drift" in table:
             common = self.evidence.weigh_common("thermal_drift", joints)
             found.append(_add_up("thermal_all", common, skip))
-        if not any(joint.side is not self.evidence.field for joint in joints):
+        if all(joint.side is self.evidence.field for joint in joints):
             holds = self.holds.find(joints)
             found += [_weigh_hold(hold, self.num_joints) for hold in _choose_hold(holds)]
         return sorted(found, key=lambda one: -one.nats)

@@ -137,9 +137,8 @@ class RowEvidence:
         self.field = field
         self.bases = fit_reference(reference)
         field.ask_others([base.numbers for base in self.bases])
-        self.rows = reference.model.rows
         self.outside = reference.model.list_outside(reference.num_joints)
-        self.every = [*self.rows, *self.outside]
+        self.every = [*reference.model.rows, *self.outside]
         self.names = np.array([row.effect for row in self.every])
         joints = range(reference.num_joints)
         self.nuisances = [estimate_nuisance(reference, j, self.bases[j]) for j in joints]
