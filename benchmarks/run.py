@@ -25,27 +25,30 @@ from typing import Any
 
 from measurement import RESULTS, ROOT, Measurement, Table, hash_code, load_json, run_git
 from rooms import ROOMS
+from rooms.headlines import HEADLINES
 
 PAGE = ROOT / "docs/results.md"
+SHOWN = 1
+"""Commands of a result that the page shows; its file holds them all."""
 HEAD = """# Results
 
 <!-- rendered by `python benchmarks/run.py page`; edit benchmarks/rooms instead -->
 
-This page holds the figures of the project. Each table says what was simulated, the baseline, the
-commands, the machine and the commit. All machines are simulated, but for the logs that are said to be
-real. *Older than its code* means that files which the figure depends on have changed since it was
-measured. Then today's code may give another figure. The file of a figure names this code.
+Each table says what was simulated, the baseline, the commands, the machine and the commit. All machines are
+simulated, but for the logs that are said to be real. *Older* means that code which the figure depends on has
+changed since, so that today's may give another figure. The file of a result names this code.
 
 * **Strict success:** the tip is 0.10 m or more below the rim, inside the hole with 1 cm of clearance, tilted
   by 0.11 rad at most, and no contact force of the episode was above 10 kN.
-* **Inserted:** the same without force and tilt. Tables of policies from before commit 1b306612 have no such
-  column: their strict success is what is called inserted today.
+* **Inserted:** the same without force and tilt. Older tables without this column call it strict success.
 * **Paper's criterion:** the weaker criterion of the paper, shown beside it.
-* **Plant:** a simulated machine on which a policy is judged. `mlp` is the network through which policies
-  are trained, `hydraulic` the plant to which it was fitted. Nothing was fitted to `load_sensing`,
-  `post_compensated` and `open_center`.
+* **Plant:** a simulated machine that judges a policy. `mlp` is the network through which policies are
+  trained, `hydraulic` the plant to which it was fitted; nothing was fitted to the others.
 
-`python benchmarks/run.py list` names the measurements, and `measure <name>` makes one again.
+## README's figures
+
+`python benchmarks/run.py measure <name>` makes one again, with the commands below.
+
 """
 
 
@@ -94,9 +97,28 @@ def describe_machine() -> str:
     return f"{torch.cuda.get_device_name()}, {text}" if torch.cuda.is_available() else text
 
 
+def render_headlines() -> str:
+    """Return the table of README's figures, with what each rests on."""
+    table: Table = []
+    for one in HEADLINES:
+        result = load_json(RESULTS / f"{one.result}.json")
+        row = {"claim": one.claim, "figure": one.read(result["rows"])}
+        row["baseline"] = one.baseline(result["rows"])
+        row["name"] = f"[{one.result}](../benchmarks/results/{one.result}.json)"
+        row["commit"] = result["commit"]
+        row["code"] = "today's" if is_current(result) else "older"
+        table.append(row)
+    return render_table(table) + "\n"
+
+
+def is_current(result: dict[str, Any]) -> bool:
+    """Return whether the code that a result depends on has not changed since."""
+    return hash_code(result["code"]) == result["code_sha256"]
+
+
 def render_page() -> str:
     """Return the page of all results."""
-    parts = [HEAD]
+    parts = [HEAD + render_headlines()]
     for room, measurements in ROOMS.items():
         present = [one for one in measurements if (RESULTS / f"{one.name}.json").exists()]
         if present:
@@ -108,9 +130,10 @@ def render_page() -> str:
 
 def render_result(one: Measurement, result: dict[str, Any]) -> str:
     """Return heading, conditions, table and origin of one result."""
-    commands = "\n".join(result["commands"]).replace("{out}", "<out>")
-    is_current = hash_code(result["code"]) == result["code_sha256"]
-    age = "Today's code." if is_current else "**Older than its code.**"
+    shown = [command.replace("{out}", "<out>") for command in result["commands"][:SHOWN]]
+    if len(result["commands"]) > SHOWN:
+        shown.append(f"# {len(result['commands']) - SHOWN} more: in the file")
+    age = "Today's code." if is_current(result) else "**Older than its code.**"
     origin = f"{result['machine']}; commit {result['commit']}, {result['date']}"
     lines = [
         f"### {one.title}",
@@ -121,7 +144,9 @@ def render_result(one: Measurement, result: dict[str, Any]) -> str:
         "",
         f"{origin}. {age} [File](../benchmarks/results/{one.name}.json).",
         "",
-        f"```\n{commands}\n```",
+        "```",
+        *shown,
+        "```",
         "",
     ]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Measurements of the diagnosis and of the deployment doctor."""
+"""Measurements of the diagnosis."""
 
 from __future__ import annotations
 
@@ -47,17 +47,6 @@ def read_marks(folder: Path) -> Table:
     return rows
 
 
-def read_doctor(folder: Path) -> Table:
-    """Return what a blind exam of the doctor came to."""
-    score = load_json(folder / "score.json")
-    rows: Table = []
-    for name in ("faults", "verdicts", "false_alarms"):
-        rows.append({"": name, **score[name]})
-    for name, one in score["by_kind"].items():
-        rows.append({"": f"faults of kind {name}", **one})
-    return rows
-
-
 def list_exam_commands(words: str) -> tuple[str, ...]:
     """Return the commands that make an exam, answer it and open its labels."""
     return (
@@ -89,20 +78,5 @@ MEASUREMENTS = (
         read=read_marks,
         where="two cores",
         minutes=300,
-    ),
-    Measurement(
-        name="doctor",
-        title="Blind exam of the deployment doctor",
-        conditions="120 logs with a mistake in the deployed loop, the machine or the task, and 20 without one. Three policies; a third of the logs holds "
-        "commands only. The third of three exams; in the others 114 and 113 of 120 faults were named, with 0 of 20 false alarms. The faults are the project's own. The program of the exam is in that commit only.",
-        commands=(
-            "python benchmarks/doctor/blind_exam.py make {out} --seed 3",
-            "python benchmarks/doctor/blind_exam.py answer {out}",
-            "python benchmarks/doctor/blind_exam.py score {out} {out}/score.json",
-        ),
-        code=("diagnosis/deployment",),
-        read=read_doctor,
-        where="commit cc7613e5, which holds the program and its policies",
-        minutes=60,
     ),
 )

@@ -1,4 +1,4 @@
-"""Measurements of speed, and of the code that a training runs."""
+"""Measurements of speed."""
 
 from __future__ import annotations
 
@@ -40,23 +40,6 @@ def read_scaling(folder: Path) -> Table:
     return rows
 
 
-def read_success(folder: Path) -> Table:
-    """Return the seconds until the levels of success, a row for each seed."""
-    rows: Table = []
-    for one in load_json(folder / "sweep/sweep.json")["rows"]:
-        row = {"seed": one["seed"]}
-        for level in ("0.95", "0.99"):
-            row[f"s until {level}"] = one[f"seconds_to_{level}"] - one["first_iteration_s"]
-        rows.append({name: round(value, 1) for name, value in row.items()})
-    return rows
-
-
-def read_main_path(folder: Path) -> Table:
-    """Return how many files and functions run before the first update ends."""
-    counts = (folder / "path.txt").read_text().splitlines()[-1].split(", ")
-    return [{count.split()[1]: count.split()[0] for count in counts}]
-
-
 MEASUREMENTS = (
     Measurement(
         name="rates",
@@ -71,19 +54,6 @@ MEASUREMENTS = (
         minutes=5,
     ),
     Measurement(
-        name="seconds_to_success",
-        title="Seconds of training until success",
-        conditions="4,096 worlds, five seeds. A level is passed when so large a part of the newest 4,096 episodes of training succeeds, exploration included; "
-        "they scatter by 0.0016, so 0.99 is passed a little early. Seconds count from the second iteration, since the first one compiles for up to 10 s. The controller alone has 0.972.",
-        commands=(
-            "python benchmarks/success_sweep.py {out}/sweep --num-envs 4096 --epochs 4 --mini-batches 8 --seeds 1 2 3 4 5 --max-seconds 60 preset=gpu",
-        ),
-        code=CODE,
-        read=read_success,
-        where="one GPU of 80 GB",
-        minutes=6,
-    ),
-    Measurement(
         name="scaling",
         title="Several GPUs",
         conditions="One policy on one, two and four GPUs, 16,384 worlds on each, not fused. The baseline is one GPU.",
@@ -96,15 +66,5 @@ MEASUREMENTS = (
         read=read_scaling,
         where="four GPUs of one computer",
         minutes=10,
-    ),
-    Measurement(
-        name="main_path",
-        title="Code on the way to the first update",
-        conditions="Files and functions of the project that run from `brokk mode=train` to the end of the first PPO update.",
-        commands=("bash -c 'python benchmarks/main_path.py > {out}/path.txt'",),
-        code=("brokk_rl", "tasks", "actuators"),
-        read=read_main_path,
-        where="one core",
-        minutes=2,
     ),
 )

@@ -113,34 +113,6 @@ MEASUREMENTS = (
         minutes=6,
     ),
     Measurement(
-        name="five_seeds",
-        title="Five trainings on a GPU",
-        conditions="Five seeds, 150 s of training each, 1,024 episodes a policy, judged through the network and on the plant that PPO never used. "
-        "The baseline is the classical controller; in these runs its numbers were those from before its search.",
-        commands=(
-            "brokk -m preset=gpu session.seed=1,2,3,4,5 rl.fuse=false rl.budget.max_env_steps=null evaluation.video=false session.out={out}/seeds",
-            "brokk mode=compare compare.runs={out}/seeds session.out={out}/comparison",
-        ),
-        code=TRAINING_CODE,
-        read=read_comparison,
-        where="one GPU of 80 GB",
-        minutes=20,
-    ),
-    Measurement(
-        name="direct_policies",
-        title="Policies that command alone",
-        conditions="`experiment=direct` has no classical controller beneath it. Five seeds of 40 million control steps, 1,024 episodes each. The "
-        "baseline is the residual policy, trained as long. The last columns are other plants, which no policy met before.",
-        commands=(
-            "brokk -m preset=gpu experiment=direct session.seed=1,2,3,4,5 rl.budget.max_env_steps=40e6 evaluation.video=false session.out={out}/direct",
-            "brokk mode=compare compare.runs={out}/direct session.out={out}/comparison",
-        ),
-        code=TRAINING_CODE,
-        read=read_comparison,
-        where="one GPU of 80 GB",
-        minutes=15,
-    ),
-    Measurement(
         name="ablations",
         title="Ablations",
         conditions="Each row leaves out one choice. Five seeds of 40 million control steps, 1,024 episodes on the plant `hydraulic`, Student's 95 % "

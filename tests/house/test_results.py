@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-AGE = re.compile(r"\*\*Older than its code\.\*\*|Today's code\.")
+AGE = re.compile(r"\*\*Older than its code\.\*\*|Today's code\.|\b(today's|older)\|$", re.M)
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +26,22 @@ def benchmarks() -> Iterator[Any]:
             del sys.modules[name]
 
 
-def test_the_page_shows_the_files(benchmarks: Any) -> None:
+def test_the_page_shows_the_files(benchmarks: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The page is rendered from the results. The mark of old figures is left out: it changes with commits."""
     page = (ROOT / "docs/results.md").read_text()
+    monkeypatch.setattr(benchmarks, "is_current", lambda result: True)
     assert AGE.sub("", page) == AGE.sub("", benchmarks.render_page()), "make results"
+
+
+def test_readme_shows_the_figures_of_the_files(benchmarks: Any) -> None:
+    """Each row of README links to a result; its strict figures and baselines stand in that file."""
+    readme = (ROOT / "README.md").read_text()
+    for one in benchmarks.HEADLINES:
+        anchor = re.sub(r"[^\w -]", "", benchmarks.list_measurements()[one.result].title.lower())
+        (line,) = [row for row in readme.splitlines() if f"#{anchor.replace(' ', '-')})" in row]
+        rows = json.loads((ROOT / f"benchmarks/results/{one.result}.json").read_text())["rows"]
+        figures = [one.read(rows), *re.findall(r"[\d.]+ %", one.baseline(rows))]
+        assert [figure for figure in figures if figure not in line] == [], one.claim
 
 
 def test_each_result_says_what_it_rests_on(benchmarks: Any) -> None:

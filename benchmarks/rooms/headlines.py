@@ -1,0 +1,142 @@
+"""The figures of README's table, each with its baseline, read from the results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from measurement import Table
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Headline:
+    """A figure of README.
+
+    Attributes:
+        claim: What it is a figure of.
+        result: Name of the measurement that it is read from.
+        read: Returns the figure as README writes it.
+        baseline: Returns the figure of the baseline, or says in words what it would be.
+    """
+
+    claim: str
+    result: str
+    read: Callable[[Table], str]
+    baseline: Callable[[Table], str]
+
+
+def find_row(rows: Table, **cells: Any) -> Row:
+    """Return the one row with these cells."""
+    (row,) = [row for row in rows if all(row[name] == cell for name, cell in cells.items())]
+    return row
+
+
+def read_policy(column: str, **cells: Any) -> Callable[[Table], str]:
+    """Return a reader of a share of episodes, in percent."""
+    return lambda rows: f"{100 * find_row(rows, **cells)[column]:.1f} %"
+
+
+def read_count(meaning: str) -> Callable[[Table], str]:
+    """Return a reader of a rate of an exam as a count of cases."""
+
+    def read(rows: Table) -> str:
+        row = find_row(rows, **{"": meaning})
+        return f"{round(row['reached'] * row['of'])} of {row['of']}"
+
+    return read
+
+
+def read_range(model: str) -> Callable[[Table], str]:
+    """Return a reader of the smallest and largest error of a model over the joints."""
+
+    def read(rows: Table) -> str:
+        errors = [cell for name, cell in find_row(rows, model=model).items() if name != "model"]
+        return f"{min(errors):.1f} to {max(errors):.1f} %"
+
+    return read
+
+
+def read_holes(distance_m: float) -> Callable[[Table], str]:
+    """Return a reader of recall and error at one distance, over all conditions."""
+
+    def read(rows: Table) -> str:
+        row = find_row(rows, condition="all", **{"distance, m": distance_m})
+        within = f"{row['position, mm, 95 %']:.1f} mm"
+        return f"{100 * row['found']:.0f} % at {distance_m:.0f} m within {within}"
+
+    return read
+
+
+def read_death(rows: Table) -> str:
+    """Return the worst time without flow after a process has died or stands still."""
+    deaths = [row for row in rows if "SIG" in row["event"]]
+    return f"{max(row['flow_worst_ms'] for row in deaths):.0f} ms"
+
+
+def read_rate(column: str) -> Callable[[Table], str]:
+    """Return a reader of a rate with 16,384 worlds."""
+    return lambda rows: f"{find_row(rows, worlds=16384)[column]:.1f} million"
+
+
+def say(words: str) -> Callable[[Table], str]:
+    """Return a reader of a baseline that needs no measurement."""
+    return lambda rows: words
+
+
+STRICT, INSERTED = "strict success", "inserted"
+ONE, SETS = "one effect: named first", "two or three effects: exact set"
+NONE = "unchanged machines: an effect or `unknown`"
+NO_FINDER, NO_GUARD = say("none was run"), say("the last command stays in force")
+HEADLINES = (
+    *(
+        Headline(
+            f"shipped policy, {column}, plant `{plant}`",
+            "shipped_policy",
+            read_policy(column, plant=plant, policy="trained"),
+            read_policy(column, plant=plant, policy="classical"),
+        )
+        for plant, column in (("mlp", STRICT), ("hydraulic", STRICT), ("mlp", INSERTED))
+    ),
+    *(
+        Headline(
+            f"`make train`, {column}",
+            "short_training",
+            read_policy(column, policy="trained"),
+            read_policy(column, policy="classical"),
+        )
+        for column in (STRICT, INSERTED)
+    ),
+    Headline("error after 5 s, joints", "real_excavator", read_range("mlp"), read_range("arx")),
+    *(
+        Headline(f"{exam}: {meaning}", result, read_count(meaning), say(baseline))
+        for exam, result, singles in (
+            ("valves", "exam_valves", "about 5 of 105"),
+            ("servos", "exam_servos", "about 4 of 35"),
+        )
+        for meaning, baseline in (
+            (ONE, singles),
+            (SETS, "0, one name always"),
+            (NONE, "none or all"),
+        )
+    ),
+    *(
+        Headline(f"holes, {distance_m:.0f} m", "holes", read_holes(distance_m), NO_FINDER)
+        for distance_m in (1.0, 4.0)
+    ),
+    Headline("no flow after a process died", "reactions", read_death, NO_GUARD),
+    Headline(
+        "no flow after e-stop",
+        "reactions",
+        lambda rows: f"{find_row(rows, event='estop')['flow_worst_ms']} ms",
+        NO_GUARD,
+    ),
+    Headline(
+        "training, control steps a second",
+        "rates",
+        read_rate("training, 1e6 control steps/s"),
+        read_rate("whole control step, 1e6/s"),
+    ),
+)
