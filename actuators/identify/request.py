@@ -9,6 +9,7 @@ from typing import Annotated
 
 from annotated_types import Ge
 
+from brokk_rl import record
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import Count, Positive, spec
 
@@ -40,3 +41,6 @@ class Identification:
     def check(self) -> None:
         if self.folds is not None and self.test is not None:
             raise ConfigError("folds: folds and test are two ways of judging; give one of them")
+        for patterns in (self.recordings, self.test):
+            if patterns is not None:
+                record.find_files(patterns, "recording")

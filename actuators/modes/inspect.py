@@ -50,6 +50,9 @@ class InspectionRequest:
     recordings: str | tuple[str, ...]
     pictures: Index
 
+    def check(self) -> None:
+        record.find_files(self.recordings, "recording")  # refused before the preview loads torch
+
 
 @dataclass(frozen=True)
 class InspectedFile:
