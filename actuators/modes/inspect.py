@@ -4,8 +4,6 @@ import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +11,8 @@ import numpy as np
 
 from actuators.identify import dead_time
 from actuators.recordings import inspection_picture, preview_report
-from actuators.recordings.inspection import (
-    FINDINGS,
-    Inspection,
-    InspectionThresholds,
-    inspect_recording,
-)
+from actuators.recordings.finding_kinds import FINDINGS
+from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
 from actuators.recordings.preview import EffectPreview, PreviewResult
 from actuators.recordings.recording_checks import find_targets
 from brokk_rl import record
@@ -44,7 +38,7 @@ class InspectionRequest:
     Attributes:
         recordings: Glob, or list of globs, of recordings.
         pictures: One picture a recording up to so many recordings, beyond that those with the most
-            findings; an overview always.
+            findings.
     """
 
     recordings: str | tuple[str, ...]
@@ -113,7 +107,7 @@ class Inspect:
             "machine": self.machine.name,
             "delay_s": self._delays(sound),
             "joints": self._overall(inspected),
-            "remarks": [*_list_resampled(inspected), *_check_clocks(inspected)],
+            "remarks": _list_resampled(inspected),
             "recordings": [one.plain() for one in inspected],
         }
         preview = None
@@ -122,9 +116,7 @@ class Inspect:
         if preview:
             result["preview"] = preview.plain()
         write_json(folder / "inspection.json", result)
-        pictures = {"overview": folder / "overview.png"}
-        rows = {one.path.stem: _make_overview_row(one) for one in inspected}
-        inspection_picture.draw_overview(pictures["overview"], rows)
+        pictures: dict[str, Path] = {}
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
             if one.recording and one.inspection:
                 path = folder / f"{one.path.stem}.png"
@@ -208,15 +200,16 @@ class Inspect:
         return head, rows
 
     def _counts(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-        """Return heading and cells of the table of findings by joint."""
+        """Return heading and cells of the table of findings: a row a kind that occurs, a column a joint."""
         counts = Counter(
             (f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"]
         )
         names = [*self.machine.joint_names, None]
-        return ["joint", *FINDINGS], [
-            [name or "all at once", *(str(counts[name, kind] or "–") for kind in FINDINGS)]
-            for name in names
-        ]
+        rows = []
+        for kind in FINDINGS:
+            if any(counts[name, kind] for name in names):
+                rows.append([kind, *(str(counts[name, kind] or "–") for name in names)])
+        return ["finding", *self.machine.joint_names, "all at once"], rows
 
     def _show(self, result: dict[str, Any], inspected: Sequence[InspectedFile]) -> None:
         tables = {
@@ -261,15 +254,17 @@ class Inspect:
         if preview:
             self._add_preview(page, preview)
         page.add_heading("Findings")
-        page.add_table(*self._counts(result))
-        page.add_list([f"{name}: {kind.meaning}" for name, kind in FINDINGS.items()])
+        head, rows = self._counts(result)
+        page.add_table(head, rows)
+        page.add_list([f"{kind}: {FINDINGS[kind].meaning}" for kind, *_ in rows])
         page.add_heading("Recordings")
         page.add_table(FILES, [_format_file_row(one) for one in inspected])
         if result["remarks"]:
             page.add_list(result["remarks"])
         for name, path in pictures.items():
-            lines = "" if name == "overview" else ", breaches of the format are vertical lines"
-            page.add_picture(path, f"{name}: findings are shaded{lines}")
+            page.add_picture(
+                path, f"{name}: findings are shaded, breaches of the format are vertical lines"
+            )
         for one in inspected:
             if one.num_remarks:
                 page.add_heading(one.path.name, 3)
@@ -323,41 +318,6 @@ def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
         if rate:
             resampled.append(f"run {run}: resampled from {rate}")
     return resampled
-
-
-def _check_clocks(inspected: Sequence[InspectedFile]) -> list[str]:
-    """Return remarks on start times that contradict the parts of a run."""
-    remarks, parts, num_without = [], dict[str, list[tuple[datetime, InspectedFile]]](), 0
-    for one in inspected:
-        if one.recording is None:
-            continue
-        try:
-            begin = datetime.fromisoformat(one.recording.metadata["created"])
-        except (KeyError, ValueError):
-            num_without += "created" not in one.recording.metadata
-            continue
-        parts.setdefault(one.recording.run, []).append((begin, one))
-    if num_without:
-        remarks.append(
-            f"{num_without} recordings do not say when they began (brokk.created): no warm-up can be read across files"
-        )
-    for run, members in parts.items():
-        ordered = sorted(members, key=lambda member: member[0].timestamp())
-        for (begin, one), (following, other) in pairwise(ordered):
-            assert one.recording is not None
-            overlap_s = one.recording.duration_s - (following - begin).total_seconds()
-            if overlap_s > 1.0:
-                remarks.append(
-                    f"run {run}: {other.path.name} begins {overlap_s:.1f} s before {one.path.name} ends; look at the clock"
-                )
-    return remarks
-
-
-def _make_overview_row(one: InspectedFile) -> inspection_picture.OverviewRow:
-    duration_s = one.recording.duration_s if one.recording else 0.0
-    return inspection_picture.OverviewRow(
-        duration_s, one.inspection.findings if one.inspection else [], len(one.breaches)
-    )
 
 
 def _format_file_row(one: InspectedFile) -> list[str]:

@@ -6,7 +6,7 @@ Axes: `T` time, `J` joints. Recordings may be broken: missing values are NaN and
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge
@@ -17,72 +17,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
 from brokk_rl.spec import Share, spec
 
-Severity = Literal["note", "warn", "bad"]
-
-
-@dataclass(frozen=True)
-class FindingKind:
-    """Severity, meaning and remedy of a kind of finding.
-
-    Attributes:
-        severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`: good to know.
-        meaning: Possible causes.
-        advice: The remedy.
-    """
-
-    severity: Severity
-    meaning: str
-    advice: str
-
-
-FINDINGS = {
-    "command without motion": FindingKind(
-        "warn",
-        "a dead band wider than expected, an interlock or dead-man that is not logged, or a load too heavy",
-        "log the interlocks; leave these stretches out if the machine was not allowed to move",
-    ),
-    "does not obey": FindingKind(
-        "bad",
-        "the joint stays away from its target: its drive is off or blocked, or too weak for the load",
-        "leave these stretches out, or log the enable signal and use the parts in which the drive is on",
-    ),
-    "jumps": FindingKind(
-        "bad",
-        "the position steps by more than a machine moves: an angle or a counter that wraps, a sign bit, a reset, or two sources",
-        "import again with log.wraps, or leave the other source out; no model can follow these steps",
-    ),
-    "motion without command": FindingKind(
-        "warn",
-        "the load sinks (a leak), or the joint was moved by something that is not logged",
-        "log every input; a slow sinking towards the load is the effect 'creep'",
-    ),
-    "unlogged input": FindingKind(
-        "bad",
-        "the joint moves at a working speed without command: something moves it that is not logged",
-        "log every input that moves the machine: levers, a second operator, automatic functions",
-    ),
-    "frozen sensor": FindingKind(
-        "warn",
-        "equal samples, then a jump, or equal samples of a sensor with noise: it did not measure",
-        "check sensor and cable; the motion is real",
-    ),
-    "lost frames": FindingKind(
-        "note",
-        "all joints repeat the row before while one of them moves: positions were lost on their way",
-        "record frame counters; small rates are the effect 'frame_loss' or a slow sensor",
-    ),
-    "beyond limit": FindingKind(
-        "warn",
-        "measured beyond the limits of the machine's file",
-        "measure the end stops; correct the machine's file",
-    ),
-    "exclusive joint": FindingKind(
-        "bad",
-        "an exclusive joint is commanded together with others, which the machine forbids: one of both is not carried out",
-        "record what was really sent",
-    ),
-}
-"""Findings in single recordings."""
 FAST_SHARE = 0.2
 """Speed, of full speed, from which motion without command is no sinking load but an input that is
 not logged. The effect `creep` sinks at a few percent; chosen by hand."""
@@ -110,6 +44,15 @@ LEAST_ROWS = 5
 """Least number of rows of a stretch: a slow log has one in seconds."""
 LONGEST_LAG_S = 1.5
 """Time within which a joint answers its target: more than twice the 0.55 s of the slowest machine known."""
+MAX_IRREGULAR_SHARE = 0.05
+"""Share of periods further than 10 % from the median from which a clock is irregular; chosen by hand."""
+JUMP_PERIODS = 1.15
+"""Period over the median that counts as a jump; the format of recordings refuses 1.2."""
+MAX_CLOCK_PPM = 2000.0
+"""Largest deviation of the clock's rate from the stated one, ppm; chosen by hand: loggers are off by 10 to 4000."""
+MIN_SATURATED_ROWS = 10
+"""Least number of rows at the extreme of a sensor, away from the stops, that count as saturation; chosen by
+hand: half a second at 20 Hz."""
 
 
 @spec
@@ -241,24 +184,16 @@ class _RecordingScan:
 
     def timing(self) -> dict[str, float | None]:
         """Return duration, rate and jitter."""
-        period_s = np.diff(self._t_s)
-        period_s = period_s[np.isfinite(period_s)]
-        if not len(period_s):
-            return {
-                "duration_s": 0.0,
-                "rate_hz": None,
-                "stated_rate_hz": 1.0 / self._period_s,
-                "jitter_s": None,
-                "longest_s": None,
-            }
-        median_s = float(np.median(period_s))
-        return {
-            "duration_s": _to_json_number(np.nanmax(self._t_s) - np.nanmin(self._t_s)),
-            "rate_hz": 1.0 / median_s if median_s > 0 else None,
+        periods_s = np.diff(self._t_s)
+        median_s = np.nanmedian(periods_s)
+        figures = {
+            "duration_s": np.nanmax(self._t_s) - np.nanmin(self._t_s),
+            "rate_hz": 1.0 / median_s if median_s > 0 else np.nan,
             "stated_rate_hz": 1.0 / self._period_s,
-            "jitter_s": _to_json_number(np.percentile(np.abs(period_s - median_s), 95)),
-            "longest_s": _to_json_number(period_s.max()),
+            "jitter_s": np.nanpercentile(np.abs(periods_s - median_s), 95),
+            "longest_s": np.nanmax(periods_s),
         }
+        return {name: _to_json_number(value) for name, value in figures.items()}
 
     def joints(self) -> dict[str, dict[str, float | None]]:
         """Return the figures of each joint."""
@@ -268,26 +203,29 @@ class _RecordingScan:
             self._q > self._machine.upper - margin
         )
         for j, name in enumerate(self._machine.joint_names):
-            found[name] = {
-                "lowest": _to_json_number(np.nanmin(self._q[:, j])),
-                "highest": _to_json_number(np.nanmax(self._q[:, j])),
-                "commanded": _to_json_number(np.mean(size[:, j] > self._limits.commanded)),
-                "full_command": _to_json_number(np.mean(size[:, j] > 0.99)),
-                "moving": _to_json_number(np.mean(self._is_moving[:, j])),
-                "at_limit": _to_json_number(np.mean(at_limit[:, j])),
-                "fastest": _to_json_number(np.nanquantile(np.abs(self._v[:, j]), 0.99)),
-                "noise": _to_json_number(self._noise[j]),
-                "step": _to_json_number(self._step[j]),
+            figures = {
+                "lowest": np.nanmin(self._q[:, j]),
+                "highest": np.nanmax(self._q[:, j]),
+                "commanded": np.mean(size[:, j] > self._limits.commanded),
+                "full_command": np.mean(size[:, j] > 0.99),
+                "moving": np.mean(self._is_moving[:, j]),
+                "at_limit": np.mean(at_limit[:, j]),
+                "fastest": np.nanquantile(np.abs(self._v[:, j]), 0.99),
+                "noise": self._noise[j],
+                "step": self._step[j],
             }
+            found[name] = {key: _to_json_number(value) for key, value in figures.items()}
         return found
 
     def find_all(self) -> Iterator[RecordingFinding]:
         """Yield all findings, kind by kind."""
+        yield from self._find_clock_faults()
         for j, joint in enumerate(self._machine.joints):
             yield from self._find_ignored_commands(j, joint.name)
             yield from self._find_jumps(j, joint.name, joint.unit)
             yield from self._find_uncommanded_motion(j, joint.name, joint.unit)
             yield from self._find_frozen(j, joint.name, joint.unit)
+            yield from self._find_saturation(j, joint.name, joint.unit)
             over = np.fmax(self._q[:, j] - joint.upper.value, joint.lower.value - self._q[:, j])
             for row, count in find_stretches(over > self._visible[j]):
                 text = (
@@ -394,6 +332,45 @@ class _RecordingScan:
             elif is_noisy and count + 1 >= self._limits.equal_rows:
                 text = f"{count + 1} equal samples of a sensor with noise"
                 yield self._finding("frozen sensor", name, row - 1, count + 1, text)
+
+    def _find_saturation(self, j: int, name: str, unit: str) -> Iterator[RecordingFinding]:
+        """Yield rows at the extreme of a sensor while the joint is driven further, away from its stops."""
+        q, margin = self._q[:, j], self._limits.at_limit * self._travel[j]
+        acting = np.roll(self._u[:, j], round(self._machine.dead_time_s / self._period_s))
+        if not np.ptp(q) > margin:
+            return
+        for extreme, outward in ((q.max(), 1.0), (q.min(), -1.0)):
+            stop = self._machine.upper[j] if outward > 0 else self._machine.lower[j]
+            if abs(stop - extreme) < margin:
+                continue
+            is_driven = outward * acting > self._limits.driving
+            for row, count in find_stretches((q == extreme) & is_driven):
+                if count >= MIN_SATURATED_ROWS:
+                    text = f"{count} samples at {extreme:.4g} {unit} while driven further"
+                    yield self._finding("saturated sensor", name, row, count, text)
+
+    def _find_clock_faults(self) -> Iterator[RecordingFinding]:
+        """Yield what is wrong with the clock as a whole, or its jumps."""
+        periods_s = np.diff(self._t_s)
+        if not np.isfinite(periods_s).all():
+            return
+        median_s = float(np.median(periods_s))
+        is_odd = np.abs(periods_s / median_s - 1.0) > 0.1
+        if is_odd.mean() > MAX_IRREGULAR_SHARE:
+            low, high = 1e3 * np.percentile(periods_s, (5, 95))
+            text = (
+                f"periods of {low:.1f} to {high:.1f} ms (5 to 95 %), median {1e3 * median_s:.1f} ms"
+            )
+            yield self._finding("irregular clock", None, 0, len(self._t_s), text)
+        else:
+            for row in np.flatnonzero(periods_s > JUMP_PERIODS * median_s):
+                text = f"{1e3 * periods_s[row]:.1f} ms, median {1e3 * median_s:.1f} ms"
+                yield self._finding("clock jumps", None, int(row), 2, text)
+        mean_s = float(periods_s.mean())
+        ppm = 1e6 * (mean_s / self._period_s - 1.0)
+        if abs(ppm) > MAX_CLOCK_PPM:
+            text = f"{ppm:+.0f} ppm: {1.0 / mean_s:.3f} Hz, stated {1.0 / self._period_s:g} Hz"
+            yield self._finding("clock rate", None, 0, len(self._t_s), text)
 
     def _find_long(self, condition: np.ndarray) -> list[tuple[int, int]]:
         """Return the stretches of a condition that last long enough to be told."""

@@ -1,13 +1,13 @@
 """Pictures of recordings and their findings."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from actuators.recordings.inspection import FINDINGS, Inspection, RecordingFinding
+from actuators.recordings.finding_kinds import FINDINGS
+from actuators.recordings.inspection import Inspection
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure, save_figure
 from brokk_rl.record import Breach, Recording
@@ -15,30 +15,16 @@ from brokk_rl.record import Breach, Recording
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# distinguishable by those who see no red or green (Okabe and Ito)
+# Okabe and Ito's, which those tell apart who see no red or green, and Tol's
 HUES = (
-    "#e69f00", "#f0e442", "#000000", "#cc79a7", "#882255", "#56b4e9", "#0072b2", "#d55e00", "#009e73"
+    "#e69f00", "#f0e442", "#000000", "#cc79a7", "#882255", "#56b4e9", "#0072b2", "#d55e00", "#009e73",
+    "#999999", "#bbbbbb", "#dddddd", "#332288",
 )  # fmt: skip
 COLOURS = dict(zip(FINDINGS, HUES, strict=True))
 BREACH = "#b00020"
 THINNEST = 0.002
 """A finding is drawn at least this wide, as a part of the picture, so that a single row can be
 seen."""
-
-
-@dataclass(frozen=True)
-class OverviewRow:
-    """One recording in the overview.
-
-    Attributes:
-        duration_s: Its length.
-        findings: Its findings.
-        num_breaches: How often it breaks the format.
-    """
-
-    duration_s: float
-    findings: Sequence[RecordingFinding]
-    num_breaches: int
 
 
 def draw_recording(
@@ -90,36 +76,6 @@ def draw_recording(
         figure,
         {finding.kind for finding in inspection.findings},
         any(breach.row is not None for breach in breaches),
-    )
-    save_figure(figure, path)
-
-
-def draw_overview(path: Path, lines: Mapping[str, OverviewRow]) -> None:
-    """Draw one line a recording with its findings; writes a PNG."""
-    figure = make_figure(12, 1.2 + 0.26 * len(lines))
-    axis = figure.subplots()
-    longest_s = max((line.duration_s for line in lines.values()), default=0.0) or 1.0
-    for place, line in enumerate(lines.values()):
-        axis.barh(place, line.duration_s, height=0.7, color="0.9")
-        # Longest first, so that none hides a shorter one.
-        for finding in sorted(line.findings, key=lambda finding: -finding.duration_s):
-            width_s = max(finding.duration_s, THINNEST * longest_s)
-            axis.barh(place, width_s, left=finding.t_s, height=0.7, color=COLOURS[finding.kind])
-        if line.num_breaches:
-            text = (
-                f" breaks the format {line.num_breaches} ×"
-                if line.num_breaches > 1
-                else " breaks the format"
-            )
-            axis.text(line.duration_s, place, text, color=BREACH, va="center", fontsize=8)
-    axis.set_yticks(range(len(lines)), list(lines), fontsize=8)
-    axis.invert_yaxis()
-    axis.set_xlim(
-        0.0, longest_s * (1.25 if any(line.num_breaches for line in lines.values()) else 1.0)
-    )
-    axis.set_xlabel("time [s]")
-    _add_legend(
-        figure, {finding.kind for line in lines.values() for finding in line.findings}, False
     )
     save_figure(figure, path)
 

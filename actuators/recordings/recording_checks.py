@@ -1,9 +1,7 @@
-"""Checks of recordings before any physics: clocks, lost frames, interlocks, sensors, idle joints.
+"""Remarks on recordings: findings of one kind on one joint together, locks, and joints at rest.
 
-`inspection` finds single stretches. This module merges stretches of one kind into one
-remark a recording, and stretches that share a condition into an interlock. It adds the checks that
-need a whole recording: clock, saturation, excitation.
-Axes: `T` time, `J` joints.
+`inspection` finds stretches in single recordings. Stretches in which a joint ignores its commands under one
+condition become a lock. Axes: `T` time, `J` joints.
 """
 
 from __future__ import annotations
@@ -15,33 +13,26 @@ from typing import Any
 
 import numpy as np
 
+from actuators.recordings.finding_kinds import FINDINGS, FindingKind, Severity
 from actuators.recordings.inspection import (
-    FINDINGS,
-    FindingKind,
     InspectionThresholds,
     RecordingFinding,
-    Severity,
     inspect_recording,
 )
-from actuators.recordings.interlocks import Interlock, find_interlock
 from actuators.scales import choose_horizon_s
 from brokk_rl.commands import read_targets, view_recordings
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording, find_stretches
+from brokk_rl.record import Recording
 
-MAX_IRREGULAR_SHARE = 0.05
-"""Share of periods further than 10 % from the median from which a clock is irregular; chosen by
-hand."""
-JUMP_PERIODS = 1.15
-"""Period over the median that counts as a jump; the format of recordings refuses 1.2."""
-MAX_CLOCK_PPM = 2000.0
-"""Largest deviation of the clock's rate from the stated one, ppm; chosen by hand: loggers are off
-by 10 to 4000."""
-MIN_SATURATED_ROWS = 10
-"""Least number of consecutive samples at the extreme of a sensor, away from the stops, that count
-as saturation; chosen by hand: half a second at 20 Hz."""
 MIN_COMMANDED_RUNS = 2
 """Least time with a command, in free runs; chosen by hand."""
+MIN_STRETCHES = 5
+"""Least number of ignored stretches of a lock; chosen by hand: fewer may share a condition by coincidence."""
+MIN_AGREEMENT = 0.9
+"""A lock holds in at least this share of the ignored rows, and in at most the rest of the obeyed ones; chosen by hand."""
+NUM_POSITIONS = 15
+"""Positions of a joint that are tried as the edge of a lock; chosen by hand."""
+ORDER: tuple[Severity, ...] = ("bad", "warn", "note")
 
 
 @dataclass(frozen=True)
@@ -86,31 +77,14 @@ REMARKS = FINDINGS | {
         "the joint ignores its command whenever that condition holds: a lock that is not logged",
         "log the lock as a command of 0, or leave these stretches out",
     ),
-    "irregular clock": FindingKind(
-        "warn",
-        "rows are not equally spaced in time",
-        "stamp rows where they are measured, not where they are written",
-    ),
-    "clock jumps": FindingKind(
-        "warn", "single periods are much longer than the others", "record frame counters"
-    ),
-    "clock rate": FindingKind(
-        "note",
-        "the clock runs faster or slower than the stated rate",
-        "state the true rate, or discipline the clock",
-    ),
-    "saturated sensor": FindingKind(
-        "bad",
-        "the sensor stays at one end of its range, away from the joint's stops: it cannot say more, or a stop is nearer than known",
-        "check the sensor's range and the machine's limits",
-    ),
     "joint at rest": FindingKind(
         "note",
         "hardly commanded here: nothing can be said about this joint",
         "record runs that move it",
     ),
 }
-"""All remarks: findings in single recordings, and what only whole recordings show."""
+"""All remarks: findings in single recordings, and what only several of them show."""
+IGNORED = "command without motion"
 
 
 def examine_recordings(
@@ -121,24 +95,17 @@ def examine_recordings(
     for one, seen in zip(recordings, view_recordings(recordings, machine), strict=True):
         targets = find_targets(one, machine)
         inspected.append((seen, inspect_recording(seen, machine, thresholds, targets).findings))
-    recordings = [recording for recording, _ in inspected]
-    remarks: list[RecordingRemark] = []
-    locked = set()
+    locks = {}
     for j, name in enumerate(machine.joint_names):
-        lock = find_interlock(inspected, machine, j, thresholds)
-        if lock is not None:
-            locked.add(name)
-            remarks += _report_interlock(lock, recordings)
+        if text := _find_lock(inspected, machine, j, thresholds):
+            locks[name] = text
+    remarks: list[RecordingRemark] = []
     for recording, findings in inspected:
-        left = [f for f in findings if f.kind != "command without motion" or f.joint not in locked]
-        remarks += _group_findings(recording, left, machine)
-        remarks += _check_clock(recording)
-        remarks += _check_saturation(recording, machine, thresholds)
-    remarks += _check_excitation(recordings, machine, thresholds)
-    order = ("bad", "warn", "note")
+        remarks += _group_findings(recording, findings, machine, locks)
+    remarks += _check_excitation([seen for seen, _ in inspected], machine, thresholds)
     return sorted(
         remarks,
-        key=lambda one: (order.index(one.severity), one.name, one.joint or "", one.recording),
+        key=lambda one: (ORDER.index(one.severity), one.name, one.joint or "", one.recording),
     )
 
 
@@ -157,22 +124,23 @@ def name_recording(recording: Recording) -> str:
 def _make_remark(
     name: str,
     joint: str | None,
-    recording: Recording | str,
-    span_s: tuple[float | np.ndarray, float | np.ndarray],
+    where: str,
+    span_s: tuple[float, float],
     count: int,
     amount: str,
     share: float = 0.0,
 ) -> RecordingRemark:
     kind = REMARKS[name]
-    where = recording if isinstance(recording, str) else name_recording(recording)
-    begin_s, end_s = map(float, span_s)
     return RecordingRemark(
-        name, kind.severity, joint, where, begin_s, end_s, count, amount, kind.meaning, kind.advice, share
-    )  # fmt: skip
+        name, kind.severity, joint, where, *span_s, count, amount, kind.meaning, kind.advice, share
+    )
 
 
 def _group_findings(
-    recording: Recording, findings: Sequence[RecordingFinding], machine: Machine
+    recording: Recording,
+    findings: Sequence[RecordingFinding],
+    machine: Machine,
+    locks: dict[str, str],
 ) -> Iterator[RecordingRemark]:
     """Yield one remark for all stretches of one kind and joint."""
 
@@ -186,76 +154,76 @@ def _group_findings(
         if name == "jumps":  # each spoils the free run that it lies in
             part = min(1.0, len(some) * choose_horizon_s(machine) / max(recording.duration_s, 1e-9))
         text = f"{some[0].text}; {seconds:.1f} s in all, {100 * part:.1f} % of the recording"
+        if name == IGNORED and joint in locks:
+            name, text = "interlock", locks[joint]
         span_s = some[0].t_s, some[-1].t_s + some[-1].duration_s
-        yield _make_remark(name, joint or None, recording, span_s, len(some), text, part)
+        where = name_recording(recording)
+        yield _make_remark(name, joint or None, where, span_s, len(some), text, part)
 
 
-def _report_interlock(
-    lock: Interlock, recordings: Sequence[Recording]
-) -> Iterator[RecordingRemark]:
-    for number, recording in enumerate(recordings):
-        rows = lock.rows[number]
-        if len(rows):
-            span_s = recording.t_s[rows[0]], recording.t_s[rows[-1]]
-            share = len(rows) / recording.num_samples
-            yield _make_remark(
-                "interlock",
-                lock.joint,
-                recording,
-                span_s,
-                lock.num_stretches[number],
-                lock.text,
-                share,
-            )
-
-
-def _check_clock(recording: Recording) -> Iterator[RecordingRemark]:
-    t_s, period_s = recording.t_s, np.diff(recording.t_s)
-    median_s = float(np.median(period_s))
-    is_odd = np.abs(period_s / median_s - 1.0) > 0.1
-    late = np.flatnonzero(period_s > JUMP_PERIODS * median_s)
-    if is_odd.mean() > MAX_IRREGULAR_SHARE:
-        low, high = np.percentile(period_s, (5, 95)) * 1e3
-        text = f"periods of {low:.1f} to {high:.1f} ms (5 to 95 %), median {median_s * 1e3:.1f} ms"
-        span_s = t_s[0], t_s[-1]
-        yield _make_remark("irregular clock", None, recording, span_s, int(is_odd.sum()), text)
-    elif len(late):
-        text = f"up to {period_s.max() * 1e3:.1f} ms, median {median_s * 1e3:.1f} ms"
-        span_s = t_s[late[0]], t_s[late[-1] + 1]
-        yield _make_remark("clock jumps", None, recording, span_s, len(late), text)
-    mean_s = (t_s[-1] - t_s[0]) / len(period_s)
-    ppm = 1e6 * (mean_s * recording.rate_hz - 1.0)
-    if abs(ppm) > MAX_CLOCK_PPM:
-        text = f"{ppm:+.0f} ppm: {1.0 / mean_s:.3f} Hz, stated {recording.rate_hz:g} Hz"
-        yield _make_remark("clock rate", None, recording, (t_s[0], t_s[-1]), 1, text)
-
-
-def _check_saturation(
-    recording: Recording, machine: Machine, thresholds: InspectionThresholds
-) -> Iterator[RecordingRemark]:
-    margin, back = (
-        thresholds.at_limit * (machine.upper - machine.lower),
-        round(machine.dead_time_s * recording.rate_hz),
+def _find_lock(
+    inspected: Sequence[tuple[Recording, Sequence[RecordingFinding]]],
+    machine: Machine,
+    joint: int,
+    thresholds: InspectionThresholds,
+) -> str | None:
+    """Return the condition that separates ignored commands of a joint from obeyed ones, as text, or `None`."""
+    name = machine.joint_names[joint]
+    lead = round((machine.dead_time_s + thresholds.settle_s) / machine.period_s)
+    ignored, obeyed, count = [], [], 0
+    for recording, findings in inspected:
+        is_ignored = np.zeros(recording.num_samples, dtype=bool)
+        near = np.zeros(recording.num_samples, dtype=bool)
+        for finding in findings:
+            if finding.kind == IGNORED and finding.joint == name:
+                count += 1
+                end = finding.row + finding.num_rows
+                is_ignored[finding.row : end] = True
+                near[max(0, finding.row - lead) : end + lead] = True
+        is_driven = np.abs(recording.u[:, joint]) > thresholds.driving
+        speed = np.gradient(recording.q[:, joint].astype(float)) * recording.rate_hz
+        is_moving = np.abs(speed) > 2.0 * thresholds.still * machine.max_speed[joint]
+        ignored.append(is_ignored)
+        obeyed.append(is_driven & is_moving & ~near)
+    if count < MIN_STRETCHES:
+        return None
+    ignores, obeys = np.concatenate(ignored), np.concatenate(obeyed)
+    if not obeys.any():
+        return f"{name} ignores every command"
+    u = np.concatenate([recording.u for recording, _ in inspected])
+    q = np.concatenate([recording.q for recording, _ in inspected])
+    best = (0.0, 1.0, "")
+    for text, condition in _list_conditions(u, q, machine, joint, thresholds):
+        # a lock may stop the motion itself, or the command on its way
+        for delay in (0, round(machine.dead_time_s / machine.period_s)):
+            holds = np.roll(condition, delay)
+            found = float(holds[ignores].mean()), float(holds[obeys].mean()), text
+            best = max(best, found, key=lambda one: one[0] - one[1])
+    if best[0] < MIN_AGREEMENT or best[1] > 1.0 - MIN_AGREEMENT:
+        return None
+    return (
+        f"{name} ignores its command when {best[2]}: so in {100 * best[0]:.0f} % of the ignored and "
+        f"{100 * best[1]:.0f} % of the obeyed time"
     )
-    for j, name in enumerate(recording.joints):
-        q, acting = recording.q[:, j], np.roll(recording.u[:, j], back)
-        if np.ptp(q) <= margin[j]:
-            continue
-        for extreme, outward in ((q.max(), 1.0), (q.min(), -1.0)):
-            stop = machine.upper[j] if outward > 0 else machine.lower[j]
-            if abs(stop - extreme) < margin[j]:
-                continue
-            driven = outward * acting > thresholds.driving
-            stuck = [
-                run
-                for run in find_stretches((q == extreme) & driven)
-                if run[1] >= MIN_SATURATED_ROWS
-            ]
-            if stuck:
-                rows = sum(count for _, count in stuck)
-                span_s = recording.t_s[stuck[0][0]], recording.t_s[sum(stuck[-1]) - 1]
-                text = f"{rows} samples at {extreme:.4g} {recording.units[j]} while driven further"
-                yield _make_remark("saturated sensor", name, recording, span_s, len(stuck), text)
+
+
+def _list_conditions(
+    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int, thresholds: InspectionThresholds
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield what may lock a joint, with the rows in which it holds, `(T,)`."""
+    commanded = np.abs(u) > thresholds.commanded
+    others = np.asarray(np.delete(commanded, joint, axis=1).any(1))
+    yield "any other joint is commanded", others
+    yield "no other joint is commanded", ~others
+    yield "its command is positive", u[:, joint] > 0
+    yield "its command is negative", u[:, joint] < 0
+    for k, name in enumerate(machine.joint_names):
+        if k != joint:
+            yield f"{name} is commanded", commanded[:, k]
+        for value in np.quantile(q[:, k], np.linspace(0.0, 1.0, NUM_POSITIONS + 2)[1:-1]):
+            unit = machine.joints[k].unit
+            yield f"{name} is above {value:.2f} {unit}", q[:, k] > value
+            yield f"{name} is below {value:.2f} {unit}", q[:, k] < value
 
 
 def _check_excitation(

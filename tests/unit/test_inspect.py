@@ -12,12 +12,15 @@ import pyarrow.parquet as pq
 import pytest
 from composed import option
 
+from actuators.identify.request import Identification
+from actuators.modes.inspect import InspectionRequest
 from actuators.recordings.inspection import (
     InspectionThresholds,
     RecordingFinding,
     inspect_recording,
 )
 from brokk_rl import record
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -252,7 +255,7 @@ def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
     assert done.code == 0, done.err
     for told in (
         "b.parquet: column 'q_q5_rad' is missing", "b.parquet: row 5, column 'u_q2': command 1.5 lies outside [-1, 1] (2 such rows",
-        "b.parquet: row 90, column 'u_q2'", "c.parquet: truncated", "1 recordings do not say when they began",
+        "b.parquet: row 90, column 'u_q2'", "c.parquet: truncated",
     ):  # fmt: skip
         assert told in done.out, told
     result = json.loads(Path("out/inspection.json").read_text())
@@ -262,28 +265,21 @@ def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
     assert result["joints"]["q3"]["noise"] == pytest.approx(NOISE, rel=0.1)
     page = Path("out/inspection.html").read_text()
     assert "2 break the format" in page
-    for name in ("overview", "a", "b"):
+    for name in ("a", "b"):
         assert Path(f"out/{name}.png").stat().st_size > 1000
 
 
-def test_parts_of_a_run_that_overlap_in_time_are_told(
-    brokk: Callable[..., object], machine: Machine, tmp_path: Path
+@pytest.mark.parametrize(
+    "request_recordings",
+    [
+        lambda where: InspectionRequest(recordings=where, pictures=0),
+        lambda where: Identification(
+            recordings=where, test=None, folds=None, hold_out=6, stride_s=2.0, threads=1
+        ),
+    ],
+)
+def test_recordings_that_match_nothing_are_refused_before_anything_is_loaded(
+    request_recordings: Callable[[str], object],
 ) -> None:
-    first = sound(machine, 20.0)
-    later = record.add_seconds(first.metadata["created"], 15.0)
-    record.write_recording(first, tmp_path / "a_0.parquet")
-    record.write_recording(
-        replace(first, metadata={**first.metadata, "created": later}), tmp_path / "a_1.parquet"
-    )
-    done = brokk(
-        "mode=inspect",
-        "inspect.recordings=*.parquet",
-        "session.out=out",
-        "inspect.pictures=0",
-        "preview=null",
-    )
-    assert done.code == 0, done.err
-    # 19.95 s - 15 s.
-    assert (
-        "run sound: a_1.parquet begins 5.0 s before a_0.parquet ends; look at the clock" in done.out
-    )
+    with pytest.raises(RecordingError, match="no recording matches nowhere"):
+        request_recordings("nowhere/*.parquet")
