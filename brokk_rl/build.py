@@ -12,12 +12,12 @@ import sys
 import traceback
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
-from brokk_rl import extras
+from brokk_rl import extras, registry
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import SpecError
 
@@ -48,11 +48,11 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     if RUN not in values:
         raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
     nodes = {key: value for key, value in values.items() if key != RUN}
+    known = registry.list_fields(values[RUN])
+    if known:  # else the import says why
+        _check_keys(known, nodes.keys() - set(shared), nodes)
     built = build_quick_nodes(values, shared)
-    with _refuse_slow_import(), suppress(_SlowImport, _LackingPackageError):  # said below
-        _check_keys(load_class(values[RUN], ""), nodes.keys() - set(shared), nodes)
     kind = load_class(values[RUN], "")
-    _check_keys(kind, nodes.keys() - set(shared), nodes)
     own = {field.name for field in fields(kind)}
     for key in nodes.keys() - built.keys():
         if key in own:
@@ -60,18 +60,16 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     return _call(kind, {key: built[key] for key in nodes if key in built}, "")
 
 
-def _check_keys(kind: type, keys: Collection[str], given: Collection[str]) -> None:
+def _check_keys(known: Mapping[str, bool], keys: Collection[str], given: Collection[str]) -> None:
     """Refuse keys that a mode does not have, and a mode that lacks one of its own."""
-    known = [field.name for field in fields(kind)]
     for key in sorted(keys):
         if key not in known:
             raise ConfigError(
                 f"the mode has no '{key}'; {list_choices(key, known)}. A preset or experiment that "
                 "sets it is for other modes: leave it out"
             )
-    for field in fields(kind):
-        if field.default is MISSING and field.name not in given:
-            key = field.name
+    for key, is_needed in known.items():
+        if is_needed and key not in given:
             raise ConfigError(f"the mode needs '{key}': give {key}=<option>, or leave ~{key} out")
 
 
@@ -91,6 +89,8 @@ def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -
                     built[key] = build_node(value, key)
             except ConfigError as error:
                 refusals.append(error)
+    if "machine" in built:
+        refusals += _list_foreign_joints(values.get("effect"), built["machine"])
     for other in built.keys() & BESIDE:
         for part in built.values():
             try:
@@ -101,6 +101,19 @@ def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -
     if refusals:
         raise ConfigError("\n".join(map(str, refusals))) from refusals[0]
     return built
+
+
+def _list_foreign_joints(effects: Any, machine: Any) -> Iterator[ConfigError]:
+    """Yield an error for each joint that an effect names and the machine does not have.
+
+    Effects compute with torch, so they are not built yet.
+    """
+    for place, name in registry.iterate_leaves(effects):
+        if "joints" in place and name not in ("all", *machine.joint_names):
+            yield ConfigError(
+                f"{'.'.join(('effect', *place))}: '{name}' is no joint of machine '{machine.name}'; "
+                f"{list_choices(str(name), machine.joint_names)}"
+            )
 
 
 def build_node(node: Any, place: str = "") -> Any:

@@ -162,19 +162,48 @@ def read_attributes(target: str) -> dict[str, str]:
     return found
 
 
+def list_fields(target: str) -> dict[str, bool]:
+    """Return the fields of the class `target`, and whether each must be given, from its source.
+
+    Nothing is imported. A class whose source cannot be found has none.
+    """
+    module, _, name = str(target).rpartition(".")
+    nodes = _read_source(module)
+    imported: dict[str, str] = {}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                imported[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+    found: dict[str, bool] = {}
+    for node in nodes:
+        if not isinstance(node, ast.ClassDef) or node.name != name:
+            continue
+        for base in map(ast.unparse, node.bases):
+            found |= list_fields(imported.get(base, f"{module}.{base}"))
+        for item in node.body:
+            if isinstance(item, ast.AnnAssign) and "ClassVar" not in ast.unparse(item.annotation):
+                found[ast.unparse(item.target)] = item.value is None
+    return found
+
+
 def _read_docstring(target: str) -> str:
     """Return the docstring of the class or function `target` from its source, or an empty string."""
     module, _, name = str(target).rpartition(".")
-    try:
-        place = util.find_spec(module)
-    except (ImportError, ValueError):
-        return ""
-    if place is None or not place.origin:
-        return ""
-    for node in ast.parse(Path(place.origin).read_text()).body:
+    for node in _read_source(module):
         if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == name:
             return ast.get_docstring(node) or ""
     return ""
+
+
+def _read_source(module: str) -> list[ast.stmt]:
+    """Return the statements of a module that is not imported; none where it has no source."""
+    try:
+        place = util.find_spec(module)
+    except (ImportError, ValueError):
+        return []
+    if place is None or not str(place.origin).endswith(".py"):
+        return []
+    return ast.parse(Path(str(place.origin)).read_text()).body
 
 
 def _read_comment(text: str) -> str:

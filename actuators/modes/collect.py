@@ -90,12 +90,13 @@ class Collect:
         """
         self.session.seed_all()
         settings, run_s = self.collect, self.collect.run_minutes * 60.0
+        # The link refuses what it cannot do before a plan is written.
+        link = self.link.build(self.machine, settings.num_runs, self.session)
         count, generator = settings.num_runs, self.session.generator("collect")
         plan = plan_runs(self.excitation, self.machine, settings.approach, count, run_s, generator)
         self._show(plan)
         if settings.only_plan:
             return
-        link = self.link.build(self.machine, settings.num_runs, self.session)
         writer = Writer(self.machine, plan, self._folder, settings, self._metadata(plan))
         num_periods = round(run_s / self.machine.period_s)
         title = f"control periods of {settings.num_runs} runs"

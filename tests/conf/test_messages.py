@@ -70,6 +70,10 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=inspect", "recording=x"): ("did you mean inspect.recordings=x?",),
     ("mode=play", "session.seed=3"): ("play.seed=3",),
     ("task..memory=3",): ("'task..memory'", "is no key"),
+    ("+foo=3",): ("the mode has no 'foo'", "rl"),
+    ("~task",): ("the mode needs 'task'", "leave ~task out"),
+    ("mode=play", "preset=gpu"): ("the mode has no", "leave it out"),
+    ("effect=[backlash]", "effect.backlash.joints=[q9]"): ("joints: 'q9' is no joint",),
     (*COMPARE, "+session.sed=1"): ("no field 'sed'", "did you mean 'seed'?"),
     ("effect=[backlash]", "effect.backlash.width=1"): ("'effect.backlash' has no", "gap_rad"),
     ("mode=perceive", "perception/segmenter=onnx", "perception.segmenter.wrong=1"): (
@@ -110,9 +114,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
 }
 """A command, and parts of its message."""
 AFTER_TORCH = {
-    ("~task",): ("the mode needs 'task'", "leave ~task out"),
     ("mode=check", "subject=arm"): ("subject: expected a table with model, name",),
-    ("mode=play", "preset=gpu"): ("the mode has no", "leave it out"),
     ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
     ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
     ("--config-dir", "own", "actuator=fails"): ("fails.py, line 2", "squareroot"),
