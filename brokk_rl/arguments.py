@@ -53,6 +53,10 @@ def read_arguments(words: Sequence[str]) -> list[str]:
         if word[:1] == "~":
             read.append(word)
             continue
+        key, _, value = word.partition("=")
+        if value in ("none", "null") and key in groups and value not in groups[key]:
+            read.append(f"~{key}")  # a group of which nothing is chosen
+            continue
         if "=" not in word or word == "=":
             raise ConfigError(_explain_word(word, values[place + 1 :], groups))
         if word.startswith("mode=") and any(other.startswith("mode=") for other in values[:place]):
@@ -151,6 +155,10 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
         raise ConfigError(_explain_several(key, value, key in groups, is_single))
     if is_single and value.startswith("[") and "," in value:
         raise ConfigError(_explain_several(key, value.strip("[]"), True, is_single))
+    names = value.strip("[]").split(",") if key in groups else []
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"{word}: '{name}' stands in it twice; leave one out")
     return word
 
 

@@ -133,8 +133,6 @@ def _explain_bad_choice(error: BaseException) -> str:
     for argument in sys.argv[1:]:
         group, _, value = argument.partition("=")
         names = [option.name for option in options if option.group == group]
-        if names and value == "null":
-            return f"{group}=null: ~{group} takes a group out; {list_choices('', names)}"
         if names and (value in ("true", "false") or re.fullmatch(r"[\d.eE+-]+", value)):
             keys = [key for key in _find_keys(compose_choices(), group) if "." in key]
             if keys:
@@ -157,7 +155,9 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
     text = str(error)
     if lacking := re.search(r"must specify '([^']+)'", text):
         return _explain_missing_choice(lacking[1])
-    found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
+    if twice := re.search(r"(\S+) appears more than once", text):
+        return f"{twice[1]} is chosen already; another option is given without the '+': {twice[1]}=<option>"
+    found = re.search(r"(?:In '(.+?)': )?Could not (?:override|delete from config\.) '(.+?)'", text)
     if not found:
         text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
         if mixed := re.search(

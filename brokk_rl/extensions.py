@@ -269,6 +269,10 @@ def _find_package(
         return stated[1]
     if "_target_" in node:
         return packages.get(str(node["_target_"]))
+    named = [place[-1] for place, _ in registry.iterate_leaves(node)]
+    classes = [name for name in packages if "." in name]
+    if classes and not {"_target_", "defaults"} & {*named, *node}:
+        raise ConfigError(f"{where}: expected _target_: <class>; {list_choices('', classes)}")
     return EVERYWHERE if used == {EVERYWHERE} else None
 
 

@@ -293,6 +293,6 @@ def _build_mode(
             effects=None if effects is None else tuple(effects),
             workers=workers,
             prices=extensions.load_part("prices"),
-            certainty=_load_option("certainty", "default"),
+            certainty=extensions.load_part("certainty"),
         ),
     )

@@ -2,7 +2,7 @@
 
 A log-likelihood gain is no probability: simulator, noise and forms of effects are all a little
 wrong, so a Bayes factor of e to 40 is wrong once in twenty. The weights in
-`conf/certainty` were fitted to development exams. All signs mean the same on any machine.
+`conf/certainty.yaml` were fitted to development exams. All signs mean the same on any machine.
 Axes: `J` joints.
 """
 

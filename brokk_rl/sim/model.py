@@ -14,7 +14,7 @@ The simulation has no gravity. The actuator model was learned on a machine that 
 its increments already contain the effect of gravity, which must not be counted twice.
 
 MuJoCo C (`sim=native`) simulates all of MuJoCo. `sim=warp` leaves stages out, and our kernels
-(`sim.fused`) write the dynamics of a chain of links on servos anew. Whether that is the motion of the
+write the dynamics of a chain of links on servos anew. Whether that is the motion of the
 machine at hand is measured when its worlds are built (`brokk_rl.sim.parity`). `FEATURES` names only
 parts that act late, seldom, or in MuJoCo C as wrongly.
 """
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -53,17 +53,8 @@ can do, and a multiple of what a faster machine can."""
 FASTEST_MODE = 0.7
 """Largest change of phase of the drives' fastest mode in a substep, rad, that a new machine gets: the
 integrator becomes unstable at 2, and `brokk170` reaches 0.9 in its worst pose."""
-Backend = Literal["native", "staged", "fused"]
-"""`native` is MuJoCo C, `staged` is `sim=warp sim.fused=false`, `fused` is `sim=warp`."""
-WORDS: dict[Backend, str] = {
-    "native": "sim=native",
-    "staged": "sim.fused=false",
-    "fused": "sim=warp",
-}
-
 MAX_DOFS = 16
-"""Up to here Warp unrolls the loops over degrees of freedom; beyond, a solver for any size is the
-better one."""
+"""Up to here Warp unrolls the loops over degrees of freedom."""
 
 _DISABLE = mujoco.mjtDisableBit
 _NEEDED = _DISABLE.mjDSBL_ACTUATION | _DISABLE.mjDSBL_SENSOR | _DISABLE.mjDSBL_AUTORESET
@@ -431,51 +422,43 @@ def _has_branches(model: mujoco.MjModel) -> bool:
     return bool((model.dof_parentid != np.arange(-1, model.nv - 1)).any())
 
 
-FEATURES: dict[str, tuple[Callable[[mujoco.MjModel], Any], tuple[Backend, ...]]] = {
+FEATURES: dict[str, tuple[Callable[[mujoco.MjModel], Any], bool]] = {
     "a flag actuation=disable, sensor=disable or autoreset=disable": (
         lambda model: model.opt.disableflags & _NEEDED,
-        (),
+        False,
     ),
-    "mocap bodies of its own": (lambda model: model.nmocap > 1, ()),
-    "flags that switch a part of MuJoCo on": (lambda model: model.opt.enableflags, ("native",)),
-    "friction in joints": (lambda model: model.dof_frictionloss.any(), ("native",)),
-    "springs that yield": (
-        lambda model: model.nplastic or model.jnt_springyield.any(),
-        ("native",),
-    ),
-    "tendons": (lambda model: model.ntendon, ("native",)),
-    "equalities": (lambda model: model.neq, ("native",)),
-    "deformable bodies": (lambda model: model.nflex, ("native",)),
-    "plugins": (lambda model: model.nplugin, ("native",)),
-    "branches": (_has_branches, ("native", "staged")),
-    f"more than {MAX_DOFS} joints": (lambda model: model.nv > MAX_DOFS, ("native", "staged")),
+    "mocap bodies of its own": (lambda model: model.nmocap > 1, False),
+    "flags that switch a part of MuJoCo on": (lambda model: model.opt.enableflags, True),
+    "friction in joints": (lambda model: model.dof_frictionloss.any(), True),
+    "springs that yield": (lambda model: model.nplastic or model.jnt_springyield.any(), True),
+    "tendons": (lambda model: model.ntendon, True),
+    "equalities": (lambda model: model.neq, True),
+    "deformable bodies": (lambda model: model.nflex, True),
+    "plugins": (lambda model: model.nplugin, True),
+    "branches": (_has_branches, True),
+    f"more than {MAX_DOFS} joints": (lambda model: model.nv > MAX_DOFS, True),
 }
-"""By name: whether a model has the part, and the backends that simulate it. Found by comparing the
-backends' sources for MuJoCo 4.0.0 and mujoco_warp 4.0.0."""
+"""By name: whether a model has the part, and whether `sim=native` simulates it; `sim=warp` does not.
+Found by comparing the sources of MuJoCo 4.0.0 and mujoco_warp 4.0.0."""
 
 
-def list_left_out(model: mujoco.MjModel, backend: Backend) -> list[str]:
-    """Return the parts of a model that a backend does not simulate, as an error names them."""
-    found = []
-    for name, (is_used, backends) in FEATURES.items():
-        if backend not in backends and is_used(model):
-            found.append(name)
-    return found
-
-
-def check_simulated(model: mujoco.MjModel, machine: str, backend: Backend) -> None:
-    """Raise a `ConfigError` for a model with parts that a backend does not simulate.
+def check_simulated(model: mujoco.MjModel, machine: str, is_warp: bool) -> None:
+    """Raise a `ConfigError` for a model with parts that a simulator leaves out.
 
     Args:
         model: The compiled model.
         machine: Name of the machine, for the message.
-        backend: The backend that is about to simulate it.
+        is_warp: Whether `sim=warp` is about to simulate it; else `sim=native`.
     """
-    if not (found := list_left_out(model, backend)):
-        return
-    others = [words for other, words in WORDS.items() if not list_left_out(model, other)]
-    instead = f", or choose {' or '.join(others)}" if others else ""
-    raise ConfigError(
-        f"machine {machine}: {WORDS[backend]} simulates a chain of links driven by servos, but the "
-        f"MJCF has {', '.join(found)}; remove that from the MJCF{instead}"
-    )
+    found = {}
+    for name, (is_used, is_native) in FEATURES.items():
+        if is_used(model) and (is_warp or not is_native):
+            found[name] = is_native
+    if found:
+        name, instead = "sim=warp" if is_warp else "sim=native", ""
+        if all(found.values()):
+            instead = ", or choose sim=native"
+        raise ConfigError(
+            f"machine {machine}: {name} simulates a chain of links driven by servos, but the MJCF "
+            f"has {', '.join(found)}; remove that from the MJCF{instead}"
+        )

@@ -57,7 +57,7 @@ class NativeWorld:
     ) -> None:
         self.num_worlds, self.device = num_worlds, torch.device("cpu")
         self.model = compile_model(machine, machine.period_s / substeps, site=site)
-        check_simulated(self.model, machine.name, "native")
+        check_simulated(self.model, machine.name, is_warp=False)
         self._batch = Batch(self.model, num_worlds, num_threads)
         self.substeps = substeps
         self._state, self._warning = (

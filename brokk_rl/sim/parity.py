@@ -140,7 +140,7 @@ def check_parity(
     if not result.is_alike:
         raise ConfigError(
             f"machine {machine.name}: sim=warp does not simulate it as MuJoCo C does: "
-            f"{result.describe()}; choose sim.fused=false or sim=native"
+            f"{result.describe()}; choose sim=native"
         )
     return result
 

@@ -75,10 +75,6 @@ class WarpSimulator:
         iterations: Bound on the solver's iterations in a substep.
         linesearch_iterations: Bound on the line search's iterations in each of them.
         tolerance: At which the solver stops.
-        fused: Use our own kernels for dynamics, contact solver and integration (`warp_dynamics`,
-            `warp_solver`): 18 launches a substep instead of 60, and none instead of ten per solver
-            iteration. The physics is the same. Tests compare it with MuJoCo C on the CPU and on a
-            GPU; docs/results.md holds its rates.
         parity_worlds: Worlds in which each machine is compared with MuJoCo C before it is used
             (`brokk_rl.sim.parity`); 0 for no comparison.
     """
@@ -90,7 +86,6 @@ class WarpSimulator:
     iterations: Count
     linesearch_iterations: Count
     tolerance: Positive
-    fused: bool
     parity_worlds: Index
 
     def build(
@@ -145,7 +140,6 @@ class WarpSimulator:
             iterations=self.iterations,
             linesearch_iterations=self.linesearch_iterations,
             tolerance=self.tolerance,
-            fused=self.fused,
             varied=varied,
             site=site,
         )

@@ -2,7 +2,7 @@
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
 # pyright: reportArgumentType=false, reportOperatorIssue=false, reportReturnType=false
 # pyright: reportGeneralTypeIssues=false, reportAssignmentType=false
-"""Worlds stepped by `mujoco_warp`, from its own stages or from our kernels.
+"""Worlds on a GPU: kinematics, collisions and constraint rows of `mujoco_warp`, the rest our kernels.
 
 `brokk_rl.sim.simulator.WarpSimulator` is the spec that builds them.
 """
@@ -26,70 +26,14 @@ from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 from brokk_rl.sim.warp_dynamics import ArmDynamics
 from brokk_rl.sim.warp_solver import ContactSolver
 
-_CONTACT = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
-"""Constraints of this type and those after it are contacts."""
 
-
-@wp.kernel(enable_backward=False)
-def _keep_peak(
-    num_rows: wp.array[int],
-    kind: wp.array2d[int],
-    contact: wp.array2d[int],
-    force: wp.array2d[float],
-    first_row: wp.array2d[int],
-    peak: wp.array[float],
-):
-    """Raise each world's peak to the sum of the normal forces of its contacts.
-
-    The normal force is the first row of each contact in an elliptic cone.
-
-    `sim=native` sums up the same.
-    """
-    world = wp.tid()
-    total = wp.float32(0.0)  # a plain literal would be a constant to Warp
-    for row in range(wp.min(num_rows[world], kind.shape[1])):
-        if kind[world, row] >= _CONTACT and first_row[contact[world, row], 0] == row:
-            total += force[world, row]
-    peak[world] = wp.max(peak[world], total)
-
-
-def make_staged_substep(model: mjw.Model, data: mjw.Data, peak: wp.array) -> Callable[[], None]:
-    """Return `mjw.step` without the stages that a chain of bodies does not need.
-
-    Left out: cameras, deformable bodies, tendons and sensors.
-
-    Some 60 launches, and ten an iteration of the solver. The GPU waits for launches, not for
-    arithmetic: every stage that a model does not need costs time.
-
-    Args:
-        model: The model.
-        data: All worlds.
-        peak: Raised to the contact force of each world, `(N,)`, N.
-    """
-    rows = data.efc
-    forces = [data.nefc, rows.type, rows.id, rows.force, data.contact.efc_address]
-
-    def step() -> None:
-        mjw.kinematics(model, data)
-        mjw.com_pos(model, data)
-        mjw.crb(model, data)
-        mjw.collision(model, data)
-        mjw.make_constraint(model, data)
-        mjw.transmission(model, data)
-        mjw.fwd_velocity(model, data)
-        mjw.fwd_actuation(model, data)
-        mjw.fwd_acceleration(model, data, factorize=True)
-        mjw.solve(model, data)
-        mjw.implicit(model, data)
-        wp.launch(_keep_peak, data.nworld, forces, [peak])
-
-    return step
-
-
-def make_fused_substep(
+def make_substep(
     compiled: mujoco.MjModel, model: mjw.Model, data: mjw.Data, peak: wp.array
 ) -> Callable[[], None]:
     """Return a substep for an arm of a few joints driven by servos, in 18 launches.
+
+    `mujoco_warp` alone takes some 60, and ten an iteration of the solver. The GPU waits for
+    launches, not for arithmetic.
 
     Args:
         compiled: The model as MuJoCo has it.
@@ -129,8 +73,7 @@ class WarpWorld:
 
     All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep
     every address, so that the caller may capture them together with its own torch operations inside
-    `torch.cuda.graph`. Outside a capture the solver's loop (`fused: false`) asks the host after
-    each iteration, which is slow.
+    `torch.cuda.graph`.
 
     Args:
         machine: The machine.
@@ -142,7 +85,6 @@ class WarpWorld:
         iterations: Bound on the solver's iterations.
         linesearch_iterations: Bound on the line search's iterations.
         tolerance: At which the solver stops.
-        fused: Use our own kernels for dynamics, contact solver and integration.
         varied: Properties of the machine that differ from world to world.
         site: MJCF of what stands beside the block.
     """
@@ -159,7 +101,6 @@ class WarpWorld:
         iterations: int,
         linesearch_iterations: int,
         tolerance: float,
-        fused: bool,
         varied: tuple[Property, ...] = (),
         site: Path | None = None,
     ) -> None:
@@ -172,7 +113,7 @@ class WarpWorld:
                 self.alarm_names[int(kind)] = BUFFERS.get(kind, f"the buffer {name} is full")
         self.substeps = substeps
         self.model = compile_model(machine, machine.period_s / substeps, site=site)
-        check_simulated(self.model, machine.name, "fused" if fused else "staged")
+        check_simulated(self.model, machine.name, is_warp=True)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(device)
@@ -214,11 +155,7 @@ class WarpWorld:
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
         peak = wp.from_torch(self.contact_force_n)
-        self._substep = (
-            make_fused_substep(self.model, model, data, peak)
-            if fused
-            else make_staged_substep(model, data, peak)
-        )
+        self._substep = make_substep(self.model, model, data, peak)
         fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(varied)}
         self._properties = (
             WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None

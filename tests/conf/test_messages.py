@@ -17,6 +17,7 @@ FILES = {
     "bad.yaml": "_target_: brokk_rl.machine.Machine\nname: [1, 2\nfoo: 3\n",
     "tabs.yaml": "_target_: brokk_rl.machine.Machine\n\tname: a\n",
     "foreign.yaml": "_target_: os.system\ncommand: ls\n",
+    "notes.yaml": "to do: nothing\n",
     "list.yaml": "- 1\n- 2\n",
     "own/mode/broken.yaml": "# @package _global_\nname: [1, 2\n",
     "own/actuator/typo.yaml": "_target_: actuators.models.lag.FirstOrderLags\n",
@@ -57,6 +58,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=list", "session.seed=1"): ("'mode=list' has no 'session'",),
     (*COMPARE, "session=other"): ("session.<name>=", "seed"),
     ("effect=backlash,lag",): ("a list: 'effect=[backlash,lag]'",),
+    ("effect=[backlash,backlash]",): ("'backlash' stands in it twice",),
     ("policy=[shipped,classical]",): ("one option: policy=shipped;", "brokk -m"),
     ("mode=import", "import.x=1"): ("'import' is a group",),
     ("mode=evaluate", "policy=shipped", "task=goal_pose"): ("was trained for task=",),
@@ -65,6 +67,8 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     # keys
     ("mod=train",): ("did you mean 'mode'?",),
     ("hidden_dims=256",): ("rl.runner.actor.hidden_dims=256",),
+    ("~rl.lr",): ("'rl' has no 'lr'", "rl.runner.algorithm.learning_rate"),
+    ("+machine=brokk170",): ("without the '+'",),
     ("lr=1e-4",): ("rl.runner.algorithm.learning_rate=1e-4",),
     ("mode=import", "logs=x"): ("mode=import --help",),
     ("mode=inspect", "recording=x"): ("did you mean inspect.recordings=x?",),
@@ -99,6 +103,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("machine=@tabs.yaml",): ("line 2", "'\\t'"),
     ("machine=@foreign.yaml",): ("os.system' is no machine",),
     ("machine=@list.yaml",): ("expected a mapping",),
+    ("task=@notes.yaml",): ("task=@notes.yaml: expected _target_: <class>",),
     ("machine=@nowhere.yaml",): ("there is no such file",),
     ("--config-dir", "own", "mode=broken"): ("broken.yaml", "line"),
     ("policy=a#b",): ("there is no policy=a#b", "or the path of a run"),
@@ -110,7 +115,6 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     (*COMPARE, "session.seed=abc"): ("session.seed: expected a whole number", "'abc'"),
     (*COMPARE, "session.seed=-1"): ("session.seed", "0 or more"),
     ("mode=evaluate", "sim=native", "sim.num_worlds=1e12"): ("sim.num_worlds: expected", "1e+07"),
-    ("mode=evaluate", "target=null"): ("~target takes a group out", "perceived"),
 }
 """A command, and parts of its message."""
 AFTER_TORCH = {

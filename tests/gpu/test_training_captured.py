@@ -30,7 +30,7 @@ CUDA = torch.device("cuda")
 NUM = 64
 WARP: Any = WarpSimulator(
     num_worlds=NUM, substeps=5, num_contacts=16, num_constraints=40, iterations=12,
-    linesearch_iterations=8, tolerance=1e-6, fused=True, parity_worlds=0,
+    linesearch_iterations=8, tolerance=1e-6, parity_worlds=0,
 )  # fmt: skip
 NATIVE: Any = NativeSimulator(num_worlds=NUM, substeps=5, num_threads=0)
 WILD = 5

@@ -1,7 +1,5 @@
 """The Warp world on a real GPU: graphs, parity with MuJoCo C, faults."""
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -20,14 +18,8 @@ SPEC = WarpSimulator(
     iterations=20,
     linesearch_iterations=20,
     tolerance=1e-6,
-    fused=False,
     parity_worlds=0,
 )
-
-
-@pytest.fixture(params=[False, True], ids=["staged", "fused"])
-def spec(request):
-    return dataclasses.replace(SPEC, fused=request.param)
 
 
 def _captured(world, increment):
@@ -42,8 +34,8 @@ def _captured(world, increment):
     return graph
 
 
-def test_a_captured_control_step_does_what_the_eager_one_does(machine, spec):
-    eager, graphed = (spec.build(machine, "cuda") for _ in range(2))
+def test_a_captured_control_step_does_what_the_eager_one_does(machine):
+    eager, graphed = (SPEC.build(machine, "cuda") for _ in range(2))
     generator = torch.Generator("cuda").manual_seed(0)
     increment = torch.zeros(NUM_WORLDS, machine.num_joints, device="cuda")
     start = graphed.state_dict()
@@ -60,8 +52,8 @@ def test_a_captured_control_step_does_what_the_eager_one_does(machine, spec):
     torch.testing.assert_close(graphed.q, eager.q, atol=1e-6, rtol=0)
 
 
-def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine, spec):
-    warp = spec.build(machine, "cuda")
+def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine):
+    warp = SPEC.build(machine, "cuda")
     native = NativeSimulator(num_worlds=NUM_WORLDS, substeps=5, num_threads=0).build(machine, "cpu")
     generator = torch.Generator().manual_seed(1)
     speed = torch.tensor(machine.max_speed, dtype=torch.float32)
@@ -81,8 +73,8 @@ def test_free_motion_agrees_with_mujoco_c_for_five_seconds(machine, spec):
     torch.testing.assert_close(warp.q.cpu()[still], native.q[still], atol=1e-4, rtol=0)
 
 
-def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine, spec):
-    world = spec.build(machine, "cuda")
+def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):
+    world = SPEC.build(machine, "cuda")
     increment = torch.zeros(NUM_WORLDS, machine.num_joints, device="cuda")
     increment[3, 1] = float("nan")
     start = world.q.clone()
@@ -94,19 +86,19 @@ def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine, spec):
     torch.testing.assert_close(world.q, start, atol=1e-6, rtol=0)
 
 
-def test_states_with_contact_go_on_as_in_mujoco_c(machine, spec):
+def test_states_with_contact_go_on_as_in_mujoco_c(machine):
     """Half of the worlds stand at a block: the gate that every run passes, for other states."""
     for seed in range(1, 5):
-        result = measure_parity(spec.build(machine, "cuda"), machine, spec.substeps, seed)
+        result = measure_parity(SPEC.build(machine, "cuda"), machine, SPEC.substeps, seed)
         assert result.num_touching > NUM_WORLDS // 4
         assert result.is_alike, result.describe()
 
 
-def test_paired_episodes_with_contact_end_alike(machine, spec):
+def test_paired_episodes_with_contact_end_alike(machine):
     """The tool is pushed down on a block for three seconds, with the same noise in both backends."""
     worlds = [
         NativeSimulator(num_worlds=NUM_WORLDS, substeps=5, num_threads=0).build(machine, "cpu"),
-        spec.build(machine, "cuda"),
+        SPEC.build(machine, "cuda"),
     ]
     generator = torch.Generator().manual_seed(2)
     speed = torch.tensor(machine.max_speed, dtype=torch.float32)

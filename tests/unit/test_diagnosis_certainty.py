@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from composed import option
+from brokk_rl.extensions import load_part
 
 from actuators.open_loop import FreeRunWindows
 from brokk_rl.contracts.actuator import Actuator
@@ -26,7 +26,7 @@ from diagnosis.search import EffectSet
 
 @pytest.fixture
 def weights() -> ProbabilityModel:
-    return option("certainty", "default")
+    return load_part("certainty")
 
 
 def moving(

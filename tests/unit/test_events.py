@@ -104,11 +104,8 @@ def test_a_saturated_drive_accelerates_by_yield_force_over_mass(machine: Machine
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fused", [False, True], ids=["staged", "fused"])
-def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(
-    machine: Machine, fused: bool
-) -> None:
-    sim = dataclasses.replace(option("sim", "warp"), num_worlds=NUM, fused=fused)
+def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(machine: Machine) -> None:
+    sim = dataclasses.replace(option("sim", "warp"), num_worlds=NUM)
     worlds = [vary(spec.build(machine, "cpu", NUM, varied=ALL)) for spec in (NATIVE, sim)]
     native, warp = (np.array(path) for path in drive_into_the_ground(machine, worlds))
     assert native[..., -1].max() > 0

@@ -65,14 +65,10 @@ def change_mjcf(machine: Machine, folder, change: tuple[str, str]) -> Machine:
     return dataclasses.replace(machine, mjcf=str(folder / "changed.xml"))
 
 
-def make_warp(machine: Machine, is_fused: bool):
+def make_warp(machine: Machine):
     """Return worlds of `sim=warp` on the CPU, not yet compared, with a solver that goes to its end."""
     simulator = dataclasses.replace(
-        option("sim", "warp"),
-        fused=is_fused,
-        parity_worlds=0,
-        iterations=50,
-        linesearch_iterations=50,
+        option("sim", "warp"), parity_worlds=0, iterations=50, linesearch_iterations=50
     )
     return simulator.build(machine, "cpu", NUM_WORLDS)
 
@@ -92,10 +88,9 @@ def test_each_part_matters_so_that_leaving_it_out_would_be_seen(machine, tmp_pat
 
 @pytest.mark.slow
 def test_the_shipped_machine_is_alike_in_all_worlds(machine):
-    for is_fused in (False, True):
-        result = check_parity(make_warp(machine, is_fused), machine, SUBSTEPS)
-        assert result.num_different == 0 and result.num_touching >= 10
-        assert result.position_error.max() < POSITION_TOLERANCE / 5
+    result = check_parity(make_warp(machine), machine, SUBSTEPS)
+    assert result.num_different == 0 and result.num_touching >= 10
+    assert result.position_error.max() < POSITION_TOLERANCE / 5
 
 
 class Spoiled:
@@ -143,7 +138,7 @@ def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
     def refuse(name: str) -> str:
         model = compile_model(change_mjcf(machine, tmp_path, CHANGES[name]), 0.01)
         with pytest.raises(ConfigError) as refusal:
-            check_simulated(model, "brokk170", "fused")
+            check_simulated(model, "brokk170", is_warp=True)
         return str(refusal.value)
 
     assert refuse("friction").endswith("choose sim=native")

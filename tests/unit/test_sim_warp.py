@@ -21,11 +21,8 @@ WARP = WarpSimulator(
     iterations=12,
     linesearch_iterations=8,
     tolerance=1e-6,
-    fused=False,
     parity_worlds=0,
 )
-FUSED = dataclasses.replace(WARP, fused=True)
-both = pytest.mark.parametrize("warp", [WARP, FUSED], ids=["staged", "fused"])
 NATIVE = NativeSimulator(num_worlds=NUM_WORLDS, substeps=5, num_threads=2)
 
 
@@ -41,9 +38,8 @@ def _motion(machine, steps, push):
 
 
 @pytest.mark.slow
-@both
-def test_five_seconds_of_motion_and_contact_agree_with_the_native_world(machine, warp):
-    worlds = [spec.build(machine, "cpu") for spec in (NATIVE, warp)]
+def test_five_seconds_of_motion_and_contact_agree_with_the_native_world(machine):
+    worlds = [spec.build(machine, "cpu") for spec in (NATIVE, WARP)]
     largest, pressed = torch.zeros(NUM_WORLDS), torch.zeros(NUM_WORLDS)
     for increment in _motion(machine, steps=100, push=0.004):
         for world in worlds:
@@ -61,9 +57,8 @@ def test_five_seconds_of_motion_and_contact_agree_with_the_native_world(machine,
 
 
 @pytest.mark.slow
-@both
-def test_a_peak_of_force_is_the_same_in_both_worlds(machine, warp):
-    native, warp = (spec.build(machine, "cpu") for spec in (NATIVE, warp))
+def test_a_peak_of_force_is_the_same_in_both_worlds(machine):
+    native, warp = (spec.build(machine, "cpu") for spec in (NATIVE, WARP))
     down = torch.zeros(NUM_WORLDS, machine.num_joints)
     down[:, 1] = 0.003
     peaks = [torch.zeros(NUM_WORLDS), torch.zeros(NUM_WORLDS)]
@@ -76,10 +71,9 @@ def test_a_peak_of_force_is_the_same_in_both_worlds(machine, warp):
 
 
 @pytest.mark.slow
-@both
-def test_a_control_step_is_that_of_mujoco_warp(machine, warp):
+def test_a_control_step_is_that_of_mujoco_warp(machine):
     """From the same state, in the air and pressed onto the ground."""
-    ours, whole = warp.build(machine, "cpu"), WARP.build(machine, "cpu")
+    ours, whole = WARP.build(machine, "cpu"), WARP.build(machine, "cpu")
     whole._substep = lambda: mujoco_warp.step(whole._model, whole._data)
     pressed = 0.0
     for increment in _motion(machine, steps=40, push=0.006):
@@ -87,17 +81,13 @@ def test_a_control_step_is_that_of_mujoco_warp(machine, warp):
         ours.step(increment)
         whole.step(increment)
         pressed = max(pressed, float(ours.contact_force_n.amax()))
-        if warp.fused:
-            torch.testing.assert_close(ours.q, whole.q, rtol=0.0, atol=2e-5)
-        else:
-            assert torch.equal(ours.q, whole.q)
+        torch.testing.assert_close(ours.q, whole.q, rtol=0.0, atol=2e-5)
     assert pressed > 1_000.0
 
 
 @pytest.mark.slow
-@both
-def test_a_masked_reset_and_a_restored_state_are_exact(machine, warp):
-    world = warp.build(machine, "cpu")
+def test_a_masked_reset_and_a_restored_state_are_exact(machine):
+    world = WARP.build(machine, "cpu")
     for increment in _motion(machine, steps=10, push=0.0):
         world.step(increment)
     before = world.state_dict()
@@ -121,9 +111,8 @@ def test_a_masked_reset_and_a_restored_state_are_exact(machine, warp):
 
 
 @pytest.mark.slow
-@both
-def test_nan_and_a_full_buffer_are_faults_of_their_worlds_alone(machine, warp):
-    world = dataclasses.replace(warp, num_worlds=3, num_constraints=2).build(machine, "cpu")
+def test_nan_and_a_full_buffer_are_faults_of_their_worlds_alone(machine):
+    world = dataclasses.replace(WARP, num_worlds=3, num_constraints=2).build(machine, "cpu")
     start, scene = world.q.clone(), make_nominal_scenes(3)
     start[2] = torch.tensor([0.0, 0.0, 0.9, 1.0, -0.329])  # deep in the ground: more rows than two
     world.reset(torch.ones(3, dtype=torch.bool), start, scene)
@@ -139,7 +128,7 @@ def test_what_the_launches_leave_out_is_refused_by_name(machine, tmp_path):
     assert drawn in text
     (tmp_path / "other.xml").write_text(text.replace(drawn, f'{drawn} frictionloss="5"'))
     with pytest.raises(ConfigError, match="friction in joints"):
-        FUSED.build(dataclasses.replace(machine, mjcf=str(tmp_path / "other.xml")), "cpu")
+        WARP.build(dataclasses.replace(machine, mjcf=str(tmp_path / "other.xml")), "cpu")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
