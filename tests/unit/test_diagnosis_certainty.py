@@ -8,11 +8,11 @@ from typing import cast
 
 import numpy as np
 import pytest
-from brokk_rl.extensions import load_part
 
 from actuators.open_loop import FreeRunWindows
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from diagnosis import calibration, decision, residual_model
 from diagnosis.detection import DetectionResult
