@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import hydra
 import pytest
 from composed import every
@@ -13,11 +15,8 @@ from brokk_rl.build import build_node
 OVERRIDES = ("experiment", "preset", "search", "exam_protocol")
 ASKING_FOR_A_POLICY = ("doctor_policy", "export", "why")
 """Modes without a policy of their own; `test_values` holds what they answer without one."""
-PARTS = [
-    (entry.group, entry.name)
-    for entry in registry.list_options()
-    if entry.group not in (*OVERRIDES, "mode")
-]
+PARTS = [one for one in registry.list_options() if one.group not in (*OVERRIDES, "mode")]
+BASE = ("~mode", "+machine=brokk170")
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -25,15 +24,30 @@ def composed(*overrides: str) -> DictConfig:
         return hydra.compose("config", overrides=list(overrides), return_hydra_config=True)
 
 
-@pytest.mark.parametrize(("group", "name"), PARTS)
-def test_every_option_composes_and_is_what_its_spec_says(group: str, name: str) -> None:
-    if group == "deploy":  # its parts come from the mode
-        cfg = composed("mode=deploy", f"deploy={name}").deploy
-    else:
-        cfg = composed("~mode", "+machine=brokk170", f"+{group}@subject={name}").subject
+def has_own_place(part: registry.Option) -> bool:
+    """Says whether an option names the place in the configuration that it fills."""
+    return "@package _global_" in part.path.read_text().partition("\n")[0]
+
+
+def build_part(group: str, cfg: Any) -> None:
     if "_target_" in cfg and not OmegaConf.missing_keys(cfg) - {"out"}:
         given = {"out": "somewhere"} if group == "session" else {}
         build_node({**OmegaConf.to_container(cfg, resolve=True), **given}, group)
+
+
+@pytest.mark.parametrize("group", dict.fromkeys(part.group for part in PARTS))
+def test_every_option_composes_and_is_what_its_spec_says(group: str) -> None:
+    """Options compose together, each at a place of its own; that is nine times as fast."""
+    parts = [part for part in PARTS if part.group == group]
+    together = [part for part in parts if group != "deploy" and not has_own_place(part)]
+    cfg = composed(*BASE, *(f"+{group}@{part.name}_part={part.name}" for part in together))
+    for part in parts:
+        if part in together:
+            build_part(group, cfg[f"{part.name}_part"])
+        elif group == "deploy":  # its parts come from the mode
+            build_part(group, composed("mode=deploy", f"deploy={part.name}").deploy)
+        else:
+            assert composed(*BASE, f"+{group}={part.name}")
 
 
 @every("mode")
@@ -60,11 +74,8 @@ def test_every_exam_protocol_composes(name: str) -> None:
     assert cfg.exam.sealed is (name == "sealed")
 
 
-@pytest.mark.parametrize(
-    "entry", registry.list_options(), ids=lambda entry: f"{entry.group}={entry.name}"
-)
-def test_every_option_says_in_one_line_what_it_is(entry: registry.Option) -> None:
-    assert len(entry.summary()) > 10
+def test_every_option_says_in_one_line_what_it_is() -> None:
+    assert [one for one in registry.list_options() if len(one.summary()) <= 10] == []
 
 
 def test_the_default_is_to_train() -> None:

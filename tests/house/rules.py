@@ -104,15 +104,29 @@ class Import:
     line: int
 
 
-def imports(tree: ast.Module) -> Iterator[Import]:
-    """Yields what a module imports when it runs; imports for the type checker alone bind nothing together."""
-    for node in _without_type_checking(tree):
+@functools.cache
+def imports(tree: ast.Module) -> list[Import]:
+    """Return what a module imports when it runs; what the type checker alone imports binds nothing."""
+    found = []
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield Import(alias.name, node.lineno)
+            found += [Import(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            for alias in node.names:
-                yield Import(f"{node.module}.{alias.name}", node.lineno)
+            found += [Import(f"{node.module}.{alias.name}", node.lineno) for alias in node.names]
+        elif isinstance(node, ast.stmt | ast.Module | ast.ExceptHandler | ast.match_case):
+            waiting += [one for one in ast.iter_child_nodes(node) if not is_for_types(node)]
+    return found
+
+
+def is_for_types(node: ast.AST) -> bool:
+    """Says whether a statement is a block that only a type checker reads."""
+    return (
+        isinstance(node, ast.If)
+        and isinstance(node.test, ast.Name)
+        and node.test.id == "TYPE_CHECKING"
+    )
 
 
 def floor(module: str) -> int | None:
@@ -128,7 +142,7 @@ def within(module: str, package: str) -> bool:
 def floors(sources: Mapping[str, str]) -> list[str]:
     """Imports go down only; `brokk_rl` imports no room, and rooms import each other by doors only."""
     found = []
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         mine, room = floor(module), module.split(".")[0]
         for entry in imports(tree):
             other, top = floor(entry.name), entry.name.split(".")[0]
@@ -148,7 +162,7 @@ def floors(sources: Mapping[str, str]) -> list[str]:
 def doors(sources: Mapping[str, str]) -> list[str]:
     """Each foreign package has one door, and some packages stay out of others altogether."""
     found = []
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         for entry in imports(tree):
             allowed = DOORS.get(entry.name.split(".")[0])
             if allowed and not any(within(module, package) for package in allowed):
@@ -167,7 +181,7 @@ def prints(sources: Mapping[str, str]) -> list[str]:
     """`logging`, never `print`, outside what a mode shows the person."""
     return [
         f"{module}:{node.lineno} prints"
-        for module, tree in _trees(sources)
+        for module, tree in read_trees(sources)
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
@@ -189,7 +203,7 @@ def vague_names(sources: Mapping[str, str]) -> list[str]:
 def docstrings(sources: Mapping[str, str]) -> list[str]:
     """Every public module, class, function and method says what it is."""
     found = []
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         if not ast.get_docstring(tree):
             found.append(f"{module} has no docstring")
         found += [
@@ -203,7 +217,7 @@ def docstrings(sources: Mapping[str, str]) -> list[str]:
 def units(sources: Mapping[str, str]) -> list[str]:
     """Physical names carry SI units; counts are `num_…`."""
     found = []
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         for node in ast.walk(tree):
             name = (
                 node.target.id
@@ -238,7 +252,7 @@ VERBS = frozenset(Path(__file__).with_name("verbs.txt").read_text().split())
 def verb_names(sources: Mapping[str, str], exceptions: Collection[str] = ()) -> list[str]:
     """A function of a module begins with a verb."""
     found = []
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         for node in tree.body:
             if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                 continue
@@ -251,7 +265,7 @@ def verb_names(sources: Mapping[str, str], exceptions: Collection[str] = ()) -> 
 def unique_classes(sources: Mapping[str, str]) -> list[str]:
     """The name of a public class exists once."""
     owners: dict[str, list[str]] = {}
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         for node in tree.body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 owners.setdefault(node.name, []).append(module)
@@ -266,7 +280,7 @@ def first_lines(sources: Mapping[str, str]) -> list[str]:
     """A docstring begins with an imperative or a noun phrase."""
     found = []
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         for node in ast.walk(tree):
             text = ast.get_docstring(node) if isinstance(node, documented) else None
             if text and text.lower().startswith(FIRST_WORDS):
@@ -277,7 +291,7 @@ def first_lines(sources: Mapping[str, str]) -> list[str]:
 def circles(sources: Mapping[str, str]) -> list[str]:
     """Modules do not import each other in a circle, not even for the type checker alone."""
     graph: dict[str, set[str]] = {}
-    for module, tree in _trees(sources):
+    for module, tree in read_trees(sources):
         names = set()
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -291,7 +305,8 @@ def circles(sources: Mapping[str, str]) -> list[str]:
     return []
 
 
-def _trees(sources: Mapping[str, str]) -> Iterator[tuple[str, ast.Module]]:
+def read_trees(sources: Mapping[str, str]) -> Iterator[tuple[str, ast.Module]]:
+    """Yields each module's name and tree."""
     for module, text in sources.items():
         yield module, _parse(text)
 
@@ -316,18 +331,6 @@ def _public(
             yield node
         if isinstance(node, ast.ClassDef):
             yield from _public(node.body)
-
-
-def _without_type_checking(node: ast.AST) -> Iterator[ast.AST]:
-    for child in ast.iter_child_nodes(node):
-        if (
-            isinstance(child, ast.If)
-            and isinstance(child.test, ast.Name)
-            and child.test.id == "TYPE_CHECKING"
-        ):
-            continue
-        yield child
-        yield from _without_type_checking(child)
 
 
 NUMBER = re.compile(r"(?:^|[\s:,\[{])-?\d[\d_]*\.?\d*(?:e[-+]?\d+)?(?=[\s,\]}]|$)")

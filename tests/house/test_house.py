@@ -1,7 +1,8 @@
-"""The house stands: floors, doors, names and words, read from the sources without importing them."""
+"""Floors, doors, names, words and the picture of the packages, read from the sources without importing them."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,6 +14,9 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("brokk_rl", "conf", *rules.ROOMS, *rules.EXTENSIONS)
 LONG: dict[str, str] = {}
 """Modules of over 500 lines, and why."""
+GROUND = "brokk_rl"
+PARTS = ("brokk_rl.modes", "brokk_rl.sim", "brokk_rl.rl", "brokk_rl.play", GROUND)
+ARROW = re.compile(r"^  (\S+) --> (\S+)$", re.M)
 
 
 def module_name(path: Path) -> str:
@@ -42,6 +46,22 @@ SOURCES = {
 )
 def test_the_sources_keep(rule: Callable[[Mapping[str, str]], list[str]]) -> None:
     assert rule(SOURCES) == []
+
+
+def find_package(module: str) -> str | None:
+    packages = (*PARTS, *rules.ROOMS, *rules.EXTENSIONS)
+    return next((name for name in packages if rules.within(module, name)), None)
+
+
+def test_the_picture_in_contributing_shows_the_imports() -> None:
+    found = set()
+    for module, tree in rules.read_trees(SOURCES):
+        package = find_package(module)
+        for entry in rules.imports(tree):
+            other = find_package(entry.name)
+            if package not in (None, other) and other not in (None, GROUND):
+                found.add((package, other))
+    assert set(ARROW.findall((ROOT / "CONTRIBUTING.md").read_text())) == found
 
 
 NOUNS = ("spec",)
