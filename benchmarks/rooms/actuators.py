@@ -50,8 +50,7 @@ MEASUREMENTS = (
     Measurement(
         name="identification",
         title="Models of the simulated machine",
-        conditions="Error of free runs, which get commands and their own predictions only, on an hour of random levels with another seed. Only the fit to sines "
-        "meets another excitation than its own. The baselines are `hold` (the machine stands still) and `arx` (linear).",
+        conditions="Error of free runs on an hour of random levels with another seed. Only the fit to sines meets another excitation than its own. The baselines are `hold` (the machine stands still) and `arx` (linear).",
         commands=(
             "brokk mode=collect session.out={out}/sine",
             f"{LEVELS} session.seed=1 collect.run_minutes=10 session.out={{out}}/levels",
@@ -67,8 +66,7 @@ MEASUREMENTS = (
     Measurement(
         name="real_excavator",
         title="A real 1:12 excavator",
-        conditions="Real logs: nine, of several operators, 21 minutes, four joints. Each log is judged by a model fitted to the other eight, free runs of 5 s. "
-        "Error in % of the travel. The baselines are `hold` and `arx`. The logs belong to others and are not included.",
+        conditions="Nine real logs of several operators, 21 minutes. Each is judged by a model fitted to the other eight, free runs of 5 s; error in % of the travel. The baselines are `hold` and `arx`. The logs are not included.",
         commands=(
             f"{IMPORT} session.out={{out}}/read",
             "brokk mode=identify machine=mini_excavator 'identify.recordings={out}/read/recordings/*' identify.folds=9 session.device=cpu session.out={out}/fit",

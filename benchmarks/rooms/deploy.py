@@ -48,8 +48,7 @@ MEASUREMENTS = (
     Measurement(
         name="reactions",
         title="Reaction times of real processes",
-        conditions="Twin, bus process and commander as processes of one computer, with real-time priority where it is granted. Time until the valves get nothing any "
-        "more, as a listener on the bus hears it. Without the guard the last command would stay in force.",
+        conditions="Twin, bus process and commander as processes of one computer. Time until the valves get nothing any more, as a listener on the bus hears it. Without the guard the last command would stay in force.",
         commands=("python benchmarks/deploy/reactions.py {out}/reactions.json 60",),
         code=CODE,
         read=read_reactions,
@@ -59,8 +58,7 @@ MEASUREMENTS = (
     Measurement(
         name="injections",
         title="Faults on the way between gateway and computer",
-        conditions="The same parts on a simulated clock; each trial begins at another phase of all cycles. `moves` counts trials in which the valves still got something "
-        "at the end of the time watched.",
+        conditions="The same parts on a simulated clock; each trial begins at another phase of all cycles.",
         commands=("python benchmarks/deploy/injections.py {out}/injections.json 60",),
         code=CODE,
         read=read_injections,

@@ -11,25 +11,25 @@ CODE = (
 )  # fmt: skip
 ROWS = {
     "top1": "one effect: named first",
-    "top1_equivalent": "… or a listed equivalent",
+    "top1_equivalent": "… or an equivalent",
     "exactly_one": "one effect: nothing else named",
-    "exact_set": "two or three effects: exact set",
-    "exact_set_equivalent": "… or listed equivalents",
-    "set_f1": "two or three effects: F1 of the names",
-    "joints": "joints right, where the effect is",
+    "exact_set": "several effects: exact set",
+    "exact_set_equivalent": "… or equivalents",
+    "set_f1": "several effects: F1",
+    "joints": "joints right",
     "false_alarms_none": "unchanged machines: an effect or `unknown`",
-    "false_alarms_faint": "change below the noise: a false effect or `unknown`",
-    "unknown_recall": "causes outside the library: said unknown",
-    "unknown_auroc": "area under the curve of `unknown`",
-    "unknown_wrongly": "a known effect called unknown",
-    "missed": "a known effect called none",
+    "false_alarms_faint": "faintly changed: a false effect or `unknown`",
+    "unknown_recall": "outside causes: said unknown",
+    "unknown_auroc": "AUROC of `unknown`",
+    "unknown_wrongly": "effects called unknown",
+    "missed": "effects called none",
     "ece": "calibration error",
-    "parameter_error": "error of a size, median share",
-    "cover_90": "90 % intervals that hold the true size",
-    "closed_of_oracle": "gap closed, of what the true effects close; median",
-    "closed_examined": "gap closed on withheld recordings; median",
-    "closed_differs": "stated closing that the examiner contradicts",
-    "closed_missing": "effects named without a share of the gap",
+    "parameter_error": "size: median error",
+    "cover_90": "size: inside 90 %",
+    "closed_of_oracle": "gap closed, of the possible",
+    "closed_examined": "gap closed, withheld parts",
+    "closed_differs": "stated closing contradicted",
+    "closed_missing": "named without closing",
 }
 
 
@@ -60,9 +60,7 @@ MEASUREMENTS = (
     Measurement(
         name="exam_valves",
         title="Sealed exam: machines with valves",
-        conditions="300 simulated machines of a make that nothing was fitted to, answered once. The labels were sealed by a hash, and the engine was "
-        "registered before. Always answering `none` or the most frequent effect names at most 1 of 23 effects. The diagnosis has another engine since then, "
-        "which has sat no sealed exam.",
+        conditions="300 simulated machines of a make that nothing was fitted to, answered once; the labels were sealed by a hash. The baseline is one name always: it names 1 of 23 effects. Today's engine has sat no sealed exam.",
         commands=list_exam_commands("exam_plants=held_out"),
         code=(*CODE, "exam"),
         read=read_marks,

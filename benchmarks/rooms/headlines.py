@@ -87,7 +87,7 @@ def say(words: str) -> Callable[[Table], str]:
 
 
 STRICT, INSERTED = "strict success", "inserted"
-ONE, SETS = "one effect: named first", "two or three effects: exact set"
+ONE, SETS = "one effect: named first", "several effects: exact set"
 NONE = "unchanged machines: an effect or `unknown`"
 NO_FINDER, NO_GUARD = say("none was run"), say("the last command stays in force")
 HEADLINES = (

@@ -41,8 +41,7 @@ MEASUREMENTS = (
     Measurement(
         name="holes",
         title="Boreholes in rendered pictures",
-        conditions="Stereo pairs of 1080p by a perfect rig, scenes that no development used (seed 7). No picture of a real block was seen. "
-        "In the rows `decoy` and `empty` flat discs or nothing stand in the place of holes.",
+        conditions="Stereo pairs of 1080p by a perfect rig, scenes of seed 7. No picture of a real block was seen. In `decoy` and `empty` flat discs or nothing stand in the place of holes.",
         commands=(
             "python benchmarks/perception/table.py {out} plane_conic --count 12 --seed 7 --render rig/sensor=mosaic",
         ),
@@ -54,8 +53,7 @@ MEASUREMENTS = (
     Measurement(
         name="stage_times",
         title="Time of a frame, stage by stage",
-        conditions="A frame of 1080p from both pictures, without the network. `whole` searches the whole picture, `followed` the places of known holes. "
-        "Median and 95 % in ms; `processor_time` is the sum over the stages on one core, the others are wall time.",
+        conditions="A frame of 1080p, without the network, in ms. `whole` searches the picture, `followed` the places of known holes. `processor_time` is the sum on one core, the others are wall time.",
         commands=("python benchmarks/perception/speed.py {out}/speed.json --count 1",),
         code=CODE,
         read=read_times,

@@ -81,7 +81,7 @@ PRIVILEGED = "privileged"
 REFUSED_PARTS = {
     "rnd_cfg": "random network distillation is not supported; more exploration comes from "
     "rl.runner.actor.distribution_cfg.std_range",
-    "symmetry_cfg": "mirrored steps are not supported: they showed no gain (docs/results.md)",
+    "symmetry_cfg": "mirrored steps are not supported: they showed no gain",
 }
 """Parts of rsl-rl's algorithm that are not supported, and another way."""
 

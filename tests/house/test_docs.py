@@ -6,10 +6,11 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name != "results.md"]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+RENDERED = "results.md"
 DECIMAL = re.compile(r"(?<![\w.])\d*\.\d+(?![\w.])")
 MOST_WORDS, MOST_WORDS_OF_A_PAGE, MOST_DECIMALS = 24_000, 1_500, 300
-"""Bounds of the pages that people write; the results page is rendered from files."""
+"""Bounds; decimals stand on the results page, which is rendered from files and may be longer."""
 
 
 def count_words(path: Path) -> int:
@@ -19,9 +20,11 @@ def count_words(path: Path) -> int:
 def test_the_pages_are_short() -> None:
     assert sum(map(count_words, PAGES)) <= MOST_WORDS
     long = {page.name: count_words(page) for page in PAGES}
-    assert {name for name, words in long.items() if words > MOST_WORDS_OF_A_PAGE} == set()
+    too_long = {name for name, words in long.items() if words > MOST_WORDS_OF_A_PAGE}
+    assert too_long <= {RENDERED}
 
 
 def test_figures_stand_on_the_results_page() -> None:
-    found = [len(DECIMAL.findall(page.read_text())) for page in PAGES]
+    written = [page for page in PAGES if page.name != RENDERED]
+    found = [len(DECIMAL.findall(page.read_text())) for page in written]
     assert sum(found) <= MOST_DECIMALS
