@@ -68,7 +68,7 @@ class LogSelection:
     rate_hz: Positive | None
     wraps: float | dict[str, float] | None
     dbc: str | None
-    channel: int | None
+    channel: int | str | None
     damaged: Damaged
 
     def check(self) -> None:

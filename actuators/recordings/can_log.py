@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, fields
 from datetime import datetime
 from io import StringIO
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import can
 import cantools
 import numpy as np
+import pandas as pd
 
 from actuators.recordings.advice import advise
 from actuators.recordings.log_tables import LogFile, LogRun, Table
@@ -25,109 +25,16 @@ from brokk_rl import registry
 from brokk_rl.errors import ConfigError, RecordingError
 
 TIME = "time"
-HEAD_FRAMES = 20000
-"""Frames from the beginning in which messages are looked for: slow ones come once a second."""
 BLOCK_FRAMES = 65536
+"""Frames that are decoded at once, and in the first of which messages are looked for: slow ones come once a second."""
 WORD_BYTES = 8
 """Data of a classic frame."""
-BLF_FRAME = np.dtype(
-    [
-        ("signature", "S4"),
-        ("header_size", "<u2"),
-        ("version", "<u2"),
-        ("size", "<u4"),
-        ("kind", "<u4"),
-        ("time_unit", "<u4"),
-        ("client", "<u2"),
-        ("object_version", "<u2"),
-        ("ticks", "<u8"),
-        ("channel", "<u2"),
-        ("flags", "u1"),
-        ("length", "u1"),
-        ("frame_id", "<u4"),
-        ("data", "u1", (WORD_BYTES,)),
-    ]
-)
-"""A classic frame in a BLF file, as `can.io.blf` unpacks it: object header, its version 1, CAN message."""
-CLASSIC_KIND, REMOTE_FLAG, ID_BITS = 1, 0x80, 0x1FFFFFFF
 EXTENDED = 1 << 31
-"""Bit of an identifier that has 29 bits, as in BLF and DBC files."""
-TICKS_OF_10_US = 1
-"""Time unit of 10 µs; others are of 1 ns."""
+"""Bit of an identifier that has 29 bits, as in DBC files."""
+FRAME_FIELDS = ["time_s", "frame_id", "channel", "data"]
 PRINTED_LINE = re.compile(
     r"^\s*\(([-\d:. ]+)\)\s+(\S+)\s+([0-9A-Fa-f]+)\s+\[\d+\]((?:\s+[0-9A-Fa-f]{2})*).*$"
 )
-
-
-@dataclass(frozen=True)
-class FrameBlock:
-    """Frames that carry data, one after another, `N` of them.
-
-    Attributes:
-        time_s: Their times, `(N,)`.
-        frame_id: Their identifiers, with `EXTENDED` for one of 29 bits, `(N,)`.
-        channel: Channels of the recorder, `(N,)`.
-        length: Bytes of their data, `(N,)`.
-        data: The data, zero beyond its end, `(N, B)`.
-    """
-
-    time_s: np.ndarray
-    frame_id: np.ndarray
-    channel: np.ndarray
-    length: np.ndarray
-    data: np.ndarray
-
-
-class BlfBlockReader(can.BLFReader):
-    """A reader that parses a container of classic frames at once, and others frame by frame."""
-
-    def _parse_data(self, data: bytes) -> Iterator[Any]:
-        frames = np.frombuffer(data, BLF_FRAME, len(data) // BLF_FRAME.itemsize)
-        is_classic = (
-            (frames["signature"] == b"LOBJ")
-            & (frames["size"] == BLF_FRAME.itemsize)
-            & (frames["version"] == 1)
-            & (frames["kind"] == CLASSIC_KIND)
-        )
-        if not len(frames) or not is_classic.all():
-            yield from super()._parse_data(data)
-            return
-        self._pos = len(frames) * BLF_FRAME.itemsize
-        unit_s = np.where(frames["time_unit"] == TICKS_OF_10_US, 1e-5, 1e-9)
-        time_s = frames["ticks"] * unit_s + self.start_timestamp
-        length = np.minimum(frames["length"], WORD_BYTES)
-        inside = np.arange(WORD_BYTES) < length[:, None]
-        content = np.where(inside, frames["data"], 0).astype(np.uint8)
-        frame_id = frames["frame_id"] & np.uint32(ID_BITS | EXTENDED)
-        channel = frames["channel"].astype(int) - 1  # python-can counts from 0
-        found = FrameBlock(time_s, frame_id.astype(np.int64), channel, length, content)
-        yield select_frames(found, frames["flags"] & REMOTE_FLAG == 0)
-
-
-def select_frames(block: FrameBlock, chosen: np.ndarray) -> FrameBlock:
-    """Return some frames of a block."""
-    return FrameBlock(*(getattr(block, one.name)[chosen] for one in fields(FrameBlock)))
-
-
-def gather_frames(frames: list[can.Message]) -> FrameBlock:
-    """Return frames as a block."""
-    lengths = [len(frame.data) for frame in frames]
-    widest = max(WORD_BYTES, *lengths)
-    text = b"".join(bytes(frame.data).ljust(widest, b"\0") for frame in frames)
-    names = {name: at for at, name in enumerate(sorted({str(frame.channel) for frame in frames}))}
-    channels = []
-    for frame in frames:
-        text_of_number = re.search(r"\d+$", str(frame.channel))
-        channels.append(int(text_of_number[0]) if text_of_number else names[str(frame.channel)])
-    return FrameBlock(
-        np.array([frame.timestamp for frame in frames]),
-        np.array(
-            [frame.arbitration_id | (EXTENDED if frame.is_extended_id else 0) for frame in frames]
-        ),
-        np.array(channels),
-        np.array(lengths),
-        np.frombuffer(text, np.uint8).reshape(len(frames), widest),
-    )
 
 
 class CanLog(LogFile):
@@ -139,39 +46,29 @@ class CanLog(LogFile):
         channel: Channel of the recorder to read; `None` for all, where no message comes on two.
     """
 
-    def __init__(self, path: Path, dbc: str, channel: int | None = None) -> None:
+    def __init__(self, path: Path, dbc: str, channel: int | str | None = None) -> None:
         super().__init__(path)
         self._channel = channel
         self._messages = {}
         for message in load_dbc(dbc):
-            self._messages[message.frame_id | (EXTENDED if message.is_extended_frame else 0)] = (
-                message
-            )
+            kind = EXTENDED if message.is_extended_frame else 0
+            self._messages[message.frame_id | kind] = message
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the signals of the messages of the DBC that the beginning of the log has."""
-        seen: dict[int, set[int]] = {}
-        count = 0
-        for block in self._iterate():
-            pairs = np.unique(np.stack([block.frame_id, block.channel], 1), axis=0)
-            for frame_id, channel in pairs.tolist():
-                seen.setdefault(frame_id, set()).add(channel)
-            count += len(block.frame_id)
-            if count >= HEAD_FRAMES:
-                break
+        block = next(self._iterate(), pd.DataFrame(columns=FRAME_FIELDS))
         tables = {}
-        for frame_id, message in self._messages.items():
-            channels = sorted(seen.get(frame_id, ()))
-            if len(channels) > 1:
-                self._refuse_channels(message.name, channels)
-            if channels:
+        for frame_id, frames in block.groupby("frame_id"):
+            message = self._messages.get(frame_id)
+            if message is not None:
+                self._refuse_channels(message.name, frames)
                 tables[message.name] = [TIME, *(signal.name for signal in message.signals)]
         if not tables:
-            ids = ", ".join(
-                f"0x{one & ID_BITS:X}{'x' if one & EXTENDED else ''}" for one in sorted(seen)[:8]
-            )
+            ids = []
+            for one in sorted(block["frame_id"].unique())[:8]:
+                ids.append(f"0x{one & ~EXTENDED:X}{'x' if one & EXTENDED else ''}")
             raise RecordingError(
-                f"{self.path}: no message of the DBC is in this log; its identifiers are {ids or 'none'}"
+                f"{self.path}: no message of the DBC is in this log; its identifiers are {', '.join(ids) or 'none'}"
             )
         return tables
 
@@ -179,105 +76,85 @@ class CanLog(LogFile):
         self, wanted: Mapping[str, Collection[str]], max_rows: int | None
     ) -> Iterator[LogRun]:
         """Yield the log as one run."""
-        chosen = {i: m for i, m in self._messages.items() if m.name in wanted}
-        names: dict[int, list[str]] = {}
+        chosen = {at: one for at, one in self._messages.items() if one.name in wanted}
+        names, parts = {}, {}
         for at, message in chosen.items():
-            names[at] = [
-                signal.name for signal in message.signals if signal.name in wanted[message.name]
-            ]
-        parts: dict[int, list[list[np.ndarray]]] = {at: [] for at in chosen}
-        counts, before = dict.fromkeys(chosen, 0), 0
+            names[at] = [one.name for one in message.signals if one.name in wanted[message.name]]
+            parts[at] = [np.empty((0, 1 + len(names[at])))]
         for block in self._iterate():
-            for at, message in chosen.items():
-                rows = np.flatnonzero(block.frame_id == at)
-                rows = rows[: None if max_rows is None else max_rows - counts[at]]
-                if len(rows):
-                    part = select_frames(block, rows)
-                    channels = np.unique(part.channel)
-                    if len(channels) > 1:
-                        self._refuse_channels(message.name, channels.tolist())
-                    values = self._decode(message, names[at], part, before + rows)
-                    parts[at].append([part.time_s, *values])
-                    counts[at] += len(rows)
-            before += len(block.frame_id)
-            if max_rows is not None and all(count >= max_rows for count in counts.values()):
+            for at, frames in block.groupby("frame_id"):
+                if at in chosen:
+                    self._refuse_channels(chosen[at].name, frames)
+                    values = self._decode(chosen[at], names[at], frames)
+                    parts[at].append(np.column_stack([frames["time_s"], values]))
+            counts = [sum(map(len, several)) for several in parts.values()]
+            if max_rows is not None and min(counts, default=0) >= max_rows:
                 break
         tables = {}
         for at, message in chosen.items():
-            blocks = parts[at] or [[np.empty(0)] * (1 + len(names[at]))]
-            values = [np.concatenate(column) for column in zip(*blocks, strict=True)]
-            columns = dict(zip([TIME, *names[at]], values, strict=True))
+            values = np.concatenate(parts[at])[:max_rows]
+            columns = dict(zip([TIME, *names[at]], values.T, strict=True))
             units = {signal.name: signal.unit for signal in message.signals if signal.unit}
             tables[message.name] = Table(columns, units, TIME, message.is_multiplexed())
         yield LogRun(self.path.stem, str(self.path), tables)
 
-    def _refuse_channels(self, name: str, channels: list[int]) -> None:
-        listed = ", ".join(map(str, channels))
-        raise RecordingError(
-            f"{self.path}: message '{name}' comes on the channels {listed}, which are two sources; "
-            f"{advise('channel', channel=channels[0])}"
-        )
+    def _refuse_channels(self, name: str, frames: pd.DataFrame) -> None:
+        channels = sorted(frames["channel"].unique())
+        if len(channels) > 1:
+            raise RecordingError(
+                f"{self.path}: message '{name}' comes on the channels {', '.join(channels)}, which are two sources; "
+                f"{advise('channel', channel=channels[0])}"
+            )
 
-    def _decode(
-        self, message: Any, names: list[str], block: FrameBlock, numbers: np.ndarray
-    ) -> list[np.ndarray]:
-        """Return the named signals of frames of one message; `numbers` are those of the frames."""
-        if is_plain(message) and (block.length >= message.length).all():
-            signals = {signal.name: signal for signal in message.signals}
-            return [extract_signal(signals[name], block.data) for name in names]
-        rows = []
-        for number, time_s, length, data in zip(
-            numbers, block.time_s, block.length, block.data, strict=True
-        ):
+    def _decode(self, message: Any, names: list[str], frames: pd.DataFrame) -> np.ndarray:
+        """Return the named signals of frames of one message, `(N, K)`; NaN for those of other pages."""
+        is_whole = frames["data"].str.len().min() >= message.length
+        if is_plain(message) and is_whole:
+            words = b"".join(data[:WORD_BYTES].ljust(WORD_BYTES, b"\0") for data in frames["data"])
+            rows = np.frombuffer(words, np.uint8).reshape(-1, WORD_BYTES)
+            signals = [message.get_signal_by_name(name) for name in names]
+            return np.array([extract_signal(one, rows) for one in signals]).T
+        found = np.full((len(frames), len(names)), np.nan)
+        for row, data in enumerate(frames["data"]):
             try:
-                values: Any = message.decode(data[:length].tobytes(), decode_choices=False)
+                values: Any = message.decode(data, decode_choices=False)
             except Exception as error:  # cantools and bitstruct raise what they stumble over
-                text = f"frame {number} at {time_s:.6f} s: is no message '{message.name}' of the DBC ({error})"
+                time_s = frames["time_s"].iloc[row]
+                text = f"frame {frames.index[row]} at {time_s:.6f} s: is no message '{message.name}' of the DBC ({error})"
                 self.report_damage(text, error)
                 values = {}
-            rows.append([values.get(name, np.nan) for name in names])
-        return list(np.array(rows, dtype=float).reshape(len(rows), len(names)).T)
+            found[row] = [values.get(name, np.nan) for name in names]
+        return found
 
     def _open(self) -> Any:
-        ending = self.path.suffix.lower()
-        if ending == ".blf":
-            return BlfBlockReader(self.path)
-        if ending in (".log", ".txt"):
+        if self.path.suffix.lower() in (".log", ".txt"):
             return can.CanutilsLogReader(StringIO(read_candump(self.path)))
         return can.LogReader(self.path)
 
-    def _iterate(self) -> Iterator[FrameBlock]:
-        """Yield the frames of the chosen channel that carry data, by blocks."""
+    def _iterate(self) -> Iterator[pd.DataFrame]:
+        """Yield the frames of the chosen channel that carry data, by blocks; the index is their number in the log."""
         for block in self._iterate_all():
-            if self._channel is None:
-                yield block
-            else:
-                yield select_frames(block, block.channel == self._channel)
+            is_chosen = block["channel"] == str(self._channel)
+            yield block if self._channel is None else block[is_chosen]
 
-    def _iterate_all(self) -> Iterator[FrameBlock]:
+    def _iterate_all(self) -> Iterator[pd.DataFrame]:
         count, last_s = 0, 0.0
-        waiting: list[can.Message] = []
+        waiting: dict[int, tuple[float, int, str, bytes]] = {}
         try:
             with self._open() as reader:
                 # python-can reads a file that is shorter than its header says without a word
                 stated, there = getattr(reader, "file_size", 0), self.path.stat().st_size
                 if there < stated:
                     self.report_damage(f"cut off at byte {there} of {stated}", None)
-                for found in reader:
-                    is_block = isinstance(found, FrameBlock)
-                    if waiting and (is_block or len(waiting) >= BLOCK_FRAMES):
-                        yield gather_frames(waiting)
-                        waiting = []
-                    if is_block:
-                        yield found
-                        count += len(found.time_s)
-                        last_s = float(found.time_s[-1]) if len(found.time_s) else last_s
+                for frame in reader:
+                    count, last_s = count + 1, frame.timestamp
+                    if frame.is_error_frame or frame.is_remote_frame:
                         continue
-                    count, last_s = count + 1, found.timestamp
-                    if not (found.is_error_frame or found.is_remote_frame):
-                        waiting.append(found)
-            if waiting:
-                yield gather_frames(waiting)
+                    frame_id = frame.arbitration_id | (EXTENDED if frame.is_extended_id else 0)
+                    waiting[count - 1] = (last_s, frame_id, str(frame.channel), bytes(frame.data))
+                    if len(waiting) >= BLOCK_FRAMES:
+                        yield gather_frames(waiting)
+                        waiting = {}
         except RecordingError:
             raise
         except Exception as error:  # python-can raises what its parsers stumble over
@@ -285,8 +162,13 @@ class CanLog(LogFile):
             self.report_damage(
                 f"damaged after frame {count} at {last_s:.6f} s ({kind}: {error})", error
             )
-            if waiting:
-                yield gather_frames(waiting)
+        if waiting:
+            yield gather_frames(waiting)
+
+
+def gather_frames(frames: Mapping[int, tuple[float, int, str, bytes]]) -> pd.DataFrame:
+    """Return frames by their number as a table of `FRAME_FIELDS`."""
+    return pd.DataFrame.from_dict(frames, orient="index", columns=FRAME_FIELDS)
 
 
 def read_candump(path: Path) -> str:

@@ -35,7 +35,7 @@ from actuators.recordings.log_signals import (
     refuse_missing,
     resolve_column,
 )
-from actuators.recordings.log_tables import LogFile, index_columns, join_names
+from actuators.recordings.log_tables import index_columns, join_names
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -46,7 +46,6 @@ log = logging.getLogger(__name__)
 
 __all__ = [
     "AlignedTime",
-    "CanColumnMap",
     "Column",
     "ColumnMap",
     "CommandColumn",
@@ -155,6 +154,8 @@ class JointColumns:
 class ColumnMap:
     """Reads logs of another machine by a map of their columns.
 
+    In a log of a CAN bus a column is `<message>:<signal>`, the time of each message `time`.
+
     Attributes:
         delimiter: Between the cells of a line of a CSV file.
         decimal: Decimal sign of its numbers.
@@ -167,6 +168,8 @@ class ColumnMap:
         longest_gap_s: A longer time between two rows splits the log.
         shortest_s: Shorter pieces are left out.
         damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
+        dbc: DBC file of logs of a CAN bus: a path, or `package:path` in an installed package.
+        channel: Channel of its recorder; `null` where each message comes on one.
     """
 
     delimiter: Literal[",", ";", "\t", " ", "|"]
@@ -177,7 +180,9 @@ class ColumnMap:
     overrun: NonNegative
     longest_gap_s: Positive
     shortest_s: NonNegative
-    damaged: Damaged = "refuse"  # maps from before this field have none
+    damaged: Damaged = "refuse"  # maps from before these fields have none
+    dbc: str | None = None
+    channel: int | str | None = None
 
     def check(self) -> None:
         if self.delimiter == self.decimal:
@@ -195,11 +200,6 @@ class ColumnMap:
             ConfigError: the map is not for this machine.
             RecordingError: the log cannot be used; names file, line, row and column.
         """
-        signs = (self.delimiter, self.decimal)
-        return self.read_log(open_log(path, signs, damaged=self.damaged), machine)
-
-    def read_log(self, opened: LogFile, machine: Machine) -> list[Recording]:
-        """Return the pieces of an opened log; see `read`."""
         if set(self.joints) != set(machine.joint_names):
             raise ConfigError(
                 f"import: the map names the joints {', '.join(self.joints)}, machine '{machine.name}' has "
@@ -207,23 +207,26 @@ class ColumnMap:
             )
         self._check_interface(machine)
         found, num_rows = [], 0
-        for signals in self.open_runs(opened, None):
+        for signals in self.open_runs(path):
             found += self._read_run(signals, machine)
             num_rows += max(
                 len(next(iter(one.columns.values()))) for one in signals.run.tables.values()
             )
         if not found:
             raise RecordingError(
-                f"{opened.path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
+                f"{path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
                 f"{num_rows} rows; mend longest_gap_s or the scale of time in the column map"
             )
         return found
 
-    def open_runs(self, opened: LogFile, max_rows: int | None) -> Iterator[RunSignals]:
-        """Yield the signals of each run of a log, at most so many rows of each table."""
+    def open_runs(self, path: Path) -> Iterator[RunSignals]:
+        """Yield the signals of each run of the log at `path`."""
+        opened = open_log(
+            path, (self.delimiter, self.decimal), self.dbc, self.damaged, self.channel
+        )
         places = index_columns(opened.list_tables())
-        wanted = self._list_wanted(places, opened.path)
-        for run in opened.read_runs(wanted, max_rows):
+        wanted = self._list_wanted(places, path)
+        for run in opened.read_runs(wanted, None):
             find_time = partial(self.find_time, where=run.where)
             skip = self.damaged == "skip"
             yield RunSignals(run, places, find_time, skip, self.longest_gap_s)
@@ -367,26 +370,6 @@ class ColumnMap:
         turn = column.scale * abs(column.wraps or 0.0)
         apart = float(np.median(position.interpolate(signal.t_s) - targets))
         return replace(signal, values=signal.values + turn * round(apart / turn) / column.scale)
-
-
-@spec
-class CanColumnMap:
-    """Reads logs of a CAN bus by a DBC file and a map of its signals.
-
-    Attributes:
-        dbc: The DBC file: a path, or `package:path` in an installed package.
-        channel: Channel of the recorder; `null` where each message comes on one.
-        columns: The map; a signal is `<message>:<signal>`, the time of each message `time`.
-    """
-
-    dbc: str
-    columns: ColumnMap
-    channel: int | None = None  # maps from before this field have none
-
-    def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Return the pieces of the log at `path`; see `ColumnMap.read`."""
-        opened = open_log(path, dbc=self.dbc, damaged=self.columns.damaged, channel=self.channel)
-        return self.columns.read_log(opened, machine)
 
 
 def read_column(

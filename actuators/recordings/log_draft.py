@@ -90,7 +90,7 @@ class Draft:
     best: Mapping[str, int]
     signs: tuple[str, str]
     dbc: str | None
-    channel: int | None
+    channel: int | str | None
     damaged: Damaged
     remarks: Sequence[str]
 
@@ -182,7 +182,7 @@ def make_draft(
     given: GivenColumns,
     dbc: str | None,
     damaged: Damaged = "refuse",
-    channel: int | None = None,
+    channel: int | str | None = None,
 ) -> Draft:
     """Return the draft of map and machine; joints that are never commanded are left out.
 
@@ -210,7 +210,7 @@ def make_draft(
     places = index_columns({table: [*columns] for table, columns in _list_places(samples)})
     used = {places[column][0] for joint in joints for column in (joint.command, joint.position)}
     times = {table: time for table, time in samples[0].times.items() if table in used}
-    survey = measure_logs(paths, times, joints, dbc, damaged, channel)
+    survey = measure_logs(paths, times, joints, signs, dbc, damaged, channel)
     moving = []
     for joint in joints:
         numbers = survey.joints[joint.name]

@@ -69,7 +69,7 @@ def open_log(
     signs: tuple[str, str] | None = None,
     dbc: str | None = None,
     damaged: Damaged = "refuse",
-    channel: int | None = None,
+    channel: int | str | None = None,
 ) -> LogFile:
     """Open a log.
 
@@ -114,7 +114,7 @@ def _open_folder(path: Path) -> LogFile:
 
 
 def _open_file(
-    path: Path, signs: tuple[str, str] | None, dbc: str | None, channel: int | None
+    path: Path, signs: tuple[str, str] | None, dbc: str | None, channel: int | str | None
 ) -> LogFile:
     if not path.exists():
         raise RecordingError(f"{path}: no such log")

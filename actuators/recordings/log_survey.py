@@ -10,11 +10,9 @@ import numpy as np
 
 from actuators.recordings.column_map import Column, ColumnMap, JointColumns, TargetColumn
 from actuators.recordings.column_table import JointGuess
-from actuators.recordings.log_files import Damaged, open_log
+from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_signals import Signal
-from actuators.recordings.log_tables import index_columns
 from actuators.recordings.time_guess import TimeGuess
-from brokk_rl.errors import RecordingError
 
 GAP_PERIODS = 4
 """Periods without a sample that split a log; loggers without real time skip up to two."""
@@ -126,9 +124,10 @@ def measure_logs(
     paths: Sequence[Path],
     times: Mapping[str, TimeGuess],
     joints: Sequence[JointGuess],
+    signs: tuple[str, str],
     dbc: str | None,
     damaged: Damaged,
-    channel: int | None,
+    channel: int | str | None,
 ) -> LogSurvey:
     """Return the numbers of all logs.
 
@@ -144,20 +143,12 @@ def measure_logs(
         columns[joint.name] = JointColumns(command=command, position=position)
     clocks = {table: one.time for table, one in times.items()}
     reader = ColumnMap(
-        delimiter=",", decimal=".", time=clocks[""] if list(clocks) == [""] else clocks, joints=columns,
-        optional={}, overrun=0.0, longest_gap_s=1.0, shortest_s=0.0, damaged=damaged,
+        delimiter=signs[0], decimal=signs[1], time=clocks[""] if list(clocks) == [""] else clocks, joints=columns,
+        optional={}, overrun=0.0, longest_gap_s=1.0, shortest_s=0.0, damaged=damaged, dbc=dbc, channel=channel,
     )  # fmt: skip
     survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
     for path in paths:
-        opened = open_log(path, None, dbc, damaged, channel)
-        known = index_columns(opened.list_tables())
-        for joint in joints:
-            for name in (joint.command, joint.position):
-                if name not in known:
-                    raise RecordingError(
-                        f"{path}: column '{name}' is missing, which {paths[0]} has; import logs of one kind at a time"
-                    )
-        for signals in reader.open_runs(opened, None):
+        for signals in reader.open_runs(path):
             read = []
             for joint in joints:
                 position = signals.read(joint.position, wraps=joint.wraps)

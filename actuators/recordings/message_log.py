@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import json
 import re
-import sqlite3
 import struct
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -191,9 +189,6 @@ class BagLog(MessageLog):
                     decode = lambda raw, kind=kind: bag.deserialize(raw, kind)  # noqa: E731
                     yield LoggedMessage(names[connection.id], time_ns, data, decode, "")
         except AnyReaderError as error:
-            for file in [*sorted(self.path.glob("*.db3")), self.path]:
-                if file.suffix == ".db3" and (place := find_sqlite_damage(file)):
-                    raise RecordingError(f"{file}: damaged {place} ({error})") from error
             raise RecordingError(f"{self.path}: {describe(error)}") from error
 
 
@@ -254,20 +249,6 @@ def name_tables(topics: Mapping[int, str]) -> dict[int, str]:
     """Return the name of each channel's table: its topic, with the channel where several have it."""
     counts = Counter(topics.values())
     return {key: topic if counts[topic] == 1 else f"{topic}@{key}" for key, topic in topics.items()}
-
-
-def find_sqlite_damage(file: Path) -> str | None:
-    """Return up to where the messages of a SQLite bag can be read, `None` where all can be."""
-    count, first_ns, last_ns = 0, 0, 0
-    try:
-        with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)) as bag:
-            # The message itself comes last in a row, so that its pages are read too.
-            for time_ns, _ in bag.execute("SELECT timestamp, data FROM messages ORDER BY id"):
-                first_ns = first_ns if count else time_ns
-                last_ns, count = time_ns, count + 1
-    except sqlite3.DatabaseError:
-        return f"after {count} messages, {(last_ns - first_ns) * 1e-9:.3f} s from the first one"
-    return None
 
 
 def describe(error: Exception) -> str:

@@ -6,10 +6,7 @@ A stamp is one number, in s. The layout of a ROS MultiArray says how its data li
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import reduce
-from operator import attrgetter, itemgetter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,69 +33,23 @@ class NumberReader:
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = [*names]
-        self._label_keys: list[Keys] | None = None
-        self._plans: dict[tuple[Any, ...], list[_Step]] = {}
-        self._stamps = [at for at, name in enumerate(names) if name.endswith("stamp")]
+        self._label_keys: list[Keys] = []
+        self._ways: dict[tuple[Any, ...], list[Keys]] = {}
 
     def read(self, message: Any) -> list[Any] | None:
         """Return the numbers of a message, `None` for one that it lacks, or `None` where it has none of them."""
-        if self._label_keys is None or not self._label_keys:
+        if not self._label_keys:
             self._label_keys = list(_find_labels(message, ()))
         # names of the items of lists may differ from message to message
         labels = tuple(tuple(follow(message, keys) or ()) for keys in self._label_keys)
-        if labels not in self._plans:
-            self._plans[labels] = _plan_reading(message, dict(find_leaves(message)), self.names)
-        values: list[Any] = []
-        for step in self._plans[labels]:
-            try:
-                values += step.take(step.find_parent(message))
-            except (KeyError, IndexError, TypeError, AttributeError):
-                parent = follow(message, step.parent_keys)
-                values += [follow(parent, (key,)) for key in step.keys]
-        has_any = not values or values.count(None) < len(values)
-        for at in self._stamps:
-            values[at] = read_time(values[at])
-        return values if has_any else None
-
-
-@dataclass(frozen=True)
-class _Step:
-    """Numbers beside one another: their parent in a message, and its fields or items."""
-
-    parent_keys: Keys
-    keys: list[str | int]
-    find_parent: Callable[[Any], Any]
-    take: Callable[[Any], Sequence[Any]]
-
-
-def _plan_reading(message: Any, leaves: Mapping[str, Keys], names: Sequence[str]) -> list[_Step]:
-    """Return the steps that read the named numbers, in their order."""
-    groups: list[tuple[Keys, list[str | int]]] = []
-    for name in names:
-        keys = leaves.get(name, ("",))  # no field has an empty name
-        if groups and groups[-1][0] == keys[:-1] and type(groups[-1][1][0]) is type(keys[-1]):
-            groups[-1][1].append(keys[-1])
-        else:
-            groups.append((keys[:-1], [keys[-1]]))
-    is_mapping = isinstance(message, Mapping)
-
-    def get(key: str | int) -> Callable[[Any], Any]:
-        return itemgetter(key) if is_mapping or isinstance(key, int) else attrgetter(key)
-
-    steps = []
-    for parent_keys, keys in groups:
-        getters = [get(key) for key in parent_keys]
-        find_parent = lambda value, getters=getters: reduce(_apply, getters, value)  # noqa: E731
-        several: Any = itemgetter if is_mapping or isinstance(keys[0], int) else attrgetter
-        take = several(*keys)
-        if len(keys) == 1:
-            take = lambda parent, one=take: (one(parent),)  # noqa: E731
-        steps.append(_Step(parent_keys, keys, find_parent, take))
-    return steps
-
-
-def _apply(value: Any, getter: Callable[[Any], Any]) -> Any:
-    return getter(value)
+        if labels not in self._ways:
+            leaves = dict(find_leaves(message))
+            self._ways[labels] = [leaves.get(name, ("",)) for name in self.names]  # no field is ""
+        values = []
+        for name, keys in zip(self.names, self._ways[labels], strict=True):
+            value = follow(message, keys)
+            values.append(read_time(value) if name.endswith("stamp") else value)
+        return values if not values or values.count(None) < len(values) else None
 
 
 def find_leaves(value: Any, prefix: str = "", keys: Keys = ()) -> Iterator[tuple[str, Keys]]:

@@ -19,6 +19,7 @@ from packages import EXAMPLE, install_example
 
 from brokk_rl import cli, extensions, registry
 from brokk_rl.build import build_quick_nodes
+from brokk_rl.errors import RecordingError
 
 ROOT = Path(__file__).parents[2]
 NEWCOMERS = (ROOT / "README.md", *ROOT.glob("docs/tutorials/*.md"))
@@ -161,6 +162,8 @@ def explain_fault(overrides: list[str], whole: bool) -> str | None:
         if whole:
             cfg = OmegaConf.merge(cfg, {"session": {"out": "folder"}}) if "session" in cfg else cfg
             build_quick_nodes(*extensions.read_values(cfg))
+    except RecordingError:  # recordings are there only after a run
+        return None
     except Exception as error:
         told = cli.explain(error) or repr(error)
         return told if whole or "must be given" not in told else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from carriage import check, make_carriage, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
-from actuators.recordings.can_log import BlfBlockReader, CanLog, extract_signal, gather_frames
+from actuators.recordings.can_log import CanLog, extract_signal
 from actuators.recordings.column_map import AlignedTime, Column
 from actuators.recordings.log_files import open_log
 from brokk_rl.errors import ConfigError, RecordingError
@@ -211,23 +210,15 @@ def test_a_cut_off_mcap_is_refused_by_its_place(
         reader.read(path, carriage)
 
 
-@pytest.mark.parametrize(("page", "most"), [(0.6, 0.7), (0.9, 0.95)])
-def test_a_damaged_sqlite_bag_is_refused_by_its_place(
-    tmp_path: Path, carriage: Machine, page: float, most: float
-) -> None:
-    """SQLite keeps messages in the order of its pages of 4096 bytes."""
+def test_a_damaged_sqlite_bag_is_refused_by_its_name(tmp_path: Path, carriage: Machine) -> None:
     reader = WRITERS["sqlite"](tmp_path / "bag")
     (file,) = (tmp_path / "bag").glob("*.db3")
     data = bytearray(file.read_bytes())
-    begin = int(page * len(data)) // 4096 * 4096
+    begin = int(0.6 * len(data)) // 4096 * 4096  # SQLite keeps messages in pages of 4096 bytes
     data[begin : begin + 4096] = b"\xff" * 4096
     file.write_bytes(data)
-    with pytest.raises(RecordingError, match=r"\.db3: damaged after \d+ messages, ") as told:
+    with pytest.raises(RecordingError, match=r"bag: .*malformed"):
         reader.read(tmp_path / "bag", carriage)
-    (count, seconds) = re.findall(r"after (\d+) messages, ([\d.]+) s", str(told.value))[0]
-    rows = list_rows()
-    assert 0.5 * page < int(count) / (2 * len(rows)) < most
-    assert float(seconds) == pytest.approx((rows[(int(count) - 1) // 2][0] - rows[0][0]) * 1e-9)
 
 
 def test_a_flipped_byte_of_an_mcap_is_refused(tmp_path: Path, carriage: Machine) -> None:
@@ -353,8 +344,8 @@ def test_can_logs_are_decoded_by_their_dbc(tmp_path: Path, carriage: Machine, en
     path, dbc = tmp_path / f"a.{ending}", tmp_path / "a.dbc"
     dbc.write_text(DBC)
     write_can(path)
-    reader = make_map("Command:Valve", "State:Position", "time")
-    (recording,) = reader.read_log(CanLog(path, str(dbc)), carriage)
+    reader = replace(make_map("Command:Valve", "State:Position", "time"), dbc=str(dbc))
+    (recording,) = reader.read(path, carriage)
     signals = make_signals()
     np.testing.assert_allclose(recording.u[:, 0], signals["u"][: recording.num_samples], atol=1e-6)
     np.testing.assert_allclose(recording.q[:, 0], signals["q"][: recording.num_samples], atol=1e-3)
@@ -384,24 +375,13 @@ def test_signals_of_a_block_are_those_that_cantools_reads_frame_by_frame() -> No
             np.testing.assert_allclose(extract_signal(signal, data), np.array(expected, float), rtol=1e-15)  # fmt: skip
 
 
-def test_a_block_of_classic_frames_is_what_python_can_reads(tmp_path: Path) -> None:
-    write_can(tmp_path / "a.blf")
-    with can.BLFReader(tmp_path / "a.blf") as reader:
-        frames = gather_frames(list(reader))
-    with BlfBlockReader(tmp_path / "a.blf") as reader:
-        blocks: list[Any] = list(reader)
-    for name in ("time_s", "frame_id", "channel", "length", "data"):
-        found = np.concatenate([getattr(block, name) for block in blocks])
-        np.testing.assert_allclose(found, getattr(frames, name), rtol=1e-15)
-
-
 def test_a_cut_off_blf_is_refused_by_its_frame(tmp_path: Path, carriage: Machine) -> None:
     path, dbc = tmp_path / "a.blf", tmp_path / "a.dbc"
     dbc.write_text(DBC)
     write_can(path)
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(RecordingError, match=r"a\.blf"):
-        make_map("Command:Valve", "State:Position", "time").read_log(CanLog(path, str(dbc)), carriage)  # fmt: skip
+        replace(make_map("Command:Valve", "State:Position", "time"), dbc=str(dbc)).read(path, carriage)  # fmt: skip
 
 
 def test_a_can_log_without_its_dbc_is_refused(tmp_path: Path) -> None:
