@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,50 +21,58 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(value, b[name]) for name, value in a.items())
 
 
-def test_the_same_seed_trains_the_same_weights(machine: Machine, tmp_path: Path) -> None:
-    first, second = (
-        runs.train(machine, tmp_path / name, runs.small(max_env_steps=6 * ITERATION))
-        for name in "ab"
-    )
-    assert same(runs.weights(first), runs.weights(second))
-    assert (
-        runs.progress(tmp_path / "a") == runs.progress(tmp_path / "b")
-        and len(runs.progress(tmp_path / "a")) == 6
-    )
+@pytest.fixture(scope="module")
+def whole(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with nine iterations that nothing interrupted, a checkpoint after each."""
+    folder = tmp_path_factory.mktemp("whole")
+    training = runs.small(max_env_steps=9 * ITERATION, keep_checkpoints=9)
+    runs.train(machine, folder, training)
+    return folder
 
 
-@pytest.mark.parametrize("save_interval", [1, 3])
-def test_a_resumed_run_is_the_run_that_was_never_interrupted(
-    save_interval: int, machine: Machine, tmp_path: Path
-) -> None:
-    whole = runs.train(
-        machine,
-        tmp_path / "whole",
-        runs.small(max_env_steps=9 * ITERATION, save_interval=save_interval),
-    )
-    runs.train(
-        machine,
-        tmp_path / "parts",
-        runs.small(max_env_steps=3 * ITERATION, save_interval=save_interval),
-    )
-    checkpoint = tmp_path / "parts" / "model_3.pt"
-    resumed = runs.train(
-        machine,
-        tmp_path / "parts",
-        runs.small(max_env_steps=9 * ITERATION, save_interval=save_interval),
-        checkpoint,
-    )
-    assert same(runs.weights(whole), runs.weights(resumed))
-    assert runs.progress(tmp_path / "whole") == runs.progress(tmp_path / "parts")
-    assert whole.alg.learning_rate == resumed.alg.learning_rate
-    ends = [
-        torch.load(tmp_path / name / "model_9.pt", weights_only=True) for name in ("whole", "parts")
-    ]
-    assert same(ends[0]["env"]["tensors"], ends[1]["env"]["tensors"]) and same(
-        ends[0]["random"], ends[1]["random"]
-    )
+def read_end(folder: Path) -> dict[str, Any]:
+    return torch.load(folder / "model_9.pt", weights_only=True)
+
+
+def check_same_end(folder: Path, whole: Path) -> None:
+    """Checks weights, optimizer, environments, random streams and progress."""
+    ends = [read_end(one) for one in (folder, whole)]
+    for part in ("actor_state_dict", "critic_state_dict", "random"):
+        assert same(ends[0][part], ends[1][part]), part
+    assert same(ends[0]["env"]["tensors"], ends[1]["env"]["tensors"])
     state = [end["optimizer_state_dict"]["state"] for end in ends]
     assert all(same(state[0][key], state[1][key]) for key in state[0])
+    assert runs.progress(folder) == runs.progress(whole) and len(runs.progress(whole)) == 9
+
+
+def test_the_same_seed_trains_the_same_weights_however_often_it_is_saved(
+    machine: Machine, whole: Path, tmp_path: Path
+) -> None:
+    training = runs.small(max_env_steps=9 * ITERATION, save_interval=50)
+    runs.train(machine, tmp_path / "once", training)
+    check_same_end(tmp_path / "once", whole)
+
+
+def test_a_resumed_run_is_the_run_that_was_never_interrupted(
+    machine: Machine, whole: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "parts"
+    runs.train(machine, folder, runs.small(max_env_steps=3 * ITERATION, save_interval=3))
+    training = runs.small(max_env_steps=9 * ITERATION, save_interval=3)
+    resumed = runs.train(machine, folder, training, folder / "model_3.pt")
+    check_same_end(folder, whole)
+    rates = [group["lr"] for group in read_end(whole)["optimizer_state_dict"]["param_groups"]]
+    assert rates == [resumed.alg.learning_rate] * len(rates)
+
+
+def test_going_back_to_an_older_checkpoint_drops_the_progress_after_it(
+    machine: Machine, whole: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(whole, folder)
+    training = runs.small(max_env_steps=9 * ITERATION)
+    runs.train(machine, folder, training, folder / "model_4.pt")
+    check_same_end(folder, whole)
 
 
 def test_a_resumed_run_settles_as_the_run_that_was_never_interrupted(
@@ -78,37 +88,6 @@ def test_a_resumed_run_settles_as_the_run_that_was_never_interrupted(
         == again.alg.desired_kl
         == pytest.approx(0.01 * (1 - 0.9 * (6 / 8 - 0.2) / 0.8))
     )
-
-
-def test_how_often_a_checkpoint_is_written_does_not_change_training(
-    machine: Machine, tmp_path: Path
-) -> None:
-    often, once = (
-        runs.train(
-            machine,
-            tmp_path / str(interval),
-            runs.small(max_env_steps=4 * ITERATION, save_interval=interval),
-        )
-        for interval in (1, 50)
-    )
-    assert same(runs.weights(often), runs.weights(once)) and runs.progress(
-        tmp_path / "1"
-    ) == runs.progress(tmp_path / "50")
-
-
-def test_going_back_to_an_older_checkpoint_drops_the_progress_after_it(
-    machine: Machine, tmp_path: Path
-) -> None:
-    whole = runs.train(machine, tmp_path / "run", runs.small(max_env_steps=6 * ITERATION))
-    before = runs.progress(tmp_path / "run")
-    again = runs.train(
-        machine,
-        tmp_path / "run",
-        runs.small(max_env_steps=6 * ITERATION),
-        tmp_path / "run" / "model_4.pt",
-    )
-    assert runs.progress(tmp_path / "run") == before and len(before) == 6
-    assert same(runs.weights(whole), runs.weights(again))
 
 
 def test_another_start_of_the_pool_is_not_another_run(machine: Machine, tmp_path: Path) -> None:

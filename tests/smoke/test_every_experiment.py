@@ -1,7 +1,4 @@
-"""Every experiment and changes of the task: trained for a moment, evaluated, exported, and the answers are the same.
-
-`make test` takes the other task, and the experiment that trains a task of its own.
-"""
+"""Every experiment and changes of the task: trained for a moment, evaluated, exported, and the answers are the same."""
 
 from __future__ import annotations
 
@@ -33,6 +30,8 @@ TRAINED = (
 
 CHANGES_OF_BEHAVIOUR = ("follower=person", "task.memory=1", "task.action.mask=false")
 """Words that change what a policy learns with, and so the fingerprint of its task."""
+QUICK = ("experiment=direct", "experiment=paper", "task.memory=1")
+"""What `make test` takes, beside the other task: each goes a way of its own through the code."""
 
 
 def read_options(group: str) -> dict[str, dict[str, Any]]:
@@ -49,7 +48,7 @@ def list_cases() -> list[Any]:
     cases = [pytest.param(("task=goal_pose",), (), id="task=goal_pose")]
     for name, content in read_options("experiment").items():
         if "stages" not in content:
-            cases.append(pytest.param((f"experiment={name}",), (), id=f"experiment={name}"))
+            cases.append(make_case(f"experiment={name}", ()))
             continue
         for stage in content["stages"].values():
             if stage["command"][0] == "mode=train":  # a story: its training, without its recordings
@@ -57,8 +56,13 @@ def list_cases() -> list[Any]:
                 marks = [pytest.mark.slow]
                 cases.append(pytest.param(words, (), id=f"experiment={name}", marks=marks))
     for word in CHANGES_OF_BEHAVIOUR:
-        cases.append(pytest.param((word,), (word,), id=word))
+        cases.append(make_case(word, (word,)))
     return cases
+
+
+def make_case(word: str, shared: tuple[str, ...]) -> Any:
+    marks = [] if word in QUICK else [pytest.mark.slow]
+    return pytest.param((word,), shared, id=word, marks=marks)
 
 
 def describe_words(words: tuple[str, ...]) -> str:
