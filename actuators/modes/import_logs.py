@@ -200,7 +200,8 @@ def _format_next(folder: Path, patterns: str | tuple[str, ...]) -> str:
     )
 
 
-def _summarise(draft: Draft, guesses: list[Guess]) -> str:
+def summarise(draft: Draft, guesses: list[Guess]) -> str:
+    """Return what was found in one sentence, and what is left to fill in."""
     unsure = sum(guess.sureness == "unsure" for guess in guesses)
     end = "No guess is unsure."
     if unsure:
@@ -221,7 +222,7 @@ def _summarise(draft: Draft, guesses: list[Guess]) -> str:
 def _write_page(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
     is_unsure = any(guess.sureness == "unsure" for guess in guesses)
     page = Report(
-        f"Logs of {draft.name}", _summarise(draft, guesses), "bad" if is_unsure else "plain"
+        f"Logs of {draft.name}", summarise(draft, guesses), "bad" if is_unsure else "plain"
     )
     page.add_picture(
         folder / PICTURE_FILE,
@@ -248,7 +249,7 @@ def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> Non
     print_table(HEAD, rows)
     for text in (
         *draft.remarks,
-        _summarise(draft, guesses),
+        summarise(draft, guesses),
         f"look at {folder / PAGE_FILE}, then:",
         command,
     ):

@@ -1,4 +1,4 @@
-"""Logs of arrays: Parquet, LeRobotDataset v2 and v3, NumPy archives and MATLAB files.
+"""Logs of arrays: Parquet, lines of JSON, LeRobotDataset v2 and v3, NumPy archives and MATLAB files.
 
 A column of lists becomes one column for each item, named `action[elbow]` where the dataset names
 the items and `action[2]` where it does not.
@@ -28,7 +28,9 @@ EPISODE = "episode_index"
 """Column of a LeRobotDataset that says which episode a row belongs to."""
 MOST_COLUMNS = 256
 """Widest matrix that is taken for joints; wider ones are pictures."""
-PARQUET_ERRORS = (OSError, pa.ArrowException, ValueError)
+FORMATS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json"}
+"""Formats of pyarrow by the ending of their files."""
+TABLE_ERRORS = (OSError, pa.ArrowException, ValueError)
 """Errors of pyarrow on a damaged file; a name that is no text is a `ValueError`."""
 NPZ_ERRORS = (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of NumPy on a damaged archive."""
@@ -36,8 +38,8 @@ Labels = Mapping[str, list[str]]
 """Names of the items of columns of lists."""
 
 
-class ParquetLog(LogFile):
-    """A Parquet file as a log with one table.
+class TableLog(LogFile):
+    """A Parquet file, or one of lines of JSON, as a log with one table.
 
     Args:
         path: The file.
@@ -61,44 +63,46 @@ class ParquetLog(LogFile):
 
     def read_columns(self, names: Collection[str], max_rows: int | None) -> dict[str, np.ndarray]:
         """Return the named columns, each `(T,)`; NaN for an empty cell, s since 1970 for a time."""
-        places = self._list_places()
-        lengths = Counter(column for column, _ in places.values())
-        wanted = [*{places[name][0]: None for name in names if name in places}]
-        try:
-            source = ds.dataset(self.path, format="parquet")
-            if max_rows is None:
-                table = source.to_table(columns=wanted)
-            else:
-                table = source.head(max_rows, columns=wanted)
-            values = {name: _convert_column(table[name], lengths[name]) for name in wanted}
-        except PARQUET_ERRORS as error:
-            raise RecordingError(f"{self.path}: damaged ({error})") from error
+        places = {name: place for name, place in self._list_places().items() if name in names}
+        fields = {way: pc.field(*way) for way, *_ in places.values()}
         found = {}
-        for name in names:
-            if name in places:
-                column, item = places[name]
-                found[name] = values[column][:, item]
+        try:
+            source = self._open()
+            columns = {".".join(way): field for way, field in fields.items()}
+            if max_rows is None:
+                table = source.to_table(columns=columns)
+            else:
+                table = source.head(max_rows, columns=columns)
+            for name, (way, item, length) in places.items():
+                found[name] = _convert_column(table[".".join(way)], length)[:, item]
+        except TABLE_ERRORS as error:
+            raise RecordingError(f"{self.path}: damaged ({error})") from error
         return found
 
-    def _list_places(self) -> dict[str, tuple[str, int]]:
-        """Return column and item of each name."""
+    def _open(self) -> ds.Dataset:
+        return ds.dataset(self.path, format=FORMATS[self.path.suffix.lower()])
+
+    def _list_places(self) -> dict[str, tuple[tuple[str, ...], int, int]]:
+        """Return field, item and number of items of each name; a field within another one is a way to it."""
         try:
-            head = ds.dataset(self.path, format="parquet").head(1)
+            (head,) = self._open().head(1).to_pylist() or [{}]
+            schema = self._open().schema
         except FileNotFoundError as error:
             raise RecordingError(f"{self.path}: no such log") from error
-        except PARQUET_ERRORS as error:
-            raise RecordingError(f"{self.path}: cannot be read as parquet ({error})") from error
+        except TABLE_ERRORS as error:
+            kind = FORMATS[self.path.suffix.lower()]
+            raise RecordingError(f"{self.path}: cannot be read as {kind} ({error})") from error
         places = {}
-        for field in head.schema:
-            if _is_number(field.type):
-                places[field.name] = (field.name, 0)
-            elif _is_list(field.type) and _is_number(field.type.value_type) and len(head):
-                length = len(head[field.name][0].as_py() or [])
-                names = self._labels.get(field.name, [])
-                if len({*names}) != length:
-                    names = [str(item) for item in range(length)]
-                for item, name in enumerate(names):
-                    places[f"{field.name}[{name}]"] = (field.name, item)
+        for way, kind, value in _walk_fields(schema, head):
+            name = ".".join(way)
+            if _is_number(kind):
+                places[name] = (way, 0, 1)
+            elif _is_list(kind) and _is_number(kind.value_type) and value:
+                names = self._labels.get(name, [])
+                if len({*names}) != len(value):
+                    names = [str(item) for item in range(len(value))]
+                for item, label in enumerate(names):
+                    places[f"{name}[{label}]"] = (way, item, len(value))
         return places
 
 
@@ -124,7 +128,7 @@ class LeRobotLog(LogFile):
                 f"{place}: codebase_version is '{version}', expected v2.x or v3.x; "
                 "LeRobot's own converter brings an older dataset to v3.0"
             )
-        self._files = [ParquetLog(file, labels) for file in sorted(path.glob("data/**/*.parquet"))]
+        self._files = [TableLog(file, labels) for file in sorted(path.glob("data/**/*.parquet"))]
         if not self._files:
             raise RecordingError(
                 f"{path}: no data/**/*.parquet; a LeRobotDataset keeps its rows there"
@@ -266,6 +270,18 @@ def _read_labels(features: Mapping[str, Any]) -> dict[str, list[str]]:
         if isinstance(names, list):
             labels[feature] = [str(name) for name in names]
     return labels
+
+
+def _walk_fields(
+    fields: Any, values: Any, outer: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], pa.DataType, Any]]:
+    """Yield way, type and first value of each field, of those inside of others too."""
+    for field in fields:
+        value = (values or {}).get(field.name)
+        if pa.types.is_struct(field.type):
+            yield from _walk_fields(field.type, value, (*outer, field.name))
+        else:
+            yield (*outer, field.name), field.type, value
 
 
 def _is_real(values: np.ndarray) -> bool:

@@ -185,10 +185,6 @@ class ColumnMap:
     channel: int | str | None = None
 
     def check(self) -> None:
-        if self.delimiter == self.decimal:
-            raise ConfigError(
-                f"column map: '{self.decimal}' cannot be both delimiter and decimal sign"
-            )
         for time in self.time.values() if isinstance(self.time, dict) else (self.time,):
             if not isinstance(time, RowTime) and time.scale <= 0:
                 raise ConfigError(f"column map: time.scale {time.scale:g} must be positive")

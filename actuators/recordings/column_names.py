@@ -25,7 +25,7 @@ COUNT_WORDS = _split("""
 """Words of numbers that count rows."""
 COMMAND_WORDS = _split("""
     u cmd cmds command commands commanded control ctrl action actions target targets tgt
-    goal setpoint setpoints sp desired des ref reference demand request valve flow pwm duty
+    goal set setpoint setpoints sp desired des ref reference demand request valve flow pwm duty
     soll sollwert sollwinkel sollposition stellwert vorgabe consigne input joystick lever
 """)
 MEASURED_WORDS = _split("""
@@ -55,13 +55,14 @@ ENABLE_WORDS = _split("""
     enable enabled enabling freigabe deadman active armed servo_on powered
 """)
 """Words of columns that say whether a drive is on."""
-DEG = 0.017453292519943295
+DEG = math.pi / 180.0
 UNITS = {
     **dict.fromkeys(("rad", "rads", "radians"), ("rad", 1.0)),
     **dict.fromkeys(("deg", "degree", "degrees", "grad", "°"), ("rad", DEG)),
     **dict.fromkeys(("m", "metre", "meter"), ("m", 1.0)),
+    **dict.fromkeys(("rev", "revs", "turn", "turns"), ("rad", math.tau)),
+    **dict.fromkeys(("gon", "gons"), ("rad", math.pi / 200.0)),
     "mrad": ("rad", 0.001),
-    "rev": ("rad", 6.283185307179586),
     "cm": ("m", 0.01),
     "mm": ("m", 0.001),
     "inch": ("m", 0.0254),
@@ -82,7 +83,7 @@ OTHER_UNITS = _split("""
 """Units that say neither a position nor a time."""
 FILLER_WORDS = _split("""
     joint joints motor motors data value values raw real header robot main percent pct norm
-    controller controllers dof forward servo servos
+    controller controllers dof forward servo servos axis
 """)
 """Words that name no joint."""
 ROLE_WORDS = COMMAND_WORDS | MEASURED_WORDS | frozenset().union(*QUANTITY_WORDS.values())
@@ -102,6 +103,7 @@ class ColumnName:
         quantity: The same.
         unit: Unit of a position, a key of `UNITS`; `None` where none is named.
         joint: Remaining words joined by `_`; may be empty or a number.
+        source: Those of its table.
         speed_unit: rad/s or m/s for one of the column, where its name has a unit of speed.
     """
 
@@ -111,6 +113,7 @@ class ColumnName:
     quantity: Quantity
     unit: str | None
     joint: str
+    source: str
     speed_unit: float | None
 
 
@@ -128,6 +131,13 @@ def split_unit(column: str) -> tuple[str, str | None]:
     if found and is_unit(found[2]) and not (found[2].isdigit() and column.endswith("]")):
         return found[1], found[2].lower()
     return column, None
+
+
+def find_bracketed(column: str) -> str | None:
+    """Return the text in brackets behind a name; an index or the name of an item in `[]` is none."""
+    found = UNIT_SUFFIX.fullmatch(column)
+    is_item = column.endswith("]") and not re.search(r"\s\[", column)
+    return found[2] if found and not is_item else None
 
 
 def read_speed_unit(column: str) -> float | None:
@@ -170,9 +180,7 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     plain, stated = split_unit(column)
     unit = (unit or stated or "").lower() or None
     outer, words = split_words(table), split_words(plain)
-    numbered = re.fullmatch(r"([a-z]+)(\d+)", words[0]) if words else None
-    if numbered and (len(words) == 1 or numbered[1] in ROLE_WORDS):
-        words = [numbered[1], numbered[2], *words[1:]]  # `u1` and `q1` are of joint 1
+    words = _split_numbers(words)
     role = _find_role(words) or _find_role(outer)
     quantity = _find_quantity(words)
     if quantity == "unknown":
@@ -191,8 +199,18 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
         unit = None
     desired = {"d"} if "q" in words else set()
     known = ROLE_WORDS | FILLER_WORDS | set(UNITS) | desired
-    left = [word for word in words if word not in known]
-    return ColumnName(table, column, role, quantity, unit, "_".join(left), speed_unit)
+    joint, source = ("_".join(one for one in each if one not in known) for each in (words, outer))
+    return ColumnName(table, column, role, quantity, unit, joint, source, speed_unit)
+
+
+def _split_numbers(words: list[str]) -> list[str]:
+    """Return the words with a number apart that names a joint: `u1`, `q1` and `AxisSetPos1` are of joint 1."""
+    found = []
+    for word in words:
+        numbered = re.fullmatch(r"([a-z]+)(\d+)", word)
+        is_apart = numbered is not None and (len(words) == 1 or numbered[1] in ROLE_WORDS)
+        found += numbered.groups() if numbered and is_apart else [word]
+    return found
 
 
 def _find_role(words: list[str]) -> Role | None:

@@ -58,6 +58,11 @@ class ColumnEntry:
         """Name of its joint without signs that people set differently."""
         return self.name.joint.replace("_", "")
 
+    def name_source(self) -> ColumnEntry:
+        """Return it with the words of its table before those of its joint."""
+        joint = f"{self.name.source}_{self.name.joint}".strip("_")
+        return replace(self, name=replace(self.name, joint=joint))
+
     @property
     def values(self) -> np.ndarray:
         """Its numbers, `(T,)`."""
@@ -195,6 +200,9 @@ class PairFinder:
             self._refuse_twice(twice.name.column.partition("#")[0], commands, positions)
         if not commands or not positions:
             self._refuse_names("commands" if not commands else "positions", entries)
+        if _has_several_sources(commands) and _has_several_sources(positions):
+            commands = [one.name_source() for one in commands]
+            positions = [one.name_source() for one in positions]
         commands, rivals = self._choose_by_key(commands, True)
         positions, _ = self._choose_by_key(positions, False)
         pairs: dict[str, ColumnPair] = {}
@@ -311,6 +319,14 @@ class PairFinder:
             f"{self._run.where}: no column is named like {lacking}; {advise('joints', joints=advised)}{by}; "
             f"its columns are {', '.join(self._places)}"
         )
+
+
+def _has_several_sources(entries: Sequence[ColumnEntry]) -> bool:
+    """Return whether tables of different names have a joint of one name: two arms, each on its topics."""
+    sources: dict[str, set[str]] = {}
+    for one in entries:
+        sources.setdefault(one.key, set()).add(one.name.source)
+    return any(len(several) > 1 for several in sources.values())
 
 
 def _propose_pairs(run: LogRun, entries: Sequence[ColumnEntry]) -> dict[str, tuple[str, str]]:

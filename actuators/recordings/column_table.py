@@ -16,6 +16,7 @@ from actuators.recordings.advice import advise
 from actuators.recordings.column_names import (
     ENABLE_WORDS,
     UNITS,
+    find_bracketed,
     read_unit,
     split_unit,
     split_words,
@@ -429,9 +430,14 @@ class _JointFinder:
             text = f"unit in the name of its target, which it follows 1 : {slope:.2f}"
             return *UNITS[other], Guess(subject, other, (Evidence(text, 4.0),))
         largest = float(np.abs(q).max())
+        table, column = position.name.table, position.name.column
+        unknown = self._run.tables[table].units.get(column) or find_bracketed(column)
         if largest <= 2 * math.pi:
-            text = f"largest value {largest:.3g}, at most a turn"
-            return "rad", 1.0, Guess(subject, "rad", (Evidence(text, 2.0),))
+            evidence = [Evidence(f"largest value {largest:.3g}, at most a turn", 2.0)]
+            if unknown:
+                text = f"its unit '{unknown}' is not known; {advise('unit')}"
+                evidence.append(Evidence(text, -4.0))
+            return "rad", 1.0, Guess(subject, "rad", tuple(evidence))
         text = (
             f"largest value {largest:.4g}: degrees, per cent, counts, or a length? {advise('unit')}"
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from actuators.recordings.advice import advise
-from actuators.recordings.array_log import ArrayLog, LeRobotLog, ParquetLog
+from actuators.recordings.array_log import FORMATS, ArrayLog, LeRobotLog, TableLog
 from actuators.recordings.log_tables import LogFile, LogRun
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import ConfigError, RecordingError
@@ -16,7 +16,7 @@ from brokk_rl.errors import ConfigError, RecordingError
 TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".log", ".lvm")
 CAN_ENDINGS = (".blf", ".asc", ".trc")
 BAG_ENDINGS = (".db3", ".bag")
-ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *BAG_ENDINGS, ".mcap", ".parquet", ".npz", ".mat")
+ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *BAG_ENDINGS, *FORMATS, ".mcap", ".npz", ".mat")
 """Endings of the files that are logs."""
 SAGE_FILES = ("control.csv", "state_motor.csv")
 """Files of a motion in a folder of SAGE: targets, and what the motors answered."""
@@ -120,8 +120,8 @@ def _open_file(
         raise RecordingError(f"{path}: no such log")
     ending = path.suffix.lower()
     _check_ending(path, ending)
-    if ending == ".parquet":
-        return ParquetLog(path)
+    if ending in FORMATS:
+        return TableLog(path)
     if ending in (".npz", ".mat"):
         return ArrayLog(path)
     if ending == ".mcap" or ending in BAG_ENDINGS:
@@ -192,8 +192,10 @@ def expand_logs(paths: list[Path]) -> list[Path]:
             elif entry.suffix.lower() in ENDINGS:
                 inside.append(entry)
         if not inside:
+            there = sorted({entry.suffix for entry in path.iterdir()} - {""})
+            ends = f" (its files end in {', '.join(there)})" if there else ""
             raise RecordingError(
-                f"{path}: no log in this folder; logs end in {', '.join(ENDINGS)} or are folders of their own"
+                f"{path}: no log in this folder{ends}; logs end in {', '.join(ENDINGS)} or are folders of their own"
             )
         found += inside
     return found

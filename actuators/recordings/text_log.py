@@ -297,7 +297,7 @@ def _list_signs(head: list[str]) -> list[tuple[str, str]]:
     delimiters = (stated[1],) if stated else DELIMITERS
     signs = []
     for delimiter in delimiters:
-        signs += [(delimiter, decimal) for decimal in ".," if decimal != delimiter]
+        signs += [(delimiter, decimal) for decimal in ".,"]  # quotes hold 0,5 between commas
     return signs
 
 
@@ -318,7 +318,9 @@ def _read_ends(path: Path) -> tuple[list[str], list[str], str]:
         encoding = "cp1252"
         first = head.decode(encoding, errors="replace")
     if "\0" in first:
-        raise RecordingError(f"{path}: not a text file that can be read (it holds bytes of 0)")
+        raise RecordingError(
+            f"{path}: neither text nor a kind of log that is known by its ending (it holds bytes of 0)"
+        )
     last = tail.decode(encoding.removesuffix("-sig"), errors="ignore")
     lines = first.splitlines()
     return lines if size <= SNIFFED_BYTES else lines[:-1], last.splitlines()[1:-1], encoding

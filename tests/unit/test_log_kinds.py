@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import shutil
@@ -17,10 +18,12 @@ import numpy as np
 import pytest
 import scipy.io
 from conftest import Done
+from log_import import import_log, try_draft
 from mcap.writer import Writer
 
 from actuators.recordings.advice import ADVICE
 from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
+from brokk_rl import extensions
 from brokk_rl.errors import RecordingError
 from diagnosis import api
 
@@ -46,25 +49,9 @@ def write_text(path: str, rows: np.ndarray, names: tuple[str, ...] = NAMES) -> N
     Path(path).write_text("\n".join([",".join(names), *lines]) + "\n")
 
 
-def read_recordings(folder: str) -> list[dict[str, np.ndarray]]:
-    import pyarrow.parquet as pq
-
-    found = []
-    for path in sorted(Path(folder).glob("recordings/*.parquet")):
-        table = pq.read_table(path)
-        found.append({name: table[name].to_numpy() for name in table.column_names})
-    return found
-
-
-def run_both(brokk: Callable[..., Done], *options: str) -> tuple[Done, list[dict[str, Any]]]:
-    """Runs both commands of an import, the second as the first prints it."""
-    done = brokk("mode=import", "log.name=leg", "session.out=draft", *options)
-    if done.code:
-        return done, []
-    (command,) = [line for line in done.out.splitlines() if line.startswith("brokk mode=import")]
-    second = brokk(*shlex.split(command)[1:], *(one for one in options if "reader" in one))
-    assert second.code == 0, second.err
-    return done, read_recordings("draft_recordings")
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
 
 
 def check_joints(recordings: list[dict[str, Any]], num: int = 600, atol: float = 2e-3) -> None:
@@ -92,6 +79,14 @@ def german(rows: np.ndarray, end: str) -> list[str]:
 
 GERMAN = "Zeit [ms];Soll Hip [°];Ist Hip [°];Soll Knee [°];Ist Knee [°]"
 COMMAS = [",".join(f"{v:.6f}" for v in row) for row in make_rows()]
+QUOTED = [",".join(f'"{v:.6f}"'.replace(".", ",") for v in row) for row in make_rows()]
+NESTED = []
+for stamp_s, hip_target, hip, knee_target, knee in make_rows().tolist():
+    pair = {
+        "target": {"hip": hip_target, "knee": knee_target},
+        "position": {"hip": hip, "knee": knee},
+    }
+    NESTED.append(json.dumps({"stamp": stamp_s, **pair}))
 PLAIN = [" ".join(f"{v:.6f}" for v in row) for row in make_rows()]
 
 
@@ -105,22 +100,50 @@ PLAIN = [" ".join(f"{v:.6f}" for v in row) for row in make_rows()]
         ("comments.csv", ["# operator: A. N., 2 runs", "# note", ",".join(NAMES), *COMMAS], "utf-8"),
         ("units.csv", ["time,hip target,hip pos,knee target,knee pos", "s,rad,rad,rad,rad", *COMMAS], "utf-8"),
         ("marked.dat", ["# " + " ".join(NAMES), *PLAIN], "utf-8"),
+        ("quotes.csv", [",".join(NAMES), *QUOTED], "utf-8"),
+        ("lines.jsonl", NESTED, "utf-8"),
     ],
 )  # fmt: skip
-def test_every_layout_of_text_gives_both_joints(
-    brokk: Callable[..., Done], name: str, lines: list[str], encoding: str
-) -> None:
+def test_every_layout_of_text_gives_both_joints(name: str, lines: list[str], encoding: str) -> None:
     Path(name).write_text("\r\n".join(lines) + "\r\n", encoding=encoding)
-    done, recordings = run_both(brokk, f"log.input={name}")
+    done, recordings = import_log(f"log.input={name}")
     assert done.code == 0, done.err
     assert "No guess is unsure" in done.out
     check_joints(recordings)
 
 
+@pytest.mark.parametrize(
+    ("names", "factor"),
+    [
+        (("t [s]", "hip target [turns]", "hip pos [turns]", "knee target [turns]", "knee pos [turns]"), 1 / math.tau),
+        (("Time[ms]", "AxisSetPosHip[gon]", "AxisActPosHip[gon]", "AxisSetPosKnee[gon]", "AxisActPosKnee[gon]"), 200 / math.pi),
+    ],
+)  # fmt: skip
+def test_units_behind_names_are_read(names: tuple[str, ...], factor: float) -> None:
+    rows = make_rows()
+    rows[:, 1:] *= factor
+    rows[:, 0] *= 1000.0 if "ms" in names[0] else 1.0
+    write_text("a.csv", rows, names)
+    done, recordings = import_log("log.input=a.csv")
+    assert "No guess is unsure" in done.out
+    check_joints(recordings, atol=5e-3)
+
+
+def test_a_unit_that_is_not_known_is_never_sure() -> None:
+    names = (
+        "t [s]",
+        *(f"{one} [furlong]" for one in ("hip cmd", "hip pos", "knee cmd", "knee pos")),
+    )
+    write_text("a.csv", make_rows(), names)
+    done = try_draft("log.input=a.csv")
+    assert "its unit 'furlong' is not known" in done.out
+    assert "No guess is unsure" not in done.out
+
+
 def test_a_comma_that_is_delimiter_and_decimal_sign_is_named(brokk: Callable[..., Done]) -> None:
     lines = [",".join(f"{v:.4f}".replace(".", ",") for v in row) for row in make_rows()]
     Path("a.csv").write_text("\n".join([",".join(NAMES), *lines]) + "\n")
-    done = brokk("mode=import", "log.input=a.csv")
+    done = try_draft("log.input=a.csv")
     assert done.code == 2
     assert "the comma is both delimiter and decimal sign" in done.err
 
@@ -142,7 +165,7 @@ def take_differences(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("kind", ["pair", "counter", "epoch"])
-def test_stamps_of_several_kinds_are_read(brokk: Callable[..., Done], kind: str) -> None:
+def test_stamps_of_several_kinds_are_read(kind: str) -> None:
     rows = make_rows()
     names: tuple[str, ...] = ("sec", "nanosec", *NAMES[1:])
     if kind == "pair":
@@ -155,17 +178,17 @@ def test_stamps_of_several_kinds_are_read(brokk: Callable[..., Done], kind: str)
         clock = 1.7e12 + rows[:, :1] * 1000.0
         names = ("timestamp", *NAMES[1:])
     write_text("a.csv", np.column_stack([clock, rows[:, 1:]]), names)
-    done, recordings = run_both(brokk, "log.input=a.csv")
+    done, recordings = import_log("log.input=a.csv")
     assert done.code == 0, done.err
     assert "No guess is unsure" in done.out
     check_joints(recordings)
 
 
-def test_a_gap_is_remarked_and_left_out_of_the_minutes(brokk: Callable[..., Done]) -> None:
+def test_a_gap_is_remarked_and_left_out_of_the_minutes() -> None:
     rows = make_rows(1200)
     rows[600:, 0] += 3600.0
     write_text("a.csv", rows)
-    done, recordings = run_both(brokk, "log.input=a.csv")
+    done, recordings = import_log("log.input=a.csv")
     assert "1 runs, 0.4 minutes" in done.out
     assert "3600 s without samples" in done.out
     assert len(recordings) == 2
@@ -188,12 +211,12 @@ def test_wraps_are_taken_out_and_said(
     names = ("time_s", "hip_target", "hip_pos")
     write_text("a.csv", np.column_stack([rows[:, 0], np.round(wrapped, 0 if half == 0.0 else 6)]), names)  # fmt: skip
     unit = "0.00153398 rad" if kind == "counter" else "rad"
-    done, recordings = run_both(brokk, "log.input=a.csv", f"log.position_unit={unit}")
+    done, recordings = import_log("log.input=a.csv", f"log.position_unit={unit}")
     assert done.code == 0, done.err
     assert "hip: wraps" in done.out
     q = recordings[0]["q_hip_rad"]
     np.testing.assert_allclose(q - q[0], rows[: len(q), 2] - rows[0, 2], atol=5e-3)
-    done = brokk("mode=import", "log.input=a.csv", f"log.position_unit={unit}", "log.wraps=0", "session.out=raw")  # fmt: skip
+    done = try_draft("log.input=a.csv", f"log.position_unit={unit}", "log.wraps=0")
     assert "No guess is unsure" not in done.out
 
 
@@ -223,12 +246,12 @@ def test_steps_that_no_machine_makes_are_found() -> None:
     assert not len(find_jumps(t_s, delay(step), step, 1.5))
 
 
-def test_what_is_given_is_weighed_like_a_guess(brokk: Callable[..., Done]) -> None:
+def test_what_is_given_is_weighed_like_a_guess() -> None:
     rows = make_rows()
     rows[:, 4] = np.random.default_rng(0).normal(size=len(rows))
     write_text("a.csv", rows)
     given = 'log.joints={knee: ["knee_target_rad", "knee_pos_rad"]}'
-    done, _ = run_both(brokk, "log.input=a.csv", given, "log.command=position")
+    done, _ = import_log("log.input=a.csv", given, "log.command=position")
     assert done.code == 0, done.err
     assert "the numbers speak against what was given" in done.out
     assert "No guess is unsure" not in done.out
@@ -240,12 +263,12 @@ def test_a_drive_that_is_off_is_said_with_its_times(brokk: Callable[..., Done]) 
     enable = np.ones(len(rows))
     enable[300:450] = 0.0
     write_text("a.csv", np.column_stack([rows, enable]), (*NAMES, "knee_torque_enable"))
-    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    done = try_draft("log.input=a.csv")
     assert "knee: its drive is off in 25% of the rows, first at 6.00 s, last at 8.98 s" in done.out
 
 
 @pytest.mark.parametrize("kind", ["structure", "matrices"])
-def test_signals_of_simulink_are_read(brokk: Callable[..., Done], kind: str) -> None:
+def test_signals_of_simulink_are_read(kind: str) -> None:
     rows = make_rows()
     targets, positions = rows[:, 1:4:2], rows[:, 2:5:2]
     if kind == "structure":
@@ -258,7 +281,7 @@ def test_signals_of_simulink_are_read(brokk: Callable[..., Done], kind: str) -> 
         content = {"target_rad": targets.T[:, None], "position_rad": positions.T[:, None]}
         content["tout"] = rows[:, :1]
     scipy.io.savemat("a.mat", content)
-    done, recordings = run_both(brokk, "log.input=a.mat")
+    done, recordings = import_log("log.input=a.mat")
     assert done.code == 0, done.err
     np.testing.assert_allclose(recordings[0]["q_joint_0_rad"], rows[: len(recordings[0]["t_s"]), 2], atol=2e-3)  # fmt: skip
 
@@ -305,9 +328,7 @@ def list_frames(foreign: bool) -> list[can.Message]:
 
 
 @pytest.mark.parametrize("name", ["a.blf", "a.log", "printed.txt", "dated.txt"])
-def test_pages_and_kinds_of_identifiers_are_sources_of_their_own(
-    brokk: Callable[..., Done], name: str
-) -> None:
+def test_pages_and_kinds_of_identifiers_are_sources_of_their_own(name: str) -> None:
     Path("a.dbc").write_text(DBC)
     frames = list_frames(foreign=True)
     if name.endswith(".txt"):
@@ -328,7 +349,7 @@ def test_pages_and_kinds_of_identifiers_are_sources_of_their_own(
         with can.Logger(name) as logger:
             for frame in frames:
                 logger.on_message_received(frame)
-    done, recordings = run_both(brokk, f"log.input={name}", "log.dbc=a.dbc")
+    done, recordings = import_log(f"log.input={name}", "log.dbc=a.dbc")
     assert done.code == 0, done.err
     assert "No guess is unsure" in done.out
     found = recordings[0]
@@ -424,15 +445,12 @@ def test_advice_that_is_followed_to_the_letter_reads_the_log(
 ) -> None:
     options = write_advised(case)
     key = ADVISED[case]
-    first = brokk("mode=import", "log.name=leg", "session.out=first", *options)
-    text = first.err
-    if first.code == 0:
-        guesses = json.loads(Path("first/import.json").read_text())["guesses"]
-        text = " ".join(guess["reason"] for guess in guesses)
+    first = try_draft(*options)
+    text = first.err or first.out
     begin = ADVICE[key].split("{")[0]
     assert begin in text, text
     advised = follow_advice(text[text.index(begin) :]).replace("<file>", "a.dbc")
-    done, recordings = run_both(brokk, *options, advised)
+    done, recordings = import_log(*options, advised)
     assert done.code == 0, done.err
     assert "fill in ???" not in done.out
     expected = make_rows(1200)
@@ -482,7 +500,7 @@ def write_messages(path: str, messages: list[tuple[float, str, dict[str, Any]]])
         writer.finish()
 
 
-def test_arm_and_wheels_on_one_topic_keep_their_own_rates(brokk: Callable[..., Done]) -> None:
+def test_arm_and_wheels_on_one_topic_keep_their_own_rates() -> None:
     messages = []
     for number, row in enumerate(make_rows()):
         names = ["hip", "knee"]
@@ -493,11 +511,25 @@ def test_arm_and_wheels_on_one_topic_keep_their_own_rates(brokk: Callable[..., D
             content = {"name": ["wheel"], "position": [0.1 * number + 0.02 * part]}
             messages.append((row[0] + 0.001 + 0.004 * part, "/joint_states", content))
     write_messages("a.mcap", messages)
-    done, recordings = run_both(brokk, "log.input=a.mcap")
+    done, recordings = import_log("log.input=a.mcap")
     assert done.code == 0, done.err
     assert "2 joints at 50 Hz" in done.out
     assert "layout" not in done.out
     check_joints(recordings)
+
+
+def test_two_arms_on_topics_of_their_own_keep_all_joints() -> None:
+    messages = []
+    for row in make_rows():
+        for side, first in (("left", 1), ("right", 3)):
+            content = {"name": ["hip"], "target": [row[first]]}
+            messages.append((row[0], f"/{side}/joint_commands", content))
+            content = {"name": ["hip"], "position": [row[first + 1]]}
+            messages.append((row[0], f"/{side}/joint_states", content))
+    write_messages("a.mcap", messages)
+    done, recordings = import_log("log.input=a.mcap")
+    assert "No guess is unsure" in done.out
+    assert {"q_left_hip_rad", "q_right_hip_rad"} <= recordings[0].keys()
 
 
 def test_two_programs_on_one_topic_are_never_sure(brokk: Callable[..., Done]) -> None:
@@ -509,20 +541,20 @@ def test_two_programs_on_one_topic_are_never_sure(brokk: Callable[..., Done]) ->
         messages.append((row[0] + 0.001, "/joint_states", {**content, "position": [0.0]}))
         messages.append((row[0], "/command", {**content, "target": [row[1]]}))
     write_messages("a.mcap", messages)
-    done, _ = brokk("mode=import", "log.input=a.mcap", "session.out=draft"), None
+    done = try_draft("log.input=a.mcap")
     assert "two programs send to '/joint_states'" in done.out
     assert "No guess is unsure" not in done.out
 
 
-def test_the_next_log_of_a_kind_fits_into_the_draft(brokk: Callable[..., Done]) -> None:
+def test_the_next_log_of_a_kind_fits_into_the_draft() -> None:
     rows = make_rows()
     write_text("a.csv", rows)
+    import_log("log.input=a.csv")
     rows[:, 1:] *= 1.05
     write_text("b.csv", rows)
-    done, _ = run_both(brokk, "log.input=a.csv")
-    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml")
-    done = brokk("mode=import", "log.input=b.csv", *options, "session.out=next")
-    assert done.code == 0, done.err
+    reader, machine = (extensions.load_option(one, f"@{one}.yaml") for one in ("import", "machine"))
+    (recording,) = reader.read(Path("b.csv"), machine)
+    assert recording.num_samples == len(rows)
 
 
 def test_a_joint_that_hangs_is_remarked_by_import_and_inspect(brokk: Callable[..., Done]) -> None:

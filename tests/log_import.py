@@ -1,0 +1,70 @@
+"""`mode=import` without its command: the draft of a log, and the recordings that it makes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from conftest import Done
+
+from actuators.modes.import_logs import summarise
+from actuators.recordings import conversion, log_draft
+from actuators.recordings.guess import GivenColumns
+from actuators.recordings.log_draft import Draft
+from brokk_rl import extensions
+from brokk_rl.errors import BrokkError
+
+GIVEN = {"joints", "command", "position_unit", "clock_offset_s", "time", "rate_hz", "wraps"}
+
+
+def make_draft(*options: str) -> Draft:
+    values: dict[str, Any] = {}
+    for option in options:
+        key, _, value = option.removeprefix("log.").partition("=")
+        values[key] = yaml.safe_load(value)
+    paths = conversion.find_logs(values["input"])
+    given = GivenColumns(**{key: value for key, value in values.items() if key in GIVEN})
+    dbc, damaged = values.get("dbc"), values.get("damaged", "refuse")
+    return log_draft.make_draft(paths, "leg", given, dbc, damaged, values.get("channel"))
+
+
+def describe_draft(draft: Draft) -> str:
+    """Returns what the command prints about a draft."""
+    guesses = draft.list_guesses()
+    lines = [f"{one.subject}: {one.value} ({one.sureness}) {one.reason}" for one in guesses]
+    return "\n".join([*lines, *draft.remarks, summarise(draft, guesses)])
+
+
+def try_draft(*options: str) -> Done:
+    """Returns the draft as the command prints it, or its refusal."""
+    try:
+        return Done(0, describe_draft(make_draft(*options)), "")
+    except BrokkError as error:
+        return Done(2, "", str(error))
+
+
+def import_log(*options: str) -> tuple[Done, list[dict[str, np.ndarray]]]:
+    """Returns the draft as text, and the columns of the recordings that it makes."""
+    done = try_draft(*options)
+    if done.code:
+        return done, []
+    draft = make_draft(*options)
+    made = []
+    for group, template in (
+        ("machine", log_draft.MACHINE_TEMPLATE),
+        ("import", log_draft.MAP_TEMPLATE),
+    ):
+        Path(f"{group}.yaml").write_text(draft.format(template))
+        made.append(extensions.load_option(group, f"@{group}.yaml"))
+    machine, reader = made
+    found = []
+    (given,) = [one.partition("=")[2] for one in options if one.startswith("log.input=")]
+    for recordings in conversion.read_logs(given, reader, machine).values():
+        for one in recordings:
+            columns = {"t_s": one.t_s}
+            for j, (name, unit) in enumerate(zip(one.joints, one.units, strict=True)):
+                columns[f"q_{name}_{unit}"] = one.q[:, j]
+            found.append(columns)
+    return done, found
