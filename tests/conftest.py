@@ -9,12 +9,14 @@ from pathlib import Path
 import pytest
 import torch
 from composed import option
+from yaml_cache import parse_once
 
 from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl import cli
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 
+parse_once()
 torch.set_num_threads(1)  # small tensors: threads would only wait for each other
 
 

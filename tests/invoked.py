@@ -91,7 +91,13 @@ def _import_all(modules: Sequence[str]) -> None:
 
 def main() -> None:
     """Reads commands as JSON and writes how each ended."""
-    import brokk_rl.cli  # noqa: F401 - for all that are forked
+    from yaml_cache import load_cached, parse_once
+
+    import brokk_rl.cli  # for all that are forked
+
+    parse_once()
+    for path in Path(brokk_rl.cli.__file__).parents[1].glob("conf/**/*.yaml"):
+        load_cached(path)
 
     commands = json.load(sys.stdin)
     found = []

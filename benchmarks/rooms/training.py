@@ -72,7 +72,7 @@ MEASUREMENTS = (
     Measurement(
         name="other_circuits",
         title="The policy that ships, on circuits to which nothing was fitted",
-        conditions="Measured before strict success was bounded by force and tilt, from starts that the controller could do. The baseline is the classical controller.",
+        conditions="Nothing was fitted to these plants. The baseline is the classical controller.",
         commands=tuple(
             f"{EVALUATE} actuator={plant} session.out={{out}}/{plant}" for plant in CIRCUITS
         ),
@@ -129,7 +129,8 @@ MEASUREMENTS = (
         title="A simulated person follows the advice",
         conditions="The policy that ships for a person and the classical controller (baseline) with the same assumption, one seed; an episode lasts 40 s. The person moves two to four levers at once. No real person took part.",
         commands=tuple(
-            f"{EVALUATE} follower=person follower.delay_s={delay_s} policy=tasks:policies/behind_a_person session.out={{out}}/{delay_s}"
+            f"{EVALUATE} evaluation.episodes=256 follower=person follower.delay_s={delay_s} "
+            f"policy=tasks:policies/behind_a_person session.out={{out}}/{delay_s}"
             for delay_s in DELAYS_S
         ),
         code=POLICY_CODE,

@@ -19,7 +19,7 @@ from deploy.recorder import capture_reader
 from deploy.runtime.process_group import BUS_PRIORITY
 
 ROOT = Path(__file__).parents[2]
-ROOMS = ("brokk_rl", "tasks", "actuators", "perception", "deploy", "diagnosis", "exam")
+ROOMS = ("brokk_rl", "tasks", "actuators", "perception", "deploy", "diagnosis", "exam", "study")
 VENDOR_DRIVERS = {"pyzed", "pyrealsense2"}
 """Modules that come with a camera, not from a package index."""
 
