@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 
 PLACE = "brokk_rl.rl.policy"
 CLASSICAL, TRAINED = f"{PLACE}.ClassicalPolicy", f"{PLACE}.TrainedPolicy"
-SHIPPED, UNTRAINED = f"{PLACE}.ShippedPolicy", f"{PLACE}.UntrainedPolicy"
+SHIPPED = f"{PLACE}.ShippedPolicy"
 TRAIN = "brokk_rl.modes.train.Train"
 OLD_KEYS = ("policy.folder", "checkpoint", "start_from", "doctor.policy", "resume")
 """Names that `policy` had in one mode or another. Other modes than training still have `resume`."""
@@ -193,15 +193,14 @@ def _recall_overrides(given: Mapping[str, Override]) -> list[str]:
 
 
 def _choose_beginning(cfg: DictConfig, target: str | None) -> str | None:
-    """Return the class of the policy with which training begins; an untrained one is none."""
-    if target not in (None, TRAINED, SHIPPED, UNTRAINED):
+    """Return the class of the policy with which training begins."""
+    if target not in (None, TRAINED, SHIPPED):
         raise ConfigError(
             f"mode=train policy={HydraConfig.get().runtime.choices.get('policy')}: training begins "
-            "with a network; expected policy=untrained, policy=shipped, or the path of a run "
+            "with a network; expected policy=none, policy=shipped, or the path of a run "
             "folder, a policy folder or a checkpoint"
         )
-    if target in (None, UNTRAINED):
-        cfg.policy = None
+    if target is None:
         return None
     cfg.policy[TARGET] = TRAINED
     run = _find_run(str(cfg.policy.path))

@@ -268,7 +268,7 @@ class Task(Protocol):
 
 
 class Policy(Protocol):
-    """Source of actions: a trained network, the classical controller, an untrained network."""
+    """Source of actions: a trained network, the classical controller."""
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the action for the observation groups, shape `(N, num_actions)`."""

@@ -28,13 +28,7 @@ from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import LEVELS, PROGRESS, Tracking, TrainingLogger, draw_curves, find_passing
 from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
-from brokk_rl.rl.policy import (
-    ClassicalPolicy,
-    PolicySpec,
-    TrainedPolicy,
-    UntrainedPolicy,
-    load_initial_weights,
-)
+from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy, load_initial_weights
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.session import Session, read_record, write_json
@@ -208,7 +202,6 @@ class Train(SimulatedPlant):
         policies: dict[str, PolicySpec] = {
             "trained": TrainedPolicy(path=str(folder), task=None),
             "classical": ClassicalPolicy(task=None),
-            "untrained": UntrainedPolicy(training=self.rl),
         }
         results = evaluate_policies(self, self.evaluation, self.session, policies)
         line, words = None, loop.task.figures

@@ -22,7 +22,6 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import StoredPolicy, TaskDescription, find_policy
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.spec import spec
 
 EXPLORATION_PREFIX = "distribution."
@@ -61,28 +60,6 @@ class ClassicalPolicy:
         """
         loop.task.require("classical_action", "choose another policy=…")
         return _ClassicalActor(loop.task)
-
-
-@spec
-class UntrainedPolicy:
-    """A freshly initialised network, as training would start from it.
-
-    Attributes:
-        training: The training configuration that gives its shape.
-    """
-
-    training: TrainingConfig
-
-    label: ClassVar[str] = "untrained"
-
-    def build(self, loop: ControlLoop, seed: int) -> Policy:
-        """Return the policy with weights drawn from `seed`."""
-        network = self.training.describe_network()
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            actor = make_actor(network, loop.get_observations(), loop.num_actions)
-            scale_output(actor, self.training.output_gain)
-            return NetworkPolicy(actor, loop)
 
 
 @spec
@@ -221,18 +198,6 @@ def make_actor(network: Mapping[str, Any], observations: TensorDict, num_actions
         )
     actor = actor_class(observations, config["obs_groups"], "actor", num_actions, **arguments)
     return actor.to(observations.device)
-
-
-def scale_output(actor: MLPModel, gain: float) -> None:
-    """Scale the weights of the last layer, so that a fresh network acts almost alike everywhere.
-
-    Andrychowicz et al. 2021 recommend 0.01. A residual policy then begins as the controller that it
-    corrects.
-    """
-    last = [layer for layer in actor.mlp.modules() if isinstance(layer, torch.nn.Linear)][-1]
-    with torch.no_grad():
-        for parameter in last.parameters():
-            parameter.mul_(gain)
 
 
 def observe_once(task: TaskProcess, machine: Machine, device: torch.device) -> TensorDict:

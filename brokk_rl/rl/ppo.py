@@ -45,9 +45,9 @@ CLIP_MARGIN = 1e-6
 
 
 class DevicePPO(PPO):
-    """PPO for feed-forward networks.
+    """PPO for feed-forward networks with Gaussian actions.
 
-    On a CPU, without a teacher, it is rsl-rl's own, which acts on one thread.
+    It learns as rsl-rl's own, up to rounding; a CPU acts on one thread.
 
     It may follow a teacher: the loss then holds the squared distance of the mean action from the
     teacher's, in the states that the student itself meets (Ross et al. 2011; Schmitt et al. 2018).
@@ -82,14 +82,12 @@ class DevicePPO(PPO):
 
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Draw actions; see `rsl_rl.algorithms.PPO.act`."""
-        if not (self._on_device and isinstance(self.actor.distribution, GaussianDistribution)):
-            with limit_to_one_thread(self.device):
-                return super().act(obs)
         if self._rollout is None:
             # tensors of rsl-rl's inference mode could not be used outside of it
             with torch.inference_mode(False), report_compile_errors():
                 self._rollout = CapturedRollout(self, self.fuse)
-        return self._rollout.act(obs)
+        with limit_to_one_thread(self.device):
+            return self._rollout.act(obs)
 
     def process_env_step(
         self,
@@ -99,18 +97,13 @@ class DevicePPO(PPO):
         extras: dict[str, torch.Tensor],
     ) -> None:
         """Store a step; see `rsl_rl.algorithms.PPO.process_env_step`."""
-        if self._rollout is None:
-            with limit_to_one_thread(self.device):
-                super().process_env_step(obs, rewards, dones, extras)
-        else:
-            self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
+        assert self._rollout is not None
+        self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages; see `rsl_rl.algorithms.PPO.compute_returns`."""
-        if self._rollout is None:
-            super().compute_returns(obs)
-        else:
-            self._rollout.compute_returns(obs)
+        assert self._rollout is not None
+        self._rollout.compute_returns(obs)
 
     def update(self) -> dict[str, float]:
         """Learn from the stored steps; return mean losses (`rsl_rl.algorithms.PPO.update`).
@@ -118,18 +111,6 @@ class DevicePPO(PPO):
         Where a gradient or a weight is not finite, it stands among the losses by its name in
         `SIZES`.
         """
-        if self._on_device:
-            return self.update_on_device()
-        try:
-            losses = super().update()
-        except RuntimeError:  # torch draws nothing with a spread that is NaN
-            losses = _name_spoiled(self._measure_sizes().tolist())
-            if not losses:
-                raise
-        return _name_spoiled(self._measure_sizes().tolist()) | losses
-
-    def update_on_device(self) -> dict[str, float]:
-        """Learn as `update` does, with one read-back; the same numbers up to rounding."""
         order = torch.randperm(self._batch_size() * self.num_mini_batches, device=self.device)
         self.shuffle(order)
         if self._epoch is None:
@@ -179,11 +160,6 @@ class DevicePPO(PPO):
         self._epoch = None
         return super().load(loaded_dict, load_cfg, strict)
 
-    @property
-    def _on_device(self) -> bool:
-        # rsl-rl's own loss knows no teacher
-        return torch.device(self.device).type == "cuda" or self._teacher is not None
-
     def _batch_size(self) -> int:
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
 
@@ -193,7 +169,7 @@ class DevicePPO(PPO):
         The optimiser reads its rate from one of them.
         """
         self._loss = self._measure_loss
-        if self.fuse and isinstance(self.actor.distribution, GaussianDistribution):
+        if self.fuse:
             self._loss = torch.compile(self._measure_loss, fullgraph=True, dynamic=False)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
         self._wanted = torch.zeros((), device=self.device)
@@ -339,24 +315,11 @@ class DevicePPO(PPO):
         with torch.no_grad():
             new = actor.output_distribution_params
             old = tuple(batch[f"{PARAMETER}{index}"] for index in range(len(new)))
-            divergence = self._measure_divergence(old, new)
+            divergence = _measure_divergence(old, new)
         if self._teacher is not None:
             distance = (actor.output_mean - batch["wanted"]).square().mean()
             loss = loss + self._imitation * distance
         return loss, torch.stack((value_loss, surrogate_loss, entropy, divergence)).detach()
-
-    def _measure_divergence(
-        self, old: tuple[torch.Tensor, ...], new: tuple[torch.Tensor, ...]
-    ) -> torch.Tensor:
-        """Return the mean divergence of two distributions, given by their parameters.
-
-        Of Gaussians in closed form: torch finds it by a search that torch 2.11 cannot compile.
-        """
-        if not isinstance(self.actor.distribution, GaussianDistribution):
-            return self.actor.get_kl_divergence(old, new).mean()
-        (old_mean, old_std), (new_mean, new_std) = old, new
-        spread, shift = (old_std / new_std).square(), ((old_mean - new_mean) / new_std).square()
-        return (0.5 * (spread + shift - 1.0 - spread.log())).sum(-1).mean()
 
     def _sum_up(self) -> None:
         """Add up gradients and divergence of all processes; the host does not wait for it."""
@@ -386,6 +349,18 @@ class DevicePPO(PPO):
         too_near = (divergence < self._wanted / 2.0) & (divergence > 0.0)
         rate = torch.where(too_near, higher, self._rate)
         self._rate.copy_(torch.where(divergence > self._wanted * 2.0, lower, rate))
+
+
+def _measure_divergence(
+    old: tuple[torch.Tensor, ...], new: tuple[torch.Tensor, ...]
+) -> torch.Tensor:
+    """Return the mean divergence of two Gaussians, given by mean and spread each.
+
+    In closed form: torch finds it by a search that torch 2.11 cannot compile.
+    """
+    (old_mean, old_std), (new_mean, new_std) = old, new
+    spread, shift = (old_std / new_std).square(), ((old_mean - new_mean) / new_std).square()
+    return (0.5 * (spread + shift - 1.0 - spread.log())).sum(-1).mean()
 
 
 def _name_spoiled(sizes: Sequence[float]) -> dict[str, float]:

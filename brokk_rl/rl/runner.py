@@ -17,7 +17,7 @@ from brokk_rl.policy_folder import TaskDescription, list_checkpoints, read_check
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy, scale_output
+from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
 from brokk_rl.rl.settings import REFUSED_CLASSES, TrainingConfig
 
@@ -68,8 +68,6 @@ class TrainingRunner(OnPolicyRunner):
             reason = REFUSED_CLASSES["RNNModel"]
             raise ConfigError(f"rl.runner: expected networks without memory, got {reason}")
         self.logger = TrainingLogger(folder, env, training, self.group)
-        if training.output_gain != 1.0:
-            scale_output(self.alg.actor, training.output_gain)
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
             if training.teacher:

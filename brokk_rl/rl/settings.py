@@ -62,7 +62,6 @@ RUNNER_VALUES: dict[str, Any] = {
 it divides by zero, climbs instead of descends, or trains nothing; unknown words end it late."""
 
 BEGINNING = (
-    "output_gain",
     "random_episode_lengths",
     "runner.algorithm.learning_rate",
     "runner.algorithm.optimizer",
@@ -72,6 +71,7 @@ BEGINNING = (
 REFUSED_CLASSES = {
     "RNNModel": "recurrent networks are neither exported nor deployed; task.memory gives a history",
     "CNNModel": "observations are vectors, not pictures",
+    "BetaDistribution": "actions are drawn from Gaussians",
     "Distillation": "train with PPO",
     "StudentTeacher": "train with PPO",
 }
@@ -190,8 +190,6 @@ class TrainingConfig:
         keep_checkpoints: Newest checkpoints kept.
         settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
             learn fast, small ones keep it.
-        output_gain: Factor on the initial weights of the actor's last layer; 1 leaves them. With a
-            small one a residual policy begins as the classical controller.
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.ppo:CappedGaussian`.
@@ -219,7 +217,6 @@ class TrainingConfig:
     save_interval: Count
     keep_checkpoints: Count
     settling: Share
-    output_gain: Positive
     exploration: Exploration | None
     teacher: Teacher | None
     near_starts: NearStarts | None
@@ -244,7 +241,7 @@ class TrainingConfig:
                 value = require_value(f"runner.{path}", allowed, holder[name])
                 if isinstance(value, int):  # 1e2 was given for a whole number
                     holder[name] = value
-        for name in ("algorithm", "actor", "critic"):
+        for name in ("algorithm", "actor", "critic", "actor.distribution_cfg"):
             class_name = str(self._read_runner(f"{name}.class_name"))
             if reason := REFUSED_CLASSES.get(class_name.replace(":", ".").rpartition(".")[2]):
                 raise ConfigError(

@@ -21,7 +21,7 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import evaluate_policy
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.policy import ClassicalPolicy, UntrainedPolicy
+from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import NearStarts
 
 CPU = torch.device("cpu")
@@ -187,16 +187,6 @@ def test_every_policy_meets_the_same_holes_and_the_same_errors(machine: Machine)
     for act in (lambda seen: torch.zeros(16, 5), lambda seen: torch.randn(16, 5)):
         results(loop, Looks(act))
     assert len(met) == 2 and all(torch.equal(met[0][name], met[1][name]) for name in met[0])
-
-
-def test_an_untrained_policy_depends_on_its_seed_alone(machine: Machine) -> None:
-    loop = make(machine)
-    seen = loop.get_observations().to_dict()
-    untrained = UntrainedPolicy(training=runs.small(max_seconds=1.0))
-    before = torch.get_rng_state()
-    first, again, other = (untrained.build(loop, seed).act(seen) for seed in (1, 1, 2))
-    assert torch.equal(first, again) and not torch.equal(first, other)
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(

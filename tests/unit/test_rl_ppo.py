@@ -68,7 +68,7 @@ def _learn(algorithm: PPO, seed: int, last: TensorDict) -> dict[str, float]:
     with torch.inference_mode():
         algorithm.compute_returns(last)
     torch.manual_seed(seed)  # the order of mini-batches
-    return algorithm.update_on_device() if isinstance(algorithm, DevicePPO) else algorithm.update()
+    return algorithm.update()
 
 
 def _iteration(algorithm: PPO, seed: int) -> dict[str, float]:

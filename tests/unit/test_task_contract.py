@@ -150,7 +150,7 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
     assert not (tmp_path / "policy.onnx").exists() and (tmp_path / "learning_curves.png").exists()
     assert json.loads((tmp_path / "policy.json").read_text())["observation"] is None
     report = json.loads((tmp_path / "evaluation.json").read_text())
-    assert report["policies"].keys() == {"trained", "untrained"} and "moved" in report
+    assert report["policies"].keys() == {"trained"} and "moved" in report
     assert "success_paper" not in report
 
     with pytest.raises(ConfigError, match="has no policy that can leave the trainer"):
