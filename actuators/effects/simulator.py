@@ -65,14 +65,15 @@ class JointDamping(_InsideEffect):
 
     Attributes:
         joints: Joints it acts on, or `all`.
-        part: Torque at full speed, over the same torque of the drive.
+        part: Torque at full speed, over the same torque of the drive; negative where the file damps more
+            than the robot.
     """
 
     joints: Joints
     part: Value
     quantity = "damping"
     # Chosen by hand: at full speed the drive lags by 1 % of the travel more.
-    numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.2, bounds=(0.0, 5.0))}
+    numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.2, bounds=(-5.0, 5.0))}
 
 
 @spec

@@ -9,14 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
 
 from brokk_rl.observation import TARGET_DISTANCE, RangeTable
 from diagnosis.deployment.contract import PolicyContract
 from diagnosis.deployment.run_log import RunLog
 
-MARGIN = 0.05
-"""Part of the training's range by which a value may lie outside: a few hundred samples do not reach
-its ends. Chosen by hand."""
+FALSE_ALARMS = 0.01
+"""Share of runs of the training's own distribution that may lie outside in any value; chosen by hand."""
+EXPORTED_ROWS = 256
+"""Observations of the training that `mode=export` keeps."""
 LEAST_SHARE = 0.1
 """Share of the rows outside from which the task is blamed. Chosen by hand."""
 
@@ -71,12 +73,13 @@ def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidenc
             (), f"{contract.source.name} lacks the range of the training's observations; {advice}"
         )
     table: RangeTable = dict(contract.training["ranges"])
+    margin_share = measure_margin(contract.training.get("count", EXPORTED_ROWS), len(table))
     found = []
     for name, values in list_newest_values(log, contract).items():
         if name not in table:
             continue
         low, high = table[name]
-        margin = MARGIN * (high - low)
+        margin = margin_share * (high - low)
         known = np.isfinite(values)
         outside = known & ((values < low - margin) | (values > high + margin))
         if outside.any():
@@ -93,6 +96,23 @@ def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidenc
             )
     found.sort(key=lambda one: -one.share)
     return RangeEvidence(tuple(found), "")
+
+
+def measure_margin(count: int, num_values: int) -> float:
+    """Return the part of a range by which a run of the same distribution may leave it.
+
+    A few hundred samples do not reach the ends of what they come from. Values are taken as normal: the
+    range of a sample ends at its expected extremes (Blom), and only `FALSE_ALARMS` of all runs go further
+    than the range and the margin in any value. With 256 samples of nine values 2 % of drawn runs do, of
+    normal and of skewed values.
+
+    Args:
+        count: Samples of the range.
+        num_values: Values that are compared, each at both ends.
+    """
+    extreme = norm.ppf((count - 0.375) / (count + 0.25))
+    rarest = norm.isf(FALSE_ALARMS / (2 * num_values))
+    return float(max(rarest - extreme, 0.0) / (2.0 * extreme))
 
 
 def list_newest_values(log: RunLog, contract: PolicyContract) -> dict[str, np.ndarray]:

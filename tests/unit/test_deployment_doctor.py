@@ -22,6 +22,7 @@ from diagnosis.deployment import page
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
 from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
 from diagnosis.deployment.run_log import measure_resolution
+from diagnosis.deployment.training_range import measure_margin
 
 NUM_ROWS, SAMPLES = 120, 4
 TERMS = (("target", 3), ("q", 5 * SAMPLES), ("u", 5 * SAMPLES))
@@ -324,3 +325,18 @@ def test_a_contract_with_too_few_joints_is_refused(
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     with pytest.raises(CheckpointError, match="lacks 'joints'"):
         load_policy(str(tmp_path), machine)
+
+
+@pytest.mark.parametrize("name", ["standard_normal", "standard_exponential", "random"])
+def test_a_run_of_the_training_itself_is_hardly_ever_outside_of_it(name: str) -> None:
+    draw = getattr(np.random.default_rng(0), name)
+    count, num_values, num_runs = 256, 9, 2000
+    margin = measure_margin(count, num_values)
+    num_outside = 0
+    for _ in range(num_runs):
+        seen, new = draw((count, num_values)), draw(num_values)
+        low, high = seen.min(0), seen.max(0)
+        spare = margin * (high - low)
+        num_outside += ((new < low - spare) | (new > high + spare)).any()
+    assert num_outside <= 0.03 * num_runs
+    assert measure_margin(20, num_values) > margin > measure_margin(2000, num_values)
