@@ -35,6 +35,9 @@ inside each other the larger one wins, a weak larger one does not."""
 SAME_REGION = 0.6
 """Distance, as a part of the smaller major semi-axis, below which a proposal shows the region of an
 ellipse. Chosen by hand: the middle of a region with a broken rim is off by up to 0.35."""
+MOST_LOOKS, SETTLED_M = 3, 0.003
+"""Looks at a hole that was found by coarse depth, and its move at which they end: in haze each look
+corrects a third of what depth was off; a nearer hole settles at once."""
 MOST_CANDIDATES = 16
 """Candidates of a stage that are judged, the best first: each takes about 10 ms."""
 SHAPE_REASONS = (
@@ -226,6 +229,8 @@ class StagedFinder:
         judged.rejected.extend(wrong_size)
         with _time_stage(ms, "pose"):
             self._judge(frame, masks, candidates, judged, finer)
+        if finer is not None:
+            judged = replace(judged, found=self._refine(frame, judged.found, ms))
         if not judged.found:
             judged.rejected.extend(self._name_scale(frame, ms))
         return self._conclude(judged, masks, frame, ms)
@@ -257,15 +262,45 @@ class StagedFinder:
         places = [one for one in (expect_rim(hole, frame) for hole in holes) if one is not None]
         if s.depth is None or frame.right is None or frame.baseline_m is None or not places:
             return self.find(frame)
+        judged, masks = self._judge_near(frame, places, ms)
+        return self._conclude(judged, masks, frame, ms)
+
+    def _judge_near(
+        self, frame: Frame, places: Sequence[tuple[Ellipse, np.ndarray]], ms: dict[str, float]
+    ) -> tuple[_Judged, Masks]:
+        """Return what is at places where rims are expected, and the pixels of their faces."""
+        assert self.settings.depth is not None
         with _time_stage(ms, "stereo"):
-            frame, face = s.depth.match_near(frame, places)
+            frame, face = self.settings.depth.match_near(frame, places)
         masks = Masks(face, None)
         judged = _Judged([], [], [])
         # The expected rim is the candidate: it is known better than a detector would find it. None
         # of its edges has been seen yet, so that most of the circle must be.
         with _time_stage(ms, "pose"):
             self._judge(frame, masks, [place for place, _ in places], judged, None)
-        return self._conclude(judged, masks, frame, ms)
+        return judged, masks
+
+    def _refine(
+        self, frame: Frame, found: list[tuple[Ellipse, HolePose]], ms: dict[str, float]
+    ) -> list[tuple[Ellipse, HolePose]]:
+        """Return holes as they are seen when they are expected: coarse depth pulls their faces.
+
+        What is not seen again stays as it was found.
+        """
+        refined = []
+        for ellipse, pose in found:
+            for _ in range(MOST_LOOKS):
+                place = expect_rim(pose, frame)
+                again = [] if place is None else self._judge_near(frame, [place], ms)[0].found
+                if not again:
+                    break
+                moved_m = float(np.linalg.norm(again[0][1].center_m - pose.center_m))
+                # The score is that of the detected ellipse.
+                pose = replace(again[0][1], score=pose.score)
+                if moved_m < SETTLED_M:
+                    break
+            refined.append((ellipse, pose))
+        return refined
 
     def find_ellipses(self, frame: Frame) -> list[Ellipse]:
         """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""

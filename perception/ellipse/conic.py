@@ -237,28 +237,3 @@ def project_onto_plane(
         (homography.T @ build_quadratic_forms(ellipse) @ homography)[None]
     )[0]
     return origin + curve[0] * first + curve[1] * second, curve[2:4]
-
-
-def measure_slope_axes(
-    ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray
-) -> tuple[float, float]:
-    """Return half the extent of a curve on a plane along its slope and across it, m; NaN for none.
-
-    Args:
-        ellipse: In the picture, `(5,)`.
-        camera_matrix: `(3, 3)`.
-        m: The plane `m · P = 1`, `(3,)`.
-    """
-    ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
-    origin = ray / (m @ ray)
-    normal = m / np.linalg.norm(m)
-    across = np.cross(normal, origin)
-    across /= max(float(np.linalg.norm(across)), 1e-12)
-    along = np.cross(across, normal)
-    homography = camera_matrix @ np.column_stack([along, across, origin])
-    form = homography.T @ build_quadratic_forms(ellipse) @ homography
-    middle = -np.linalg.solve(form[:2, :2], form[:2, 2])
-    level = float(middle @ form[:2, :2] @ middle - form[2, 2])
-    with np.errstate(invalid="ignore"):
-        extents = np.sqrt(np.diag(np.linalg.inv(form[:2, :2])) * level)
-    return float(extents[0]), float(extents[1])

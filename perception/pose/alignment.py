@@ -173,7 +173,6 @@ def align_plane(
     ellipse: np.ndarray,
     inner: float,
     cell_px: int,
-    bias_per_m: float,
 ) -> FacePlane | None:
     """Return the plane by which both pictures agree best on the face.
 
@@ -193,7 +192,6 @@ def align_plane(
         ellipse: Rim, `(5,)`.
         inner: Inner limit in radii: nearer, both cameras see different sides of the rim.
         cell_px: Side of the squares within which errors may be correlated.
-        bias_per_m: Standard deviation of inverse depth that `face` may be off as a whole, 1/m.
     """
     height, width = both.left.shape
     # Rows are left out and columns kept: disparity is read along rows.
@@ -214,7 +212,7 @@ def align_plane(
     cov = warp.estimate_covariance(cell_px)
     if cov is None:
         return face
-    return merge_planes(face, replace(face, m=warp.m, cov=cov), bias_per_m)
+    return merge_planes(face, replace(face, m=warp.m, cov=cov))
 
 
 @dataclass(frozen=True)
@@ -350,11 +348,9 @@ def _find_face_pixels(
     return on
 
 
-def merge_planes(first: FacePlane, second: FacePlane, bias_per_m: float) -> FacePlane:
-    """Return the mean of two planes, weighted by their covariances; the first one may have a bias."""
-    # A bias of a matcher shifts the whole face, so it enters the constant term alone.
-    doubt = first.cov + np.diag([0.0, 0.0, bias_per_m**2])
-    weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
+def merge_planes(first: FacePlane, second: FacePlane) -> FacePlane:
+    """Return the mean of two planes, weighted by their covariances."""
+    weights = [np.linalg.inv(one.cov) for one in (first, second)]
     cov = np.linalg.inv(weights[0] + weights[1])
     return replace(second, m=cov @ (weights[0] @ first.m + weights[1] @ second.m), cov=cov)
 

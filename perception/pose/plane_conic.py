@@ -12,12 +12,13 @@ from annotated_types import Ge, Interval
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, Rejection
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import Positive, Share, spec
+from brokk_rl.spec import NonNegative, Positive, Share, spec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, consistency, plane, rim
 from perception.pose.appearance import Interior
+from perception.pose.focal_belief import FocalBelief, FocalDoubt, compute_focal_covariances
 from perception.pose.plane import FacePlane, FaceSupport
-from perception.pose.rim import RimCircle
+from perception.pose.rim import PlaneChart, RimCircle
 from perception.pose.wall_light import IN_DUST, WallLight, measure_wall_light
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py).
@@ -107,10 +108,13 @@ class PlaneConic:
             are correlated over wide stretches.
         matcher_bias_per_m: Standard deviation of a matcher's bias over a whole face in inverse
             depth, 1/m; with a right picture the face is aligned directly.
+        matcher_drift: The same over the noise of depth on the face, on top: in haze a matcher
+            follows its neighbours.
         bias_per_m: Standard deviation of the remaining bias that no residual shows, 1/m.
         rig_px: `Frame.disparity_std_px` of a pair that was not calibrated.
         center_px: Least standard deviation of the centre of a whole rim that no residual shows, px;
             what its waves show comes on top.
+        focal: Doubt about the focal length of a pair, until rims show that it is right.
         looks: Gates on the appearance.
     """
 
@@ -132,9 +136,11 @@ class PlaneConic:
     noise_limit_per_m: float
     matcher_alike: float
     matcher_bias_per_m: float
+    matcher_drift: NonNegative
     bias_per_m: float
     rig_px: float
     center_px: float
+    focal: FocalDoubt
     looks: AppearanceGates
 
     def check(self) -> None:
@@ -153,12 +159,14 @@ class PlaneConicEstimator:
 
     def __init__(self, settings: PlaneConic) -> None:
         self.settings = settings
+        self._focal = FocalBelief(settings.focal)
         self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s, row = self.settings, as_row(ellipse)
         gray, light, allowed = self._prepare(frame, masks)
+        self._focal.begin(frame)
         points = self._collect_support(frame, allowed, row)
         face = self._fit_face(frame, points, ellipse)
         if isinstance(face, Rejection):
@@ -170,16 +178,7 @@ class PlaneConicEstimator:
         # The right picture gives the plane again, without the bias of the matcher.
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
-            agreed = alignment.align_plane(
-                both,
-                face,
-                frame,
-                allowed,
-                row,
-                s.inner,
-                s.cell_px,
-                s.matcher_bias_per_m * plane.compare_pair(frame) * frame.depth_shrink,
-            )
+            agreed = alignment.align_plane(both, face, frame, allowed, row, s.inner, s.cell_px)
             # `None` says that the pictures disagree: then parallax means nothing either.
             both, face = (None, face) if agreed is None else (both, agreed)
             # A refined plane may turn a plausible ellipse into an implausible one.
@@ -194,7 +193,13 @@ class PlaneConicEstimator:
         circle = self._fit_circle(light, frame, face, both, ellipse, has_good_shape=shape)
         if isinstance(circle, Rejection):
             return circle
-        return self._describe_hole(light, frame, masks, face, circle, both, ellipse)
+        refused, doubt = self._judge_appearance(light, frame, masks, face, circle, both, ellipse)
+        if refused is not None:
+            return refused
+        slip = self._focal.find_slip() if frame.right is not None else None
+        if slip is not None:
+            return Rejection("pose", consistency.STRETCH, slip, 1.0, ellipse)
+        return self._describe_hole(frame, face, circle, float(ellipse.score) * doubt)
 
     def _collect_support(self, frame: Frame, allowed: np.ndarray, row: np.ndarray) -> FaceSupport:
         """Return the depth around an ellipse `(5,)`: inside the hole it shows no face."""
@@ -224,7 +229,10 @@ class PlaneConicEstimator:
         # Errors of neighbouring pixels are alike, so the count of pixels overstates the
         # precision.
         # Those of a coarse match grow with its pixels.
-        return replace(face, cov=face.cov * s.matcher_alike * frame.depth_shrink**2)
+        cov = face.cov * s.matcher_alike * frame.depth_shrink**2
+        # A bias of a matcher shifts the whole face, so it enters the constant term alone.
+        bias_per_m = s.matcher_bias_per_m * pair * frame.depth_shrink + s.matcher_drift * face.sigma
+        return replace(face, cov=cov + np.diag([0.0, 0.0, bias_per_m**2]))
 
     def _fit_circle(
         self,
@@ -252,12 +260,11 @@ class PlaneConicEstimator:
         row = as_row(ellipse) if circle is None else circle.ellipse
         ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
         chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
-        told = None
         if seen > HALF or ellipse.coverage > WHOLE:
             outline = row if seen > AS_MUCH * ellipse.coverage else as_row(ellipse)
-            told = consistency.measure_stretch(light, chart, face, outline)
-        if told is not None and abs(np.log(told[0])) > np.log(s.stretch) + 3.0 * told[1]:
-            return Rejection("pose", consistency.STRETCH, told[0], 1.0, ellipse)
+            oval = self._judge_focal_length(light, frame, chart, face, outline)
+            if oval is not None:
+                return replace(oval, ellipse=ellipse)
         is_broken = 1.0 - seen - consistency.measure_hidden_part(face, row, frame) > s.broken
         if (
             s.broken < 1.0
@@ -288,7 +295,20 @@ class PlaneConicEstimator:
             return Rejection("pose", consistency.SIZE, size, limit, ellipse)
         return circle
 
-    def _describe_hole(
+    def _judge_focal_length(
+        self, light: np.ndarray, frame: Frame, chart: PlaneChart, face: FacePlane, row: np.ndarray
+    ) -> Rejection | None:
+        """Return that a rim `(5,)` on a face is round with another focal length of the pair."""
+        told = consistency.measure_stretch(light, chart, face, row)
+        if told is None:
+            return None
+        if frame.right is not None:
+            self._focal.learn(row, frame.camera_matrix, float(np.log(told[0])), told[1])
+        if abs(np.log(told[0])) <= np.log(self.settings.stretch) + 3.0 * told[1]:
+            return None
+        return Rejection("pose", consistency.STRETCH, told[0], 1.0)
+
+    def _judge_appearance(
         self,
         light: np.ndarray,
         frame: Frame,
@@ -297,8 +317,8 @@ class PlaneConicEstimator:
         circle: RimCircle,
         both: alignment.StereoPatch | None,
         ellipse: Ellipse,
-    ) -> HolePose | Rejection:
-        """Return the hole of a rim, or the gate of the appearance that it misses."""
+    ) -> tuple[Rejection | None, float]:
+        """Return the gate of the appearance that a rim misses, and the factor on its score."""
         s, row = self.settings, circle.ellipse
         # Appearance is measured in the fitted circle: the first ellipse may follow the shade
         # within.
@@ -319,10 +339,15 @@ class PlaneConicEstimator:
             if covered > COVERED:
                 parallax = float("nan")
         refused = self._check_appearance(inside, parallax, wall, masks, row, ellipse, undecided)
-        if refused:
-            return refused
         # A network that marks mouths has decided already; without it the doubt stays.
         doubt = UNDECIDED_SCORE if undecided and masks.hole_mask is None else 1.0
+        return refused, doubt
+
+    def _describe_hole(
+        self, frame: Frame, face: FacePlane, circle: RimCircle, score: float
+    ) -> HolePose:
+        """Return the hole of a rim, with all that its place and axis may be off."""
+        s = self.settings
         own_m2 = compute_center_covariance(face, circle, s.bias_per_m * plane.compare_pair(frame))
         own_rad2 = face.normal_cov_rad2()
         shared_m2, shared_rad2 = self._compute_rig_covariances(frame, face, circle.center_m)
@@ -333,7 +358,7 @@ class PlaneConicEstimator:
             cov_m2=own_m2 if shared_m2 is None else own_m2 + shared_m2,
             axis_cov_rad2=own_rad2 if shared_rad2 is None else own_rad2 + shared_rad2,
             frame="camera",
-            score=float(ellipse.score) * doubt,
+            score=score,
             t_s=frame.t_s,
             shared_m2=shared_m2,
             shared_rad2=shared_rad2,
@@ -342,19 +367,25 @@ class PlaneConicEstimator:
     def _compute_rig_covariances(
         self, frame: Frame, face: FacePlane, center_m: np.ndarray
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Return covariances of centre and normal by the pair's error, `None` without one.
+        """Return covariances of centre and normal by the errors of a pair, `None` without one.
 
         A disparity that is wrong by `c0 + c1 x/z + c2 y/z` shifts the plane in inverse depth by
-        `(c1, c2, c0)` over focal length and baseline. No residual shows it, in any frame.
+        `(c1, c2, c0)` over focal length and baseline. No residual shows it, in any frame; the same
+        holds of a wrong focal length.
         """
         std_px = self.settings.rig_px if frame.disparity_std_px is None else frame.disparity_std_px
-        if not std_px or frame.baseline_m is None:
+        if frame.baseline_m is None or (frame.right is None and not std_px):
             return None, None
         std_per_m = std_px / (float(frame.camera_matrix[0, 0]) * frame.baseline_m)
         shifted = replace(face, cov=np.eye(3) * std_per_m**2)
         ray = center_m / center_m[2]
         along_m2 = center_m[2] ** 4 * float(ray @ shifted.cov @ ray)
-        return along_m2 * np.outer(ray, ray), shifted.normal_cov_rad2()
+        shared_m2, shared_rad2 = along_m2 * np.outer(ray, ray), shifted.normal_cov_rad2()
+        if frame.right is not None:
+            by_focal = compute_focal_covariances(center_m, face.normal, self._focal.std)
+            shared_m2 = shared_m2 + by_focal[0]
+            shared_rad2 = shared_rad2 + by_focal[1]
+        return shared_m2, shared_rad2
 
     def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return grey picture, linear light and pixels of the face, cached for a frame's ellipses."""
