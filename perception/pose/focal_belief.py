@@ -27,7 +27,7 @@ class FocalDoubt:
         gross: Probability that a measurement follows something else.
         widened: Factor on the stated deviation of a measurement.
         least_std: Standard deviation that comes on top: of a face's tilt, which no rim shows.
-        sure: Probability from which a wrong one is named.
+        sure: Probability from which a wrong one is named; it stays named while it is likelier wrong.
         factor: Least factor that is named.
     """
 
@@ -48,6 +48,7 @@ class FocalBelief:
         self._camera: tuple[object, ...] = ()
         self._is_right = self._slip = np.zeros(0)
         self._rims: list[tuple[np.ndarray, int]] = []
+        self._is_named = False
 
     def begin(self, frame: Frame) -> None:
         """Forget everything where a frame is of another camera than the last one."""
@@ -55,7 +56,7 @@ class FocalBelief:
         camera = (frame.camera_matrix[0, 0], frame.camera_matrix[1, 1], frame.baseline_m)
         if camera == self._camera:
             return
-        self._camera, self._rims = camera, []
+        self._camera, self._rims, self._is_named = camera, [], False
         doubt = self._doubt
         slip = np.exp(-0.5 * (GRID / doubt.slip_std) ** 2)
         self._slip = np.log(doubt.wrong * slip / slip.sum())
@@ -81,10 +82,9 @@ class FocalBelief:
     def find_slip(self) -> float | None:
         """Return the likeliest factor if the focal length is surely wrong, else `None`."""
         probability = self._weigh()
-        beyond = np.abs(GRID) > np.log(self._doubt.factor)
-        if probability[beyond].sum() < self._doubt.sure:
-            return None
-        return float(np.exp(GRID[np.argmax(probability)]))
+        beyond = float(probability[np.abs(GRID) > np.log(self._doubt.factor)].sum())
+        self._is_named = beyond > (0.5 if self._is_named else self._doubt.sure)
+        return float(np.exp(GRID[np.argmax(probability)])) if self._is_named else None
 
     def _weigh(self) -> np.ndarray:
         """Return the probability of each wrong factor of the grid; the rest is that of a right one."""

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -51,40 +50,6 @@ def test_each_changes_each_picture_its_own_way_and_the_same_for_the_same_seed(na
         assert not torch.equal(one[0], different)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_each_happens_as_often_as_its_probability_says(name: str) -> None:
-    off = {name: replace(SHIPPED[name], probability=0.0)}
-    assert torch.equal(
-        augmentation.apply_augmentations(picture(), off, chance(0), chance(0)), picture()
-    )
-    half, many = (
-        {name: replace(SHIPPED[name], probability=0.5)},
-        picture()[:1, :, :16, :16].repeat(200, 1, 1, 1),
-    )
-    changed = (
-        (augmentation.apply_augmentations(many, half, chance(0), chance(0)) != many)
-        .flatten(1)
-        .any(1)
-    )
-    assert 0.35 < changed.float().mean() < 0.65
-
-
-@pytest.mark.parametrize(
-    "name", sorted(SHIPPED.keys() - {"shadow", "haze"})
-)  # those change the light from place to place
-def test_nothing_moves_in_the_picture(name: str) -> None:
-    step, bright = {name: replace(SHIPPED[name], probability=1.0)}, torch.zeros(8, 3, 64, 96)
-    bright[:, :, 28:36, 44:52] = 0.6
-    rows, columns = np.meshgrid(np.arange(64), np.arange(96), indexing="ij")
-    for seen in (
-        augmentation.apply_augmentations(bright, step, chance(0), chance(0)).mean(1).numpy()
-    ):
-        weight = np.clip(seen - np.median(seen) - 0.12, 0.0, None)
-        if weight.sum() > 1.0:  # strong dust leaves nothing to see
-            assert abs((rows * weight).sum() / weight.sum() - 31.5) < 1.0
-            assert abs((columns * weight).sum() / weight.sum() - 47.5) < 1.0
-
-
 def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
     flat, close = (
         torch.full((1, 3, 8, 8), 0.25),
@@ -115,30 +80,6 @@ def test_noise_has_the_strength_it_is_given_whatever_its_grain() -> None:
         assert float(noise.changed(flat, chance(0)).std()) == pytest.approx(0.03, rel=0.05)
 
 
-def test_a_shadow_only_darkens_and_motion_smears_as_far_as_it_says() -> None:
-    shadow = augmentation.Shadow(
-        probability=1.0, depth=(0.3, 0.3), width=(0.3, 0.3), softness=(0.05, 0.05)
-    )
-    dark = shadow.changed(picture(), chance(4)) / picture()
-    assert dark.max() <= 1.0 and float(dark.min()) == pytest.approx(0.3, abs=0.01)
-    point = torch.zeros(1, 3, 41, 41)
-    point[:, :, 20, 20] = 1.0
-    smear = (
-        augmentation.MotionBlur(probability=1.0, length_px=(9.0, 9.0))
-        .changed(point, chance(2))[0, 0]
-        .numpy()
-    )
-    rows, columns = np.nonzero(smear > 0.02)
-    assert smear.sum() == pytest.approx(1.0, abs=1e-4)
-    assert 7.0 <= np.hypot(np.ptp(rows), np.ptp(columns)) <= 11.0
-
-
-def test_a_blur_is_that_of_opencv() -> None:
-    blur = augmentation.Blur(probability=1.0, sigma_px=(1.2, 1.2))
-    theirs = cv2.GaussianBlur(picture()[0, 0].numpy(), (9, 9), 1.2, borderType=cv2.BORDER_REPLICATE)
-    np.testing.assert_allclose(blur.changed(picture(), chance(0))[0, 0], theirs, atol=1e-5)
-
-
 def test_a_crop_keeps_picture_and_mask_together() -> None:
     crop = Crop(width=(0.5, 1.1), shift=0.2, roll_rad=0.3, mirror=0.5)
     bright = torch.zeros(12, 2, 144, 240, dtype=torch.uint8)
@@ -165,29 +106,3 @@ def test_a_sample_that_nothing_is_done_to_is_what_the_segmenter_would_see(closer
     seen, _ = evaluation.crop_segmenter_views(views, (80, 48))
     sample, _ = Samples(views, plain, {}, (80, 48), closer, 0, torch.device("cpu")).batch(0, 1)
     assert float((255.0 * sample[0] - seen[0, int(closer)].float()).abs().mean()) < 2.0
-
-
-def test_a_crop_is_the_part_that_opencv_cuts_out() -> None:
-    view = (255 * np.random.default_rng(0).random((12, 20))).astype(np.uint8)
-    view = cv2.resize(view, (240, 144), interpolation=cv2.INTER_CUBIC)
-    crop = Crop(width=(0.5, 0.5), shift=0.1, roll_rad=0.3, mirror=0.0)
-    window = crop.windows(torch.ones(1), (144, 240), chance(5))
-    seen = cut_windows(torch.from_numpy(view)[None, None], window, (80, 48))[0, 0].numpy()
-    # from a sample's pixels to places from -1 to 1, to places in the view, to its pixels
-    into = np.array([[2 / 80, 0, 1 / 80 - 1], [0, 2 / 48, 1 / 48 - 1], [0, 0, 1]])
-    out = np.array([[120, 0, 119.5], [0, 72, 71.5], [0, 0, 1]])
-    matrix = out @ np.vstack([window[0].numpy(), [0, 0, 1]]) @ into
-    theirs = (
-        cv2.warpAffine(
-            view.astype(np.float32),
-            matrix[:2],
-            (80, 48),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        )
-        / 255.0
-    )
-    # Half of 240 px on 80.
-    assert matrix[0, 0] == pytest.approx(
-        1.5 * np.cos(np.arctan2(matrix[1, 0], matrix[0, 0])), rel=1e-4
-    )
-    assert np.abs(seen - theirs).max() < 0.03

@@ -57,26 +57,6 @@ def test_both_closed_forms_are_exact_without_noise(seed: int, count: int) -> Non
         np.testing.assert_allclose(link, y, atol=1e-6)
 
 
-def test_links_move_as_their_motions_say(machine: Machine) -> None:
-    q, step = board.MIDDLE[None], 1e-3
-    here = arm.compute_link_poses(machine, q)
-    for joint in range(machine.num_joints):
-        there = arm.compute_link_poses(machine, q + step * np.eye(5)[joint]).base_from_link[0]
-        motion = here.joints[0, joint] * step
-        tip = here.tip_in_base_m[0]
-        np.testing.assert_allclose(
-            there[:3, 3], tip + motion[:3] + np.cross(motion[3:], tip), atol=5e-6
-        )
-        np.testing.assert_allclose(
-            there[:3, :3],
-            Rotation.from_rotvec(motion[3:]).as_matrix() @ here.base_from_link[0, :3, :3],
-            atol=5e-6,
-        )
-    np.testing.assert_allclose(
-        np.linalg.norm(here.base_from_link[0, :3, :3], axis=0), 1.0, atol=1e-6
-    )
-
-
 def off(found: np.ndarray) -> tuple[float, float]:
     """Returns how far a camera is from the true one, mm and degrees."""
     away = transforms.compute_motion(found, board.CAMERA)
@@ -425,46 +405,6 @@ def test_the_command_takes_touched_points(
     (tmp_path / "bad.yaml").write_text("points: [{pixel: [1, 2], q: [0, 0]}]")
     done = brokk(*command, f"calibration.points={tmp_path / 'bad.yaml'}", "session.out=other")
     assert done.code == 2 and "q has 2 numbers, expected 5" in done.err
-
-
-def test_a_given_point_is_as_exact_as_a_click_of_the_camera_that_is_known(
-    machine: Machine, tmp_path: Path
-) -> None:
-    # beside the axis a point is known by its click alone: 2 px at 2 m are 2 * 2 / 400 m
-    matrix = np.array([[400.0, 0.0, 160.0], [0.0, 400.0, 120.0], [0.0, 0.0, 1.0]])
-    dataset.write_camera(tmp_path, matrix, (320, 240), None, None)
-    depth = np.full((240, 320), 2.0, np.float32)
-    dataset.write_frame(tmp_path / "00", np.zeros((240, 320, 3), np.uint8), depth)
-    measured = {"camera_m": [0.0, 0.0, 2.0], "base_m": [2.0, 0.0, 0.0]}
-    clicked = {"frame": "00", "pixel": [160.0, 120.0], "base_m": [2.0, 0.0, 0.0]}
-    for name, points, std_m in (
-        ("alone", [measured], 2 * 2 / 1000),
-        ("beside", [measured, clicked], 2 * 2 / 400),
-    ):
-        path = tmp_path / f"{name}.yaml"
-        path.write_text(yaml.safe_dump({"points": points}))
-        calibration = touched_points.TouchCalibration(
-            source=FrameFolder(
-                folder=str(tmp_path),
-                stereo=load_part("stereo"),
-                pair=load_part("pair_check"),
-                rate_hz=10.0,
-                least_known=0.01,
-                needs="depth",
-                base_from_camera=None,
-            ),
-            points=str(path),
-            tip_std_m=0.003,
-            click_px=2.0,
-            noise_per_m=0.0024,
-            window_px=6,
-            least_width_m=0.1,
-            work_m=2.5,
-            temperature_c=None,
-        )
-        pairs = calibration._collect_pairs(machine)[1]
-        for cov in pairs.cov_m2:
-            assert np.sqrt(np.diag(cov)[:2]) == pytest.approx([std_m, std_m])
 
 
 def judged(machine: Machine, poses: board.Posed, q: np.ndarray, seed: int) -> verdict.Verdict:

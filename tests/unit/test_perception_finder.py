@@ -116,20 +116,6 @@ def test_a_hole_is_where_it_is_through_a_lens_that_bends() -> None:
     assert np.isin(straight_m[np.isfinite(straight_m)], bent.depth_m).all()
 
 
-def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None:
-    depth_m = np.full((480, 640), 2.0, np.float32)
-    # What the arm hides from the right camera, and the arm.
-    depth_m[:, 300:360], depth_m[:, 360:] = (np.nan, 0.8)
-    mask = np.zeros(depth_m.shape, bool)
-    mask[100:400, 100:300] = True
-    frame = replace(drawn()[0], depth_m=depth_m)
-    (level,) = search.plan_search_levels(frame, mask, 0.05, 0.25, 8.0)
-    # a hole has 13 px there, 17 at most: the whole strip is searched, the arm no farther than a rim
-    # reaches, the ground likewise
-    seen = np.repeat(np.repeat(level.region > 0, search.STEP, 0), search.STEP, 1)
-    assert seen[110:390, 300:360].all() and not seen[:, 390:].any() and not seen[:, :70].any()
-
-
 class Drawn:
     """An ellipse detector that always finds the same."""
 
@@ -166,21 +152,6 @@ def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
     assert missed[150.0] is None
     # 16.5 px at 3.2 m, and a slack of 35 %
     assert missed[500.0] == pytest.approx(16.5 * 1.35, rel=1e-6)
-
-
-def test_the_rim_of_a_mouth_that_something_of_unknown_depth_cuts_is_looked_at() -> None:
-    columns, rows = np.meshgrid(np.arange(640), np.arange(480))
-    depth_m = np.full((480, 640), 1.0, np.float32)
-    mouth = np.hypot(columns - 320, rows - 250) < 53
-    depth_m[mouth] = 1.3
-    # Beside the mouth's lower half nothing is in reach of it but its own depth.
-    depth_m[rows > 260] = np.nan
-    mask = (columns > 120) & (columns < 520) & (rows > 80) & (rows <= 260)
-    matrix = np.array([[1056.0, 0.0, 320.0], [0.0, 1056.0, 240.0], [0.0, 0.0, 1.0]])
-    frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=matrix)
-    found = search.plan_search_levels(frame, mask, 0.05, 0.35, 6.5)
-    # Nothing stands before the face.
-    assert found and not any(level.nearest_m is None or level.nearest_m.any() for level in found)
 
 
 def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks_closer() -> None:

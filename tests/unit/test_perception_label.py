@@ -18,7 +18,6 @@ from brokk_rl.signals import Frame
 from perception import dataset
 from perception.label import cuboid as label_placing
 from perception.label.camera_pose import Charuco, TagGrid
-from perception.label.cuboid import compute_pixel_rays, trace_rays
 from perception.label.outline_match import match_outline
 from perception.label.refinement import (
     prepare_view,
@@ -161,20 +160,6 @@ def test_an_outline_on_mere_texture_is_never_kept() -> None:
         found.append(match.is_significant)
     assert not all(found)
     assert match_outline(outline, np.full((540, 960), 255, np.float32), 14.0) is None
-
-
-def test_rays_meet_a_cuboid_where_a_second_renderer_says(
-    footage: tuple[Path, list[cuboid.View]],
-) -> None:
-    view = cuboid.seen(cuboid.looking(EYES_M[0], (0.1, 0.0, 0.3)), SIZE_PX)
-    placing = label_placing.BlockPlacing(None, CORNERS_M, 1.2, ((cuboid.HOLE_M, cuboid.RADIUS_M),))
-    block = label_placing.place_cuboid(placing, view.frame, view.world_from_camera)
-    block = label_placing.place_mouths(block, placing, view.frame, view.world_from_camera)
-    seen = trace_rays(block, compute_pixel_rays(view.frame), view.world_from_camera)
-    np.testing.assert_array_equal(seen.face >= 0, view.block)
-    np.testing.assert_array_equal(seen.mouth, view.mouth)
-    flat = view.block & ~view.mouth
-    np.testing.assert_allclose(seen.depth_m[flat], view.frame.depth_m[flat], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["charuco", "apriltag"])

@@ -10,14 +10,11 @@ import pytest
 from composed import every, option
 
 from brokk_rl.contracts.vision import HolePose
-from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_part
-from brokk_rl.kinematics import compute_link_pose, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from perception.mount.next_view import HoleBelief
 from perception.mount.occlusion import Capsules, compute_visible_share, sample_circle
 from perception.render.scene_ranges import view_from
-from perception.render.stereo_camera import place_rig
 from perception.target_sensor import WatchedHole
 
 RIG = option("rig", "zed_2i_1080p")
@@ -53,17 +50,6 @@ def test_a_mount_is_at_its_start_at_once_and_later_elsewhere(name: str, machine:
     one = mount.locate(views[-1], q)
     np.testing.assert_allclose(one, poses[-1, 0], atol=1e-12)
     assert mount.describe(mount.start)
-
-
-def test_the_frame_of_a_link_is_that_of_the_tool_s_chain(machine: Machine) -> None:
-    q = np.array([0.3, -0.7, 0.5, 0.9, 0.4])
-    arm = compute_tool_kinematics(machine, q)
-    last = compute_link_pose(machine, q, machine.joint_names[-1])
-    np.testing.assert_allclose(last[:3, :3] @ machine.tip_m + last[:3, 3], arm.tip_in_base_m)
-    third = compute_link_pose(machine, q, machine.joint_names[2])
-    np.testing.assert_allclose(third[:3, 3], arm.joints_in_base_m[2])
-    with pytest.raises(ConfigError, match="q9"):
-        compute_link_pose(machine, q, "q9")
 
 
 def test_lift_and_pan_move_the_camera_as_worked_out_by_hand(machine: Machine) -> None:
@@ -119,34 +105,6 @@ def test_a_camera_that_sees_the_hole_as_well_as_any_stays(machine: Machine) -> N
     view = planner.choose(believe(), mount.start, q).view
     assert not view.is_moving and view.travel_s == 0.0
     assert "stays" in view.explain()
-
-
-def test_what_is_not_seen_ages_in_the_tracker_and_is_corrected_by_the_next_view() -> None:
-    fusion = replace(load_part("tracker"), drift_m_sqrt_s=0.001)
-    cov = 0.001**2 * np.eye(3)
-    pose = HolePose(HOLE_M, UP, 0.05, cov, np.zeros((3, 3)), "base", 0.9, 0.0)
-    tracker = fusion.build()
-    tracker.update([pose], 0.0)
-    (hole,) = tracker.update([], 8.0)
-    # a random walk: 1 mm² of its own, 1 mm² more in each second
-    assert hole.std_m == pytest.approx(0.003)
-    np.testing.assert_allclose(hole.pose.cov_m2, 9e-6 * np.eye(3))
-    moved = replace(pose, center_m=HOLE_M + np.array([0.01, 0.0, 0.0]))
-    (hole,) = tracker.update([moved], 8.0)
-    # weights 1 to 9
-    assert hole.pose.center_m[0] == pytest.approx(HOLE_M[0] + 0.009)
-    assert hole.std_m == pytest.approx(np.sqrt(0.9) * 0.001)
-
-
-def test_a_part_of_a_picture_from_elsewhere_shows_the_same_points() -> None:
-    pose = RIG.base_from_camera.copy()
-    pose[:3, 3] += [0.1, -0.4, 0.3]
-    part = place_rig(RIG, pose, (700, 300), (448, 336))
-    point = np.linalg.inv(pose) @ np.append(HOLE_M, 1.0)
-    whole = RIG.left.project(point[:3])
-    np.testing.assert_allclose(part.left.project(point[:3]), whole - [700, 300])
-    assert (part.width, part.height) == (448, 336)
-    np.testing.assert_array_equal(part.base_from_camera, pose)
 
 
 def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:

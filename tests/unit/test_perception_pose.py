@@ -11,10 +11,10 @@ from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 
 from brokk_rl.contracts.vision import HolePose, Masks, Rejection
 from perception.ellipse import conic
-from perception.pose import alignment, appearance, consistency, plane, rim, wall_light
+from perception.pose import alignment, appearance, consistency, plane, rim
 from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
-from perception.pose.wall_light import IN_DUST, WallLight
+from perception.pose.wall_light import IN_DUST
 
 
 @pytest.fixture(scope="module")
@@ -195,38 +195,6 @@ def test_a_plane_among_gross_errors_is_as_uncertain_as_it_varies() -> None:
     assert max(sigmas) < 25.0
 
 
-def test_a_wall_is_lit_by_as_much_as_was_drawn_whatever_the_gradient_of_dust() -> None:
-    frame, _, ellipse = drawn(depth_m=0.0)
-    face = plane.FacePlane(AXIS / (AXIS @ CENTER), np.eye(3) * 1e-6, 1e-3, 1000, 7.0)
-    place = (pose_row(ellipse), K, face, CENTER, 0.05)
-    flat = np.full(frame.depth_m.shape, 180.0)
-    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
-    inside = conic.measure_radii(place[0], columns, rows) < 1
-    depth_m, around = wall_light._find_wall_places(RAYS[inside], face.normal, CENTER, 0.05)
-    # by hand: a point of the wall is where the ray leaves the cylinder about the axis
-    wall = RAYS[inside] * ((AXIS @ CENTER - depth_m) / (RAYS[inside] @ AXIS))[:, None] - CENTER
-    across = wall - np.outer(wall @ AXIS, AXIS)
-    np.testing.assert_allclose(np.linalg.norm(across, axis=1), 0.05, atol=2e-3)
-    np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1.0, atol=0.05)
-    # by hand: a ray from the wall towards the sun leaves within the mouth
-    sun = np.cross(AXIS, [0.3, 1.0, 0.2])
-    sun = 0.8 * sun / np.linalg.norm(sun) - 0.6 * AXIS
-    leaves = across + depth_m[:, None] / 0.6 * (sun + 0.6 * AXIS)
-    facing = np.maximum(-across @ sun / 0.05, 0.0)
-    sunlit = facing * (np.linalg.norm(leaves, axis=1) <= 0.05 + 1e-6)
-    for sky, direct in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.3)):
-        lit = sky * np.exp(-depth_m / (wall_light.FADE * 0.05)) + direct * sunlit
-        flat[inside] = 100.0 + 0.3 * (columns[inside] - ellipse.x) + 80.0 * lit
-        gray = np.clip(np.rint(flat), 0, 255).astype(np.uint8)
-        light = wall_light.measure_wall_light(gray, frame.depth_m, *place)
-        if not direct:
-            assert light.sky == pytest.approx(sky, abs=0.05)
-        else:
-            assert light.explained > 0.6
-        assert (light.log_ratio > 0) == (sky + direct > 0)
-    assert WallLight(1.5, 0.01).log_ratio == 0.0
-
-
 @pytest.mark.parametrize("arm", [True, False])
 def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(
     arm: bool, estimator
@@ -286,17 +254,6 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(
         )
 
 
-def test_the_edge_of_a_shadow_across_the_face_is_no_grain() -> None:
-    generator = np.random.default_rng(6)
-    even = generator.normal(150, 6, 4000).astype(np.float32)
-    half = np.concatenate([even[:2000], even[2000:] - 40])
-    # the darker part lies 30 above what is inside, five standard deviations of its grain
-    assert appearance._measure_contrast(half, 80.0) == pytest.approx(5.0, rel=0.25)
-    # even grain, as far: its darker half lies 0.67 standard deviations nearer, and varies half as
-    # much
-    assert appearance._measure_contrast(even, 120.0) == pytest.approx((5.0 - 0.67) / 0.5, rel=0.25)
-
-
 def test_what_stands_before_a_face_may_be_darker_than_dust(estimator) -> None:
     frame, masks, ellipse = drawn()
     dusty = (0.3 * frame.color.astype(float) + 0.7 * 150).astype(np.uint8)
@@ -327,23 +284,6 @@ def test_a_rim_knows_its_centre_by_what_is_seen_of_it(seen_rad: float) -> None:
         # towards the part that is hidden, radius and centre are told apart by what bends: much
         # worse than across it
         assert cov[0, 0] > 2.5 * cov[1, 1] > 2.0 * (0.03 * 0.002) ** 2
-
-
-def test_edges_beside_what_hides_the_rest_of_a_rim_do_not_draw_its_circle() -> None:
-    angles = np.linspace(-np.pi, np.pi, 144, endpoint=False)
-    edges = np.full((144, rim.PEAKS, 2), np.nan)
-    on = np.abs(angles) <= 0.75 * np.pi
-    inward_px = 0.5 * np.exp(
-        -np.arange(144) / 2.0
-    )  # as the blur across profiles draws them, most at the ends of the arc
-    beside = np.minimum(np.arange(on.sum()), np.arange(on.sum())[::-1])
-    radius = 0.05 - 0.002 * inward_px[beside]
-    edges[on, 0] = radius[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    fit = rim._fit_circle(np.array([0.0, 0.0, 0.05]), edges, np.full(144, 0.002), 0.03)
-    assert fit is not None and fit.coverage == pytest.approx(on.mean())
-    assert np.hypot(*fit.circle[:2]) < 0.02 * 0.002 and fit.rms_px < 0.02, (
-        "a fiftieth of a pixel; the end profiles are off by half of one"
-    )
 
 
 def test_the_mouth_channel_is_believed(estimator) -> None:
@@ -431,24 +371,6 @@ def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
         )
         is None
     )
-
-
-def test_a_plane_ignores_another_face() -> None:
-    generator = np.random.default_rng(2)
-    rays = np.column_stack([generator.uniform(-0.3, 0.3, (4000, 2)), np.ones(4000)])
-    m = np.array([0.0, 0.4, 0.7])
-    inverse = np.where(
-        rays[:, 0] < 0.15, rays @ m, rays @ np.array([1.5, 0.4, 0.475])
-    ) + generator.normal(0, 0.002, 4000)
-    radii = 1.25 + 30 * np.linalg.norm(rays[:, :2], axis=1)
-    found = plane.fit_plane(
-        plane.FaceSupport(rays, inverse, radii, np.arange(4000) // 10, 1.0),
-        (2.6, 4.0, 7.0, 12.0),
-        2e-4,
-        generator,
-    )
-    assert found is not None
-    assert found.m == pytest.approx(m, abs=2e-3)
 
 
 def test_an_inside_that_is_nearer_than_its_face_is_no_hole(estimator) -> None:

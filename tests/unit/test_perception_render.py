@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 from composed import names, option
 
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
-from perception import dataset
 from perception.render.block_sampler import build_frame
 from perception.render.camera_sensor import (
     CameraExposure,
@@ -36,10 +35,10 @@ from perception.render.hole_light import (
 )
 from perception.render.materials import Material
 from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
-from perception.render.ray_tracer import GroundBounce, Light, Pinhole, Tracer
+from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
-from perception.render.solids import Box, Cylinder, PlaneSolid, SolidPose
+from perception.render.solids import Box, PlaneSolid, SolidPose
 from perception.render.stereo_camera import StereoRig
 
 GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
@@ -145,19 +144,6 @@ def test_the_mouth_is_the_projected_circle(obliquity: float) -> None:
     assert wrong.sum() <= 2  # the polygon of 2000 points against the circle
 
 
-def test_a_tilted_face_has_the_depth_of_its_plane() -> None:
-    rotation, center = build_frame(np.array([0.3, -0.5, -0.8]), 0.3), np.array([0.05, 0.02, 1.5])
-    view = seen([drilled(rotation, center)])
-    normal = rotation[:, 2]
-    y, x = np.mgrid[:240, :320]
-    plane = (center @ normal) / (
-        ((x - 159.5) * normal[0] + (y - 119.5) * normal[1]) / 400.0 + normal[2]
-    )
-    on_face = (view.solid == 0) & ~view.mouth & (np.abs(x - 176) < 25) & (np.abs(y - 125) < 25)
-    assert on_face.sum() > 1000
-    np.testing.assert_allclose(view.depth_m[on_face], plane[on_face], atol=2e-6)
-
-
 def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
     # On the rim, 1 cm above the face: a bowl 22.9 mm wide, 15 mm deep.
     chip = Chip(np.array([0.05, 0.0, 0.31]), 0.025)
@@ -174,41 +160,6 @@ def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
         np.array([0.06, 0.0, 0.0]), np.array([[0.0, 0.0, 1.0]], np.float32)
     )
     assert t[0] == pytest.approx(1.0 + 0.01291, abs=1e-5) and part[0] == chipped.break_part
-
-
-def test_a_bar_in_the_concrete_is_seen_through_the_hole_alone() -> None:
-    # the bar, 10 mm thick, lies 50 mm below the face across the whole block
-    bar = Cylinder(
-        "block", SolidPose(np.eye(3)[:, [1, 2, 0]], np.array([0.0, 0.0, 1.05])), 0.005, 0.4, (GREY,)
-    )
-    view = seen([drilled(FACING, np.array([0.0, 0.0, 1.0])), bar])
-    assert (view.solid == 1).sum() > 100 and view.mouth[view.solid == 1].all()
-    # half a pixel beside its middle: 0.5 / 400 of 1.045 m, 1.3 mm
-    assert view.depth_m[120, 160] == pytest.approx(
-        1.05 - np.sqrt(0.005**2 - 0.0013065**2), abs=1e-5
-    )
-    assert view.depth_m[120, 160 + 25] == pytest.approx(1.0, abs=1e-6)
-
-
-def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
-    # upright
-    post = Cylinder(
-        "arm", SolidPose(np.eye(3)[:, [2, 0, 1]], np.array([0.1, 0.0, 1.0])), 0.05, 0.2, (GREY,)
-    )
-    crate = Box(
-        "clutter",
-        SolidPose(np.eye(3), np.array([-0.2, 0.0, 1.0])),
-        np.array([0.1, 0.1, 0.1]),
-        (GREY,),
-    )
-    t, solid, _ = Tracer([post, crate], NOON, (0, 0, 0)).first(
-        np.zeros(3), np.array([[0.1, 0.0, 1.0], [-0.2, 0.0, 1.0], [0.0, 0.0, 1.0]], np.float32)
-    )
-    # along (0.1, 0, 1) s the post's axis is hit at s = 1, its skin 0.05 / |(0.1, 1)| of the way
-    # before
-    assert t[0] == pytest.approx(1.0 - 0.05 / np.hypot(0.1, 1.0), abs=1e-5)
-    assert t[1] == pytest.approx(0.9, abs=1e-6)
-    assert solid.tolist() == [0, 1, -1]
 
 
 def test_a_shadow_lies_where_the_light_is_blocked() -> None:
@@ -327,23 +278,6 @@ def test_dust_takes_contrast_as_it_says() -> None:
     assert taken[0, -1, 0] == pytest.approx(255 * (0.8 / 4 + 0.6 * 3 / 4), abs=1)
 
 
-def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
-    light, depth = np.full((200, 200, 3), 0.5, np.float32), np.ones((200, 200), np.float32)
-    dim = CameraExposure(0.15, 0.0, 0.0, 0.0, 0.0, 8000.0, 8.0, 1.0, 0.0)
-    taken = take_picture(
-        light,
-        depth,
-        dim,
-        draw_dust(0.0, np.random.default_rng(0)),
-        LinearCamera(),
-        np.random.default_rng(1),
-    ).astype(float)
-    # 0.075 of 8000 electrons are 600; their noise sqrt(600 + 8^2) is 25.8 electrons or 0.82 of 255
-    # steps, rounding adds 1 / 12
-    assert taken.mean() == pytest.approx(0.075 * 255, abs=0.1)
-    assert taken.std() == pytest.approx(np.hypot(25.77 / 8000 * 255, np.sqrt(1 / 12)), rel=0.05)
-
-
 def plain_mosaic(**changes: Any) -> MosaicCamera:
     """Returns a colour camera without errors, noise or processing beyond its mosaic."""
     plain = MosaicCamera(
@@ -397,22 +331,6 @@ def test_motion_smears_a_point_along_its_way() -> None:
     assert smeared[:9].sum() == smeared[12:].sum() == 0.0
 
 
-def test_a_sensor_draws_one_pair_for_a_seed_and_another_for_each_frame() -> None:
-    sensor = option("rig/sensor", "mosaic")
-    chance = np.random.default_rng(3)
-    first, second = sensor.draw_pair(chance), sensor.draw_pair(chance)
-    assert first[0] != second[0] and first[0].gain != first[1].gain
-    assert first[0].motion_px == first[1].motion_px, "the rig shakes as one"
-    assert first == sensor.draw_pair(np.random.default_rng(3))
-    one = replace(sensor, seed=5)
-    first, second = one.draw_pair(chance), one.draw_pair(chance)
-    still = {"motion_px": (0.0, 0.0), "gain": 1.0}  # these belong to the frame
-    assert replace(first[1], **still) == replace(second[1], **still)
-    assert first[0].gain / first[1].gain == pytest.approx(second[0].gain / second[1].gain)
-    with pytest.raises(ConfigError, match="jpeg_quality"):
-        replace(sensor, jpeg_quality=(0, 90))
-
-
 def test_light_in_a_white_hole_is_that_outside_and_a_dark_one_sends_none_on() -> None:
     factors, mouth = compute_view_factors(0.05, 0.35)
     np.testing.assert_allclose(factors.sum(1) + mouth, 1.0, atol=1e-12)
@@ -434,18 +352,6 @@ def test_sunlight_on_the_wall_and_floor_of_a_hole_is_that_which_enters() -> None
         first = measure_sunlight(0.05, 0.2, (np.arange(400) + 0.5) * 0.2 / 400, rise)
         fallen = first[:-1].mean() * 2 * np.pi * 0.05 * 0.2 + first[-1] * np.pi * 0.05**2
         assert fallen == pytest.approx(np.pi * 0.05**2 * rise, rel=0.02)
-
-
-def test_a_floor_of_a_hole_is_brighter_with_bounced_light_and_walls_see_the_ground() -> None:
-    camera = Pinhole(65, 65, 400.0, np.zeros(3))
-    block = drilled(FACING, np.array([0.0, 0.0, 2.0]))
-    up = np.array([0.0, -1.0, 0.0])
-    direct = Light(np.array([0.0, 0.0, -1.0]), 0.0, 1.0)
-    bounced = replace(direct, ground=GroundBounce(up, 0.4))
-    plain, lit = (seen([block], camera, light).radiance[..., 0] for light in (direct, bounced))
-    # A wall that stands on the ground: half of its light is the sky's, half the ground's.
-    assert lit[32, 58] / plain[32, 58] == pytest.approx(0.5 * (1.0 + 0.4), rel=1e-4)
-    assert lit[32, 32] / lit[32, 58] > 1.3 * plain[32, 32] / plain[32, 58]
 
 
 @pytest.mark.parametrize("name", names("scene"))
@@ -520,24 +426,6 @@ def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(
         brokk("mode=render", "scene=varied", "session.out=two", "session.seed=1", *size).code == 0
     )
     assert digests(tmp_path / "two" / "frames")["00000.color.png"] != first["00000.color.png"]
-
-
-def test_truth_and_masks_come_back_as_they_were_written(rig: StereoRig, tmp_path: Path) -> None:
-    chance, stem = np.random.default_rng(2), tmp_path / "00000"
-    maker = studio("decoy", rig)
-    shot = maker.shot(compose_scene(kind("decoy"), rig, chance), chance)
-    dataset.write_frame(stem, shot.color, shot.depth_m, shot.right, shot.label, shot.truth)
-    again = dataset.read_truth(stem)
-    assert again.holes[0].radius_m == shot.truth.holes[0].radius_m and len(again.decoys) == len(
-        shot.truth.decoys
-    )
-    np.testing.assert_allclose(again.holes[0].center_m, shot.truth.holes[0].center_m)
-    np.testing.assert_array_equal(dataset.read_label(stem).hole_mask, shot.label.hole_mask)
-    assert dataset.list_stems(tmp_path) == [stem]
-    with pytest.raises(FrameError, match="no truth"):
-        dataset.read_truth(tmp_path / "other")
-    with pytest.raises(FrameError, match="no such folder"):
-        dataset.list_stems(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(

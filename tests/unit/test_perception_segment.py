@@ -24,7 +24,7 @@ from perception.render.scene_sampler import compose_scene
 from perception.segment import network as segment_network
 from perception.segment.network import NetworkSegmenter
 from perception.segment.unet import UNet, read_checkpoint
-from perception.segment.window import Window, bound_block, center_window, cover_picture
+from perception.segment.window import Window
 from perception.train import export
 
 SIZE_PX = (640, 360)
@@ -95,21 +95,6 @@ def test_a_window_brings_back_what_it_took(
     if covered.sum() > 400:
         # a pixel of the window may be several of the picture
         assert np.abs(back - picture)[covered].max() < 0.05 + 0.06 * width / 80
-
-
-def test_windows_keep_the_shape_and_hold_what_they_are_around() -> None:
-    for shape in ((1080, 1920, 3), (480, 640, 3), (720, 1280, 3)):
-        window = cover_picture(shape, (320, 192))
-        assert window.left <= 0 and window.top <= 0
-        assert window.left + window.width >= shape[1] and window.top + window.height >= shape[0]
-        assert window.width / window.height == pytest.approx(320 / 192, rel=0.01)
-    closer = center_window((100, 50, 40, 60), (320, 192), 0.25)
-    assert (closer.width, closer.height) == (150, 90)  # 60 px high, a quarter on each side
-    assert (closer.left + closer.width / 2, closer.top + closer.height / 2) == (120, 80)
-    block = np.zeros((50, 50), np.float32)
-    assert bound_block(block, 0.5, 0.2) is None
-    block[10:30, 20:40], block[45:47, 0:2] = 1.0, 1.0  # a speck that does not count
-    assert bound_block(block, 0.5, 0.2) == (20, 10, 20, 20)
 
 
 def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:

@@ -23,7 +23,6 @@ from perception.render.materials import Material, read_photograph
 from perception.render.photographed_surfaces import PhotographedSurfaces
 from perception.segment.network import NetworkSegmenter
 from perception.sources.lens_file import read_pair_lens
-from perception.train.samples import list_pictures, read_views
 
 SIZE_PX = (96, 64)
 
@@ -146,13 +145,6 @@ def test_real_and_rendered_sessions_are_different_rows(tmp_path: Path) -> None:
     (tmp_path / "wrong.yaml").write_text("holes: [{center_m: [1, 2]}]\nstd_m: 0.1\n")
     with pytest.raises(ConfigError, match=r"hole 1.*expected YAML such as"):
         read_measured(tmp_path / "wrong.yaml")
-
-
-def test_pictures_without_a_block_have_empty_masks(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.jpg"), draw_pair(1))
-    views = read_views(list_pictures(str(tmp_path)), (64, 32), 0.15, 0, negatives=True)
-    assert len(views) == 1 and views.conditions == ("negative",)
-    assert views.layers[0, :, :3].any() and not views.layers[0, :, 3:].any()
 
 
 @pytest.mark.parametrize(("side", "named"), [(2, False), (12, True)])

@@ -142,3 +142,19 @@ def test_a_hole_that_nobody_sees_becomes_stale_and_is_forgotten() -> None:
     (hole,) = tracker.update([], 0.2 + 1.01 * FUSION.stale_s)
     assert hole.stale
     assert tracker.update([], 0.3 + FUSION.forget_s) == []
+
+
+def test_what_is_not_seen_ages_and_is_corrected_when_it_is_seen_again() -> None:
+    fusion = replace(load_part("tracker"), drift_m_sqrt_s=0.001)
+    pose = detect((2.6, 0.0, 0.75), 0.001)
+    tracker = fusion.build()
+    tracker.update([pose], 0.0)
+    (hole,) = tracker.update([], 8.0)
+    # a random walk: 1 mm² of its own, 1 mm² more in each second
+    assert hole.std_m == pytest.approx(0.003)
+    np.testing.assert_allclose(hole.pose.cov_m2, 9e-6 * np.eye(3))
+    moved = replace(pose, center_m=np.array([2.61, 0.0, 0.75]))
+    (hole,) = tracker.update([moved], 8.0)
+    # weights 1 to 9
+    assert hole.pose.center_m[0] == pytest.approx(2.609)
+    assert hole.std_m == pytest.approx(np.sqrt(0.9) * 0.001)

@@ -5,18 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cuboid
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from perception import dataset
 from perception.dataset import FrameLabel
-from perception.segment.unet import compute_loss
 from perception.train import evaluation, samples, trainer
 
 SMALL = (
@@ -44,15 +41,6 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
             label=FrameLabel(view.block, view.mouth, view.occluder),
         )
     return folder
-
-
-def test_the_loss_of_a_worked_example_is_right() -> None:
-    logits = torch.full((1, 2, 1, 2), 0.0)
-    target = torch.tensor([[[[1.0, 0.0]], [[0.0, 0.0]]]])
-    # probabilities are one half everywhere: entropy ln 2; Dice (2 * 0.5 + 1) / (2 + 1) and 1 / (1 +
-    # 1)
-    expected = np.log(2.0) + 1.0 - (2.0 / 3.0 + 1.0 / 2.0) / 2.0
-    assert float(compute_loss(logits, target)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_figures_of_a_worked_example_are_right() -> None:
@@ -132,39 +120,6 @@ def test_a_training_begins_with_the_network_it_is_given(
     assert refused.code == 2 and "widths [6, 12, 16]" in refused.err
 
 
-def test_a_training_keeps_the_mean_of_its_last_networks(
-    brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command = (
-        "mode=train_perception",
-        f"training.frames={frames}",
-        *SMALL,
-        "training.validate_every=4",
-    )
-    assert brokk(*command, "training.updates=1", "session.out=first").code == 0
-    seen, step = [], trainer._Training._step
-
-    def watched(self: Any, *batch: torch.Tensor) -> torch.Tensor:
-        value = step(self, *batch)
-        seen.append((self, self._network.head.weight.detach().clone()))
-        return value
-
-    monkeypatch.setattr(trainer._Training, "_step", watched)
-    done = brokk(
-        *command,
-        "training.updates=4",
-        "training.average=0.25",
-        "training.start=first/segmenter.safetensors",
-        "session.out=run",
-    )
-    assert done.code == 0, done.err
-    # a quarter of the training is one update here: each one moves the mean by 1 - 1/e of the way
-    mean = load_file("first/segmenter.safetensors")["head.weight"]
-    for _, weight in seen:
-        mean = mean + (1.0 - np.exp(-1.0)) * (weight - mean)
-    torch.testing.assert_close(seen[0][0]._mean["head.weight"], mean)
-
-
 def test_an_interrupted_training_goes_on_exactly(
     brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,30 +150,6 @@ def test_an_interrupted_training_goes_on_exactly(
     )
     refused = brokk(*command, "session.out=parts", "resume=parts", "training.rate=0.02")
     assert refused.code == 2 and "its settings differ" in refused.err
-
-
-def test_a_training_ends_in_time_with_its_rate_at_nothing(
-    brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rates, rate = [], trainer._Training._rate
-    monkeypatch.setattr(
-        trainer._Training, "_rate", lambda self: rates.append(rate(self)) or rates[-1]
-    )
-    clock = iter(range(1000))
-    # a second an update; the clock of others goes on
-    own = SimpleNamespace(monotonic=lambda: float(next(clock)))
-    monkeypatch.setattr(trainer, "time", own)
-    done = brokk(
-        "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=10000", "training.max_seconds=8",
-        "training.validate_every=3", "session.out=run",
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    result = json.loads(Path("run/training.json").read_text())
-    assert (result["updates"], result["seconds"]) == (8, 8.0)
-    assert [entry["update"] for entry in result["curve"]] == [3, 6, 8]
-    # the rise, 20 of the part spent, is over after one second; then half a cosine from 1 to 0 over
-    # 8
-    assert rates[1:] == pytest.approx([0.005 * (1 + np.cos(np.pi * k / 8)) for k in range(1, 8)])
 
 
 def test_folders_without_masks_are_refused(brokk: Callable[..., Any], tmp_path: Path) -> None:
