@@ -25,9 +25,9 @@ def believe(factors: tuple[float, ...], is_same_rim: bool = False) -> FocalBelie
     return belief
 
 
-def test_without_a_rim_half_of_the_focal_lengths_are_wrong_by_the_usual_slip() -> None:
+def test_without_a_rim_a_focal_length_may_be_off_by_the_usual_slip() -> None:
     # The grid ends at three of these deviations.
-    assert believe(()).std == pytest.approx(np.sqrt(DOUBT.wrong) * DOUBT.slip_std, rel=0.05)
+    assert believe(()).std == pytest.approx(np.sqrt(DOUBT.wrong) * DOUBT.slip_std, rel=0.03)
     assert believe(()).find_slip() is None
 
 
@@ -53,7 +53,7 @@ def test_another_camera_is_believed_anew_and_another_part_of_the_picture_is_not(
     belief.begin(replace(frame, camera_matrix=matrix))
     assert belief.std < 0.003
     belief.begin(replace(frame, camera_matrix=K * [[1.1], [1.1], [1.0]]))
-    assert belief.std > 0.3
+    assert belief.std > 0.2
 
 
 def test_the_covariance_of_a_hole_is_what_stretched_depth_does_to_it() -> None:
