@@ -186,7 +186,7 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
     the edge of an occluder.
     """
     height, width = frame.depth_m.shape
-    # A step of 5 degrees. Chosen by hand; not searched.
+    # A step of 5 degrees.
     nearer = np.zeros(72, bool)
     for scale in BESIDE:
         points = conic.sample_ellipses(
