@@ -1,4 +1,4 @@
-"""What the rims of a session say of the focal length of a pair: a belief that holes are stated by.
+"""Belief about the focal length of a pair by the rims of a session; holes are stated no surer.
 
 A focal length that is too long by a factor stretches the depth of a pair by it. Faces that are seen
 straight on show nothing of that, rims on tilted faces do: they are round with the right one alone.

@@ -19,7 +19,7 @@ from perception.robust_fit import TUKEY, compute_biweight, guess_plane
 # median error by 0.4 mm at most.
 GROWING = 3.0
 """Limit of the biweight, standard deviations, while the plane is grown: beyond an edge of the block
-another face begins."""
+another face begins at the same depth, and a wider limit would follow it."""
 NEARNESS, LEAN = 0.3, 0.4
 """Allowed relative error of inverse depth beside that of a circle of the ellipse's size, and
 addition to the slope that its shape allows: occluders differ by more."""
