@@ -31,10 +31,9 @@ same rim. Chosen by hand: a rim found in two resolutions differs by a few percen
 STRONG_SCORE = 0.5
 """Part of the best score from which an ellipse counts as strong. Chosen by hand: among strong rims
 inside each other the larger one wins, a weak larger one does not."""
-
 SAME_REGION = 0.6
-"""Distance, as a part of the smaller major semi-axis, below which a proposal shows the region of an
-ellipse. Chosen by hand: the middle of a region with a broken rim is off by up to 0.35."""
+"""Distance, as a part of the smaller major semi-axis, below which a candidate lies on the place of one
+that was judged."""
 MOST_CANDIDATES = 16
 """Candidates of a stage that are judged, the best first: each takes about 10 ms."""
 SHAPE_REASONS = (
@@ -117,11 +116,6 @@ EXPLANATIONS = {
     ),
     "local normals around the rim": ("there is too little depth around it for normals", ""),
     "angle between local normals, rad": ("the normals around it do not agree", ""),
-    "known pose of the camera": ("the pose of the camera is unknown", "Run mode=calibrate."),
-    "angle to the expected normal, rad": (
-        "as a circle it would lie on a face of another direction than expected",
-        "",
-    ),
 }
 """Explanation and remedy for each `Rejection.reason`."""
 
@@ -187,7 +181,7 @@ class _Judged:
 
 
 class StagedFinder:
-    """Finder that runs the stages of `StagedPerception`; a `brokk_rl.contracts.vision.BoreholeFinder`."""
+    """Finder that runs the stages of `StagedPerception`; see `BoreholeFinder`."""
 
     def __init__(self, settings: StagedPerception) -> None:
         self.settings = settings
@@ -280,18 +274,14 @@ class StagedFinder:
     def _refine(
         self, frame: Frame, found: list[tuple[Ellipse, HolePose]], ms: dict[str, float]
     ) -> list[tuple[Ellipse, HolePose]]:
-        """Return holes as they are seen when they are expected: coarse depth pulls their faces.
-
-        What is not seen again stays as it was found.
-        """
+        """Return holes as they look where they are expected, or as they were found: coarse depth errs."""
         refined = []
         for ellipse, pose in found:
             place = expect_rim(pose, frame)
             again = [] if place is None else self._judge_near(frame, [place], ms)[0].found
             # The score is that of the detected ellipse.
             seen = [replace(one, score=pose.score) for _, one in again]
-            pose = seen[0] if seen else pose
-            refined.append((ellipse, pose))
+            refined.append((ellipse, seen[0] if seen else pose))
         return refined
 
     def find_ellipses(self, frame: Frame) -> list[Ellipse]:

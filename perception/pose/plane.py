@@ -73,6 +73,16 @@ class FacePlane:
         project = (np.eye(3) - np.outer(self.normal, self.normal)) / length
         return project @ self.cov @ project
 
+    def point_cov_m2(self, point_m: np.ndarray, bias_per_m: float) -> np.ndarray:
+        """Return the covariance of a point of it, `(3, 3)`, where a ray meets it.
+
+        A small error of inverse depth, of the plane and of `bias_per_m` besides, moves the point by
+        depth squared.
+        """
+        ray = point_m / point_m[2]
+        variance = float(ray @ self.cov @ ray) + bias_per_m**2
+        return np.outer(ray, ray) * (point_m[2] ** 4 * variance)
+
     def inverse_depth(self, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return inverse depth at columns and rows of a picture, which are broadcast."""
         return compute_inverse_depth(self.m, camera_matrix, u, v)

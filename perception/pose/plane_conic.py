@@ -227,9 +227,7 @@ class PlaneConicEstimator:
         if face.sigma > limit_per_m:
             reason = "depth noise on the face, 1/m"
             return Rejection("pose", reason, face.sigma, limit_per_m, ellipse)
-        # Errors of neighbouring pixels are alike, so the count of pixels overstates the
-        # precision.
-        # Those of a coarse match grow with its pixels.
+        # Errors of neighbouring pixels are alike; those of a coarse match grow with its pixels.
         cov = face.cov * s.matcher_alike * frame.depth_shrink**2
         # A bias of a matcher shifts the whole face, so it enters the constant term alone.
         bias_per_m = s.matcher_bias_per_m * pair * frame.depth_shrink + s.matcher_drift * face.sigma
@@ -349,7 +347,8 @@ class PlaneConicEstimator:
     ) -> HolePose:
         """Return the hole of a rim, with all that its place and axis may be off."""
         s = self.settings
-        own_m2 = compute_center_covariance(face, circle, s.bias_per_m * plane.compare_pair(frame))
+        bias_per_m = s.bias_per_m * plane.compare_pair(frame)
+        own_m2 = face.point_cov_m2(circle.center_m, bias_per_m) + circle.cov_m2
         own_rad2 = face.normal_cov_rad2()
         shared_m2, shared_rad2 = self._compute_rig_covariances(frame, face, circle.center_m)
         return HolePose(
@@ -379,9 +378,7 @@ class PlaneConicEstimator:
             return None, None
         std_per_m = std_px / (float(frame.camera_matrix[0, 0]) * frame.baseline_m)
         shifted = replace(face, cov=np.eye(3) * std_per_m**2)
-        ray = center_m / center_m[2]
-        along_m2 = center_m[2] ** 4 * float(ray @ shifted.cov @ ray)
-        shared_m2, shared_rad2 = along_m2 * np.outer(ray, ray), shifted.normal_cov_rad2()
+        shared_m2, shared_rad2 = shifted.point_cov_m2(center_m, 0.0), shifted.normal_cov_rad2()
         if frame.right is not None:
             by_focal = compute_focal_covariances(center_m, face.normal, self._focal.std)
             shared_m2 = shared_m2 + by_focal[0]
@@ -481,15 +478,6 @@ class PlaneConicEstimator:
         if undecided and not has_parallax and (is_sure or not has_mask):
             return None
         return None if evidence >= 1.0 else refuse("evidence of depth inside", evidence, 1.0)
-
-
-def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: float) -> np.ndarray:
-    """Return the covariance of a centre, `(3, 3)` m²: plane along the ray, circle on the plane."""
-    center = circle.center_m
-    # The ray of unit depth: a small error of inverse depth moves the point by depth squared.
-    ray = center / center[2]
-    depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
-    return np.outer(ray, ray) * depth_var + circle.cov_m2
 
 
 def as_row(ellipse: Ellipse) -> np.ndarray:
