@@ -204,11 +204,13 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
 
 
 def _split_numbers(words: list[str]) -> list[str]:
-    """Return the words with a number apart that names a joint: `u1`, `q1` and `AxisSetPos1` are of joint 1."""
+    """Return the words with a number apart that names a joint: `u1` and `AxisSetPos1` are of joint 1, `u_q1` is of q1."""
     found = []
-    for word in words:
+    for place, word in enumerate(words):
         numbered = re.fullmatch(r"([a-z]+)(\d+)", word)
-        is_apart = numbered is not None and (len(words) == 1 or numbered[1] in ROLE_WORDS)
+        is_word = numbered is not None and numbered[1] in ROLE_WORDS and len(numbered[1]) > 1
+        is_first = numbered is not None and place == 0 and numbered[1] in ROLE_WORDS
+        is_apart = is_word or is_first or len(words) == 1
         found += numbered.groups() if numbered and is_apart else [word]
     return found
 

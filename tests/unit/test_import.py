@@ -5,19 +5,37 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from composed import option
 from conftest import Done
+from log_import import import_log, make_draft, try_draft
 
 from actuators.recordings.column_names import read_column_name
-from brokk_rl import record
+from actuators.recordings.guess import Guess
+from actuators.recordings.log_draft import MACHINE_TEMPLATE, MAP_TEMPLATE
 from brokk_rl.machine import Machine
 
 RATE_HZ = 50.0
 LAG = 6
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def read_guesses(*options: str) -> dict[str, Guess]:
+    return {
+        guess.subject: guess for guess in make_draft("log.input=a.csv", *options).list_guesses()
+    }
+
+
+def draft_file(template: str, *options: str) -> dict[str, Any]:
+    return yaml.safe_load(make_draft("log.input=a.csv", *options).format(template))
 
 
 def make_targets(num: int = 1500) -> np.ndarray:
@@ -47,24 +65,14 @@ def write_servo_log(path: Path, swapped: bool = False) -> None:
     write_table(path, columns)
 
 
-def read_positions(path: Path, joint: str) -> np.ndarray:
-    import pyarrow.parquet as pq
-
-    return pq.read_table(path)[f"q_{joint}_rad"].to_numpy()
-
-
-def read_guesses(folder: str) -> dict[str, dict[str, str]]:
-    found = json.loads((Path(folder) / "import.json").read_text())["guesses"]
-    return {guess["subject"]: guess for guess in found}
-
-
 def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
     brokk: Callable[..., Done],
 ) -> None:
     write_servo_log(Path("logs/a.csv"))
     done = brokk("mode=import", "log.input=logs", "log.name=leg", "session.out=leg")
     assert done.code == 0, done.err
-    guesses = read_guesses("leg")
+    content = json.loads((Path("leg") / "import.json").read_text())["guesses"]
+    guesses = {guess["subject"]: guess for guess in content}
     assert {guess["sureness"] for guess in guesses.values()} <= {"sure", "likely"}
     assert guesses["knee: columns"]["value"] == "knee_target → knee_pos_rad"
     assert guesses["knee: command"]["value"] == "a target of the position"
@@ -90,9 +98,7 @@ def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
     assert earlier.code == 0, earlier.err
 
 
-def test_columns_that_share_no_names_are_paired_by_their_numbers(
-    brokk: Callable[..., Done],
-) -> None:
+def test_columns_that_share_no_names_are_paired_by_their_numbers() -> None:
     rows = make_targets()
     commands, speeds = np.tanh(3 * rows), np.cumsum(delay(np.tanh(3 * rows)), 0) / RATE_HZ
     columns = {"t": np.arange(len(rows)) / RATE_HZ}
@@ -101,13 +107,11 @@ def test_columns_that_share_no_names_are_paired_by_their_numbers(
     for j, k in enumerate((1, 2, 0)):
         columns[f"angle_{'abc'[j]}_deg"] = 57.3 * speeds[:, k]
     write_table(Path("a.csv"), columns)
-    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
-    assert done.code == 0, done.err
-    guesses = read_guesses("draft")
+    guesses = read_guesses()
     for j, k in enumerate((1, 2, 0)):
         guess = guesses[f"{'abc'[j]}: columns"]
-        assert guess["value"] == f"valve{k} → angle_{'abc'[j]}_deg"
-        assert guess["sureness"] == "likely"
+        assert guess.value == f"valve{k} → angle_{'abc'[j]}_deg"
+        assert guess.sureness == "likely"
 
 
 def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
@@ -117,8 +121,8 @@ def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
     done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
     assert done.code == 0, done.err
     assert "guesses are unsure: fill in ???" in done.out
-    guesses = read_guesses("draft")
-    assert {guesses[f"{name}: columns"]["sureness"] for name in ("hip", "knee")} == {"unsure"}
+    guesses = read_guesses()
+    assert {guesses[f"{name}: columns"].sureness for name in ("hip", "knee")} == {"unsure"}
     text = Path("draft/column_map.yaml").read_text()
     assert 'column: "???"' in text
     done = brokk(
@@ -140,55 +144,42 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[
             "q": 100 + 60 * np.cumsum(targets[:, 0]) / RATE_HZ,
         },
     )
-    brokk("mode=import", "log.input=a.csv", "session.out=one")
-    assert read_guesses("one")["joint: unit"]["sureness"] == "unsure"
-    (joint,) = yaml.safe_load(Path("one/machine.yaml").read_text())["joints"]
+    assert read_guesses()["joint: unit"].sureness == "unsure"
+    (joint,) = draft_file(MACHINE_TEMPLATE)["joints"]
     assert {joint[name]["value"] for name in ("lower", "upper", "max_speed")} == {"???"}
-    brokk("mode=import", "log.input=a.csv", "log.position_unit=0.5 cm", "session.out=counts")
-    assert "scale: 0.005," in Path("counts/column_map.yaml").read_text()
-    brokk("mode=import", "log.input=a.csv", "log.position_unit=cm", "session.out=two")
-    assert read_guesses("two")["joint: unit"]["sureness"] == "sure"
-    assert "kind: slide" in Path("two/machine.yaml").read_text()
-    brokk("mode=import", "log.input=a.csv", "log.position_unit={joint: mm}", "session.out=by_joint")
-    assert read_guesses("by_joint")["joint: unit"]["value"] == "mm"
+    counts = draft_file(MAP_TEMPLATE, "log.position_unit=0.5 cm")
+    assert counts["joints"]["joint"]["position"]["scale"] == 0.005
+    assert read_guesses("log.position_unit=cm")["joint: unit"].sureness == "sure"
+    assert draft_file(MACHINE_TEMPLATE, "log.position_unit=cm")["joints"][0]["kind"] == "slide"
+    assert read_guesses("log.position_unit={joint: mm}")["joint: unit"].value == "mm"
     done = brokk("mode=import", "log.input=a.csv", "log.position_unit=furlong", "session.out=three")
     assert done.code == 2 and "unknown unit 'furlong'" in done.err
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_valve_commands_get_neutral_full_and_sign_from_the_logs(
-    brokk: Callable[..., Done], sign: int
-) -> None:
+def test_valve_commands_get_neutral_full_and_sign_from_the_logs(sign: int) -> None:
     generator = np.random.default_rng(0)
     levels = np.repeat(generator.choice([0.0, 0.0, 0.6, -0.5, 1.0, -1.0], 60), 25)
     q = np.cumsum(delay(levels, 4)) / RATE_HZ * 0.1
     pwm = 7.5 + 2.5 * sign * levels
     t_s = 12.0 + np.arange(len(q)) / RATE_HZ
     write_table(Path("a.csv"), {"Time": t_s, "Boom Cmd": pwm, "Boom Ms": q})
-    done = brokk("mode=import", "log.input=a.csv", "log.name=digger", "session.out=draft")
-    assert done.code == 0, done.err
-    command = yaml.safe_load(Path("draft/column_map.yaml").read_text())["joints"]["boom"]["command"]
+    command = draft_file(MAP_TEMPLATE)["joints"]["boom"]["command"]
     expected = {"neutral": 7.5, "full_plus": 7.5 + 2.5 * sign, "full_minus": 7.5 - 2.5 * sign}
     assert {key: command[key] for key in expected} == pytest.approx(expected)
 
 
-def test_commands_that_go_one_way_only_are_said(brokk: Callable[..., Done]) -> None:
+def test_commands_that_go_one_way_only_are_said() -> None:
     generator = np.random.default_rng(0)
     levels = np.repeat(generator.choice([0.0, 0.0, 0.6, 1.0], 60), 25)
     q = np.cumsum(delay(levels, 4) - 0.4) / RATE_HZ * 0.1  # falls back by its weight
     write_table(Path("a.csv"), {"t": np.arange(len(q)) / RATE_HZ, "u": 200 * levels, "q": q})
-    done = brokk("mode=import", "log.input=a.csv", "log.name=lift", "session.out=draft")
-    assert done.code == 0, done.err
-    assert "commands go one way only" in done.out
-    assert "full_minus: null" in Path("draft/column_map.yaml").read_text()
-    done = brokk(
-        "mode=import", "machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv",
-        "session.out=out",
-    )  # fmt: skip
-    assert done.code == 0, done.err
+    done, recordings = import_log("log.input=a.csv")
+    assert "commands go one way only" in done.out and recordings
+    assert draft_file(MAP_TEMPLATE)["joints"]["joint"]["command"]["full_minus"] is None
 
 
-def test_joints_that_are_never_commanded_are_left_out_and_said(brokk: Callable[..., Done]) -> None:
+def test_joints_that_are_never_commanded_are_left_out_and_said() -> None:
     targets = make_targets()
     still = np.full(len(targets), 0.5)
     write_table(
@@ -201,21 +192,8 @@ def test_joints_that_are_never_commanded_are_left_out_and_said(brokk: Callable[.
             "q_b": still,
         },
     )
-    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
-    assert done.code == 0, done.err
-    assert "b is left out: its command never changes" in done.out
-    assert list(yaml.safe_load(Path("draft/column_map.yaml").read_text())["joints"]) == ["a"]
-
-
-def test_a_damaged_log_leaves_no_map(brokk: Callable[..., Done]) -> None:
-    write_servo_log(Path("a.csv"))
-    lines = Path("a.csv").read_text().splitlines()
-    lines[900] = lines[900].replace(",", ";", 3)
-    Path("a.csv").write_text("\n".join(lines) + "\n")
-    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
-    assert done.code == 2
-    assert "a.csv: line 901 (row 899): 7 cells, the header has 10" in done.err
-    assert not list(Path().rglob("column_map.yaml"))
+    assert "b is left out: its command never changes" in try_draft("log.input=a.csv").out
+    assert list(draft_file(MAP_TEMPLATE)["joints"]) == ["a"]
 
 
 def test_one_of_machine_and_map_alone_is_refused(brokk: Callable[..., Done]) -> None:
@@ -231,16 +209,14 @@ def test_columns_that_no_name_tells_are_given_with_the_torque_that_they_set(
     volts = 5.0 * np.sin(2.0 * t_s) + np.where(t_s > 5, 3.0, 0.0)
     q = np.cumsum(np.cumsum(volts)) / RATE_HZ**2 / 10.0
     write_table(Path("a.csv"), {"t": t_s, "q": q, "vir": volts})
-    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
-    assert done.code == 2
-    assert "no column is named like commands" in done.err and "vir" in done.err
-    assert "log.joints={boom" in done.err
-    done = brokk("mode=import", "log.input=a.csv", "log.joints={slide: [vir, qm]}")
-    assert done.code == 2 and "'qm', which is missing; did you mean 'q'?" in done.err
+    refused = try_draft("log.input=a.csv").err
+    assert "no column is named like commands" in refused and "vir" in refused
+    assert "log.joints={boom" in refused
+    refused = try_draft("log.input=a.csv", "log.joints={slide: [vir, qm]}").err
+    assert "'qm', which is missing; did you mean 'q'?" in refused
     given = ("log.joints={slide: [vir, q]}", "log.command=torque", "log.position_unit=m")
     done = brokk("mode=import", "log.input=a.csv", *given, "session.out=draft")
     assert done.code == 0, done.err
-    assert read_guesses("draft")["slide: columns"]["sureness"] == "sure"
     options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv")
     done = brokk("mode=import", *options, "session.out=out")
     assert done.code == 2 and "max_force.value has no value: fill in ???" in done.err
@@ -256,9 +232,7 @@ def test_columns_that_no_name_tells_are_given_with_the_torque_that_they_set(
     np.testing.assert_allclose(u, volts[: len(u)] / np.abs(volts).max(), atol=1e-4)
 
 
-def test_a_position_that_does_not_follow_its_command_is_left_to_a_person(
-    brokk: Callable[..., Done],
-) -> None:
+def test_a_position_that_does_not_follow_its_command_is_left_to_a_person() -> None:
     targets = make_targets()
     columns = {"t_s": np.arange(len(targets)) / RATE_HZ}
     for j, name in enumerate(("hip", "knee")):
@@ -266,10 +240,9 @@ def test_a_position_that_does_not_follow_its_command_is_left_to_a_person(
     columns["hip_pos_rad"] = delay(targets)[:, 0]
     columns["knee_pos_rad"] = np.random.default_rng(0).normal(size=len(targets))
     write_table(Path("a.csv"), columns)
-    assert brokk("mode=import", "log.input=a.csv", "session.out=draft").code == 0
-    guesses = read_guesses("draft")
-    assert guesses["hip: columns"]["sureness"] == "sure"
-    assert guesses["knee: columns"]["sureness"] == "unsure"
+    guesses = read_guesses()
+    assert guesses["hip: columns"].sureness == "sure"
+    assert guesses["knee: columns"].sureness == "unsure"
 
 
 @pytest.mark.parametrize(
@@ -284,6 +257,8 @@ def test_a_position_that_does_not_follow_its_command_is_left_to_a_person(
         ("state_motor", "torques[3]", ("measured", "effort", None, "3")),
         ("/joint_states", "position[left_knee]", ("measured", "position", None, "left_knee")),
         ("", "u2", ("command", "unknown", None, "2")),
+        ("", "u_q2", ("command", "unknown", None, "q2")),
+        ("", "AxisSetPos2[deg]", ("command", "position", "deg", "2")),
         ("", "cmd_left_rad_s", ("command", "velocity", None, "left")),
         ("", "A3_soll", ("command", "position", None, "a3")),
         ("", "jointVelocity_mm", (None, "velocity", "mm", "")),
@@ -294,9 +269,7 @@ def test_names_are_read_as_words(table: str, column: str, expected: tuple[str | 
     assert (name.role, name.quantity, name.unit, name.joint) == expected
 
 
-def test_logs_of_the_model_excavator_give_the_map_that_a_person_wrote(
-    brokk: Callable[..., Done], machine: Machine
-) -> None:
+def test_logs_of_the_model_excavator_give_the_map_that_a_person_wrote(machine: Machine) -> None:
     """A recording of the shipped machine as CSV is guessed column by column."""
     generator = np.random.default_rng(1)
     levels = np.repeat(generator.uniform(-1, 1, (60, 5)).round(2), 10, 0)
@@ -305,18 +278,15 @@ def test_logs_of_the_model_excavator_give_the_map_that_a_person_wrote(
     columns |= {f"u_q{j + 1}": levels[:, j] for j in range(5)}
     columns |= {f"q_q{j + 1}_rad": q[:, j] for j in range(5)}
     write_table(Path("a.csv"), columns)
-    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
-    assert done.code == 0, done.err
-    drafted = yaml.safe_load(Path("draft/column_map.yaml").read_text())
+    drafted = draft_file(MAP_TEMPLATE)
     shipped = option("import", "brokk170")
     for (name, joint), expected in zip(drafted["joints"].items(), shipped.joints.values(), strict=True):  # fmt: skip
         assert joint["command"]["column"] == expected.command.column, name
         assert joint["position"]["column"] == expected.position.column
-    assert record.name_command_column("q1") in columns
 
 
 def test_rows_that_repeat_a_time_or_lack_a_number_are_refused_or_left_out_and_counted(
-    brokk: Callable[..., Done], caplog: pytest.LogCaptureFixture
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     targets = make_targets()
     columns = {"t": np.arange(len(targets)) / RATE_HZ, "hip_cmd": targets[:, 0]}
@@ -324,51 +294,37 @@ def test_rows_that_repeat_a_time_or_lack_a_number_are_refused_or_left_out_and_co
     columns["t"][40] = columns["t"][39]
     columns["hip_pos_rad"][[7, 900]] = np.nan
     write_table(Path("a.csv"), columns)
-    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
-    assert done.code == 2
-    assert "'t': the time does not increase in 1 of 1500 rows, first in line 42 (row 40); log.damaged=skip" in done.err  # fmt: skip
-    assert not Path("draft").exists()
-    done = brokk("mode=import", "log.input=a.csv", "log.damaged=skip", "session.out=draft")
-    assert done.code == 0, done.err
-    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv")
-    done = brokk("mode=import", *options, "session.out=out")
-    assert done.code == 0, done.err
+    refused = try_draft("log.input=a.csv").err
+    assert "'t': the time does not increase in 1 of 1500 rows, first in line 42 (row 40); log.damaged=skip" in refused  # fmt: skip
+    _, (recording,) = import_log("log.input=a.csv", "log.damaged=skip")
     assert "the time does not increase in 1 of 1500 rows; 1 of 1500 rows left out" in caplog.text
     assert "column 'hip_pos_rad': 2 of 1500 rows lack a number and are left out" in caplog.text
-    assert "brokk mode=diagnose machine=@draft/machine.yaml 'diagnosis.field=out/recordings/*'" in done.out  # fmt: skip
-    (path,) = Path("out/recordings").iterdir()
-    np.testing.assert_allclose(read_positions(path, "hip"), delay(targets)[:, 0], atol=2e-3)
+    np.testing.assert_allclose(recording["q_hip_rad"], delay(targets)[:, 0], atol=2e-3)
 
 
-def test_actions_that_are_scaled_and_added_to_a_pose_are_targets_in_another_unit(
-    brokk: Callable[..., Done],
-) -> None:
+def test_actions_that_are_scaled_and_added_to_a_pose_are_targets_in_another_unit() -> None:
     targets = make_targets()
     actions = (targets - [0.1, 0.8, -1.5]) / 0.25
     np.savez("a.npz", time=np.arange(len(targets)) / RATE_HZ, actions=actions, dof_pos=delay(targets))  # fmt: skip
-    done = brokk("mode=import", "log.input=a.npz", "session.out=draft")
-    assert done.code == 0, done.err
-    guesses = read_guesses("draft")
-    assert guesses["joint_1: command"]["value"] == "a target of the position"
-    assert guesses["joint_1: unit of targets"]["value"] == "0.25 × target + 0.8"
-    text = Path("draft/column_map.yaml").read_text()
+    draft = make_draft("log.input=a.npz")
+    guesses = {guess.subject: guess for guess in draft.list_guesses()}
+    assert guesses["joint_1: command"].value == "a target of the position"
+    assert guesses["joint_1: unit of targets"].value == "0.25 × target + 0.8"
+    text = draft.format(MAP_TEMPLATE)
     assert text.count('scale: "???", full_speed: null, offset: "???"') == 3
 
 
-def test_a_position_that_leads_its_target_is_left_to_a_person(brokk: Callable[..., Done]) -> None:
+def test_a_position_that_leads_its_target_is_left_to_a_person() -> None:
     targets = make_targets()
     columns = {"t": np.arange(len(targets)) / RATE_HZ}
     columns |= {"hip_target": delay(targets)[:, 0], "hip_pos_rad": targets[:, 0]}
     write_table(Path("a.csv"), columns)
-    assert brokk("mode=import", "log.input=a.csv", "session.out=draft").code == 0
-    guess = read_guesses("draft")["hip: columns"]
-    assert guess["sureness"] == "unsure"
-    assert "the position leads it by 0.12 s: columns swapped, or clocks apart?" in guess["reason"]
+    guess = read_guesses()["hip: columns"]
+    assert guess.sureness == "unsure"
+    assert "the position leads it by 0.12 s: columns swapped, or clocks apart?" in guess.reason
 
 
-def test_files_of_one_run_in_a_folder_keep_their_clocks_and_a_given_offset(
-    brokk: Callable[..., Done],
-) -> None:
+def test_files_of_one_run_in_a_folder_keep_their_clocks_and_a_given_offset() -> None:
     targets = make_targets()
     t_s = np.arange(len(targets)) / RATE_HZ
     for run in ("one", "two"):
@@ -378,43 +334,33 @@ def test_files_of_one_run_in_a_folder_keep_their_clocks_and_a_given_offset(
             Path(f"logs/{run}/states.csv"),
             {"stamp": t_s + 3600.0, "hip.pos_rad": delay(targets)[:, 0]},
         )
-    done = brokk("mode=import", "log.input=logs", "session.out=draft")
-    assert done.code == 2
-    assert "if they began together, give 'log.clock_offset_s={states: -3600}'" in done.err
-    done = brokk(
-        "mode=import", "log.input=logs", "log.clock_offset_s={states: -3600}", "session.out=draft"
-    )
-    assert done.code == 0, done.err
-    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=logs")
-    done = brokk("mode=import", *options, "session.out=out")
-    assert done.code == 0, done.err
-    positions = read_positions(Path("out/recordings/one_00.parquet"), "hip")
-    np.testing.assert_allclose(positions, delay(targets)[: len(positions), 0], atol=1e-5)
+    offset = "log.clock_offset_s={states: -3600}"
+    assert f"if they began together, give '{offset}'" in try_draft("log.input=logs").err
+    _, recordings = import_log("log.input=logs", offset)
+    found = recordings[0]["q_hip_rad"]
+    np.testing.assert_allclose(found, delay(targets)[: len(found), 0], atol=1e-5)
 
 
-def test_a_slide_in_millimetres_stands_beside_hinges_in_radians(brokk: Callable[..., Done]) -> None:
+def test_a_slide_in_millimetres_stands_beside_hinges_in_radians() -> None:
     targets = make_targets()
     columns = {"t_ms": 1000.0 * np.arange(len(targets)) / RATE_HZ}
     for j, (name, scale) in enumerate((("hip", 1.0), ("lift_mm", 100.0))):
         columns[f"cmd_{name}"] = scale * targets[:, j]
         columns[f"meas_{name}"] = scale * delay(targets)[:, j]
     write_table(Path("a.csv"), columns)
-    assert brokk("mode=import", "log.input=a.csv", "session.out=draft").code == 0
-    drafted = yaml.safe_load(Path("draft/machine.yaml").read_text())
+    drafted = draft_file(MACHINE_TEMPLATE)
     assert {one["name"]: one["kind"] for one in drafted["joints"]} == {"hip": "hinge", "lift": "slide"}  # fmt: skip
 
 
-def test_speeds_in_rad_per_second_count_alike_both_ways(brokk: Callable[..., Done]) -> None:
+def test_speeds_in_rad_per_second_count_alike_both_ways() -> None:
     generator = np.random.default_rng(0)
     speeds = np.repeat(generator.uniform(-3.0, 5.0, 60), 25)
     columns = {"t_s": np.arange(len(speeds)) / RATE_HZ, "cmd_left_rad_s": speeds}
     columns["ticks_left"] = np.cumsum(delay(speeds, 4)) / RATE_HZ / 0.00153
     write_table(Path("a.csv"), columns)
     unit = "log.position_unit=0.00153 rad"
-    done = brokk("mode=import", "log.input=a.csv", unit, "session.out=draft")
-    assert done.code == 0, done.err
     full = speeds.max()
-    command = yaml.safe_load(Path("draft/column_map.yaml").read_text())["joints"]["left"]["command"]
+    command = draft_file(MAP_TEMPLATE, unit)["joints"]["left"]["command"]
     assert [command["full_plus"], command["full_minus"]] == pytest.approx([full, -full])
-    (joint,) = yaml.safe_load(Path("draft/machine.yaml").read_text())["joints"]
+    (joint,) = draft_file(MACHINE_TEMPLATE, unit)["joints"]
     assert joint["max_speed"]["value"] == pytest.approx(full, rel=1e-4)
