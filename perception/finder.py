@@ -18,7 +18,7 @@ from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception import pair_check, rim_scale, search
 from perception.contracts import EllipseDetectorSpec, PoseEstimatorSpec, SegmenterSpec
 from perception.pair_check import PairCheck
-from perception.pair_depth import FaceMatcher, PairDepth
+from perception.pair_depth import PairDepth
 from perception.pose import consistency
 from perception.pose.plane_conic import convert_to_gray
 from perception.pose.rim import build_chart
@@ -31,19 +31,8 @@ same rim. Chosen by hand: a rim found in two resolutions differs by a few percen
 STRONG_SCORE = 0.5
 """Part of the best score from which an ellipse counts as strong. Chosen by hand: among strong rims
 inside each other the larger one wins, a weak larger one does not."""
-SAME_REGION = 0.6
-"""Distance, as a part of the smaller major semi-axis, below which a candidate lies on the place of one
-that was judged."""
 MOST_CANDIDATES = 16
-"""Candidates of a stage that are judged, the best first: each takes about 10 ms."""
-SHAPE_REASONS = (
-    "part of a circle on the face with a rim",
-    "radius, m",
-    "axis ratio on the face",
-    consistency.SIZE,
-    consistency.STRETCH,
-)
-"""Reasons that refuse an ellipse and not its region: it may have followed the wrong edges."""
+"""Candidates that are judged, the best first: each takes about 10 ms."""
 
 EXPLANATIONS = {
     **pair_check.EXPLANATIONS,
@@ -136,8 +125,8 @@ class StagedPerception:
         block_probability: Probability from which a pixel counts as block.
         roi: Search region: the `mask` of the block, or its bounding `box`.
         apart: Holes nearer to each other than this many radii are one; the outer rim wins.
-        depth: Matches pairs of frames that come without depth, and candidates again where depth is
-            coarse; `null` for never.
+        depth: Matches pairs of frames that come without depth, and holes again where depth is coarse;
+            `null` for never.
         rims: Says whether rims of another size than that of the holes show a wrong scale of depth
             where no hole is found; `null` for never.
         search_every: Frames of which one is searched as a whole; in the others `follow` looks at
@@ -172,12 +161,10 @@ class _Judged:
     Attributes:
         found: Holes, with the candidates they come from.
         rejected: Refused candidates.
-        decided: Candidates that were judged by their appearance.
     """
 
     found: list[tuple[Ellipse, HolePose]]
     rejected: list[Rejection]
-    decided: list[Ellipse]
 
 
 class StagedFinder:
@@ -213,15 +200,14 @@ class StagedFinder:
             rejected = [Rejection("segment", reason, share, s.smallest_block)]
             rejected += self._name_scale(frame, ms)
             return FrameDetections([], rejected, [], masks, ms)
-        judged = _Judged([], [], [])
-        finer = s.depth.build(frame, on_block) if s.depth else None
+        judged = _Judged([], [])
         with _time_stage(ms, "ellipse"):
             candidates, wrong_size = self._detect_ellipses(frame, on_block)
         judged.rejected.extend(wrong_size)
         with _time_stage(ms, "pose"):
-            self._judge(frame, masks, candidates, judged, finer)
-        if finer is not None:
-            judged = replace(judged, found=self._refine(frame, judged.found, ms))
+            self._judge(frame, masks, candidates, judged)
+        if frame.depth_shrink > 1:
+            judged = self._look_again(frame, judged, ms)
         if not judged.found:
             judged.rejected.extend(self._name_scale(frame, ms))
         return self._conclude(judged, masks, frame, ms)
@@ -264,25 +250,28 @@ class StagedFinder:
         with _time_stage(ms, "stereo"):
             frame, face = self.settings.depth.match_near(frame, places)
         masks = Masks(face, None)
-        judged = _Judged([], [], [])
+        judged = _Judged([], [])
         # The expected rim is the candidate: it is known better than a detector would find it. None
         # of its edges has been seen yet, so that most of the circle must be.
         with _time_stage(ms, "pose"):
-            self._judge(frame, masks, [place for place, _ in places], judged, None)
+            self._judge(frame, masks, [place for place, _ in places], judged)
         return judged, masks
 
-    def _refine(
-        self, frame: Frame, found: list[tuple[Ellipse, HolePose]], ms: dict[str, float]
-    ) -> list[tuple[Ellipse, HolePose]]:
-        """Return holes as they look where they are expected, or as they were found: coarse depth errs."""
-        refined = []
-        for ellipse, pose in found:
+    def _look_again(self, frame: Frame, judged: _Judged, ms: dict[str, float]) -> _Judged:
+        """Return holes as they look where they are expected: coarse depth errs, and tells discs less."""
+        if self.settings.depth is None or frame.right is None or frame.baseline_m is None:
+            return judged
+        again = _Judged([], judged.rejected)
+        for ellipse, pose in judged.found:
             place = expect_rim(pose, frame)
-            again = [] if place is None else self._judge_near(frame, [place], ms)[0].found
+            if place is None:
+                again.found.append((ellipse, pose))
+                continue
+            near, _ = self._judge_near(frame, [place], ms)
+            again.rejected.extend(near.rejected)
             # The score is that of the detected ellipse.
-            seen = [replace(one, score=pose.score) for _, one in again]
-            refined.append((ellipse, seen[0] if seen else pose))
-        return refined
+            again.found.extend((ellipse, replace(one, score=pose.score)) for _, one in near.found)
+        return again
 
     def find_ellipses(self, frame: Frame) -> list[Ellipse]:
         """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
@@ -320,34 +309,22 @@ class StagedFinder:
         return detections.in_base_frame(frame)
 
     def _judge(
-        self,
-        frame: Frame,
-        masks: Masks,
-        candidates: Sequence[Ellipse],
-        judged: _Judged,
-        finer: FaceMatcher | None,
+        self, frame: Frame, masks: Masks, candidates: Sequence[Ellipse], judged: _Judged
     ) -> None:
         """Add the holes among some candidates, and why the others are none."""
-        # The appearance of a place is judged in one stage; its shape may be wrong, and another right.
-        decided = list(judged.decided)
         # Every candidate is judged alone: holes do not compete until all are known.
         for number, candidate in enumerate(candidates):
-            if _is_near_any(candidate, decided):
-                continue
             if number >= MOST_CANDIDATES:
                 reason = "candidates of a frame before it"
                 judged.rejected.append(
                     Rejection("ellipse", reason, float(number), MOST_CANDIDATES, candidate)
                 )
                 continue
-            seen = finer.match_around(candidate) if finer else frame
-            pose = self._pose.estimate(seen, masks, candidate)
+            pose = self._pose.estimate(frame, masks, candidate)
             if isinstance(pose, Rejection):
                 judged.rejected.append(pose)
             else:
                 judged.found.append((candidate, pose))
-            if not isinstance(pose, Rejection) or pose.reason not in SHAPE_REASONS:
-                judged.decided.append(candidate)
 
     def _detect_ellipses(
         self, frame: Frame, on_block: np.ndarray
@@ -477,14 +454,6 @@ def _remove_duplicates(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
         if not any(_is_same_ellipse(one, other, size) for other in kept):
             kept.append(one)
     return kept
-
-
-def _is_near_any(one: Ellipse, others: Sequence[Ellipse]) -> bool:
-    """Return whether an ellipse lies on one of the others."""
-    return any(
-        float(np.hypot(one.x - other.x, one.y - other.y)) < SAME_REGION * min(one.a, other.a)
-        for other in others
-    )
 
 
 def _is_same_ellipse(one: Ellipse, other: Ellipse, size: float) -> bool:

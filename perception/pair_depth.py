@@ -1,9 +1,8 @@
 """Depth of a pair where it is needed: coarse for the whole picture, fine around places.
 
-A coarse match of the whole picture is enough to find the block and places on it. Around each of
-them the pictures are matched again, in a narrow band of disparities around the coarse ones, or
-around the plane of a hole that was seen before. Near places are matched coarsely, far ones finely,
-so that a hole is as many pixels wide everywhere.
+A coarse match of the whole picture is enough to find the block and holes on it. Around each hole
+the pictures are matched again, in a narrow band of disparities around its plane. Near places are
+matched coarsely, far ones finely, so that a hole is as many pixels wide everywhere.
 """
 
 from __future__ import annotations
@@ -24,10 +23,6 @@ from perception.pose.plane import compute_inverse_depth
 from perception.stereo import PicturePart, Stereo
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py).
-LEAST = 50
-"""Pixels of coarse depth on the block around a place from which its band is known."""
-OUTER = 1.0, 99.0
-"""Percentiles of these disparities between which the face lies."""
 BEHIND_M = 0.3
 """Depth behind the face that is matched too: the inside of a hole."""
 BEFORE_M, NEAREST_M = 0.2, 0.3
@@ -37,7 +32,7 @@ ON_FACE = 0.03
 """Relative departure of depth from an expected face within which it may be it: the base may have
 moved by centimetres since."""
 BAND_PX = 2.0
-"""Margin of the band, and largest change, in pixels of the coarse match."""
+"""Margin of the band, in pixels of the match."""
 
 
 @spec
@@ -101,79 +96,6 @@ class PairDepth:
                 face[square] = np.abs(found_m * inverse - 1.0) < ON_FACE
         return replace(frame, depth_m=depth_m, depth_shrink=finest), face
 
-    def build(self, frame: Frame, on_block: np.ndarray) -> FaceMatcher | None:
-        """Return the matcher of a frame; `None` where its depth is fine enough, or has no pair.
-
-        Args:
-            frame: The frame; it is not changed.
-            on_block: Pixels of the block, `(h, w)` bool.
-        """
-        if frame.right is None or frame.baseline_m is None or frame.depth_shrink == 1:
-            return None
-        return FaceMatcher(self, frame, frame.right, frame.baseline_m, on_block)
-
-
-class FaceMatcher:
-    """Depth of one frame, which grows finer place by place."""
-
-    def __init__(
-        self,
-        settings: PairDepth,
-        frame: Frame,
-        right: np.ndarray,
-        baseline_m: float,
-        on_block: np.ndarray,
-    ) -> None:
-        self._settings, self._coarse, self._on_block = settings, frame, on_block
-        self._baseline_m = baseline_m
-        self._pair = [cv2.cvtColor(some, cv2.COLOR_RGB2GRAY) for some in (frame.color, right)]
-        # One frame for each resolution: those who look at it keep what they computed of it.
-        self._fine: dict[int, Frame] = {}
-        self._matched: dict[int, list[PicturePart]] = {}
-
-    def match_around(self, place: Ellipse) -> Frame:
-        """Return the frame with depth as fine around a place as it needs."""
-        coarse = self._coarse
-        shrink = max(1, int(place.a / self._settings.radius_px))
-        if shrink >= coarse.depth_shrink:
-            return coarse
-        if shrink not in self._fine:
-            own = replace(coarse, depth_m=coarse.depth_m.copy(), depth_shrink=shrink)
-            self._fine[shrink], self._matched[shrink] = own, []
-        # A place near the middle of a matched square needs no other one.
-        if not any(_is_central(place, part) for part in self._matched[shrink]):
-            height, width = self._on_block.shape
-            part = _build_square(place, self._settings.extent * place.a, shrink, height, width)
-            self._matched[shrink].append(part)
-            self._match(part, shrink)
-        return self._fine[shrink]
-
-    def _match(self, part: PicturePart, shrink: int) -> None:
-        """Match a part; its depth counts where it agrees with the coarse one.
-
-        Outside the band, on an occluder or deep inside a hole, the coarse depth stays.
-        """
-        coarse, matcher = self._coarse, replace(self._settings.stereo, shrink=shrink)
-        pull_px = float(coarse.camera_matrix[0, 0]) * self._baseline_m
-        square = np.s_[part.top : part.top + part.height, part.left : part.left + part.width]
-        before_m = coarse.depth_m[square]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            before_px = pull_px / before_m
-        face_px = before_px[self._on_block[square] & np.isfinite(before_px)]
-        if len(face_px) < LEAST:
-            return
-        far_px, near_px = np.percentile(face_px, OUTER)
-        room_px = BAND_PX * coarse.depth_shrink
-        least_px = max(0.0, pull_px / (pull_px / far_px + BEHIND_M) - room_px)
-        largest_px = near_px + room_px
-        found_px = matcher.match_part(self._pair[0], self._pair[1], part, least_px, largest_px)
-        found_m = _convert_to_depth(found_px, coarse, part)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            differs = np.abs(pull_px / found_m - before_px) > room_px
-            outside = (before_px < least_px) | (before_px > largest_px)
-        # Where either is unknown, both comparisons are false: the fine match decides.
-        self._fine[shrink].depth_m[square] = np.where(differs | outside, before_m, found_m)
-
 
 def _convert_to_depth(found_px: np.ndarray, frame: Frame, part: PicturePart) -> np.ndarray:
     """Return the depth of a part, m, from its disparities, without their known error."""
@@ -196,10 +118,3 @@ def _build_square(
     right = int(np.clip(place.x + reach_px, 1, width))
     bottom = int(np.clip(place.y + reach_px, 1, height))
     return PicturePart(left, top, max(1, right - left), max(1, bottom - top))
-
-
-def _is_central(place: Ellipse, part: PicturePart) -> bool:
-    """Return whether a place lies in the middle third of a part."""
-    x = (place.x - part.left) / part.width
-    y = (place.y - part.top) / part.height
-    return 1 / 3 < x < 2 / 3 and 1 / 3 < y < 2 / 3

@@ -47,10 +47,6 @@ def make_frame(disparity: np.ndarray, coarse_px: np.ndarray, shrink: int) -> Fra
     )  # fmt: skip
 
 
-def hole_at(x: float, y: float, a: float = 13.0) -> Ellipse:
-    return Ellipse(x, y, a, a, 0.0, rms_px=0.0, coverage=1.0, score=1.0)
-
-
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_a_part_in_a_band_is_matched_as_exactly_as_the_picture(stereo: Stereo, shrink: int) -> None:
     left, right = make_pair(SLANT)
@@ -62,36 +58,18 @@ def test_a_part_in_a_band_is_matched_as_exactly_as_the_picture(stereo: Stereo, s
     assert np.nanmedian(np.abs(error)) < 0.1 * shrink
 
 
-def test_a_far_place_is_matched_again_and_a_near_one_is_not(stereo: Stereo) -> None:
-    coarse_px = SLANT + 1.0
-    frame = make_frame(SLANT, coarse_px, 4)
-    finer = PairDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(
-        frame, np.ones_like(SLANT, bool)
-    )
-    assert finer is not None
-    assert finer.match_around(hole_at(260, 120, a=53.0)) is frame
-    seen = finer.match_around(hole_at(260, 120))
-    assert seen.depth_shrink == 1
-    square = np.s_[60:180, 200:320]
-    assert np.nanmedian(np.abs(PULL_PX / seen.depth_m[square] - SLANT[square])) < 0.1
-    assert np.array_equal(seen.depth_m[:, :150], frame.depth_m[:, :150])
-    assert np.array_equal(frame.depth_m, (PULL_PX / coarse_px).astype(np.float32))
-    assert finer.match_around(hole_at(262, 121)) is seen
-
-
-def test_an_occluder_outside_the_band_keeps_its_coarse_depth(stereo: Stereo) -> None:
-    coarse_px = SLANT.copy()
-    coarse_px[:, 280:300] = 90.0
-    on_block = coarse_px < 60.0
-    frame = make_frame(SLANT, coarse_px, 4)
-    finer = PairDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(frame, on_block)
-    assert finer is not None
-    seen = finer.match_around(hole_at(260, 120))
-    assert np.array_equal(seen.depth_m[:, 280:300], frame.depth_m[:, 280:300])
-
-
-def test_fine_depth_and_depth_without_a_pair_stay() -> None:
-    faces = PairDepth(stereo=instantiate(OmegaConf.load("conf/stereo.yaml")), radius_px=12.0, extent=6.0)  # fmt: skip
-    frame, on = make_frame(SLANT, SLANT, 4), np.ones_like(SLANT, bool)
-    assert faces.build(replace(frame, depth_shrink=1), on) is None
-    assert faces.build(replace(frame, right=None), on) is None
+@pytest.mark.parametrize(("size_px", "shrink"), [(13.0, 1), (53.0, 4)])
+def test_the_face_of_a_known_hole_is_matched_as_finely_as_it_needs(
+    stereo: Stereo, size_px: float, shrink: int
+) -> None:
+    nothing = np.full_like(SLANT, np.nan)
+    frame = make_frame(SLANT, nothing, 1)
+    rise = np.array([SLANT[0, 1] - SLANT[0, 0], SLANT[1, 0] - SLANT[0, 0], SLANT[0, 0]])
+    place = Ellipse(260.0, 120.0, size_px, size_px, 0.0, rms_px=0.0, coverage=1.0, score=1.0)
+    matcher = PairDepth(stereo=stereo, radius_px=12.0, extent=3.0)
+    seen, face = matcher.match_near(frame, [(place, frame.camera_matrix.T @ rise / PULL_PX)])
+    assert seen.depth_shrink == shrink
+    near = np.s_[100:140, 240:280]
+    assert np.nanmedian(np.abs(PULL_PX / seen.depth_m[near] - SLANT[near])) < 0.1 * shrink
+    assert face[near].mean() > 0.9
+    assert not np.isfinite(seen.depth_m[:, :90]).any() and not face[:, :90].any()
