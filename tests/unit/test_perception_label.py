@@ -131,7 +131,7 @@ def test_depth_that_is_off_as_a_whole_does_not_pull_the_block_off_its_edges() ->
 
 @pytest.mark.parametrize("miss_px", [0.0, 6.0])
 def test_an_outline_is_judged_by_the_copy_that_fits_best(miss_px: float) -> None:
-    for number, eye in enumerate(EYES_M):
+    for number, eye in enumerate(EYES_M[:2]):
         view = cuboid.seen(cuboid.looking(eye, (0.1, 0.0, 0.3)), (960, 540), seed=number)
         pose = view.world_from_camera
         block = label_placing.build_cuboid(CORNERS_M, 1.2, pose[:3, 3])
