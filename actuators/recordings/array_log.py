@@ -306,10 +306,11 @@ def _convert_column(column: pa.ChunkedArray, length: int) -> np.ndarray:
     Raises:
         ValueError: A list has another length.
     """
-    flat = pc.list_flatten(column) if _is_list(column.type) else column
+    whole: Any = column.combine_chunks()
+    flat = whole.flatten() if _is_list(column.type) else whole
     if len(flat) != length * len(column):
         raise ValueError(f"a list of another length than {length}")
     unit = 1.0
     if pa.types.is_timestamp(flat.type):
         flat, unit = flat.cast(pa.timestamp("ns")).cast(pa.int64()), 1e-9
-    return unit * np.asarray(flat.to_numpy(), dtype=float).reshape(-1, length)
+    return unit * np.asarray(flat.to_numpy(zero_copy_only=False), dtype=float).reshape(-1, length)

@@ -134,8 +134,9 @@ class CanLog(LogFile):
     def _iterate(self) -> Iterator[pd.DataFrame]:
         """Yield the frames of the chosen channel that carry data, by blocks; the index is their number in the log."""
         for block in self._iterate_all():
-            is_chosen = block["channel"] == str(self._channel)
-            yield block if self._channel is None else block[is_chosen]
+            if self._channel is not None:
+                block = block.loc[block["channel"] == str(self._channel)]
+            yield block
 
     def _iterate_all(self) -> Iterator[pd.DataFrame]:
         count, last_s = 0, 0.0
@@ -166,7 +167,7 @@ class CanLog(LogFile):
             yield gather_frames(waiting)
 
 
-def gather_frames(frames: Mapping[int, tuple[float, int, str, bytes]]) -> pd.DataFrame:
+def gather_frames(frames: dict[int, tuple[float, int, str, bytes]]) -> pd.DataFrame:
     """Return frames by their number as a table of `FRAME_FIELDS`."""
     return pd.DataFrame.from_dict(frames, orient="index", columns=FRAME_FIELDS)
 

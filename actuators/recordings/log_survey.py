@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -124,7 +125,7 @@ def measure_logs(
     paths: Sequence[Path],
     times: Mapping[str, TimeGuess],
     joints: Sequence[JointGuess],
-    signs: tuple[str, str],
+    signs: tuple[Any, Any],
     dbc: str | None,
     damaged: Damaged,
     channel: int | str | None,

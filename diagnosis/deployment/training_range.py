@@ -17,6 +17,8 @@ from diagnosis.deployment.run_log import RunLog
 
 FALSE_ALARMS = 0.01
 """Share of runs of the training's own distribution that may lie outside in any value; chosen by hand."""
+LEAST_MARGIN = 0.05
+"""Least margin, as a part of the range: samples are of single moments, a run passes through more. Chosen by hand."""
 EXPORTED_ROWS = 256
 """Observations of the training that `mode=export` keeps."""
 LEAST_SHARE = 0.1
@@ -112,7 +114,7 @@ def measure_margin(count: int, num_values: int) -> float:
     """
     extreme = norm.ppf((count - 0.375) / (count + 0.25))
     rarest = norm.isf(FALSE_ALARMS / (2 * num_values))
-    return float(max(rarest - extreme, 0.0) / (2.0 * extreme))
+    return max(float(rarest - extreme) / (2.0 * float(extreme)), LEAST_MARGIN)
 
 
 def list_newest_values(log: RunLog, contract: PolicyContract) -> dict[str, np.ndarray]:

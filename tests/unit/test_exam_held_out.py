@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import names, option
+from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -17,10 +17,8 @@ from brokk_rl.signals import Command
 from exam.case_distribution import PlantRun, UnknownFault
 from exam.held_out import causes, parameters
 from exam.held_out.arm import HeldOutPlants, SensingArm
-from exam.held_out.hydraulics import Linkage, compute_orifice
 from exam.held_out.parameters import change_machine, draw_machine
 from exam.held_out.readings import SteppedEncoders, draw_bursts
-from exam.plants import out_of_library_faults
 from exam.plants.linkage import Arm
 from exam.plants.plant_parameters import PlantParameters
 
@@ -90,30 +88,11 @@ def test_development_cannot_draw_the_held_out_make(
     assert replace(plants, sealed=True).build(machine, [run], 1.0).read().q.shape == (1, 5)
 
 
-def test_what_the_held_out_make_has_no_other_make_has() -> None:
-    others = [option("exam_plants", name) for name in names("exam_plants") if name != "held_out"]
-    assert others and not any(one.is_held_out for one in others)
-    assert len(causes.CAUSES) >= 6
-    for one in others:
-        assert not set(one.outside_faults) & set(causes.CAUSES)
-    assert not set(out_of_library_faults.KINDS) & set(causes.CAUSES)
-
-
 def test_a_clean_machine_goes_at_full_speed_and_by_its_notches_below(machine: Machine) -> None:
     found = find_speeds(machine, [(clean(machine), u) for u in (1.0, -1.0, 0.55, 0.19, 0.08)])
     # opening 0.5 of 0.9: (2 * 0.5 - 0.2) / 1.8; opening 0.1, in the notches: 0.01 / (0.2 * 1.8)
     assert found == pytest.approx([1.0, -1.0, 0.444, 0.028, 0.0], abs=0.035)
     assert abs(found[4]) < 0.002
-
-
-def test_orifice_and_notches_are_those_of_the_textbook() -> None:
-    drop = np.array([0.24, 0.06, -0.06])
-    # flow grows with the root of the drop: twice the flow at four times the drop
-    assert compute_orifice(drop, 0.06) == pytest.approx([2.0, 1.0, -1.0], abs=0.002)
-    notch = np.array(0.2)
-    below, above = (parameters.compute_notch_area(np.array(0.2 + d), notch) for d in (-1e-6, 1e-6))
-    assert above - below == pytest.approx(2e-6 * 2.0 / 1.8, rel=1e-3)  # no jump, slope 2 / 1.8
-    assert float(parameters.compute_notch_area(np.array(1.0), notch)) == pytest.approx(1.0)
 
 
 STEADY = {
@@ -178,17 +157,6 @@ def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine) -> N
     assert alone[Q3] == pytest.approx(1.0, abs=0.05)
     assert flow.sum() == pytest.approx(2.0, rel=0.15)  # the pump's flow at half each
     assert np.ptp(flow[[0, 2, 3, 4]]) > 0.1  # no proportional split: the heaviest is starved
-
-
-def test_a_linkage_is_a_triangle(machine: Machine) -> None:
-    numbers = {"linkage_rad": np.full((1, 5), 1.5), "linkage_swing_rad": np.full((1, 5), 0.2)}
-    linkage = Linkage(numbers, machine, np.zeros((1, 5)))
-    middle = 0.5 * (machine.lower + machine.upper)
-    assert linkage.compute_lever(middle[None]) == pytest.approx(np.ones((1, 5)))
-    # the lever arm is the change of the third side's length with the angle, by the law of cosines
-    side = lambda angle: np.sqrt(1.0 + 0.3**2 - 2.0 * 0.3 * np.cos(angle))  # noqa: E731
-    slope = [(side(a + 1e-5) - side(a - 1e-5)) / 2e-5 for a in (1.7, 1.5)]
-    assert linkage.compute_lever(machine.upper[None])[0, 0] == pytest.approx(slope[0] / slope[1])
 
 
 def test_frames_are_lost_in_bursts_at_the_stated_share() -> None:
