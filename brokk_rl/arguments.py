@@ -25,6 +25,8 @@ SHOWN = ("job", "hydra", "all")
 """Parts of the configuration that `--cfg` prints."""
 SWEEP = {"--multirun", "-m"}
 ROBOT_FILES = (".urdf", ".xml", ".mjcf", ".xacro")
+NOTHING = ("none", "null")
+"""Options that no group needs: they leave it out."""
 KEY = r"\+{0,2}[\w/]+(?:[.@:][\w:]+)*"
 """A key as Hydra takes it: `+group@package`, `task.hole.radius_m`."""
 MEANINGFUL = frozenset(",[](){}'\"$\\")
@@ -50,12 +52,13 @@ def read_arguments(words: Sequence[str]) -> list[str]:
         raise ConfigError("completion of words: brokk -sc install=bash, or uninstall=bash")
     read = []
     for place, word in enumerate(values):
+        key, _, value = word.lstrip("~").partition("=")
+        if key in groups and word in (f"~{key}", *(f"{key}={no}" for no in NOTHING)):
+            # nothing of a group is chosen, unless it has an option of that name
+            if value not in groups[key]:
+                word = f"{key}=[]" if _is_list_group(key) else f"~{key}"
         if word[:1] == "~":
             read.append(word)
-            continue
-        key, _, value = word.partition("=")
-        if value in ("none", "null") and key in groups and value not in groups[key]:
-            read.append(f"~{key}")  # a group of which nothing is chosen
             continue
         if "=" not in word or word == "=":
             raise ConfigError(_explain_word(word, values[place + 1 :], groups))

@@ -157,7 +157,9 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
         return _explain_missing_choice(lacking[1])
     if twice := re.search(r"(\S+) appears more than once", text):
         return f"{twice[1]} is chosen already; another option is given without the '+': {twice[1]}=<option>"
-    found = re.search(r"(?:In '(.+?)': )?Could not (?:override|delete from config\.) '(.+?)'", text)
+    found = re.search(
+        r"(?:In '(.+?)': )?Could not (?:override|delete(?: from config\.)?) '(.+?)'", text
+    )
     if not found:
         text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
         if mixed := re.search(

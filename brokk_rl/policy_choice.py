@@ -205,7 +205,7 @@ def _choose_beginning(cfg: DictConfig, target: str | None) -> str | None:
     cfg.policy[TARGET] = TRAINED
     run = _find_run(str(cfg.policy.path))
     out = OmegaConf.select(cfg, "session.out", default=None) or "."
-    is_new = is_going_on(cfg, Path(out)) and not (run / CONTRACT).exists()
+    is_new = is_going_on(cfg, Path(out)) and read_record(run) and not (run / CONTRACT).exists()
     return None if is_new else TRAINED  # a run that was stopped before it began knows nothing
 
 

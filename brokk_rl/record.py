@@ -371,7 +371,8 @@ def find_files(patterns: str | Sequence[str], what: str) -> list[Path]:
     patterns = [patterns] if isinstance(patterns, str) else list(patterns)
     paths = sorted({name for pattern in patterns for name in glob(pattern, recursive=True)})
     if not paths:
-        raise RecordingError(f"no {what} matches {', '.join(patterns)} (seen from {Path.cwd()})")
+        given = ", ".join(patterns) or "an empty list"
+        raise RecordingError(f"no {what} matches {given} (seen from {Path.cwd()})")
     return [Path(name) for name in paths]
 
 

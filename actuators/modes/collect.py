@@ -55,7 +55,7 @@ class Collection:
     """
 
     num_runs: Count
-    run_minutes: float
+    run_minutes: Positive
     file_minutes: Positive
     flush_s: Positive
     only_plan: bool

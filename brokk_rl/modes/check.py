@@ -74,6 +74,8 @@ class CheckSubject:
     def check(self) -> None:
         if self.model is not None and not Path(self.model).is_file():
             raise ConfigError(f"model: there is no file {self.model} (seen from {Path.cwd()})")
+        if self.model is None and (self.chain or self.tip or self.name):
+            raise ConfigError("model: expected the file of a robot beside name, chain and tip")
         if self.name is not None and not re.fullmatch(r"\w+", self.name):
             raise ConfigError(
                 f"name: expected letters, digits and _, got '{self.name}'; it names files and recordings"

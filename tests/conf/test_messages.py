@@ -26,6 +26,7 @@ FILES = {
     "own/actuator/slip.yaml": "_target_: slip.Arm\n",
     "fails.py": "import math\nfrom math import squareroot\n",
     "old/model_10.pt": "cut off",
+    "empty/notes.txt": "",
     "slip.py": "x = 1\ndef f(:\n",
 }
 """Files in the folder from which the commands are started, by name."""
@@ -74,6 +75,9 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=inspect", "recording=x"): ("did you mean inspect.recordings=x?",),
     ("mode=play", "session.seed=3"): ("play.seed=3",),
     ("task..memory=3",): ("'task..memory'", "is no key"),
+    ("policy=empty", "session.out=empty"): ("empty holds no policy",),
+    ("mode=check", "subject.chain=[a,b]"): ("subject.model: expected the file of a robot",),
+    ("mode=collect", "collect.run_minutes=-1"): ("collect.run_minutes", "above 0"),
     ("+foo=3",): ("the mode has no 'foo'", "rl"),
     ("~task",): ("the mode needs 'task'", "leave ~task out"),
     ("mode=play", "preset=gpu"): ("the mode has no", "leave it out"),
