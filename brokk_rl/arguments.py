@@ -53,10 +53,9 @@ def read_arguments(words: Sequence[str]) -> list[str]:
     read = []
     for place, word in enumerate(values):
         key, _, value = word.lstrip("~").partition("=")
-        if key in groups and word in (f"~{key}", *(f"{key}={no}" for no in NOTHING)):
-            # nothing of a group is chosen, unless it has an option of that name
-            if value not in groups[key]:
-                word = f"{key}=[]" if _is_list_group(key) else f"~{key}"
+        is_nothing = word == f"~{key}" or value in NOTHING
+        if is_nothing and key in groups and value not in groups[key]:
+            word = f"{key}=[]" if _is_list_group(key) else f"~{key}"
         if word[:1] == "~":
             read.append(word)
             continue

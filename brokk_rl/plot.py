@@ -9,8 +9,8 @@ from typing import Literal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
+from brokk_rl.session import write_bytes
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#8c8c8c"
 PURPLE = "#cc79a7"
@@ -75,10 +75,4 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         StorageError: It could not be written; nothing was left behind.
     """
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        temporary.write_bytes(draw_png(figure))
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+    write_bytes(path, draw_png(figure))

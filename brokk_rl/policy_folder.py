@@ -31,7 +31,7 @@ from brokk_rl.build import TARGET, describe_spec, drop_targets, name_class
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import measure_ranges, restore_encoder
-from brokk_rl.session import write_json
+from brokk_rl.session import write_bytes, write_json
 
 if TYPE_CHECKING:
     import torch
@@ -222,12 +222,11 @@ def write_policy(
     folder: Path, contract: Mapping[str, Any], weights: Mapping[str, torch.Tensor]
 ) -> None:
     """Write weights and contract into `folder`, each in one step."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
-    part = folder / f".{WEIGHTS}.part"
     saved = {name: value.detach().cpu().contiguous() for name, value in weights.items()}
-    save_file(saved, part, {STAMP: contract["task"]["fingerprint"]})
-    part.replace(folder / WEIGHTS)
+    stamp = {STAMP: contract["task"]["fingerprint"]}
+    write_bytes(folder / WEIGHTS, save(saved, stamp))
     write_json(folder / CONTRACT, contract)
 
 

@@ -4,9 +4,8 @@ Reading stops at the first breach; inspecting a recording lists them all. Rows c
 time.
 """
 
-import contextlib
+import io
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
@@ -15,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from brokk_rl.errors import RecordingError, StorageError, list_choices
+from brokk_rl.errors import RecordingError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.session import write_bytes
 
 SCHEMA = "1"
 DAMAGE = "damage"
@@ -257,17 +257,9 @@ def write_recording(recording: Recording, path: Path) -> None:
     table = pa.table(columns).replace_schema_metadata(
         {f"brokk.{key}": value for key, value in metadata.items()}
     )
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(table, temporary, compression="zstd")
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise StorageError(
-            f"cannot write recording {path}: {error.strerror or error}; nothing was left behind"
-        ) from error
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    write_bytes(path, buffer.getvalue())
 
 
 def read_recording(path: Path, machine: Machine) -> Recording:

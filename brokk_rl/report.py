@@ -163,7 +163,7 @@ class Report:
         Raises:
             StorageError: It could not be written.
         """
-        write_page(path, self.render())
+        write_text(path, self.render())
 
     def _add(self, kind: str, **values: Any) -> None:
         """Add an element as the template takes it."""
@@ -174,20 +174,6 @@ def render_page(template: Path, values: Mapping[str, Any]) -> str:
     """Return a page by a template that is, or extends, `report.html.jinja`; `values` has its `title`."""
     made = f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"
     return _load_template(template).render(**values, made=made)
-
-
-def write_page(path: Path, text: str) -> None:
-    """Write a page in one step: readers see the old file or the whole new one.
-
-    Raises:
-        StorageError: It could not be written.
-    """
-    try:
-        write_text(path, text)
-    except OSError as error:
-        raise StorageError(
-            f"cannot write {path}: {error.strerror or error}; nothing was left behind"
-        ) from error
 
 
 def embed_picture(source: Figure | Path) -> str:

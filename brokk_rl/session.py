@@ -161,14 +161,8 @@ class Session:
             fields["resumed"] = [*before.get("resumed", []), _format_now()]
         record = SessionRecord(self.folder, fields)
         new_folders = list_missing_folders(self.folder)
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_text(self.folder / RESOLVED, resolved)
-            record.write()
-        except OSError as error:
-            raise StorageError(
-                f"cannot write into {self.folder}: {error.strerror}. Choose session.out=<folder>."
-            ) from error
+        write_text(self.folder / RESOLVED, resolved)
+        record.write()
         outcome = "failed"
         try:
             yield record
@@ -273,13 +267,28 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in one step; on a full disk the old file stays."""
+    """Write a text as `write_bytes` does."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file in one step, and the folders above it: readers see the old file or the new one.
+
+    Raises:
+        StorageError: It cannot be written; nothing is left behind.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        part.write_text(text)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(data)
         part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink()
+        raise StorageError(
+            f"cannot write {path}: {error.strerror or error}; nothing was left behind. Choose "
+            "another place, for a run session.out=<folder>."
+        ) from error
 
 
 def list_missing_folders(folder: Path) -> list[Path]:

@@ -190,10 +190,7 @@ class Answer:
         Raises:
             StorageError: it could not be written.
         """
-        try:
-            write_json(path, self.to_json())
-        except OSError as error:
-            raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+        write_json(path, self.to_json())
 
 
 def read_answer(path: Path) -> Answer:

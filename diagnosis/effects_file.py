@@ -8,7 +8,6 @@ from typing import Any
 
 import yaml
 
-from brokk_rl.errors import StorageError
 from brokk_rl.session import write_text
 from diagnosis.answer import Answer, Selected
 from diagnosis.effect_library import EffectType
@@ -46,10 +45,7 @@ def write_effects(answer: Answer, kinds: Sequence[EffectType], path: Path) -> No
             values[name] = {joint: float(f"{v.mean:.6g}") for joint, v in estimates.items()}
         nodes[one.effect] = build_node(one, by_name[one.effect], values)
     text = yaml.safe_dump(nodes, sort_keys=False) if nodes else ""
-    try:
-        write_text(path, "\n".join(lines) + "\n" + text)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+    write_text(path, "\n".join(lines) + "\n" + text)
 
 
 def build_node(

@@ -8,7 +8,8 @@ from typing import Any
 
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
-from brokk_rl.report import Tone, embed_picture, render_page, write_page
+from brokk_rl.report import Tone, embed_picture, render_page
+from brokk_rl.session import write_text
 from diagnosis import plots, report_checks
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 
@@ -225,7 +226,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "format_error": format_error,
         "format_estimate": format_estimate,
     }
-    write_page(folder / REPORT_FILE, render_page(TEMPLATE, values))
+    write_text(folder / REPORT_FILE, render_page(TEMPLATE, values))
 
 
 def _rank_rivals(evidence: Any) -> list[Mapping[str, Any]]:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from brokk_rl.report import Tone, render_page, write_page
+from brokk_rl.report import Tone, render_page
+from brokk_rl.session import write_text
 from brokk_rl.statistics import compute_wilson_interval
 
 COMPARISON_FILE = "close_gap.json"
@@ -172,4 +173,4 @@ def write_report(found: Mapping[str, Any], folder: Path) -> None:
         "plants": PLANT_NAMES,
         "policies": POLICY_NAMES,
     }
-    write_page(folder / REPORT_FILE, render_page(TEMPLATE, values))
+    write_text(folder / REPORT_FILE, render_page(TEMPLATE, values))

@@ -14,8 +14,8 @@ from brokk_rl import registry
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, remove_frame
-from brokk_rl.report import embed_picture, render_page, write_page
-from brokk_rl.session import read_record
+from brokk_rl.report import embed_picture, render_page
+from brokk_rl.session import read_record, write_text
 from diagnosis import answer, report
 from diagnosis.deployment.page import EVIDENCE_FILE, PAGE_FILE
 from diagnosis.retraining import format_rate
@@ -81,7 +81,7 @@ def write_why_page(
         "format_estimate": report.format_estimate,
         "format_rate": format_rate,
     }
-    write_page(folder / WHY_PAGE, render_page(TEMPLATE, values))
+    write_text(folder / WHY_PAGE, render_page(TEMPLATE, values))
 
 
 def _show_evidence(result: WhyResult, machine: Machine | None) -> tuple[str, str] | None:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from brokk_rl.console_table import MISSING
 from brokk_rl.plot import make_figure, save_figure
-from brokk_rl.report import Cell, embed_picture, render_page, write_page
+from brokk_rl.report import Cell, embed_picture, render_page
 from brokk_rl.session import write_text
 from exam.metrics import METRICS
 
@@ -90,7 +90,7 @@ def write_report(
         "pictures": pictures,
         "join_counts": _join_counts,
     }
-    write_page(folder / REPORT_FILE, render_page(TEMPLATE, values))
+    write_text(folder / REPORT_FILE, render_page(TEMPLATE, values))
     write_text(folder / TABLE_FILE, format_markdown(["", *tables], rows))
 
 

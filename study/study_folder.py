@@ -348,12 +348,5 @@ def _read(path: Path) -> Any:
 
 
 def _write(path: Path, value: Any) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, value)
-    except OSError as error:
-        # `write_json` writes beside and renames, so that no half file is left.
-        raise StorageError(
-            f"cannot write {path}: {error.strerror or error}; nothing was left behind"
-        ) from error
+    write_json(path, value)
     return path

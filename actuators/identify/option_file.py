@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_json, write_text
 
@@ -41,10 +40,6 @@ def write_option(
     node = {"_target_": f"{kind.__module__}.{kind.__qualname__}", **numbers}
     text = yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=130)
     lines = [f"# {line}" for line in comment.splitlines()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if facts is not None:
-            write_json(folder / f"{name}.json", facts)
-        write_text(folder / f"{name}.yaml", "\n".join(lines) + f"\n{text}")
-    except OSError as error:
-        raise StorageError(f"cannot write into {folder}: {error.strerror or error}") from error
+    if facts is not None:
+        write_json(folder / f"{name}.json", facts)
+    write_text(folder / f"{name}.yaml", "\n".join(lines) + f"\n{text}")

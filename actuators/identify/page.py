@@ -10,6 +10,7 @@ from actuators.identify.results import HOLD
 from brokk_rl import report
 from brokk_rl.machine import Machine
 from brokk_rl.plot import save_figure
+from brokk_rl.session import write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,7 +49,7 @@ def write_page(
         "has_mjcf": machine.mjcf is not None,
         "dead_time_s": machine.dead_time_s,
     }
-    report.write_page(folder / PAGE, report.render_page(TEMPLATE, values))
+    write_text(folder / PAGE, report.render_page(TEMPLATE, values))
 
 
 def find_least(models: Mapping[str, Any], horizon: str) -> float:

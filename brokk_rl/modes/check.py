@@ -15,11 +15,11 @@ from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import BrokkError, ConfigError, StorageError
+from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Dimension, Machine
-from brokk_rl.session import Session, write_json, write_text
+from brokk_rl.session import Session, write_bytes, write_json, write_text
 from brokk_rl.spec import Count, name_spec, spec
 
 if TYPE_CHECKING:
@@ -219,7 +219,8 @@ class Check:
         )
         imported = import_model(path, name, choices)
         folder = self.session.folder
-        _write_meshes(folder, imported.meshes)
+        for file, data in imported.meshes.items():
+            write_bytes(folder / file, data)
         write_text(folder / f"{name}.xml", imported.mjcf)
         write_text(folder / f"{name}.yaml", imported.format_yaml())
         mjcf = str((folder / f"{name}.xml").resolve())
@@ -265,15 +266,6 @@ class Check:
                 (found.missing if is_endured else found.problems).append(fault)
         except BrokkError as error:
             found.problems.append(str(error))
-
-
-def _write_meshes(folder: Path, meshes: dict[str, bytes]) -> None:
-    try:
-        for file, data in meshes.items():
-            (folder / file).parent.mkdir(exist_ok=True)
-            (folder / file).write_bytes(data)
-    except OSError as error:
-        raise StorageError(f"the meshes could not be written to {folder}: {error}") from error
 
 
 def check_machine(machine: Machine, num_poses: int, generator: np.random.Generator) -> MachineCheck:

@@ -9,7 +9,6 @@ import logging
 import math
 import os
 import pickle
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -22,10 +21,10 @@ import mujoco
 import numpy as np
 import torch
 
-from brokk_rl.errors import StorageError
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
+from brokk_rl.session import write_bytes
 from brokk_rl.sim.posed_scene import SHOWN_GROUPS, PosedScene
 from brokk_rl.sim.probe import find_renderer
 from brokk_rl.sim.scene import FAR_M
@@ -117,11 +116,9 @@ def render_video(
         job = RenderJob(machine, episode, draft, site)
         if not _run_renderer(job, library):
             return None
-        try:
-            for file in sorted(draft.parent.glob("video*.[mp][pn]*")):
-                shutil.copyfile(file, path.with_name(file.name.replace("video", path.stem, 1)))
-        except OSError as error:
-            raise StorageError(f"the video could not be written to {path}: {error}") from error
+        for file in sorted(draft.parent.glob("video*.[mp][pn]*")):
+            name = file.name.replace("video", path.stem, 1)
+            write_bytes(path.with_name(name), file.read_bytes())
     return path
 
 

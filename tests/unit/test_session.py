@@ -123,13 +123,13 @@ def test_a_file_is_written_whole_or_not_at_all(
 ) -> None:
     write_json(tmp_path / "a.json", {"old": 1})
 
-    def fill_disk(path: Path, text: str) -> None:
-        with path.open("w") as file:
-            file.write(text[:3])
+    def fill_disk(path: Path, data: bytes) -> None:
+        with path.open("wb") as file:
+            file.write(data[:3])
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    monkeypatch.setattr(Path, "write_text", fill_disk)
-    with pytest.raises(OSError, match="No space left") as caught:
+    monkeypatch.setattr(Path, "write_bytes", fill_disk)
+    with pytest.raises(StorageError, match="No space left") as caught:
         write_json(tmp_path / "a.json", {"new": 2})
     assert json.loads((tmp_path / "a.json").read_bytes()) == {"old": 1}
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
