@@ -54,7 +54,7 @@ def read_arguments(words: Sequence[str]) -> list[str]:
     for place, word in enumerate(values):
         key, _, value = word.lstrip("~").partition("=")
         is_nothing = word == f"~{key}" or value in NOTHING
-        if is_nothing and key in groups and value not in groups[key]:
+        if is_nothing and key in groups and value not in groups[key] and key != "mode":
             word = f"{key}=[]" if _is_list_group(key) else f"~{key}"
         if word[:1] == "~":
             read.append(word)
@@ -157,6 +157,9 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
         raise ConfigError(_explain_several(key, value, key in groups, is_single))
     if is_single and value.startswith("[") and "," in value:
         raise ConfigError(_explain_several(key, value.strip("[]"), True, is_single))
+    is_name = override.is_sweep_override() or isinstance(override.value(), (str, list))
+    if key in groups and not is_name:
+        return f"{key}='{value}'"  # so that Hydra looks for an option of that name
     names = value.strip("[]").split(",") if key in groups else []
     for name in names:
         if names.count(name) > 1:

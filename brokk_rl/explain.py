@@ -67,8 +67,6 @@ def explain(error: BaseException) -> str | None:
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark:
         mark = error.problem_mark
         return f"{mark.name}, line {mark.line + 1}: no valid YAML ({error.problem})"
-    if str(error).startswith("Config group override must"):
-        return _explain_bad_choice(error)
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error)
     return None
@@ -125,22 +123,6 @@ def _find_typed(place: str) -> tuple[str, str, str] | None:
             if f"{group}/{name}" == place:
                 return group, equals, name
     return None
-
-
-def _explain_bad_choice(error: BaseException) -> str:
-    """Explain a number, `true` or `null` in the place of an option."""
-    options = registry.list_options()
-    for argument in sys.argv[1:]:
-        group, _, value = argument.partition("=")
-        names = [option.name for option in options if option.group == group]
-        if names and (value in ("true", "false") or re.fullmatch(r"[\d.eE+-]+", value)):
-            keys = [key for key in _find_keys(compose_choices(), group) if "." in key]
-            if keys:
-                return (
-                    f"{group}=<option> chooses one of {', '.join(names)}; {_suggest(keys, value)}"
-                )
-            return f"there is no {group}={value}; {list_choices(value, names)}"
-    return str(error)
 
 
 def _explain_interpolation(error: InterpolationResolutionError) -> str:
@@ -244,7 +226,7 @@ def _find_value(key: str) -> str:
     for argument in sys.argv[1:]:
         name, _, value = argument.lstrip("+").partition("=")
         if name == key:
-            return value
+            return value.strip("'")
     return "<value>"
 
 

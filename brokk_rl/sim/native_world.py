@@ -12,7 +12,7 @@ from mujoco.batch import Batch, SimulationError
 from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model, mask_normal_forces
-from brokk_rl.sim.properties import WorldProperties, list_fields
+from brokk_rl.sim.properties import StoredWorld, WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
 WARNINGS = {
@@ -27,7 +27,7 @@ WARNINGS = {
 """MuJoCo's warnings, in words."""
 
 
-class NativeWorld:
+class NativeWorld(StoredWorld):
     """World on a thread pool; fulfils `brokk_rl.contracts.world.World`.
 
     Results are the same at any number of threads.
@@ -113,16 +113,6 @@ class NativeWorld:
         """Return bits of MuJoCo's warnings; see `brokk_rl.contracts.world.TracedWorld`."""
         return (self._warning[:, :, 1] > 0).long() @ torch.tensor(list(self.alarm_names))
 
-    @property
-    def properties(self) -> dict[str, torch.Tensor]:
-        """Factors by property; see `brokk_rl.contracts.world.VariedWorld`."""
-        return self._properties.factors if self._properties else {}
-
-    def apply_properties(self) -> None:
-        """Make `properties` count; see `brokk_rl.contracts.world.VariedWorld`."""
-        if self._properties:
-            self._properties.apply()
-
     def bare_step(self) -> None:
         """Run the substeps of `mujoco.batch` alone, without drive and read-out.
 
@@ -156,15 +146,6 @@ class NativeWorld:
         size, pos = self._placement.geoms(scene)
         index = (rows[:, None], self._placement.geom_ids)
         self._geom_size[index], self._geom_pos[index] = size, pos
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return copies of everything that must be stored to go on bit for bit."""
-        return {name: tensor.clone() for name, tensor in self._stored().items()}
-
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Restore a copy that `state_dict` returned."""
-        for name, tensor in self._stored().items():
-            tensor.copy_(state[name])
 
     def _stored(self) -> dict[str, torch.Tensor]:
         return {

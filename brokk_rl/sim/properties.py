@@ -110,3 +110,32 @@ class WorldProperties:
             fields["actuator_forcerange"][..., 1].copy_(bound)
         if "stiffness" in factors or "yield_force" in factors:
             self._drive.set_servos(stiffness, damping, bound)
+
+
+class StoredWorld:
+    """What worlds of both simulators share: properties that vary, and a state that is stored."""
+
+    _properties: WorldProperties | None
+    """Properties that vary from world to world, if any do."""
+
+    @property
+    def properties(self) -> dict[str, torch.Tensor]:
+        """See `brokk_rl.contracts.world.VariedWorld`."""
+        return self._properties.factors if self._properties else {}
+
+    def apply_properties(self) -> None:
+        """See `brokk_rl.contracts.world.VariedWorld`."""
+        if self._properties:
+            self._properties.apply()
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return a copy of all that `load_state_dict` needs to go on exactly."""
+        return {name: tensor.clone() for name, tensor in self._stored().items()}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Go on from a state of these worlds."""
+        for name, tensor in self._stored().items():
+            tensor.copy_(state[name])
+
+    def _stored(self) -> dict[str, torch.Tensor]:
+        raise NotImplementedError

@@ -107,6 +107,8 @@ class WarpSimulator:
         """
         import torch
 
+        from brokk_rl.sim.warp_world import WarpWorld
+
         device = torch.device(device)
         if device.type == "cuda" and not torch.cuda.is_available():
             raise DeviceError(
@@ -118,31 +120,7 @@ class WarpSimulator:
         if self.parity_worlds:
             _check_parity(self, machine, device, site)
         num = self.num_worlds if num_worlds is None else num_worlds
-        return self._make_world(machine, device, num, varied, site)
-
-    def _make_world(
-        self,
-        machine: Machine,
-        device: torch.device,
-        num_worlds: int,
-        varied: tuple[Property, ...],
-        site: Path | None,
-    ) -> WarpWorld:
-        from brokk_rl.sim.warp_world import WarpWorld
-
-        return WarpWorld(
-            machine,
-            device,
-            num_worlds=num_worlds,
-            substeps=self.substeps,
-            num_contacts=self.num_contacts,
-            num_constraints=self.num_constraints,
-            iterations=self.iterations,
-            linesearch_iterations=self.linesearch_iterations,
-            tolerance=self.tolerance,
-            varied=varied,
-            site=site,
-        )
+        return WarpWorld(machine, device, num, self, varied, site)
 
 
 @spec
@@ -176,8 +154,9 @@ def _check_parity(
 ) -> ParityResult:
     """Compare a simulator with MuJoCo C on a machine, once in a process."""
     from brokk_rl.sim.parity import check_parity
+    from brokk_rl.sim.warp_world import WarpWorld
 
-    world = simulator._make_world(machine, device, simulator.parity_worlds, (), site)
+    world = WarpWorld(machine, device, simulator.parity_worlds, simulator, site=site)
     return check_parity(world, machine, simulator.substeps, site)
 
 

@@ -21,8 +21,9 @@ import warp as wp
 from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model
-from brokk_rl.sim.properties import WorldProperties, list_fields
+from brokk_rl.sim.properties import StoredWorld, WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
+from brokk_rl.sim.simulator import WarpSimulator
 from brokk_rl.sim.warp_dynamics import ArmDynamics
 from brokk_rl.sim.warp_solver import ContactSolver
 
@@ -68,7 +69,7 @@ BUFFERS = {
 """Buffers of `mujoco_warp` whose names need words."""
 
 
-class WarpWorld:
+class WarpWorld(StoredWorld):
     """Fulfils `brokk_rl.contracts.world.World` on a GPU (or, for tests, on the CPU).
 
     All tensors are views of Warp's arrays. `step` and `reset` use torch's current stream and keep
@@ -79,12 +80,7 @@ class WarpWorld:
         machine: The machine.
         device: A CUDA device or the CPU.
         num_worlds: `N`.
-        substeps: Physics steps per control period.
-        num_contacts: Size of the contact buffer, per world on average.
-        num_constraints: Size of each world's buffer of constraint rows.
-        iterations: Bound on the solver's iterations.
-        linesearch_iterations: Bound on the line search's iterations.
-        tolerance: At which the solver stops.
+        simulator: Substeps, sizes of buffers and bounds of the solver.
         varied: Properties of the machine that differ from world to world.
         site: MJCF of what stands beside the block.
     """
@@ -93,14 +89,8 @@ class WarpWorld:
         self,
         machine: Machine,
         device: torch.device,
-        *,
         num_worlds: int,
-        substeps: int,
-        num_contacts: int,
-        num_constraints: int,
-        iterations: int,
-        linesearch_iterations: int,
-        tolerance: float,
+        simulator: WarpSimulator,
         varied: tuple[Property, ...] = (),
         site: Path | None = None,
     ) -> None:
@@ -111,8 +101,8 @@ class WarpWorld:
             if kind & _LOST and kind != mjw.OverflowType.ALL:
                 name = kind.name or str(int(kind))
                 self.alarm_names[int(kind)] = BUFFERS.get(kind, f"the buffer {name} is full")
-        self.substeps = substeps
-        self.model = compile_model(machine, machine.period_s / substeps, site=site)
+        self.substeps = simulator.substeps
+        self.model = compile_model(machine, machine.period_s / self.substeps, site=site)
         check_simulated(self.model, machine.name, is_warp=True)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
@@ -124,10 +114,9 @@ class WarpWorld:
                     ("geom_size", "geom_pos", *list_fields(varied)), num_worlds
                 ),
             )
-            self._data = mjw.make_data(
-                self.model, num_worlds, nconmax=num_contacts, njmax=num_constraints
-            )
-        self._write_options(iterations, linesearch_iterations, tolerance)
+            sizes = {"nconmax": simulator.num_contacts, "njmax": simulator.num_constraints}
+            self._data = mjw.make_data(self.model, num_worlds, **sizes)
+        self._write_options(simulator)
         data, model = self._data, self._model
         names = (
             "qpos",
@@ -207,33 +196,15 @@ class WarpWorld:
         """Return bits of full buffers; see `brokk_rl.contracts.world.TracedWorld`."""
         return (self._views["overflow"] & _LOST).long()
 
-    @property
-    def properties(self) -> dict[str, torch.Tensor]:
-        """Factors by property; see `brokk_rl.contracts.world.VariedWorld`."""
-        return self._properties.factors if self._properties else {}
-
-    def apply_properties(self) -> None:
-        """Make `properties` count; see `brokk_rl.contracts.world.VariedWorld`."""
-        if self._properties:
-            self._properties.apply()
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return copies of everything that must be stored to go on."""
-        return {name: tensor.clone() for name, tensor in self._stored().items()}
-
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Restore a copy that `state_dict` returned."""
-        for name, tensor in self._stored().items():
-            tensor.copy_(state[name])
-
     def _stored(self) -> dict[str, torch.Tensor]:
         own = {"q": self.q, "contact_force_n": self.contact_force_n, "faults": self.faults}
         return self._views | {"reference": self._drive.reference} | own
 
-    def _write_options(self, iterations: int, linesearch_iterations: int, tolerance: float) -> None:
+    def _write_options(self, simulator: WarpSimulator) -> None:
         option = self._model.opt
-        option.iterations, option.ls_iterations = iterations, linesearch_iterations
-        option.tolerance.fill_(tolerance)
+        option.iterations = simulator.iterations
+        option.ls_iterations = simulator.linesearch_iterations
+        option.tolerance.fill_(simulator.tolerance)
         # `check_simulated` has made sure that no joint has friction
         option.disableflags |= int(mjw.DisableBit.FRICTIONLOSS)
         # overflows are read on the device into `faults`, not printed
