@@ -12,7 +12,7 @@ import sys
 import traceback
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
@@ -49,10 +49,13 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
         raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
     nodes = {key: value for key, value in values.items() if key != RUN}
     known = registry.list_fields(values[RUN])
-    if known:  # else the import says why
+    if known is not None:
         _check_keys(known, nodes.keys() - set(shared), nodes)
     built = build_quick_nodes(values, shared)
     kind = load_class(values[RUN], "")
+    if known is None:  # its source was not found
+        known = {field.name: field.default is MISSING for field in fields(kind)}
+        _check_keys(known, nodes.keys() - set(shared), nodes)
     own = {field.name for field in fields(kind)}
     for key in nodes.keys() - built.keys():
         if key in own:

@@ -84,8 +84,8 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("effect=[backlash]", "effect.backlash.joints=[q9]"): ("joints: 'q9' is no joint",),
     (*COMPARE, "+session.sed=1"): ("no field 'sed'", "did you mean 'seed'?"),
     ("effect=[backlash]", "effect.backlash.width=1"): ("'effect.backlash' has no", "gap_rad"),
-    ("mode=perceive", "perception/segmenter=onnx", "perception.segmenter.wrong=1"): (
-        "'perception.segmenter' has no 'wrong'",
+    ("mode=perceive", "perception/segmenter=onnx", "perception.segmenter.foo=1"): (
+        "'perception.segmenter' has no 'foo'",
         "choices: gate, margin, threads, weights",
     ),
     # characters, quotes, shapes

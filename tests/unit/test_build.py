@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from brokk_rl import build, extensions
+from brokk_rl import build, extensions, registry
 from brokk_rl.build import build_node
 from brokk_rl.errors import ConfigError
 
@@ -62,6 +62,24 @@ def test_the_error_of_an_own_module_is_told_with_its_line(parts: Path) -> None:
     assert f"{parts / 'some_parts.py'}, line 3" in str(told.value)
 
 
+@pytest.mark.parametrize(
+    ("head", "base", "fields"),
+    [
+        ("from some_parts import Fast", "Fast", {"size_m": True, "rate": True, "more": False}),
+        ("import some_parts as parts", "parts.Fast", {"size_m": True, "rate": True, "more": False}),
+        ("from typing import Generic, TypeVar\nT = TypeVar('T')", "Generic[T]", {"more": False}),
+        ("from some_parts import *", "Fast", None),
+    ],
+)
+def test_fields_are_read_without_an_import_or_not_at_all(
+    head: str, base: str, fields: dict[str, bool] | None, parts: Path
+) -> None:
+    text = f"{head}\n\nclass Own({base}):\n    more: int = 1\n    kind: ClassVar[int] = 2\n"
+    (parts / "own_mode.py").write_text(text)
+    assert registry.list_fields("own_mode.Own") == fields
+    assert "own_mode" not in sys.modules and "some_parts" not in sys.modules
+
+
 def test_each_node_of_a_mode_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[str] = []
     call = build._call
@@ -77,7 +95,7 @@ def test_each_node_of_a_mode_is_built_once(monkeypatch: pytest.MonkeyPatch) -> N
 def test_every_node_without_torch_is_built_before_torch_is_loaded() -> None:
     program = """
 import sys
-from brokk_rl import build, extensions
+from brokk_rl import build, extensions, registry
 order = []
 call = build._call
 def record(kind, values, place):
