@@ -113,7 +113,7 @@ class WorldProperties:
 
 
 class StoredWorld:
-    """What worlds of both simulators share: properties that vary, and a state that is stored."""
+    """Base of the worlds of both simulators: properties that vary, and a state that is stored."""
 
     _properties: WorldProperties | None
     """Properties that vary from world to world, if any do."""
