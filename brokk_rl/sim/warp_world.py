@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -23,7 +24,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model
 from brokk_rl.sim.properties import StoredWorld, WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
-from brokk_rl.sim.simulator import WarpSimulator
 from brokk_rl.sim.warp_dynamics import ArmDynamics
 from brokk_rl.sim.warp_solver import ContactSolver
 
@@ -80,7 +80,7 @@ class WarpWorld(StoredWorld):
         machine: The machine.
         device: A CUDA device or the CPU.
         num_worlds: `N`.
-        simulator: Substeps, sizes of buffers and bounds of the solver.
+        simulator: Their spec, a `brokk_rl.sim.simulator.WarpSimulator`, which imports this module.
         varied: Properties of the machine that differ from world to world.
         site: MJCF of what stands beside the block.
     """
@@ -90,7 +90,7 @@ class WarpWorld(StoredWorld):
         machine: Machine,
         device: torch.device,
         num_worlds: int,
-        simulator: WarpSimulator,
+        simulator: Any,
         varied: tuple[Property, ...] = (),
         site: Path | None = None,
     ) -> None:
@@ -200,7 +200,7 @@ class WarpWorld(StoredWorld):
         own = {"q": self.q, "contact_force_n": self.contact_force_n, "faults": self.faults}
         return self._views | {"reference": self._drive.reference} | own
 
-    def _write_options(self, simulator: WarpSimulator) -> None:
+    def _write_options(self, simulator: Any) -> None:
         option = self._model.opt
         option.iterations = simulator.iterations
         option.ls_iterations = simulator.linesearch_iterations
