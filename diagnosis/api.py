@@ -41,8 +41,6 @@ from diagnosis.case import GapCase
 from diagnosis.modes.diagnose import Diagnose, DiagnosisSubject
 from diagnosis.request import FITS
 
-EXCITATIONS = ("levels", "sine", "ramps", "holds", "reversals", "staircase")
-"""Experiments that a diagnosis may propose, as in `conf/mode/diagnose.yaml`."""
 HELD_OUT = 4
 """One recording in so many stops a fit."""
 
@@ -283,16 +281,12 @@ def _build_mode(
         actuator=_load_simulator(simulator),
         simulator=None,
         own=_load_option("actuator", "own"),
-        curve_fit=extensions.load_part("curve_fit"),
         thresholds=extensions.load_part("thresholds"),
-        excitation={name: _load_option("excitation", name) for name in EXCITATIONS},
         diagnosis=DiagnosisSubject(  # pyright: ignore[reportCallIssue]
             case=None,
             field="",  # recordings are given, none is read
             unseen=None,
             effects=None if effects is None else tuple(effects),
             workers=workers,
-            prices=extensions.load_part("prices"),
-            certainty=extensions.load_part("certainty"),
         ),
     )

@@ -11,6 +11,11 @@ RELATIVE_ROUNDING = 1e-9
 """Width of an interval, over the number, below which it is rounding of double precision."""
 
 
+MIN_RESTORED = 0.5
+"""Least rise of the error without an effect, over its Shapley value, at which the effect counts as
+identified. Half: what replaces an effect then carries less than the effect. Chosen by hand."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A number with its 95 % interval.

@@ -28,7 +28,6 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
 from diagnosis.answer import Estimate
-from diagnosis.number_faults import list_number_faults
 
 log = logging.getLogger(__name__)
 
@@ -416,22 +415,6 @@ class EffectSimulator:
     def plain_runs(self) -> np.ndarray:
         """Free runs without any effect but the fixed ones, `(W, K, J)`."""
         return self.simulate([])[0]
-
-    @cached_property
-    def fault_runs(self) -> np.ndarray:
-        """The same with a small fault of each of the base's own numbers, `(P, W, K, J)`."""
-        model: Any = self.base.build(self.machine, 1, torch.device("cpu"))
-        own = {
-            name: value.numpy()
-            for name, value in (getattr(model, "parameters", None) or {}).items()
-        }
-        if not own:
-            return np.empty((0, *self.cut.measured.shape), dtype=np.float32)
-        varied = {name: np.repeat(value, len(own), 0) for name, value in own.items()}
-        faults = list_number_faults(list(own), self.machine)
-        for number, name in enumerate(own):
-            varied[name][number] += faults[number]
-        return self.simulate([], len(own), varied)
 
     @cached_property
     def _commands(self) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: speed curves and paths.
+"""Figures of a diagnosis.
 
 Black is the measurement, red the simulator as it was, blue the simulator with the effects, grey the
 floor.
@@ -6,8 +6,7 @@ floor.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,71 +15,13 @@ from matplotlib.figure import Figure
 from actuators.recordings.recording_checks import name_recording
 from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_joint_panels, remove_frame
+from brokk_rl.plot import BLUE, GREY, RED, add_legend, remove_frame
 from diagnosis.answer import Outcome
 
 BEFORE, AFTER, FLOOR = RED, BLUE, GREY
 IDLE = "#c3cbd3"
 MAX_JOINTS = 3
 """Joints whose paths are drawn."""
-
-
-def draw_speed_curves(curves: Mapping[str, Any], machine: Machine) -> Figure:
-    """Draw the speed over the command of each joint, measured and simulated, with 95 % bands.
-
-    Args:
-        curves: `curves` of `diagnosis.json`.
-        machine: The machine.
-    """
-    figure, axes = make_joint_panels(machine, "xy")
-    strokes, fastest = np.array(curves["knots"]), [1.0]
-    for axis, name in zip(axes, machine.joint_names, strict=False):
-        axis.set_title(name, loc="left", fontsize=9)
-        axis.grid(alpha=0.3)
-        remove_frame(axis)
-        found = curves["joints"].get(name)
-        if found is None:
-            axis.text(0.5, 0.5, "hardly moves", transform=axis.transAxes, ha="center")
-            continue
-        points = np.array(found["points"]).reshape(-1, 2)
-        axis.plot(*points.T, ".", color=IDLE, ms=2.5, zorder=1, label="single quarter seconds")
-        for who, colour in (("simulated", BEFORE), ("measured", "black")):
-            for side, sign in (("extend", 1.0), ("retract", -1.0)):
-                one, at = found[who][side], sign * strokes
-                low, high = (sign * np.array(one[end]) for end in ("low", "high"))
-                axis.fill_between(at, low, high, color=colour, alpha=0.2, lw=0, zorder=2)
-                label = who if sign > 0 else None
-                axis.plot(at, sign * np.array(one["speed"]), color=colour, lw=1.8, label=label)
-        fastest += [max(found[who][side]["speed"]) for who in WHO for side in SIDES]
-        told = _describe_curve_change(found["difference"])
-        axis.set_title(f"{name}\n{told}", loc="left", fontsize=8)
-    axes[0].set_ylim(-1.1 * max(fastest), 1.1 * max(fastest))  # shared by all panels
-    figure.supxlabel("stroke of the valve, of full command", fontsize=10)
-    figure.supylabel("speed, of the joint's full speed", fontsize=10)
-    add_legend(figure, axes[0])
-    return figure
-
-
-WHO, SIDES = ("measured", "simulated"), ("extend", "retract")
-
-
-def _describe_curve_change(difference: Mapping[str, Any]) -> str:
-    """Return what changes the simulated curve into the measured one, in a few words."""
-    told = []
-    for label, names in CURVE_WORDS.items():
-        values = [difference[name] for name in names]
-        if any(values):
-            numbers = [f"{one['mean']:.2f}" if one else "–" for one in values]
-            told.append(f"{label} {' / '.join(numbers)}")
-    return ", ".join(told) or "no change needed"
-
-
-CURVE_WORDS = {
-    "dead band": ("dead_band_extend", "dead_band_retract"),
-    "saturation": ("saturation",),
-    "gain": ("extend_gain", "retract_gain"),
-}
-"""Words for the numbers of a curve's change; two numbers: positive and negative side."""
 
 
 def draw_paths(outcome: Outcome, machine: Machine) -> Figure:

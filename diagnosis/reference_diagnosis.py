@@ -5,7 +5,7 @@ Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,20 +22,23 @@ from diagnosis import gates, geometry, sensors
 from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected
 from diagnosis.case import GapCase
 from diagnosis.closure import Gate
-from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
 from diagnosis.engine.decide import Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import describe_numbers
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.repair_proof import RepairProof
+from diagnosis.repair_proof import EngineProof
 from diagnosis.stages import Survey, examine_gap
 
+ProgressCallback = Callable[[str, float], None]
+"""Receives the name of a step and the share of the whole that is done."""
 DIRECT_NATS = 4.0
 NAME_NATS = 12.0
 """Cost of a joint and of a name where tool points or the scatter of samples show an effect."""
 CLOCK_SHIFT_S = 0.01
 """Least shift between encoders and tool tracker that is named; the trackers' own clock wanders less."""
+MAX_RIVALS = 4
+"""Most rivals of the named effects in a ranking."""
 NATS_OF_HALF = 20.0
 NATS_OF_SURE = 15.0
 """An effect of so many nats is there in half of the cases, and how fast that grows."""
@@ -86,18 +89,19 @@ class ReferenceDiagnosis:
         decider = Decider(reference, field, self._measure_noise(detected))
         tell("simulating every effect", 0.45)
         decision = decider.decide()
-        told = _explain_idle_joints(told, decision, machine)
+        named_joints = {machine.joint_names[j] for one in decision.named for j in one.joints}
+        told = excuse_joints(told, sorted(named_joints))
         if failed := gates.list_failures(told):
             decision = replace(decision, verdict="unknown", named=())
         tell("sizes and proof", 0.8)
         named = [] if failed else self._list_named(decision, detected)
         findings = [one.finding for one in named if one.finding is not None]
-        proof = RepairProof(case, decider, findings, self.generator)
+        proof = EngineProof(case, decider, findings, self.generator)
         judged = proof.judge() if findings or decision.verdict == "none" else []
         if not failed and (failed := gates.list_failures(judged)):
             decision = replace(decision, verdict="unknown", named=())
             named = [one for one in named if one.finding is None]
-            proof = RepairProof(case, decider, [], self.generator)
+            proof = EngineProof(case, decider, [], self.generator)
         return self._build_outcome(decision, named, proof, (*told, *judged), failed)
 
     def _detect(self) -> list[DetectedEffect]:
@@ -150,7 +154,7 @@ class ReferenceDiagnosis:
         self,
         decision: Decision,
         named: Sequence[NamedEffect],
-        proof: RepairProof,
+        proof: EngineProof,
         told: Sequence[Gate],
         failed: str,
     ) -> Outcome:
@@ -164,12 +168,12 @@ class ReferenceDiagnosis:
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
-            ranking=tuple(_rank(selected, decision, verdict, machine)),
+            ranking=rank_effects(selected, _list_rivals(decision, machine), verdict),
             where=survey.where(),
             gap=proof.measure_gap(bool(named)),
             rivals=proof.rivals,
             gates=tuple(told),
-            next_experiment=_propose(selected),
+            next_experiment=propose_measurement(selected),
             reason=_explain(verdict, selected, decision, failed),
             more=survey.more() | {"evidence": _describe_evidence(decision, machine)},
         )
@@ -184,27 +188,17 @@ class ReferenceDiagnosis:
             before, floor, after, machine, self.thresholds, dead_time_s, self.generator
         )
 
-    def _describe(self, one: NamedEffect, proof: RepairProof) -> Selected:
+    def _describe(self, one: NamedEffect, proof: EngineProof) -> Selected:
         machine = self.case.machine
         if one.detected is not None:
-            joints = one.detected.joints
-            names = [n for n, has in zip(machine.joint_names, joints, strict=True) if has]
-            own = {"own_statistic_explained": one.detected.closed}
-            return Selected(
-                effect=one.kind.name,
-                joints=tuple(names),
-                probability=estimate_probability(one.detected.net_gain),
-                parameters=one.detected.parameters,
-                gap_closed=None,
-                edit=own,
-            )
+            return describe_detected(one.detected, machine)
         finding = one.finding
         assert finding is not None, "an effect was found one way or the other"
         parameters = describe_numbers(one.kind, proof.sizes[finding.effect], finding.hold, machine)
         if one.kind.name == "clock_offset":
             parameters = {"offset_s": parameters.get("dead_time_s", {})}
         part = proof.parts.get(finding.effect)
-        like, decided_by = self._list_alike(one.kind.name, finding)
+        like, decided_by = list_alike(one.kind.name, finding.joints, self.case, self.kinds)
         return Selected(
             effect=one.kind.name,
             joints=tuple(machine.joint_names[j] for j in finding.joints),
@@ -217,34 +211,55 @@ class ReferenceDiagnosis:
             edit=None if part is None else part["edit"],
         )
 
-    def _list_alike(self, name: str, finding: EffectFinding) -> tuple[tuple[str, ...], str | None]:
-        """Return what these recordings cannot tell from an effect, and the measurement that would."""
-        if geometry.is_tracked(self.case.field, self.case.machine):
-            return (), None
-        known = {kind.name for kind in self.kinds}
-        is_whole = len(finding.joints) == self.case.machine.num_joints
-        if name == "flow_gain" and "encoder_scale" in known:
-            how = "an outside measurement of the angle (inclinometer, laser) at two positions"
-            return ("encoder_scale",), how
-        if name == "dead_time" and is_whole and "clock_offset" in known:
-            how = "one clock for commands and positions, or a pulse that both record"
-            return ("clock_offset",), how
+
+def describe_detected(one: DetectedEffect, machine: Machine) -> Selected:
+    """Return the answer about an effect that sensors or tool points show.
+
+    Its share of their error is no share of the gap.
+    """
+    names = [name for name, has in zip(machine.joint_names, one.joints, strict=True) if has]
+    return Selected(
+        effect=one.kind.name,
+        joints=tuple(names),
+        probability=estimate_probability(one.net_gain),
+        parameters=one.parameters,
+        gap_closed=None,
+        edit={"own_statistic_explained": one.closed},
+    )
+
+
+def list_alike(
+    name: str, joints: Sequence[int], case: GapCase, kinds: Sequence[EffectType]
+) -> tuple[tuple[str, ...], str | None]:
+    """Return what commands and joint positions cannot tell from an effect, and the measurement that would."""
+    if geometry.is_tracked(case.field, case.machine):
         return (), None
+    known = {kind.name for kind in kinds}
+    if name == "flow_gain" and "encoder_scale" in known:
+        how = "an outside measurement of the angle (inclinometer, laser) at two positions"
+        return ("encoder_scale",), how
+    if name == "dead_time" and len(joints) == case.machine.num_joints and "clock_offset" in known:
+        return (
+            "clock_offset",
+        ), "one clock for commands and positions, or a pulse that both record"
+    return (), None
 
 
-def _explain_idle_joints(told: Sequence[Gate], decision: Decision, machine: Machine) -> list[Gate]:
-    """Return the gates of the recordings; a joint that does not obey may have a named effect.
+EXCUSED = ("does_not_obey", "unlogged_input")
+"""Findings about a joint that a named effect may be the cause of."""
+
+
+def excuse_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate]:
+    """Return the gates of the recordings; joints that do not move as commanded may have a named effect.
 
     Whether the effect explains it is told by the proof: the repaired simulator has to beat standing
     still on that joint.
     """
-    named = {machine.joint_names[j] for one in decision.named for j in one.joints}
     found = []
     for gate in told:
-        is_explained = gate.name == "does_not_obey" and any(
-            f"on {name} " in gate.text for name in named
-        )
-        found.append(replace(gate, passed=gate.passed or is_explained))
+        is_named = any(f"on {name} " in gate.text for name in named)
+        passed = gate.passed or (gate.name in EXCUSED and is_named)
+        found.append(replace(gate, passed=passed))
     return found
 
 
@@ -303,26 +318,31 @@ def measure_clock_shift(recordings: Sequence[Recording], machine: Machine) -> fl
     return products / max(squares, 1e-12)
 
 
-def _rank(
-    selected: Sequence[Selected], decision: Decision, verdict: str, machine: Machine
-) -> list[Ranked]:
-    """Return all that is worth naming, the most probable first."""
+def rank_effects(
+    selected: Sequence[Selected], rivals: Sequence[Ranked], verdict: str
+) -> tuple[Ranked, ...]:
+    """Return all that is worth naming, the most probable first.
+
+    Args:
+        selected: What is named.
+        rivals: Other effects with what they earn, nats, in place of a probability.
+        verdict: `effects`, `none` or `unknown`.
+    """
     found = [Ranked(one.effect, one.joints, one.probability) for one in selected]
     left = 1.0 - max([one.probability for one in selected], default=0.0)
     if verdict != "effects":
         found.append(Ranked(verdict, (), 0.8))
         left = 0.2
     names = {one.effect for one in selected}
-    for finding in decision.rivals[:4]:
-        if finding.name not in names and finding.nats > 0.0:
-            joints = tuple(machine.joint_names[j] for j in finding.joints)
-            chance = left * float(np.clip(finding.nats / 100.0, 0.01, 0.5))
-            found.append(Ranked(finding.name, joints, chance))
-            names.add(finding.name)
-    return sorted(found, key=lambda one: -one.probability)
+    for one in rivals[:MAX_RIVALS]:
+        if one.effect not in names and one.probability > 0.0:
+            chance = left * float(np.clip(one.probability / 100.0, 0.01, 0.5))
+            found.append(replace(one, probability=chance))
+            names.add(one.effect)
+    return tuple(sorted(found, key=lambda one: -one.probability))
 
 
-def _propose(selected: Sequence[Selected]) -> NextExperiment | None:
+def propose_measurement(selected: Sequence[Selected]) -> NextExperiment | None:
     """Return the measurement that would tell apart what these recordings cannot."""
     for one in selected:
         if one.same_as and one.decided_by:
@@ -344,6 +364,15 @@ def _explain(verdict: str, selected: Sequence[Selected], decision: Decision, fai
         "the gap is real, and no effect of the library explains it; "
         f"the field follows a law of: {group} ({nats:.0f} nats)"
     )
+
+
+def _list_rivals(decision: Decision, machine: Machine) -> list[Ranked]:
+    """Return the effects of the first table with what they earn, nats, in place of a probability."""
+    found = []
+    for finding in decision.rivals:
+        joints = tuple(machine.joint_names[j] for j in finding.joints)
+        found.append(Ranked(finding.name, joints, finding.nats))
+    return found
 
 
 def _describe_evidence(decision: Decision, machine: Machine) -> dict[str, Any]:

@@ -5,6 +5,7 @@ Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -17,10 +18,9 @@ from actuators.scales import choose_horizon_s
 from brokk_rl.commands import view_recordings
 from brokk_rl.record import Recording
 from diagnosis import sensors
-from diagnosis.attribution import judge_edit
 from diagnosis.bootstrap import draw_weights, summarise_draws
 from diagnosis.case import GapCase
-from diagnosis.closure import Gap, Gate, RivalError
+from diagnosis.closure import MIN_RESTORED, Estimate, Gap, Gate, RivalError
 from diagnosis.engine.decide import Decider, EffectFinding
 from diagnosis.engine.holds import hold_commands
 from diagnosis.engine.proof import Floor, Windows, list_windows, run_free
@@ -42,46 +42,65 @@ LEAST_GAP = 0.02
 """Least gap over the error, so that its share can be told where the floor nearly reaches it."""
 
 
-class RepairProof:
+class RepairProof(ABC):
     """Free runs over the field, cross-fitted in two halves, and their errors.
 
     Args:
         case: The recordings.
-        decider: The engine that decided.
-        findings: Its named effects, the best first.
+        effects: Joints of each named effect that acts on the motion.
+        num_windows: `W`.
         generator: Draws the bootstraps.
     """
+
+    floor_of = "reference"
 
     def __init__(
         self,
         case: GapCase,
-        decider: Decider,
-        findings: Sequence[EffectFinding],
+        effects: Mapping[str, Sequence[int]],
+        num_windows: int,
         generator: np.random.Generator,
     ) -> None:
         self.machine = case.machine
+        self.half = np.arange(num_windows) // BLOCK_WINDOWS % 2
+        """Half of each window, `(W,)`; its sizes are those that were fitted to the other one."""
+        self.weights = draw_weights(num_windows, generator)
         self._case = case
-        self._decider = decider
-        self._findings = findings
-        self._generator = generator
-        evidence = decider.evidence
-        self._field = evidence.field
-        self._healthy = [base.numbers for base in evidence.bases]
-        horizon_s = choose_horizon_s(case.machine)
-        self.windows = list_windows(self._field, horizon_s)
-        self.half = np.arange(len(self.windows.first)) // BLOCK_WINDOWS % 2
-        self.floor = Floor(evidence.reference, evidence.bases, horizon_s)
-        self.weights = draw_weights(len(self.windows.first), generator)
-        self.sizes: dict[str, dict[int, SizedRow]] = {}
-        """Rows of each effect in the registry's form, by joint."""
-        self._rows = self._fit_rows(None)
-        self._halves = [self._fit_rows(self._list_used(half)) for half in (0, 1)]
+        self._effects = effects
         self._runs: dict[frozenset[str], np.ndarray] = {}
 
     @property
+    @abstractmethod
     def measured(self) -> np.ndarray:
         """Measured positions, `(W, K, J)`, rad or m."""
-        return self._field.q[self.windows.rows] * measure_units(self.machine)
+
+    @property
+    @abstractmethod
+    def floor_squares(self) -> np.ndarray:
+        """Mean squares at the floor in each draw, `(1 + B, J)`."""
+
+    @property
+    def moves(self) -> bool:
+        """True if a named effect acts on the free runs."""
+        return bool(self._effects)
+
+    @abstractmethod
+    def view(self, paths: np.ndarray) -> WindowedRuns:
+        """Return free runs beside the recordings of the field."""
+
+    @abstractmethod
+    def view_floor(self) -> WindowedRuns | None:
+        """Return left-out runs beside the recordings of the reference; `None` without any."""
+
+    @abstractmethod
+    def _simulate(self, effects: frozenset[str]) -> np.ndarray:
+        """Return free runs with some of the named effects, `(W, K, J)`."""
+
+    def run(self, effects: frozenset[str]) -> np.ndarray:
+        """Return free runs with some of the named effects, each window with sizes of the other half."""
+        if effects not in self._runs:
+            self._runs[effects] = self._simulate(effects)
+        return self._runs[effects]
 
     @property
     def before(self) -> np.ndarray:
@@ -91,54 +110,7 @@ class RepairProof:
     @property
     def after(self) -> np.ndarray:
         """Free runs with all named effects."""
-        return self.run(frozenset(one.effect for one in self._findings))
-
-    def _list_used(self, half: int) -> np.ndarray:
-        """Return the samples outside the windows of a half, `(T,)` bool."""
-        used = np.ones(self._field.num_samples, dtype=bool)
-        used[self.windows.rows[self.half == half]] = False
-        return used
-
-    def _fit_rows(self, used: np.ndarray | None) -> dict[str, dict[int, Row]]:
-        """Return the rows of each named effect, one fitted beside the others, to the samples `used`."""
-        numbers, side = list(self._healthy), self._field
-        found: dict[str, dict[int, Row]] = {}
-        for finding in self._findings:
-            found[finding.effect] = {}
-            if finding.hold is not None:
-                side = hold_commands(side, finding.hold.delays)
-                self.sizes[finding.effect] = {}
-                continue
-            joints = self._decider.evidence.view_field(numbers, side, used)
-            if used is None:
-                self.sizes[finding.effect] = size_finding(finding, joints)
-            found[finding.effect] = fit_rows(finding, joints)
-            numbers = self._apply(numbers, found[finding.effect])
-        return found
-
-    def _apply(self, numbers: Sequence[np.ndarray], rows: Mapping[int, Row]) -> list[np.ndarray]:
-        """Return the numbers of all joints with an effect."""
-        found = list(numbers)
-        for j, row in rows.items():
-            found[j] = self._field.model.change(found[j], [row])[0]
-        return found
-
-    def run(self, effects: frozenset[str]) -> np.ndarray:
-        """Return free runs with some of the named effects, each window with sizes of the other half."""
-        if effects not in self._runs:
-            side = self._field
-            for finding in self._findings:
-                if finding.effect in effects and finding.hold is not None:
-                    side = hold_commands(side, finding.hold.delays)
-            runs = []
-            for sizes in self._halves:
-                numbers = list(self._healthy)
-                for name in effects:
-                    numbers = self._apply(numbers, sizes[name])
-                runs.append(run_free(side, self.windows, numbers))
-            chosen = self.half[:, None, None] == 0
-            self._runs[effects] = np.where(chosen, runs[0], runs[1])
-        return self._runs[effects]
+        return self.run(frozenset(self._effects))
 
     def measure_squares(self, paths: np.ndarray) -> np.ndarray:
         """Return mean squares of free runs in each draw, `(1 + B, J)`."""
@@ -147,17 +119,6 @@ class RepairProof:
     def measure_errors(self, paths: np.ndarray) -> np.ndarray:
         """Return the error of free runs in each draw, all joints together, `(1 + B,)`."""
         return combine_joints(self.measure_squares(paths), self.machine)
-
-    @cached_property
-    def floor_squares(self) -> np.ndarray:
-        """Mean squares at the floor in each draw, `(1 + B, J)`."""
-        numbers, side = list(self._healthy), self._field
-        for finding in self._findings:
-            numbers = self._apply(numbers, self._rows[finding.effect])
-            if finding.hold is not None:
-                side = hold_commands(side, finding.hold.delays)
-        joints = self._decider.evidence.view_field(numbers, side)
-        return self.weights @ self.floor.foresee(self.windows, joints)
 
     def measure_gap(self, is_named: bool) -> Gap:
         """Return the errors and the share that is closed; 0 where only effects beside the motion are named."""
@@ -179,7 +140,7 @@ class RepairProof:
             floor=float(floor[0]),
             closed=closed,
             unit=choose_unit(self.machine),
-            floor_of="reference",
+            floor_of=self.floor_of,
             joints=joints,
             reduced=summarise_draws((before - after) / np.maximum(before, 1e-12)),
             closed_reason=reason,
@@ -194,7 +155,7 @@ class RepairProof:
     @cached_property
     def parts(self) -> dict[str, dict[str, Any]]:
         """Part of each effect: its Shapley value, and what its removal restores."""
-        names = [one.effect for one in self._findings]
+        names = list(self._effects)
         every = frozenset(names)
         before, after = self.measure_errors(self.before), self.measure_errors(self.after)
         values = compute_shapley(names, lambda some: -self.measure_errors(self.run(some)))
@@ -227,9 +188,9 @@ class RepairProof:
 
     def judge(self) -> list[Gate]:
         """Return whether the repaired simulator beats standing still on every named joint, without names on all."""
-        named = {j for one in self._findings for j in one.joints}
+        named = {j for joints in self._effects.values() for j in joints}
         joints = sorted(named or range(self.machine.num_joints))
-        noise = sensors.estimate_sensor_noise(self._case.reference)
+        noise = sensors.estimate_sensor_noise(self._case.reference or self._case.field)
         after = np.sqrt(self.measure_squares(self.after)[0])
         still = self.rivals["hold"].joints
         found = []
@@ -239,9 +200,9 @@ class RepairProof:
             passed = bool(after[j] <= max(still[name], NOISE_FACTOR * noise[j]))
             text = f"{name}: {after[j]:.3g} with the effects, {still[name]:.3g} standing still"
             found.append(Gate(f"beats_hold_{name}", passed, float(after[j]), still[name], text))
-        if any(one.rows or one.hold for one in self._findings):
+        if self.moves:
             found.append(self._judge_reduction())
-            found += self._judge_beside_arx()
+            found += self.judge_beside_arx()
         return found
 
     def _judge_reduction(self) -> Gate:
@@ -251,19 +212,123 @@ class RepairProof:
         text = f"the error is {after[0]:.3g} with the effects, {before[0]:.3g} without"
         return Gate("reduces_error", most > 0.0, float(after[0]), float(before[0]), text)
 
-    def _judge_beside_arx(self) -> list[Gate]:
+    def judge_beside_arx(self) -> list[Gate]:
         """Return whether the repaired simulator keeps up with a linear ARX that was fitted to the field."""
         least = self.rivals["arx"].rmse
         if least is None:
             return []
         after = float(self.measure_errors(self.after)[0])
-        noise = np.square(sensors.estimate_sensor_noise(self._case.reference))
+        noise = np.square(sensors.estimate_sensor_noise(self._case.reference or self._case.field))
         ratio = after / max(least, 1e-12)
         # What errs by its sensors only cannot be improved.
         is_noise = after <= NOISE_FACTOR * float(combine_joints(noise, self.machine))
         text = f"the error with the effects is {ratio:.2f} times that of an ARX fitted to the field"
         passed = is_noise or ratio <= MAX_RIVAL_RATIO
         return [Gate("near_arx", passed, ratio, MAX_RIVAL_RATIO, text)]
+
+
+def judge_edit(reduced: Estimate, rise: Estimate) -> tuple[float, bool]:
+    """Return how much of an effect's part its removal restores, and whether this identifies it."""
+    restored = rise.mean / reduced.mean if reduced.mean > 0.0 else 0.0
+    return restored, rise.has_interval and rise.ci95[0] > 0.0 and restored >= MIN_RESTORED
+
+
+class EngineProof(RepairProof):
+    """The proof of what the engine decided: the machine as it was is a joint model fitted to the reference.
+
+    Args:
+        case: The recordings.
+        decider: The engine that decided.
+        findings: Its named effects, the best first.
+        generator: Draws the bootstraps.
+    """
+
+    def __init__(
+        self,
+        case: GapCase,
+        decider: Decider,
+        findings: Sequence[EffectFinding],
+        generator: np.random.Generator,
+    ) -> None:
+        evidence = decider.evidence
+        horizon_s = choose_horizon_s(case.machine)
+        self.windows = list_windows(evidence.field, horizon_s)
+        joints = {one.effect: one.joints for one in findings}
+        super().__init__(case, joints, len(self.windows.first), generator)
+        self._decider = decider
+        self._findings = findings
+        self._field = evidence.field
+        self._healthy = [base.numbers for base in evidence.bases]
+        self.floor = Floor(evidence.reference, evidence.bases, horizon_s)
+        self.sizes: dict[str, dict[int, SizedRow]] = {}
+        """Rows of each effect in the registry's form, by joint."""
+        self._rows = self._fit_rows(None)
+        self._halves = [self._fit_rows(self._list_used(half)) for half in (0, 1)]
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Measured positions, `(W, K, J)`, rad or m."""
+        return self._field.q[self.windows.rows] * measure_units(self.machine)
+
+    @property
+    def moves(self) -> bool:
+        """True if a named effect acts on the free runs; one that shows by itself need not."""
+        return any(one.rows or one.hold for one in self._findings)
+
+    def _list_used(self, half: int) -> np.ndarray:
+        """Return the samples outside the windows of a half, `(T,)` bool."""
+        used = np.ones(self._field.num_samples, dtype=bool)
+        used[self.windows.rows[self.half == half]] = False
+        return used
+
+    def _fit_rows(self, used: np.ndarray | None) -> dict[str, dict[int, Row]]:
+        """Return the rows of each named effect, one fitted beside the others, to the samples `used`."""
+        numbers, side = list(self._healthy), self._field
+        found: dict[str, dict[int, Row]] = {}
+        for finding in self._findings:
+            found[finding.effect] = {}
+            if finding.hold is not None:
+                side = hold_commands(side, finding.hold.delays)
+                self.sizes[finding.effect] = {}
+                continue
+            joints = self._decider.evidence.view_field(numbers, side, used)
+            if used is None:
+                self.sizes[finding.effect] = size_finding(finding, joints)
+            found[finding.effect] = fit_rows(finding, joints)
+            numbers = self._apply(numbers, found[finding.effect])
+        return found
+
+    def _apply(self, numbers: Sequence[np.ndarray], rows: Mapping[int, Row]) -> list[np.ndarray]:
+        """Return the numbers of all joints with an effect."""
+        found = list(numbers)
+        for j, row in rows.items():
+            found[j] = self._field.model.change(found[j], [row])[0]
+        return found
+
+    def _simulate(self, effects: frozenset[str]) -> np.ndarray:
+        side = self._field
+        for finding in self._findings:
+            if finding.effect in effects and finding.hold is not None:
+                side = hold_commands(side, finding.hold.delays)
+        runs = []
+        for sizes in self._halves:
+            numbers = list(self._healthy)
+            for name in effects:
+                numbers = self._apply(numbers, sizes[name])
+            runs.append(run_free(side, self.windows, numbers))
+        chosen = self.half[:, None, None] == 0
+        return np.where(chosen, runs[0], runs[1])
+
+    @cached_property
+    def floor_squares(self) -> np.ndarray:
+        """Mean squares at the floor in each draw, `(1 + B, J)`."""
+        numbers, side = list(self._healthy), self._field
+        for finding in self._findings:
+            numbers = self._apply(numbers, self._rows[finding.effect])
+            if finding.hold is not None:
+                side = hold_commands(side, finding.hold.delays)
+        joints = self._decider.evidence.view_field(numbers, side)
+        return self.weights @ self.floor.foresee(self.windows, joints)
 
     def view(self, paths: np.ndarray) -> WindowedRuns:
         """Return free runs beside the recordings of the field."""

@@ -57,19 +57,15 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
         return f"{start}.{because}{told}", "warn"
     names = join_words([describe_selected(one) for one in answer.selected])
     closed = gap.closed if gap else None
-    left_over = answer.more.get("unknown_remainder")
-    rest = (
-        f" An unknown remainder is left on {join_words(left_over['joints'])}." if left_over else ""
-    )
     tone: Tone = "good" if closed is not None and closed.ci95[0] > GOOD_CLOSED else "warn"
     it = "it" if len(answer.selected) == 1 else "them"
     if closed is None or gap is None:
         fewer = f" Adding {it} removes {_format_share(gap.reduction)} of the error." if gap else ""
         why = f" No share of the gap is told: {gap.closed_reason}." if gap else ""
-        return f"The simulator lacks {names}.{fewer}{why}{told}{rest}", tone
+        return f"The simulator lacks {names}.{fewer}{why}{told}", tone
     share = f"{_format_share(closed, ' of the gap')}"
     below = " The error is then below its floor." if closed.mean > 1.0 else ""
-    return f"The simulator lacks {names}; adding {it} closes {share}.{below}{told}{rest}", tone
+    return f"The simulator lacks {names}; adding {it} closes {share}.{below}{told}", tone
 
 
 def _describe_tool(answer: Answer) -> str:
@@ -129,25 +125,10 @@ def describe_class(one: Selected) -> str:
 def describe_remainder(answer: Answer) -> str:
     """Return the error that remains above the floor after the selected effects."""
     gap = answer.gap
-    if gap is None or not answer.selected:
+    if gap is None or gap.floor is None or not answer.selected:
         return ""
-    remainder = answer.more.get("unknown_remainder")
-    above = 0.0 if gap.floor is None else max(gap.after**2 - gap.floor**2, 0.0) ** 0.5
-    beyond = (
-        f"{format_error(above, gap.unit)} beyond the floor"
-        if gap.floor is not None
-        else format_error(gap.after, gap.unit)
-    )
-    if remainder:
-        return (
-            f"An unknown remainder is left on {join_words(remainder['joints'])} ({beyond}):"
-            f" {remainder['reason']}, but no effect does."
-        )
-    return (
-        f"What is left, {beyond}, is within what the simulator errs by anyway."
-        if gap.floor is not None
-        else ""
-    )
+    beyond = max(gap.after**2 - gap.floor**2, 0.0) ** 0.5
+    return f"What is left beyond the floor is {format_error(beyond, gap.unit)}."
 
 
 def format_estimate(
@@ -235,10 +216,6 @@ def _rank_rivals(evidence: Any) -> list[Mapping[str, Any]]:
     return sorted(rows, key=lambda row: -row["score"])[:MAX_RIVALS]
 
 
-def _draw_pictures(outcome: Outcome, machine: Machine) -> dict[str, str | None]:
-    """Return the pictures as addresses that hold their data; `None` for those without content."""
-    more = outcome.answer.more
-    figures = {"paths": plots.draw_paths(outcome, machine), "curves": None}
-    if machine.interface == "speed" and more.get("curves"):
-        figures["curves"] = plots.draw_speed_curves(more["curves"], machine)
-    return {name: None if one is None else embed_picture(one) for name, one in figures.items()}
+def _draw_pictures(outcome: Outcome, machine: Machine) -> dict[str, str]:
+    """Return the pictures as addresses that hold their data."""
+    return {"paths": embed_picture(plots.draw_paths(outcome, machine))}

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from diagnosis.answer import Selected
-from diagnosis.attribution import MIN_RESTORED
-from diagnosis.closure import Gate
+from diagnosis.closure import MIN_RESTORED, Gate
 
 
 def list_failed_gates(gates: Sequence[Gate]) -> list[str]:

@@ -16,7 +16,6 @@ import numpy as np
 from actuators.open_loop import FreeRunWindows
 from brokk_rl.parallel import map_parallel
 from diagnosis.bootstrap import BLOCK_WINDOWS
-from diagnosis.residuals import INCREMENT_SAMPLES, to_increments
 
 # Chosen by hand; not searched.
 FOLDS = 4
@@ -36,6 +35,10 @@ BOOSTING = {"max_iter": 30, "max_leaf_nodes": 6, "min_samples_leaf": 60, "learni
 practice cases 60 trees of 15 leaves erred by a fifth more."""
 NO_BOOSTING = "scikit-learn is not installed (it is part of the extra 'exam')"
 TOO_FEW = "too few windows to leave some out"
+
+
+INCREMENT_SAMPLES = 5
+"""Samples in an increment: a quarter of a second at 20 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,14 @@ def measure_rivals(cut: FreeRunWindows) -> dict[str, Rival]:
         return found | {"flexible": Rival(None, NO_BOOSTING)}
     error = np.cumsum(boosted - to_increments(measured, start), 1)
     return found | {"flexible": Rival(np.square(error).mean(1))}
+
+
+def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the increments of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
+    count = paths.shape[-2] // INCREMENT_SAMPLES
+    ends = paths[..., INCREMENT_SAMPLES - 1 : count * INCREMENT_SAMPLES : INCREMENT_SAMPLES, :]
+    first = np.broadcast_to(start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
+    return np.diff(ends, axis=-2, prepend=first)
 
 
 def assign_folds(num_windows: int) -> np.ndarray:

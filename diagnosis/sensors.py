@@ -20,7 +20,6 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel, estimate_interval
-from diagnosis.residuals import Residuals
 
 SIZES = np.geomspace(0.05, 40.0, 40)
 """Sizes that are tried, of typical; steps of 19 %, up to what a broken sensor shows. Steps chosen by
@@ -250,26 +249,3 @@ def _measure(kind: EffectType, size: float, recording: Recording, machine: Machi
         model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
     with torch.inference_mode():
         return model.measure(q).numpy().astype(float)
-
-
-def adjust_residuals(
-    residuals: Residuals, case: GapCase, found: Sequence[DetectedEffect]
-) -> Residuals:
-    """Return the residuals with encoder errors in the simulator, and with the added noise of sensors."""
-    of_sensors = [one for one in found if one.kind.target.side == "measurement"]
-    steady = [(one.kind, one.values()) for one in of_sensors if _is_steady(one.kind)]
-    simulator = residuals.simulator
-    simulator = replace(simulator, fixed=[*simulator.fixed, *steady])
-    residuals = replace(residuals, simulator=simulator)
-    rough = [one.joints for one in of_sensors if not _is_steady(one.kind)]
-    if not rough:
-        return residuals
-    assert residuals.noise is not None, "noise is known by now"
-    excess = measure_excess_scatter(case.field, case.reference, case.machine)
-    reading = (excess * np.any(rough, 0)).tolist()
-    pairs = zip(residuals.noise, reading, strict=True)
-    return replace(residuals, noise=[replace(one, reading=more) for one, more in pairs])
-
-
-def _is_steady(kind: EffectType) -> bool:
-    return kind.target.smooth and not kind.target.stochastic

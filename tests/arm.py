@@ -134,6 +134,14 @@ def weaken(spec: Any) -> None:
     drive.gainprm, drive.biasprm = gain, bias
 
 
+def damp(spec: Any) -> None:
+    """Takes a fifth of the damping of the shoulder's drive, 4 Nms/rad."""
+    drive = spec.actuators[0]
+    bias = drive.biasprm.copy()
+    bias[2] = 0.8 * bias[2]
+    drive.biasprm = bias
+
+
 def limit_force(spec: Any) -> None:
     """Limits the drive of the shoulder to 5 Nm; the arm weighs 3.6 Nm stretched out."""
     drive = spec.actuators[0]

@@ -18,9 +18,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from diagnosis import answer, baseline, effect_library, simulator_changes
+from diagnosis import answer, effect_library, simulator_changes
 from diagnosis.answer import Answer
 from diagnosis.own_simulator import OwnSimulator
+from diagnosis.simulator_runs import cut_simulator_runs
 
 MJCF_FILE, SYSID_FILE = "changed.xml", "sysid_parameters.py"
 RANGES_FILE, TABLE_FILE = "randomisation.yaml", "randomisation.json"
@@ -140,8 +141,7 @@ class ChangeSimulator:
 
     def _replay(self, simulator: Actuator, recordings: Sequence[Recording]) -> dict[str, float]:
         """Return the error of free runs on the recordings by joint, rad or m."""
-        begun = [(one, 0.0) for one in recordings]
-        runs = baseline.compare_simulator(simulator, begun, self.machine, 0).residuals.simulator
+        runs = cut_simulator_runs(simulator, recordings, self.machine, 0).simulator
         error = runs.cut.measured - runs.plain_runs
         rmse = np.sqrt(np.square(error).mean((0, 1)))
         return dict(zip(self.machine.joint_names, rmse.tolist(), strict=True))

@@ -10,26 +10,24 @@ from pathlib import Path
 import torch
 
 from actuators.contracts import ActuatorFit
-from actuators.identify.curve_fit import ValveCurveFit
 from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.console_table import print_table, print_text
-from brokk_rl.contracts.actuator import Actuator, Excitation
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import use_workers
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import answer, baseline, case, effect_library, effects_file, report, report_checks
+from diagnosis import answer, case, effect_library, effects_file, report, report_checks
 from diagnosis.answer import Answer, Outcome
-from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
 from diagnosis.effect_library import EffectType
 from diagnosis.engine.side import MODELS
 from diagnosis.own_simulator import OwnSimulator
-from diagnosis.pipeline import DiagnosisPipeline
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from diagnosis.request import DiagnosisSubject
+from diagnosis.simulator_diagnosis import SimulatorDiagnosis, describe_doubts
 
 log = logging.getLogger(__name__)
 
@@ -41,14 +39,11 @@ class Diagnose:
     Attributes:
         session: Folder, seed, device.
         machine: The machine that was recorded.
-        fit: Fit of the simulator to `reference/`; without a reference, the flexible model that gives
-            the floor.
+        fit: Fit of the simulator to `reference/`, for joints commanded by torque.
         actuator: The simulator that `diagnosis.field` is held against.
         simulator: A simulator of your own in its place: `module:function`, or an MJCF file.
         own: The actuator that runs it.
-        curve_fit: Reads the speed curves of machine and simulator.
         thresholds: When a stretch of a recording is worth telling.
-        excitation: Experiments that could follow, by name.
         diagnosis: Recordings to diagnose.
     """
 
@@ -58,9 +53,7 @@ class Diagnose:
     actuator: Actuator | None
     simulator: str | None
     own: OwnSimulator
-    curve_fit: ValveCurveFit
     thresholds: InspectionThresholds
-    excitation: dict[str, Excitation]
     diagnosis: DiagnosisSubject
 
     def check(self) -> None:
@@ -101,9 +94,6 @@ class Diagnose:
             ConfigError: an effect is unknown, or there is neither a reference nor an actuator.
         """
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
-        if not given.reference and self.base is not None:
-            # Refused before the flexible model is fitted, which takes minutes.
-            self.base.build(self.machine, 1, self.session.torch_device())
         with (
             ItemProgress("fitting the simulator", SHARE) as progress,
             use_workers(self.diagnosis.workers),
@@ -113,22 +103,14 @@ class Diagnose:
                 progress.reach(done, doing)
 
             generator = self.session.generator("diagnosis")
-            if given.reference and self.machine.interface in MODELS and not given.doubts():
+            if doubts := given.doubts():
+                return describe_doubts(given, "; ".join(doubts))
+            if given.reference and self.machine.interface in MODELS:
                 work = ReferenceDiagnosis(given, self._kinds, self.thresholds, generator)
                 return work.run(tell)
-            base = self._base(given)
-            work = DiagnosisPipeline(
-                given,
-                base,
-                self._kinds,
-                self.diagnosis.prices,
-                self.diagnosis.certainty,
-                self.thresholds,
-                self.excitation,
-                self.curve_fit,
-                generator,
-            )
-            return work.run(tell)
+            base, seed = self._find_base(given), self.session.stream("base")
+            search = SimulatorDiagnosis(given, base, self._kinds, self.thresholds, generator, seed)
+            return search.run(tell)
 
     def write(self, outcome: Outcome) -> None:
         """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
@@ -159,19 +141,19 @@ class Diagnose:
             )
         return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine), unseen)
 
-    def _base(self, given: GapCase) -> Baseline:
-        seed, device = self.session.stream("base"), self.session.torch_device()
-        folder = self.session.folder
-        if given.reference:
-            return baseline.fit_baseline(given, self.fit, folder / "base", seed, device)
-        simulator = self.base
-        if simulator is None:
+    def _find_base(self, given: GapCase) -> Actuator:
+        """Return the simulator: the one that was given, or one fitted to the reference."""
+        if self.base is not None:
+            return self.base
+        if not given.reference:
             raise ConfigError(
                 "there is neither a reference nor an actuator to hold the field against"
             )
-        return baseline.accept_simulator(
-            given, simulator, self.fit, folder / "flexible", seed, device
-        )
+        pieces = case.split_recordings(given.reference, self.machine)
+        seed, device = self.session.stream("base"), self.session.torch_device()
+        folder = self.session.folder / "base"
+        known = pieces[:-1] or pieces
+        return self.fit.fit(self.machine, known, pieces[-1:], folder, seed, device)
 
 
 def _print_answer(found: Answer, folder: Path) -> None:

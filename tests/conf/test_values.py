@@ -63,7 +63,6 @@ BAD = {
     ("mode=diagnose",): "give either case=<folder with reference/ and field/>, or field=<glob>",
     ("mode=diagnose", "diagnosis.case=nowhere"): "diagnosis.case=nowhere: there is no such folder",
     ("mode=diagnose", "diagnosis.field=x", "diagnosis.workers=0"): "diagnosis.workers: expected 1",
-    ("mode=diagnose", "diagnosis.field=x", "~diagnosis.certainty.form.timing"): "certainty.form",
     ("mode=check", "subject.model=nowhere.urdf"): "subject.model: there is no file nowhere.urdf",
     ("mode=check", "subject.num_starts=0"): "subject.num_starts: expected",
     ("mode=export",): "policy has no default and must be given",

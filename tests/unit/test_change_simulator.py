@@ -18,13 +18,14 @@ from arm import ARM, NOISE_RAD, make_machine, record_arm, rub
 from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
 from brokk_rl.session import Session
-from diagnosis import api, baseline, effect_library
+from diagnosis import api, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
 from diagnosis.closure import Estimate
 from diagnosis.mjcf.changes import JointFinding, write_changed_mjcf
 from diagnosis.mjcf.plant import MjcfPlant
 from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
 from diagnosis.simulator_changes import write_sysid_priors
+from diagnosis.simulator_runs import cut_simulator_runs
 
 DELAY_S, FRICTION_NM = 0.06, 0.5
 
@@ -142,8 +143,8 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
 
     def simulate(path: Path, effects: list[Any]) -> np.ndarray:
         simulator = api._load_simulator(path)
-        compared = baseline.compare_simulator(simulator, [(recording, 0.0)], machine, 0)
-        return compared.residuals.simulator.simulate(effects)[0]
+        runs = cut_simulator_runs(simulator, [recording], machine, 0)
+        return runs.simulator.simulate(effects)[0]
 
     plain = simulate(source, [])
     for kind in effect_library.load_effects(machine, list(CHANGES), api._load_simulator(source)):

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 from axis import driven, make_axis
-from composed import option
 
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import answer, baseline, case, effect_library, effects_file
+from diagnosis import answer, case, effect_library, effects_file
 from diagnosis.answer import (
     Answer,
     Estimate,
@@ -31,10 +30,8 @@ from diagnosis.answer import (
     Where,
 )
 from diagnosis.case import GapCase
-from diagnosis.request import Penalties
 
 CPU = torch.device("cpu")
-PRICES = Penalties(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06)
 
 
 @pytest.fixture(scope="module")
@@ -88,14 +85,6 @@ def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Mach
         )
     with pytest.raises(RecordingError, match="limits differ"):
         case.load_case(tmp_path, machine)
-
-
-def test_too_little_reference_to_judge_by_is_refused(
-    axis: Machine, reference: list[Recording], tmp_path: Path
-) -> None:
-    given = GapCase(axis, reference[:1], reference[1:])
-    with pytest.raises(RecordingError, match="not fitted to"):
-        baseline.fit_baseline(given, option("fit", "valve"), tmp_path, 0, CPU)
 
 
 def said() -> Answer:

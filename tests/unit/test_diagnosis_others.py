@@ -8,27 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from actuators.models.lag import FirstOrderLag
-from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import baseline, effect_library, geometry, sensors, timing
-from diagnosis.answer import Estimate
+from diagnosis import effect_library, geometry, sensors
 from diagnosis.case import GapCase
-from diagnosis.effect_library import DetectedEffect, estimate_interval
-from diagnosis.residuals import Residuals, build_rays
-from diagnosis.responses import Response, fit_sizes
+from diagnosis.effect_library import estimate_interval
 
 CPU = torch.device("cpu")
-PLANT = FirstOrderLag(
-    dead_time_s=0.3,
-    dead_band_extend=0.05,
-    dead_band_retract=0.05,
-    gain=1.0,
-    time_constant_s=0.1,
-    spread={},
-)
 
 
 def swept(machine: Machine, seconds: float, seed: int, noise: float = 3e-4) -> Recording:
@@ -161,168 +148,6 @@ def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) ->
     assert geometry.find_geometry_errors(
         GapCase(machine, [one], [one]), effect_library.load_effects(machine), 8.0, 12.0
     ) == geometry.GeometryFindings([], 1.0)
-
-
-def held_over(
-    machine: Machine,
-    lost: float,
-    seed: int,
-    late: tuple[int, ...] = (0,) * 5,
-    only: slice = slice(None),
-) -> Recording:
-    """Returns two minutes of a lag plant under levels to and fro, each lost frame holding the level before for a period more.
-
-    `late`: periods by which all commands of each joint come later still; `only`: joints whose
-    commands get lost.
-    """
-    random = np.random.default_rng(seed)
-    levels = random.uniform(0.3, 0.8, (120, 5)) * np.where(np.arange(120) % 2, -1.0, 1.0)[:, None]
-    u = np.repeat(levels, 20, 0)
-    sent, missing = u.copy(), random.random(len(u)) < lost
-    for t in range(1, len(u)):
-        sent[t, only] = sent[t - 1, only] if missing[t] else u[t, only]
-    sent = np.stack([np.roll(column, by) for column, by in zip(sent.T, late, strict=True)], 1)
-    model, size = PLANT.build(machine, 1, CPU), machine.num_history
-    known = torch.as_tensor(
-        np.concatenate([np.zeros((size - 1, 5)), sent])[None], dtype=torch.float32
-    )
-    q = torch.as_tensor(machine.home, dtype=torch.float32)[None]
-    model.reset(torch.ones(1, dtype=torch.bool))
-    path = [q[0].numpy()]
-    for t in range(len(u) - 1):
-        q = model.step(History(q=q[:, None].repeat(1, size, 1), u=known[:, t : t + size]))
-        path.append(q[0].numpy())
-    wander = 1.0 + 0.02 * np.repeat(random.standard_normal((len(u) // 40, 5)), 40, 0)
-    steps = np.diff(path, axis=0, prepend=path[:1]) * wander
-    measured = path[0] + np.cumsum(steps, 0) + 2e-4 * random.standard_normal(u.shape)
-    blank = swept(machine, 1.0, 0)
-    return dataclasses.replace(
-        blank,
-        t_s=np.arange(len(u)) * 0.05,
-        u=u.astype(np.float32),
-        q=measured.astype(np.float32),
-        metadata={"run": f"{seed}"},
-    )
-
-
-def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machine) -> None:
-    rows = [held_over(machine, lost, seed) for lost, seed in ((0.0, 10), (0.0, 11), (0.2, 12))]
-    held = [baseline.compare_simulator(PLANT, [(one, 0.0)], machine, 0) for one in rows]
-    noises = baseline.fit_covariances(held[:2], machine)
-    whole, other, lossy = (dataclasses.replace(one.residuals, noise=noises) for one in held)
-    kinds = effect_library.load_effects(machine, ["frame_loss", "delay_jitter"])
-    changes = timing.CommandChanges(lossy)
-    found = timing.detect_timing_effect(changes, lossy.error, [whole, other], kinds, 8.0, 12.0)
-    assert found and found.kind.name == "frame_loss" and found.joints.all()
-    assert found.parameters["probability"]["q1"].mean == pytest.approx(0.2, abs=0.08)
-    assert (
-        timing.detect_timing_effect(
-            timing.CommandChanges(other), other.error, [whole], kinds, 8.0, 12.0
-        )
-        is None
-    )
-    # with their delays taken for chance, errors scatter far less: the rest is that lost frames
-    # delay on average too
-    chancy = dataclasses.replace(lossy, late=changes.spread(lossy.error))
-    before, after = (float(np.mean(np.minimum(one.z**2, 25.0))) for one in (lossy, chancy))
-    assert before > 5.0 and after < 0.4 * before
-    for j in range(2):
-        np.testing.assert_allclose(
-            chancy.rewhiten(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6
-        )
-
-
-def test_what_one_joint_alone_is_late_by_is_no_lost_frame(machine: Machine) -> None:
-    rows = [
-        held_over(machine, 0.0, 10),
-        held_over(machine, 0.2, 12, only=slice(2, 3)),
-        held_over(machine, 0.05, 13),
-    ]
-    held = [baseline.compare_simulator(PLANT, [(one, 0.0)], machine, 0) for one in rows]
-    noises = baseline.fit_covariances(held[:1], machine)
-    whole, alone, seldom = (dataclasses.replace(one.residuals, noise=noises) for one in held)
-    kinds = effect_library.load_effects(machine, ["frame_loss", "delay_jitter"])
-    assert (
-        timing.detect_timing_effect(
-            timing.CommandChanges(alone), alone.error, [whole], kinds, 4.0, 12.0
-        )
-        is None
-    )
-    # a frame carries the commands of all joints: one in twenty that is lost shows in all of them
-    found = timing.detect_timing_effect(
-        timing.CommandChanges(seldom), seldom.error, [whole], kinds, 4.0, 12.0
-    )
-    assert found and found.kind.name == "frame_loss"
-    low, high = found.parameters["probability"]["q1"].ci95
-    assert low < 0.05 < high
-
-
-def test_delays_err_as_they_do_where_no_frame_is_late() -> None:
-    random, error = np.random.default_rng(3), np.full(4000, 0.3)
-    found = timing.DelayErrorModel.of(
-        [timing.FrameDelays(1.2 * error * random.standard_t(5.0, 4000), error, np.zeros(4000))]
-    )
-    # A little is what all timing is off by.
-    assert found.scale == pytest.approx(1.15, abs=0.11) and found.freedom in (5.0, 7.0)
-    seen = timing.FrameDelays(np.repeat([0.0, 1.0], [90, 10]), np.full(100, 0.1), np.zeros(100))
-    assert (
-        found.gain(seen, np.repeat([0.0, 1.0], [9, 1]))
-        > 0.0
-        > found.gain(seen, np.repeat([0.0, 1.0], [1, 9]))
-    )
-
-
-def test_delays_beside_their_mean_are_another_common_delay_and_no_lost_frames() -> None:
-    random = np.random.default_rng(4)
-    usual = timing.DelayErrorModel(scale=1.0, freedom=5.0)
-    error, nobody = np.full(500, 0.05), np.zeros(500)
-    width = np.hypot(0.05, timing.TIMING_ERROR)
-    drawn = np.repeat([-0.1, 0.9], [9, 1])  # a frame in ten comes a period late, less the mean
-
-    # a few sure delays pull the mean to 0.2 periods beside most others: no frame is lost
-    wrong = timing.FrameDelays(-0.2 + width * random.standard_t(3.0, 500), error, nobody)
-    assert usual.gain(wrong, drawn) > 30.0  # so lost frames seem to be there
-    assert usual.gain_by_shift(wrong) > usual.gain(wrong, drawn)
-
-    lost = random.choice(drawn, 500) + width * random.standard_t(5.0, 500)
-    lost = timing.FrameDelays(lost - lost.mean(), error, nobody)
-    assert usual.gain(lost, drawn) > usual.gain_by_shift(lost) + 100.0
-
-    # where frames arrive in time and the simulator is right, a shift gains next to nothing
-    right = timing.FrameDelays(width * random.standard_t(5.0, 500), error, nobody)
-    assert 0.0 <= usual.gain_by_shift(right) < 5.0
-
-
-def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Machine) -> None:
-    rows = [held_over(machine, 0.0, 10), held_over(machine, 0.2, 12, (1, 1, 1, 4, 1))]
-    held = [baseline.compare_simulator(PLANT, [(one, 0.0)], machine, 0) for one in rows]
-    residuals = dataclasses.replace(
-        held[1].residuals, noise=baseline.fit_covariances(held[:1], machine)
-    )
-    loss, late = effect_library.load_effects(machine, ["frame_loss", "dead_time"])
-    (ray,) = build_rays(late)
-
-    def late_s(residuals: Residuals) -> list[float]:
-        shapes = [Response(ray.sizes, change) for change in residuals.response(ray)]
-        return [
-            late.size_on("dead_time_s", 0) * fit_sizes(z, [shape])[0]
-            for z, shape in zip(residuals.z, shapes, strict=True)
-        ]
-
-    def expected(lost: float) -> list[float]:
-        every = {
-            "probability": {name: Estimate(lost, (lost, lost)) for name in machine.joint_names}
-        }
-        found = DetectedEffect(loss, np.ones(5, bool), every, 0.0, 0.0, 0.0, {})
-        return late_s(timing.add_mean_delay(residuals, found, []))
-
-    assert late_s(residuals) == pytest.approx([0.05, 0.05, 0.05, 0.2, 0.05], abs=0.012)
-    # where half of the frames are lost, these wait a period on average, and may two; what one joint
-    # has alone is left
-    shared = np.array(expected(0.5))
-    assert (np.abs(np.delete(shared, 3)) < 0.02).all() and shared[3] > 0.08
-    # one in ten lost does not make all late by a period
-    assert expected(0.1) == pytest.approx([0.045, 0.045, 0.045, 0.195, 0.045], abs=0.012)
 
 
 def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:

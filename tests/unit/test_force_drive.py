@@ -21,7 +21,6 @@ from brokk_rl.record import Recording
 from diagnosis import api
 from diagnosis.case import GapCase
 from diagnosis.effect_library import load_effects
-from diagnosis.error_covariance import ForceCovariance, fit_force_noise
 
 CPU = torch.device("cpu")
 TRUE = {"mass_kg": 60.0, "viscous_n_s_m": 120.0, "coulomb_n": 15.0, "offset_n": 5.0}
@@ -125,24 +124,6 @@ class Blind:
     """A model without numbers of a drive."""
 
     state: ClassVar = {}
-
-
-def test_errors_of_force_add_up_twice() -> None:
-    """Covariance of increments against 40,000 drawn errors of speed and force."""
-    noise = ForceCovariance(0.1, 0.0, 0.0, 3.0, start=0.5, push=0.2, window=6)
-    rng, kept = np.random.default_rng(0), float(np.exp(-1.0 / 3.0))
-    drawn = np.empty((40_000, 12))
-    for first in (0, 6):
-        speed, push = 0.5 * rng.standard_normal(40_000), 0.2 * rng.standard_normal(40_000)
-        for k in range(6):
-            speed = speed + push
-            drawn[:, first + k] = speed + 0.1 * rng.standard_normal(40_000)
-            push = kept * push + 0.2 * np.sqrt(1.0 - kept**2) * rng.standard_normal(40_000)
-    found = noise.covariance(np.zeros((1, 12)))[0]
-    np.testing.assert_allclose(found, np.cov(drawn.T), atol=0.12)
-    fitted = fit_force_noise(drawn[:400], 6)
-    assert fitted.start == pytest.approx(0.5, rel=0.2)
-    assert fitted.push == pytest.approx(0.2, rel=0.2)
 
 
 @pytest.mark.slow

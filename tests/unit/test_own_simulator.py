@@ -16,6 +16,7 @@ import pytest
 from arm import (
     ARM,
     NOISE_RAD,
+    damp,
     draw_targets,
     keep,
     limit_force,
@@ -31,8 +32,9 @@ from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 from brokk_rl.session import Session
-from diagnosis import api, baseline, effect_library
+from diagnosis import api, effect_library
 from diagnosis.modes import why
+from diagnosis.simulator_runs import cut_simulator_runs
 
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/your_simulator.md").read_text()
 PENDULUM, RECORDER = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)[:2]
@@ -63,7 +65,7 @@ def measure_errors(
 ) -> np.ndarray:
     """Returns the RMS error of free runs with effects, `(J,)` rad."""
     kinds = {kind.name: kind for kind in effect_library.load_effects(machine, None, simulator)}
-    runs = baseline.compare_simulator(simulator, [(recording, 0.0)], machine, 0).residuals.simulator
+    runs = cut_simulator_runs(simulator, [recording], machine, 0).simulator
     chosen = [(kinds[name], values) for name, values in effects.items()]
     error = runs.cut.measured - runs.simulate(chosen)[0]
     return np.sqrt(np.square(error).mean((0, 1)))
@@ -271,6 +273,7 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
         (rub, 0, "joint_friction", ("elbow",)),
         (weaken, 0, "drive_gain", ("shoulder",)),
         (limit_force, 0, "drive_limit", ("shoulder",)),
+        (damp, 0, "joint_damping", ("shoulder",)),
     ],
 )
 def test_a_withheld_fault_is_named_around_the_file(

@@ -13,13 +13,9 @@ from composed import option
 
 from actuators.effects.effect import EffectSpec
 from actuators.models.joint_weight import build_joint_weight
-from actuators.open_loop import FreeRunWindows, count_samples_before
 from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from diagnosis.effect_library import EffectSimulator, load_effects
-from diagnosis.error_covariance import ErrorCovariance
-from diagnosis.residuals import Residuals, build_rays
 
 CPU = torch.device("cpu")
 NUM_ENVS, STEPS = 6, 50
@@ -146,27 +142,6 @@ def test_effects_that_draw_together_and_the_library_are_stepped(machine: Machine
             bases(machine)["lag"].build(machine, NUM_ENVS, CPU), machine, NUM_ENVS, CPU
         )
         assert model.plan_run(torch.zeros(20, NUM_ENVS, machine.num_joints), 13) is None
-
-
-@pytest.mark.parametrize("base", ["lag", "valve"])
-def test_responses_of_rays_together_are_those_of_each_alone(base: str, machine: Machine) -> None:
-    rng, before, windows = np.random.default_rng(2), count_samples_before(machine), 3
-    u = np.repeat(rng.uniform(-1, 1, (windows, 20, machine.num_joints)), 5, 1)
-    u = u[:, : before - 1 + 40].astype(np.float32)
-    middle = (machine.lower + machine.upper) / 2
-    q = np.tile(middle, (windows, before + 40, 1)).astype(np.float32)
-    cut = FreeRunWindows(u, q, np.array(["a", "a", "b"]), machine.num_history, before)
-    simulator = EffectSimulator(bases(machine)[base], machine, cut, np.zeros(windows), 0)
-    noise = [ErrorCovariance(1e-3, 0.01, 0.01, 10.0)] * machine.num_joints
-    mask = np.ones((windows, machine.num_joints), dtype=bool)
-    residuals = Residuals(simulator, noise, mask)
-    for kind in load_effects(machine, ["asymmetry", "compliance", "dead_band"]):
-        rays = build_rays(kind)
-        shape = {name: np.full(machine.num_joints, 1.5) for name in kind.shaping}
-        rays += [replace(ray, shape=shape) for ray in rays] if shape else []
-        for ray, found in zip(rays, residuals.list_responses(rays), strict=True):
-            assert np.abs(found).max() > 0.1
-            np.testing.assert_allclose(found, residuals.response(ray), atol=1e-3 * np.abs(found).max())  # fmt: skip
 
 
 def test_the_weight_of_a_planar_arm_is_that_of_its_mechanics(machine: Machine) -> None:

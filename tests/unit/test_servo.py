@@ -27,11 +27,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
-from diagnosis.baseline import apply_changes
 from diagnosis.effect_library import load_effects
-from diagnosis.error_covariance import LevelCovariance, fit_level_noise
-from diagnosis.free_runs import WindowedRuns
-from diagnosis.motion_delay import measure_motion_delays
 
 CPU = torch.device("cpu")
 
@@ -166,18 +162,6 @@ def test_a_nominal_servo_stays_and_follows(arm: Machine) -> None:
     np.testing.assert_allclose(link.read().q[0], (arm.lower + arm.upper) / 2)
 
 
-def test_errors_of_a_held_position_do_not_add_up() -> None:
-    generator = np.random.default_rng(2)
-    noise = LevelCovariance(0.002, 0.0, 0.0, 4.0, 0.0, 0.01, 20)
-    still = np.zeros((1, 60))
-    np.testing.assert_allclose(noise.strayed(still[:, :20]), 0.002**2 + 0.01**2)
-    root = np.linalg.cholesky(noise.covariance(still)[0])
-    error = (root @ generator.standard_normal((60, 40))).T
-    found = fit_level_noise(error, np.zeros_like(error), 20)
-    assert found.stray == pytest.approx(0.01, rel=0.2)
-    assert found.memory == pytest.approx(4.0, rel=0.5)
-
-
 def test_a_policy_commands_speeds_and_the_servo_gets_targets(
     arm: Machine, machine: Machine
 ) -> None:
@@ -232,38 +216,3 @@ def test_a_servo_is_fitted_again_to_other_recordings(arm: Machine) -> None:
     found = fit.refit(replace(servo, play_rad=0.05, sag_rad=0.0), arm, [log])
     assert list(found.play_rad.values()) == pytest.approx([0.03] * arm.num_joints, abs=0.001)
     assert list(found.sag_rad.values()) == pytest.approx([0.02] * arm.num_joints, abs=0.001)
-
-
-def test_the_delay_of_a_motion_is_the_shift_of_its_speed(arm: Machine) -> None:
-    """Speeds of the recording are those of its targets, three and a half periods later."""
-    t = np.arange(600.0)[:, None] + np.array([0.0, 7.0, 3.0, 11.0, 5.0])
-
-    def swing(at: np.ndarray) -> np.ndarray:
-        return 0.3 * (np.sin(0.21 * at) + np.sin(0.093 * at + 1.0))
-
-    q = read_targets(swing(t - 3.5), arm)
-    q[:, 4] = q[0, 4]  # a joint that stands still
-    log = record.make_motion(
-        arm, "log", arm.period_s * np.arange(600), view_speeds(swing(t), arm), q
-    )
-    row = 40 + 100 * np.arange(5)
-    simulated = np.stack([read_targets(swing(t - 1.0), arm)[k : k + 100] for k in row])
-    runs = WindowedRuns([log], np.zeros(5, dtype=int), row, simulated)
-    found = measure_motion_delays(runs, None, arm, seed=0)
-    assert found is not None
-    for joint in arm.joint_names[:4]:
-        one = found[joint]
-        assert one is not None
-        assert one["measured"] == pytest.approx(3.5 * arm.period_s, abs=0.1 * arm.period_s)
-        assert one["before"] == pytest.approx(1.0 * arm.period_s, abs=0.1 * arm.period_s)
-        assert one["ci95"][0] <= one["measured"] <= one["ci95"][1]
-    assert found[arm.joint_names[4]] is None
-
-
-def test_a_changed_servo_keeps_a_negative_sag(arm: Machine) -> None:
-    """Weight that pulls a joint in its positive direction is a negative sag."""
-    servo = replace(option("actuator", "servo"), sag_rad=-0.015, play_rad=0.004)
-    rows = {"sag_rad": np.full(5, 0.001), "play_rad": np.full(5, -0.01)}
-    changed: Any = apply_changes(servo, rows, arm)
-    assert list(changed.sag_rad.values()) == pytest.approx([-0.014] * 5)
-    assert list(changed.play_rad.values()) == [0.0] * 5

@@ -1,0 +1,317 @@
+"""The diagnosis of a simulator held against recordings: search, sizes and proof by its own free runs.
+
+Axes: `C` trials, `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+
+from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.recording_checks import examine_recordings
+from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.machine import Machine
+from diagnosis import gates, geometry
+from diagnosis.answer import Answer, Outcome, Ranked, Selected, Where
+from diagnosis.case import GapCase
+from diagnosis.closure import Estimate, Gate
+from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
+from diagnosis.engine.sizes import FORM_ERROR, SIGMAS
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.gap import describe_joints
+from diagnosis.reference_diagnosis import (
+    DIRECT_NATS,
+    NAME_NATS,
+    ProgressCallback,
+    describe_detected,
+    estimate_probability,
+    excuse_joints,
+    list_alike,
+    propose_measurement,
+    rank_effects,
+)
+from diagnosis.repair_proof import RepairProof
+from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
+from diagnosis.simulator_search import GrownEffect, SimulatorSearch
+from diagnosis.stages import examine_gap
+
+
+class SimulatorProof(RepairProof):
+    """The proof of what a search found: free runs of the simulator with effects around it.
+
+    The floor is the error of an ARX fitted to the field, or that of the repaired simulator where it
+    is the smaller one; with a reference it is the simulator's own error there.
+
+    Args:
+        case: The recordings.
+        search: The search.
+        effects: Named effects.
+        reference: The simulator held against the reference; `None` without any.
+        generator: Draws the bootstraps.
+    """
+
+    floor_of = "field"
+
+    def __init__(
+        self,
+        case: GapCase,
+        search: SimulatorSearch,
+        effects: Sequence[GrownEffect],
+        reference: SimulatorRuns | None,
+        generator: np.random.Generator,
+    ) -> None:
+        self._search = search
+        joints = {one.kind.name: np.flatnonzero(one.joints).tolist() for one in effects}
+        super().__init__(case, joints, len(search.runs.row), generator)
+        self._reference = reference
+        self._fitted = [search.improve(effects, self.half != half) for half in (0, 1)]
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Measured positions, `(W, K, J)`, rad or m."""
+        return self._search.runs.cut.measured
+
+    def _simulate(self, effects: frozenset[str]) -> np.ndarray:
+        runs = []
+        for fitted in self._fitted:
+            some = [one for one in fitted if one.kind.name in effects]
+            runs.append(self._search.simulate(some))
+        chosen = self.half[:, None, None] == 0
+        return np.where(chosen, runs[0], runs[1])
+
+    @cached_property
+    def floor_squares(self) -> np.ndarray:
+        """Mean squares at the floor in each draw, `(1 + B, J)`."""
+        after = self.measure_squares(self.after)
+        known = self.view_floor()
+        if known is not None:
+            squares = np.square(known.error).mean((0, 1))
+        else:
+            joints = self.rivals["arx"].joints
+            squares = np.square([joints.get(name, np.inf) for name in self.machine.joint_names])
+        return np.minimum(after, squares)
+
+    def view(self, paths: np.ndarray) -> WindowedRuns:
+        """Return free runs beside the recordings of the field."""
+        return self._search.runs.view(paths)
+
+    def view_floor(self) -> WindowedRuns | None:
+        """Return free runs beside the recordings of the reference; `None` without any."""
+        if self._reference is None:
+            return None
+        return self._reference.view(self._reference.simulator.plain_runs)
+
+
+@dataclass(frozen=True)
+class SimulatorDiagnosis:
+    """A diagnosis of what a simulator lacks.
+
+    Attributes:
+        case: The recordings; a reference is one that the simulator was fitted to.
+        base: The simulator.
+        kinds: The library.
+        thresholds: When a stretch of a recording is worth telling.
+        generator: Draws bootstraps and permutations.
+        seed: Of the effects that draw.
+    """
+
+    case: GapCase
+    base: Actuator
+    kinds: Sequence[EffectType]
+    thresholds: InspectionThresholds
+    generator: np.random.Generator
+    seed: int
+
+    def run(self, tell: ProgressCallback) -> Outcome:
+        """Return the outcome; `tell` receives the name and the progress of each step."""
+        case, machine = self.case, self.case.machine
+        if doubts := case.doubts():
+            return describe_doubts(case, "; ".join(doubts))
+        tell("recordings", 0.02)
+        remarks = examine_recordings(case.field, machine, self.thresholds)
+        told = gates.judge_recordings(remarks, case.field, case.reference, machine)
+        runs = self._cut(case.field)
+        reference = self._cut(case.reference) if case.reference else None
+        search = SimulatorSearch(runs, reference, self.kinds)
+        found = search.run(lambda done: tell("simulating every effect", 0.05 + 0.75 * done))
+        joints = np.flatnonzero(np.any([one.joints for one in found], 0)) if found else []
+        told = excuse_joints(told, [machine.joint_names[j] for j in joints])
+        if failed := gates.list_failures(told):
+            found = []
+        on_tool: Sequence[DetectedEffect] = ()
+        if not failed:
+            on_tool = geometry.find_geometry_errors(case, self.kinds, DIRECT_NATS, NAME_NATS).found
+        tell("sizes and proof", 0.85)
+        proof = SimulatorProof(case, search, found, reference, self.generator)
+        judged = [] if failed else self._judge(proof, found)
+        if not failed and (failed := gates.list_failures(judged)):
+            found = []
+            proof = SimulatorProof(case, search, found, reference, self.generator)
+        sizes = estimate_numbers(search, found, machine) if found else []
+        selected = []
+        for one, numbers in zip(found, sizes, strict=True):
+            selected.append(self._describe(one, numbers, proof))
+        selected += [describe_detected(one, machine) for one in on_tool]
+        return self._build_outcome(selected, found, search, proof, (*told, *judged), failed)
+
+    def _cut(self, recordings: Sequence[Any]) -> SimulatorRuns:
+        return cut_simulator_runs(self.base, recordings, self.case.machine, self.seed)
+
+    def _judge(self, proof: SimulatorProof, found: Sequence[GrownEffect]) -> list[Gate]:
+        """Return the gates of what was found; a simulator without effects has to keep up with an ARX too."""
+        judged = proof.judge()
+        if not found:
+            judged += proof.judge_beside_arx()
+        return judged
+
+    def _describe(
+        self, one: GrownEffect, numbers: dict[str, dict[str, Estimate]], proof: SimulatorProof
+    ) -> Selected:
+        machine = self.case.machine
+        joints = np.flatnonzero(one.joints).tolist()
+        part = proof.parts[one.kind.name]
+        like, decided_by = list_alike(one.kind.name, joints, self.case, self.kinds)
+        return Selected(
+            effect=one.kind.name,
+            joints=tuple(machine.joint_names[j] for j in joints),
+            probability=estimate_probability(one.nats),
+            parameters=numbers,
+            gap_closed=part["closed"],
+            same_as=like,
+            decided_by=decided_by,
+            identified=part["identified"],
+            edit=part["edit"],
+        )
+
+    def _build_outcome(
+        self,
+        selected: Sequence[Selected],
+        found: Sequence[GrownEffect],
+        search: SimulatorSearch,
+        proof: SimulatorProof,
+        told: Sequence[Gate],
+        failed: str,
+    ) -> Outcome:
+        machine = self.case.machine
+        before, floor = proof.view(proof.before), proof.view_floor()
+        after = proof.view(proof.after) if proof.moves else None
+        dead_time_s = np.full(machine.num_joints, machine.dead_time_s)
+        survey = examine_gap(
+            before, floor, after, machine, self.thresholds, dead_time_s, self.generator
+        )
+        verdict = "effects" if selected else "none"
+        if failed and not selected:
+            verdict = "unknown"
+        rivals = [_rank(one, machine) for one in search.rivals]
+        rows = []
+        for one in rivals:
+            rows.append({"name": one.effect, "effect": one.effect, "joints": list(one.joints)})
+            rows[-1]["score"] = one.probability
+        more: dict[str, Any] = {"evidence": {"rivals": rows, "unit": "log likelihood"}}
+        if self.case.unseen:
+            more["unseen"] = self._evaluate_unseen(found)
+        answer = Answer(
+            verdict=verdict,
+            selected=tuple(sorted(selected, key=lambda one: -one.probability)),
+            ranking=rank_effects(selected, rivals, verdict),
+            where=survey.where(),
+            gap=proof.measure_gap(bool(selected)),
+            rivals=proof.rivals,
+            gates=tuple(told),
+            next_experiment=propose_measurement(selected),
+            reason=_explain(verdict, selected, failed),
+            more=survey.more() | more,
+        )
+        return Outcome(answer, before, after, floor)
+
+    def _evaluate_unseen(self, found: Sequence[GrownEffect]) -> dict[str, Any]:
+        """Return how far the effects carry on recordings that nothing was fitted to, plain JSON data.
+
+        Raises:
+            RecordingError: no recording is long enough.
+        """
+        machine, runs = self.case.machine, self._cut(self.case.unseen)
+        errors = []
+        for effects in ((), found):
+            given = [(one.kind, one.repeat(1)) for one in effects]
+            paths = runs.simulator.simulate(given)[0]
+            errors.append(np.sqrt(np.square(paths - runs.cut.measured).mean((0, 1))))
+        joints = describe_joints(machine, errors[0], errors[1], None)
+        seconds = runs.cut.measured.shape[1] * machine.period_s * len(runs.row)
+        num_recordings = len(np.unique(runs.source))
+        told = {name: vars(one) for name, one in joints.items()}
+        return {"seconds": seconds, "recordings": num_recordings, "joints": told}
+
+
+def describe_doubts(case: GapCase, why: str) -> Outcome:
+    """Return the answer of recordings that cannot tell anything, beside joints that stand still.
+
+    Raises:
+        RecordingError: no recording is long enough for a free run.
+    """
+    runs = cut_simulator_runs(StandStill(), case.field, case.machine, 0)
+    answer = Answer(
+        verdict="unknown",
+        selected=(),
+        ranking=(Ranked("unknown", (), 1.0),),
+        where=Where({}, (), None),
+        gap=None,
+        gates=(Gate("enough_data", False, None, None, why),),
+        next_experiment=None,
+        reason=f"cannot tell, because {why}",
+    )
+    return Outcome(answer, runs.view(runs.simulator.plain_runs), None, None)
+
+
+class StandStill:
+    """An actuator that does not move."""
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> StationaryModel:
+        """Return a model whose joints stay where they are."""
+        return StationaryModel()
+
+
+def _rank(one: GrownEffect, machine: Machine) -> Ranked:
+    names = [name for name, has in zip(machine.joint_names, one.joints, strict=True) if has]
+    return Ranked(one.kind.name, tuple(names), one.nats)
+
+
+def _explain(verdict: str, selected: Sequence[Selected], failed: str) -> str:
+    if verdict == "effects":
+        return "; ".join(f"{one.effect} on {', '.join(one.joints)}" for one in selected)
+    if verdict == "unknown":
+        return f"cannot tell, because {failed}"
+    return "no effect makes the errors of the simulator likelier than chance would"
+
+
+def estimate_numbers(
+    search: SimulatorSearch, effects: Sequence[GrownEffect], machine: Machine
+) -> list[dict[str, dict[str, Estimate]]]:
+    """Return the numbers of each effect with 95 % intervals, by name and joint (or `machine`)."""
+    deviations = search.linearise(effects).estimate_deviations(effects)
+    found = []
+    for place, one in enumerate(effects):
+        numbers: dict[str, dict[str, Estimate]] = {}
+        for name, value in one.values.items():
+            least, most = one.kind.limits(name)
+            off = value - (one.kind.numbers[name].none or 0.0)
+            width = SIGMAS * np.hypot(deviations[place, name], FORM_ERROR * off)
+            low, high = np.clip([value - width, value + width], least, most)
+            at_bound = np.isclose(value, least) | np.isclose(value, most)
+            rows = zip(value.tolist(), low.tolist(), high.tolist(), at_bound.tolist(), strict=True)
+            every = [Estimate(mean, (lower, upper), end) for mean, lower, upper, end in rows]
+            if len(value) == 1:
+                numbers[name] = {"machine": every[0]}
+                continue
+            own = {}
+            for j in np.flatnonzero(one.joints).tolist():
+                own[machine.joint_names[j]] = every[j]
+            numbers[name] = own
+        found.append(numbers)
+    return found

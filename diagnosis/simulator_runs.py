@@ -1,0 +1,189 @@
+"""A simulator held against recordings: free runs, and how likely their errors are.
+
+Axes: `C` candidates, `W` windows, `K` steps, `I` intervals, `J` joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import nnls
+
+from actuators import open_loop
+from actuators.open_loop import FreeRunWindows
+from actuators.scales import choose_horizon_s, scale_time
+from brokk_rl.commands import view_recordings
+from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis.case import estimate_running_s
+from diagnosis.effect_library import EffectSimulator
+from diagnosis.free_runs import WindowedRuns
+
+INTERVAL_S = 0.25
+"""Time between two errors that count, on the reference of `actuators.scales`, s: as in the engine."""
+MEMORIES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.96)
+"""Shares of an error in the next one that are tried."""
+LEAST_DEVIATION = 1e-6
+"""Smallest deviation of an error, over the travel: rounding of single precision."""
+
+
+@dataclass(frozen=True)
+class SimulatorRuns:
+    """A simulator and all whole windows of recordings.
+
+    Attributes:
+        recordings: The recordings, their commands as speeds.
+        simulator: Makes the free runs.
+        source: Number of the recording of each window, `(W,)`.
+        row: Row of the first simulated position of each window, `(W,)`.
+    """
+
+    recordings: Sequence[Recording]
+    simulator: EffectSimulator
+    source: np.ndarray
+    row: np.ndarray
+
+    @property
+    def cut(self) -> FreeRunWindows:
+        """The windows."""
+        return self.simulator.cut
+
+    def view(self, paths: np.ndarray) -> WindowedRuns:
+        """Return free runs `(W, K, J)` beside their recordings."""
+        return WindowedRuns(self.recordings, self.source, self.row, paths.astype(float))
+
+    def select(self, windows: np.ndarray) -> SimulatorRuns:
+        """Return the same with some of the windows."""
+        cut = self.cut
+        some = replace(cut, u=cut.u[windows], q=cut.q[windows], run=cut.run[windows])
+        running_s = self.simulator.running_s[windows]
+        simulator = replace(self.simulator, cut=some, running_s=running_s)
+        return SimulatorRuns(self.recordings, simulator, self.source[windows], self.row[windows])
+
+
+def cut_simulator_runs(
+    actuator: Actuator, recordings: Sequence[Recording], machine: Machine, seed: int
+) -> SimulatorRuns:
+    """Return `actuator` held against all whole windows of recordings.
+
+    Raises:
+        RecordingError: no recording is long enough.
+    """
+    before, horizon_s = open_loop.count_samples_before(machine), choose_horizon_s(machine)
+    steps = round(horizon_s / machine.period_s)
+    cuts, source, row, running_s = [], [], [], []
+    begun_s = estimate_running_s(recordings)
+    for number, recording in enumerate(recordings):
+        if recording.num_samples < before + steps:
+            continue
+        cut = open_loop.cut_windows([recording], machine, horizon_s, horizon_s)
+        rows = before + steps * np.arange(len(cut.q))
+        cuts.append(replace(cut, run=np.full(len(cut.q), f"{number}")))
+        source += [number] * len(rows)
+        row += rows.tolist()
+        running_s += (begun_s[number] + recording.t_s[rows]).tolist()
+    if not cuts:
+        raise RecordingError(
+            f"too little data: no recording is long enough for a free run of {horizon_s:g} s"
+        )
+    windows = open_loop.join_windows(cuts)
+    simulator = EffectSimulator(actuator, machine, windows, np.array(running_s), seed)
+    viewed = view_recordings(recordings, machine)
+    return SimulatorRuns(viewed, simulator, np.array(source), np.array(row))
+
+
+class FreeRunLikelihood:
+    """Log likelihood of the errors of free runs, joint by joint.
+
+    Each error keeps a share of the one before, and has a Laplace distribution whose deviation grows
+    with the motion. Share and deviation are those that make the errors likeliest, for each
+    candidate its own.
+
+    Args:
+        cut: The windows.
+        machine: The machine.
+    """
+
+    def __init__(self, cut: FreeRunWindows, machine: Machine) -> None:
+        steps = cut.measured.shape[1]
+        every = max(1, round(scale_time(machine, INTERVAL_S) / machine.period_s))
+        self._ends = np.arange(min(every, steps) - 1, steps, every)
+        self._start = cut.q[:, cut.num_before - 1]
+        # Errors of a speed or a force add up over a run, those of a position do not.
+        self._adds_up = machine.interface != "position"
+        self.floor = LEAST_DEVIATION * (machine.upper - machine.lower)
+        self._measured = self._reduce(cut.measured)
+
+    def _reduce(self, paths: np.ndarray) -> np.ndarray:
+        """Return what counts of paths `(…, W, K, J)`, `(…, W, I, J)`."""
+        ends = paths[..., self._ends, :]
+        if not self._adds_up:
+            return ends
+        return np.diff(ends, axis=-2, prepend=self._lead(ends))
+
+    def _lead(self, ends: np.ndarray) -> np.ndarray:
+        """Return the beginnings of paths `(…, W, 1, J)`."""
+        return np.broadcast_to(self._start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
+
+    def weigh_motion(self, paths: np.ndarray) -> np.ndarray:
+        """Return the deviation of each error of simulated `paths` `(W, K, J)` over that at rest, `(W, I, J)`."""
+        ends = paths[:, self._ends]
+        moved = np.abs(np.diff(ends, axis=1, prepend=self._lead(ends)))
+        size = np.abs(self._measured - self._reduce(paths))
+        found = np.ones_like(moved)
+        for j in range(paths.shape[2]):
+            columns = np.stack([np.ones(size[..., j].size), moved[..., j].ravel()], 1)
+            (rest, share), _ = nnls(columns, size[..., j].ravel())
+            rest = max(rest, float(self.floor[j]))
+            found[..., j] = 1.0 + share / rest * moved[..., j]
+        return found
+
+    def weigh(
+        self, paths: np.ndarray, deviation: np.ndarray, used: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the log likelihood of paths `(C, W, K, J)`, nats, `(C, J)`.
+
+        Args:
+            paths: Free runs of each candidate.
+            deviation: Relative deviation of each error, `(W, I, J)`.
+            used: Windows that count, `(W,)` bool; `None`: all.
+        """
+        errors = (self._measured - self._reduce(paths)) / deviation
+        if used is not None:
+            errors = errors[:, used]
+        count = errors.shape[1] * errors.shape[2]
+        best = np.full((len(paths), paths.shape[3]), -np.inf)
+        for memory in MEMORIES:
+            mean = np.abs(_innovate(errors, memory)).sum((1, 2)) / count + self.floor
+            fresh = 0.5 * errors.shape[1] * np.log(1.0 - memory**2)
+            best = np.maximum(best, fresh - count * np.log(mean))
+        return best
+
+    def innovate(
+        self, paths: np.ndarray, deviation: np.ndarray, used: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return what is new in each error of paths `(C, W, K, J)`, `(C, W, I, J)`; the first decides on the memory."""
+        errors = (self._measured - self._reduce(paths)) / deviation
+        if used is not None:
+            errors = errors[:, used]
+        found = np.empty_like(errors)
+        sizes = []
+        for memory in MEMORIES:
+            mean = np.abs(_innovate(errors[:1], memory)).mean((0, 1, 2)) + self.floor
+            # The determinant of the memory, over the number of errors.
+            sizes.append(np.log(mean) - 0.5 * np.log(1.0 - memory**2) / errors.shape[2])
+        for j, place in enumerate(np.argmin(sizes, 0)):
+            found[..., j] = _innovate(errors[..., j : j + 1], MEMORIES[place])[..., 0]
+        return found
+
+
+def _innovate(errors: np.ndarray, memory: float) -> np.ndarray:
+    """Return errors `(C, W, I, J)` less what each keeps of the one before."""
+    found = errors.copy()
+    found[:, :, 1:] -= memory * errors[:, :, :-1]
+    found[:, :, 0] *= np.sqrt(1.0 - memory**2)
+    return found

@@ -1,0 +1,507 @@
+"""The search for what a simulator lacks: each hypothesis is simulated around it.
+
+An effect is put around the simulator in each form and size, and earns what it makes the errors of
+free runs likelier. The best one stays, all sizes are fitted again, and the search goes on beside it.
+At the end an effect that the others can replace is taken away.
+Axes: `C` candidates, `W` windows, `J` joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from diagnosis.effect_library import EffectType, EffectValues, list_shared_effects
+from diagnosis.engine.decide import JOINT_NATS, JOINT_SHARE, LEAST_NATS, SECOND_SHARE
+from diagnosis.simulator_runs import FreeRunLikelihood, SimulatorRuns
+
+SIZES = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0, 7.0)
+"""Sizes that are tried, over the typical one; less is within what a machine repeats."""
+SHAPES = (0.35, 0.6, 1.0, 1.7)
+"""Values of a number that only shapes an effect, over the typical one."""
+FACTORS = (0.5, 0.7, 0.85, 0.93, 1.0, 1.07, 1.18, 1.4, 2.0)
+"""Factors on a number by which it is fitted first."""
+STEP = 0.05
+"""Finite difference, of the typical size."""
+ROUNDS = 5
+"""Steps of Levenberg and Marquardt at most, by which all numbers are fitted together."""
+DAMPINGS = (1e-4, 1e-2, 0.3, 10.0)
+LAST_ROUNDS = 30
+"""The same once all effects are known: those of a mass and its friction trade against each other."""
+LEAST_GAIN = 0.1
+"""Nats below which these steps end."""
+LEAST_SHARE = 0.02
+"""Least rise of the error without an effect, over all that the effects remove: one that does less only
+corrects the form of another."""
+MAX_EFFECTS = 6
+MAX_TURNS = 3
+"""Rounds of adding effects and of taking away those that others can replace."""
+MAX_WINDOWS = 32
+"""Windows, evenly over the recordings, on which effects are proposed."""
+UNSEEN_SIDES = frozenset({"measurement", "kinematics"})
+"""Errors of sensors and of the tool are told by tool points, not by the motion of joints."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class GrownEffect:
+    """An effect with its numbers.
+
+    Attributes:
+        kind: The effect.
+        values: Its numbers, `(J,)` or `(1,)` each.
+        joints: Which joints have it, `(J,)` bool.
+        nats: What it earned when it was found, less the cost of its joints.
+    """
+
+    kind: EffectType
+    values: Mapping[str, np.ndarray]
+    joints: np.ndarray
+    nats: float
+
+    def repeat(self, count: int) -> dict[str, np.ndarray]:
+        """Return its numbers for some candidates, `(C, J)` or `(C, 1)` each."""
+        return {name: np.repeat(value[None], count, 0) for name, value in self.values.items()}
+
+    def keep(self, joints: np.ndarray) -> GrownEffect:
+        """Return the effect on some of its joints only."""
+        values = dict(self.values)
+        for name in self.kind.fitted:
+            if len(values[name]) > 1:
+                values[name] = np.where(joints, values[name], self.kind.numbers[name].none)
+        return replace(self, values=values, joints=joints)
+
+
+def list_candidates(kind: EffectType) -> dict[str, np.ndarray]:
+    """Return the numbers of an effect in all forms and sizes, `(C, J)` or `(C, 1)` each."""
+    forms: list[tuple[str, ...]] = [(name,) for name in kind.fitted]
+    if not kind.target.smooth:
+        forms = [kind.fitted]
+    if kind.target.smooth and len(kind.fitted) > 1:
+        forms.append(kind.fitted)
+    rows = []
+    for shape in _list_shapes(kind):
+        for form in forms:
+            for size in (*SIZES, *(-size for size in SIZES)):
+                rows.append(_place(kind, form, size, shape))
+    found = {
+        name: np.stack([row[name] for row in rows]) for name in kind.numbers if name in rows[0]
+    }
+    both = np.concatenate(list(found.values()), 1)
+    # Sizes beyond the bounds of a number are one and the same.
+    _, kept = np.unique(both.round(9), axis=0, return_index=True)
+    return {name: values[np.sort(kept)] for name, values in found.items()}
+
+
+def _list_shapes(kind: EffectType) -> Iterator[dict[str, float]]:
+    """Yield values of the numbers that only shape an effect, over the typical ones; one varies at a time."""
+    yield dict.fromkeys(kind.shaping, 1.0)
+    for name in kind.shaping:
+        number = kind.numbers[name]
+        trials = [value / number.typical for value in getattr(number, "trials", ())] or SHAPES
+        for value in trials:
+            if value != 1.0:
+                yield {**dict.fromkeys(kind.shaping, 1.0), name: value}
+
+
+def _place(
+    kind: EffectType, form: Sequence[str], size: float, shape: Mapping[str, float]
+) -> dict[str, np.ndarray]:
+    """Return the numbers of one form, size and shape, `(J,)` or `(1,)` each."""
+    found = {}
+    for name in kind.fitted:
+        step = size * kind.size(name) if name in form else 0.0 * kind.size(name)
+        found[name] = kind.clipped(name, kind.numbers[name].none + step)
+    for name, factor in shape.items():
+        found[name] = kind.clipped(name, factor * kind.typical(name))
+    return found
+
+
+class SimulatorSearch:
+    """The search for effects around a simulator.
+
+    Args:
+        runs: The simulator and the field.
+        reference: The same simulator and recordings that it was fitted to; `None` without any.
+        kinds: The library.
+    """
+
+    def __init__(
+        self, runs: SimulatorRuns, reference: SimulatorRuns | None, kinds: Sequence[EffectType]
+    ) -> None:
+        self.runs = runs
+        self.machine = runs.simulator.machine
+        shared = list_shared_effects(kinds)
+        self.kinds = [
+            kind
+            for kind in kinds
+            if kind.target.side not in UNSEEN_SIDES
+            and not getattr(kind.target, "stochastic", False)
+            # A clock that is late cannot be told from a delay by commands and positions.
+            and not (kind.name in shared and kind.stage == "timing")
+        ]
+        self.shared = shared
+        count = len(runs.row)
+        self._whole = WindowView(runs, 1.0)
+        self._views = []
+        for one in (runs, reference):
+            if one is not None:
+                most = len(one.row)
+                some = np.unique(np.linspace(0, most - 1, min(most, MAX_WINDOWS)).astype(int))
+                self._views.append(WindowView(one.select(some), count / len(some)))
+        self._plain = self._measure_error(())
+        self.rivals: list[GrownEffect] = []
+        """All effects beside the simulator alone, the best first."""
+
+    def run(self, tell: Progress) -> list[GrownEffect]:
+        """Return the effects that the simulator lacks, the first found first."""
+        found: list[GrownEffect] = []
+        for turn in range(MAX_TURNS):
+            grown = self._grow(found, lambda done, turn=turn: tell((turn + done) / MAX_TURNS))
+            kept = self._prune(grown)
+            is_settled = len(kept) == len(grown) or len(kept) <= len(found)
+            found = kept
+            if is_settled:
+                break
+            # Without what was taken away, others may show.
+        self._whole.settle(found)
+        return self.improve(found, rounds=LAST_ROUNDS)
+
+    def _grow(self, effects: Sequence[GrownEffect], tell: Progress) -> list[GrownEffect]:
+        """Return the effects with all that earn enough beside them, the best first."""
+        found = list(effects)
+        while len(found) < MAX_EFFECTS:
+            tell(len(found) / MAX_EFFECTS)
+            names = {one.kind.name for one in found}
+            for view in (self._whole, *self._views):
+                view.settle(found)
+            proposed = [self._propose(k) for k in self.kinds if k.name not in names]
+            proposed.sort(key=lambda one: -one.nats)
+            if not found:
+                self.rivals = proposed
+            if not proposed or proposed[0].nats < self._need(found):
+                break
+            found = self.fit([*found, proposed[0]])
+        return found
+
+    def _need(self, found: Sequence[GrownEffect]) -> float:
+        """Return what a further effect has to earn, nats."""
+        return max([LEAST_NATS, *(SECOND_SHARE * one.nats for one in found)])
+
+    def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
+        """Return free runs with effects, `(W, K, J)`."""
+        return self._whole.simulate(effects)
+
+    def linearise(self, effects: Sequence[GrownEffect]) -> NumberSlopes:
+        """Return the slopes of all errors over all numbers."""
+        return self._whole.linearise(effects, None)
+
+    def _propose(self, kind: EffectType) -> GrownEffect:
+        """Return an effect with the form and size that earns most on each joint."""
+        candidates = list_candidates(kind)
+        gains = self._views[0].weigh_candidates(kind, candidates)
+        for reference in self._views[1:]:
+            # What a candidate earns where the simulator was fitted is no finding.
+            gains = gains - np.maximum(reference.weigh_candidates(kind, candidates), 0.0)
+        if kind.name in self.shared or not _is_per_joint(kind):
+            best = np.full(gains.shape[1], gains.sum(1).argmax())
+            joints = np.ones(gains.shape[1], dtype=bool)
+            nats = float(gains[best[0]].sum()) - JOINT_NATS
+        else:
+            best = gains.argmax(0)
+            nets = gains.max(0) - JOINT_NATS
+            joints = (nets > 0.0) & (nets >= JOINT_SHARE * nets.max())
+            nats = float(nets[joints].sum())
+        values = {}
+        for name, rows in candidates.items():
+            values[name] = rows[best, np.arange(len(best))] if rows.shape[1] > 1 else rows[best[0]]
+        return GrownEffect(kind, values, joints, nats).keep(joints)
+
+    def fit(
+        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
+    ) -> list[GrownEffect]:
+        """Return the effects with all numbers fitted to the windows `used`, `(W,)` bool: in turn, then together."""
+        found = list(effects)
+        for place in range(len(found)):
+            for name in found[place].values:
+                found[place] = self._fit_number(found, place, name, used)
+        return self.improve(found, used)
+
+    def _fit_number(
+        self, effects: Sequence[GrownEffect], place: int, name: str, used: np.ndarray | None
+    ) -> GrownEffect:
+        """Return an effect with one of its numbers fitted, the others held."""
+        one = effects[place]
+        tried = list_trials(one, name)
+        gains = self._whole.weigh_numbers(effects, {(place, name): tried}, used)
+        if tried.shape[1] == 1 or one.kind.name in self.shared:
+            best = np.full(tried.shape[1], gains.sum(1).argmax())
+        else:
+            best = gains.argmax(0)
+        value = tried[best, np.arange(tried.shape[1])]
+        return replace(one, values={**one.values, name: value}).keep(one.joints)
+
+    def improve(
+        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None, rounds: int = ROUNDS
+    ) -> list[GrownEffect]:
+        """Return the effects with all numbers fitted together, from where they are."""
+        found = list(effects)
+        best = float(self._whole.weigh_numbers(found, {}, used).sum())
+        for _ in range(rounds if found else 0):
+            slopes = self._whole.linearise(found, used)
+            trials = slopes.list_steps(found)
+            gains = self._whole.weigh_numbers(found, trials, used).sum(1)
+            top = int(np.argmax(gains))
+            if gains[top] < best + LEAST_GAIN:
+                break
+            best = float(gains[top])
+            for (place, name), rows in trials.items():
+                one = found[place]
+                found[place] = replace(one, values={**one.values, name: rows[top]})
+        return found
+
+    def _prune(self, effects: Sequence[GrownEffect]) -> list[GrownEffect]:
+        """Return the effects without those that the others can replace."""
+        found = list(effects)
+        while len(found) > 1:
+            whole, error = self._measure(found), self._measure_error(found)
+            rests = []
+            for one in found:
+                others = [other for other in found if other is not one]
+                rest = self.improve(others)
+                rise = (self._measure_error(rest) - error) / max(self._plain - error, 1e-12)
+                lost = whole - self._measure(rest)
+                is_needed = lost >= self._need(rest) and rise >= LEAST_SHARE
+                rests.append((is_needed, lost, others))
+            needed, _, rest = min(rests, key=lambda one: one[:2])
+            if needed:
+                break
+            found = self.fit(rest)
+        return found
+
+    def _measure_error(self, effects: Sequence[GrownEffect]) -> float:
+        """Return the root mean square error over the travel of all joints."""
+        off = self.simulate(effects) - self.runs.cut.measured
+        return float(np.sqrt(np.square(off / (self.machine.upper - self.machine.lower)).mean()))
+
+    def _measure(self, effects: Sequence[GrownEffect]) -> float:
+        """Return the log likelihood of all joints with effects, nats."""
+        return float(self._whole.weigh_numbers(effects, {}, None).sum())
+
+
+@dataclass(frozen=True)
+class NumberSlopes:
+    """Errors of free runs as linear functions of the numbers of effects.
+
+    Attributes:
+        spots: Place of the effect and name of each number, `P` of them.
+        steps: Finite difference of each number, `(J,)` or `(1,)`.
+        errors: What is new in each error, `(E, J)`.
+        changes: What a step of each number adds to it, `(P, E, J)`.
+    """
+
+    spots: Sequence[tuple[int, str]]
+    steps: Sequence[np.ndarray]
+    errors: np.ndarray
+    changes: np.ndarray
+
+    def _list_unknowns(self, effects: Sequence[GrownEffect]) -> list[list[tuple[int, int]]]:
+        """Return the numbers that act on each joint, each with the place of its unknown."""
+        found: list[list[tuple[int, int]]] = [[] for _ in range(self.errors.shape[1])]
+        count = 0
+        for number, (place, _) in enumerate(self.spots):
+            is_single = len(self.steps[number]) == 1
+            for j in np.flatnonzero(effects[place].joints).tolist():
+                found[j].append((number, count))
+                count += not is_single
+            count += is_single
+        return found
+
+    def _form_normal(
+        self, effects: Sequence[GrownEffect]
+    ) -> tuple[np.ndarray, np.ndarray, list[list[tuple[int, int]]]]:
+        """Return normal matrix and gradient of all unknowns, in steps, and the unknowns of each joint.
+
+        Errors count by the inverse of their size, as those of a Laplace distribution do.
+        """
+        unknowns = self._list_unknowns(effects)
+        size = 1 + max([place for row in unknowns for _, place in row], default=-1)
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        for j, row in enumerate(unknowns):
+            if not row:
+                continue
+            numbers = [number for number, _ in row]
+            places = [place for _, place in row]
+            left = self.errors[:, j]
+            scale = max(float(np.abs(left).mean()), 1e-12)
+            weight = 1.0 / (scale * np.maximum(np.abs(left), scale))
+            columns = self.changes[numbers, :, j]
+            normal[np.ix_(places, places)] += (columns * weight) @ columns.T
+            gradient[places] -= (columns * weight) @ left
+        return normal, gradient, unknowns
+
+    def list_steps(self, effects: Sequence[GrownEffect]) -> dict[tuple[int, str], np.ndarray]:
+        """Return the numbers after a step with each of `DAMPINGS`, `(C, J)` or `(C, 1)` each."""
+        normal, gradient, unknowns = self._form_normal(effects)
+        moves = []
+        for damping in DAMPINGS:
+            damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
+            moves.append(np.linalg.solve(damped, gradient))
+        found = {}
+        for number, (place, name) in enumerate(self.spots):
+            kind = effects[place].kind
+            rows = np.repeat(effects[place].values[name][None], len(moves), 0)
+            for j, row in enumerate(unknowns):
+                where = dict(row).get(number)
+                if where is not None:
+                    own = j if rows.shape[1] > 1 else 0
+                    change = np.array([move[where] for move in moves]) * self.steps[number][own]
+                    rows[:, own] = effects[place].values[name][own] + change
+            found[place, name] = kind.clipped(name, rows)
+        return found
+
+    def follow(self, errors: np.ndarray, effects: Sequence[GrownEffect]) -> np.ndarray:
+        """Return errors `(C, E, J)` less what the numbers of the effects can explain of them."""
+        found = errors.copy()
+        for j, row in enumerate(self._list_unknowns(effects)):
+            if not row:
+                continue
+            columns = self.changes[[number for number, _ in row], :, j]
+            left = np.abs(self.errors[:, j])
+            weight = 1.0 / np.maximum(left, max(float(left.mean()), 1e-12))
+            normal = (columns * weight) @ columns.T
+            normal += np.diag(DAMPINGS[0] * np.diag(normal) + 1e-9)
+            shares = np.linalg.solve(normal, (columns * weight) @ errors[..., j].T)
+            found[..., j] -= shares.T @ columns
+        return found
+
+    def estimate_deviations(
+        self, effects: Sequence[GrownEffect]
+    ) -> dict[tuple[int, str], np.ndarray]:
+        """Return the standard error of each number, `(J,)` or `(1,)`, all fitted together."""
+        normal, _, unknowns = self._form_normal(effects)
+        variance = np.diag(np.linalg.pinv(normal + 1e-9 * np.eye(len(normal))))
+        found = {}
+        for number, spot in enumerate(self.spots):
+            deviation = np.zeros_like(self.steps[number])
+            for j, row in enumerate(unknowns):
+                where = dict(row).get(number)
+                if where is not None:
+                    own = j if len(deviation) > 1 else 0
+                    deviation[own] = np.sqrt(variance[where]) * abs(self.steps[number][own])
+            found[spot] = deviation
+        return found
+
+
+class WindowView:
+    """Some windows, and the likelihood of the simulator with effects there.
+
+    Args:
+        runs: The windows.
+        factor: Windows of the field for each of them.
+    """
+
+    def __init__(self, runs: SimulatorRuns, factor: float) -> None:
+        self.runs = runs
+        self._factor = factor
+        self._likelihood = FreeRunLikelihood(runs.cut, runs.simulator.machine)
+        self.settle(())
+
+    def settle(self, effects: Sequence[GrownEffect]) -> None:
+        """Let the deviation of the errors be that beside effects, and new candidates be put beside these."""
+        self._effects = effects
+        self.deviation = self._likelihood.weigh_motion(self.simulate(effects))
+        self._slopes = self.linearise(effects) if effects else None
+
+    def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
+        """Return free runs with effects, `(W, K, J)`."""
+        given = [(one.kind, one.repeat(1)) for one in effects]
+        return self.runs.simulator.simulate(given)[0]
+
+    def weigh_candidates(self, kind: EffectType, candidates: EffectValues) -> np.ndarray:
+        """Return what candidates of an effect earn beside those that are there, nats, `(C, J)`.
+
+        The numbers of those that are there follow each candidate, to first order.
+        """
+        count = len(next(iter(candidates.values())))
+        beside = [(one.kind, one.repeat(count)) for one in self._effects]
+        paths = self.runs.simulator.simulate([*beside, (kind, candidates)], count)
+        if self._slopes is None:
+            known = self._likelihood.weigh(self.simulate(())[None], self.deviation)
+            return self._factor * (self._likelihood.weigh(paths, self.deviation) - known)
+        paths = np.concatenate([self.simulate(self._effects)[None], paths])
+        errors = self._likelihood.innovate(paths, self.deviation)
+        errors = errors.reshape(len(errors), -1, errors.shape[-1])
+        left = self._slopes.follow(errors, self._effects)
+        found = -left.shape[1] * np.log(np.abs(left).mean(1) + self._likelihood.floor)
+        return self._factor * (found[1:] - found[0])
+
+    def linearise(
+        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
+    ) -> NumberSlopes:
+        """Return the slopes of all errors over all numbers."""
+        spots, steps = [], []
+        for place, one in enumerate(effects):
+            for name, value in one.values.items():
+                # At an upper end the difference is taken downwards.
+                most = one.kind.limits(name)[1]
+                step = STEP * np.abs(one.kind.size(name)) * np.ones_like(value)
+                spots.append((place, name))
+                steps.append(np.where(value + step > most, -step, step))
+        trials = {}
+        for number, (place, name) in enumerate(spots):
+            rows = np.repeat(effects[place].values[name][None], 1 + len(spots), 0)
+            rows[1 + number] += steps[number]
+            trials[place, name] = rows
+        paths = self._simulate_numbers(effects, trials)
+        errors = self._likelihood.innovate(paths, self.deviation, used)
+        errors = errors.reshape(len(errors), -1, errors.shape[-1])
+        return NumberSlopes(spots, steps, errors[0], errors[1:] - errors[0])
+
+    def _simulate_numbers(
+        self, effects: Sequence[GrownEffect], trials: Mapping[tuple[int, str], np.ndarray]
+    ) -> np.ndarray:
+        """Return free runs `(C, W, K, J)` with trials `(C, J)` or `(C, 1)` of some numbers."""
+        count = len(next(iter(trials.values()))) if trials else 1
+        given = []
+        for place, one in enumerate(effects):
+            values = one.repeat(count)
+            for name in values:
+                values[name] = trials.get((place, name), values[name])
+            given.append((one.kind, values))
+        return self.runs.simulator.simulate(given, count)
+
+    def weigh_numbers(
+        self,
+        effects: Sequence[GrownEffect],
+        trials: Mapping[tuple[int, str], np.ndarray],
+        used: np.ndarray | None,
+    ) -> np.ndarray:
+        """Return the log likelihood with trials of some numbers, `(C, J)`."""
+        paths = self._simulate_numbers(effects, trials)
+        return self._likelihood.weigh(paths, self.deviation, used)
+
+
+def _is_per_joint(kind: EffectType) -> bool:
+    """Return whether any number of an effect differs between joints."""
+    return any(kind.numbers[name].per_joint for name in kind.fitted)
+
+
+def list_trials(one: GrownEffect, name: str) -> np.ndarray:
+    """Return values of a number that are tried around its present one, `(C, J)` or `(C, 1)`."""
+    kind, value = one.kind, one.values[name]
+    none = kind.numbers[name].none
+    if none is None:
+        tried = np.array(FACTORS)[:, None] * value
+        return kind.clipped(name, tried)
+    off = value - none
+    sizes = kind.size(name)
+    steps = []
+    for factor in FACTORS:
+        # One that is not there may begin either way.
+        small = (2.0 * factor - 2.0) * 0.5 * sizes
+        steps.append(np.where(off == 0.0, small, factor * off))
+    return kind.clipped(name, none + np.stack(steps))
