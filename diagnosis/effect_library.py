@@ -209,11 +209,6 @@ def list_shared_effects(kinds: Iterable[EffectType]) -> frozenset[str]:
     return frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
 
 
-def list_alike_effects(kinds: Iterable[EffectType]) -> frozenset[str]:
-    """Return the effects with one cause for all joints and about the same size on each."""
-    return list_shared_effects(kind for kind in kinds if getattr(kind.target, "alike", True))
-
-
 def _check_simulable(kind: EffectType, machine: Machine) -> None:
     """Raise a `ConfigError` when the effect needs unknown properties of the machine."""
     device = torch.device("cpu")

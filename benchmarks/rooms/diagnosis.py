@@ -7,7 +7,7 @@ from pathlib import Path
 from measurement import Measurement, Table, load_json
 
 CODE = (
-    "diagnosis", "actuators/effects", "actuators/models", "actuators/identify", "conf/certainty.yaml",
+    "diagnosis", "actuators/effects", "actuators/models", "actuators/identify",
 )  # fmt: skip
 ROWS = {
     "top1": "one effect: named first",
