@@ -146,7 +146,7 @@ class TellableEffects:
 
 @dataclass(frozen=True, eq=False)
 class NumberChange:
-    """What one number of an effect changes.
+    """Change that one number of an effect makes.
 
     Attributes:
         kind: The effect.
