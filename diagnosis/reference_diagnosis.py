@@ -90,7 +90,7 @@ class ReferenceDiagnosis:
         tell("simulating every effect", 0.45)
         decision = decider.decide()
         named_joints = {machine.joint_names[j] for one in decision.named for j in one.joints}
-        told = excuse_joints(told, sorted(named_joints))
+        told = accept_named_joints(told, sorted(named_joints))
         if failed := gates.list_failures(told):
             decision = replace(decision, verdict="unknown", named=())
         tell("sizes and proof", 0.8)
@@ -245,11 +245,11 @@ def list_alike(
     return (), None
 
 
-EXCUSED = ("does_not_obey", "unlogged_input")
+ACCEPTED_FINDINGS = ("does_not_obey", "unlogged_input")
 """Findings about a joint that a named effect may be the cause of."""
 
 
-def excuse_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate]:
+def accept_named_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate]:
     """Return the gates of the recordings; joints that do not move as commanded may have a named effect.
 
     Whether the effect explains it is told by the proof: the repaired simulator has to beat standing
@@ -258,7 +258,7 @@ def excuse_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate]:
     found = []
     for gate in told:
         is_named = any(f"on {name} " in gate.text for name in named)
-        passed = gate.passed or (gate.name in EXCUSED and is_named)
+        passed = gate.passed or (gate.name in ACCEPTED_FINDINGS and is_named)
         found.append(replace(gate, passed=passed))
     return found
 

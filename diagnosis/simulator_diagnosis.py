@@ -29,9 +29,9 @@ from diagnosis.reference_diagnosis import (
     DIRECT_NATS,
     NAME_NATS,
     ProgressCallback,
+    accept_named_joints,
     describe_detected,
     estimate_probability,
-    excuse_joints,
     list_alike,
     propose_measurement,
     rank_effects,
@@ -141,7 +141,7 @@ class SimulatorDiagnosis:
         search = SimulatorSearch(runs, reference, self.kinds)
         found = search.run(lambda done: tell("simulating every effect", 0.05 + 0.75 * done))
         joints = np.flatnonzero(np.any([one.joints for one in found], 0)) if found else []
-        told = excuse_joints(told, [machine.joint_names[j] for j in joints])
+        told = accept_named_joints(told, [machine.joint_names[j] for j in joints])
         if failed := gates.list_failures(told):
             found = []
         on_tool: Sequence[DetectedEffect] = ()

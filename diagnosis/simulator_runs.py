@@ -158,12 +158,12 @@ class FreeRunLikelihood:
         count = errors.shape[1] * errors.shape[2]
         best = np.full((len(paths), paths.shape[3]), -np.inf)
         for memory in MEMORIES:
-            mean = np.abs(_innovate(errors, memory)).sum((1, 2)) / count + self.floor
+            mean = np.abs(_subtract_memory(errors, memory)).sum((1, 2)) / count + self.floor
             fresh = 0.5 * errors.shape[1] * np.log(1.0 - memory**2)
             best = np.maximum(best, fresh - count * np.log(mean))
         return best
 
-    def innovate(
+    def subtract_memory(
         self, paths: np.ndarray, deviation: np.ndarray, used: np.ndarray | None = None
     ) -> np.ndarray:
         """Return what is new in each error of paths `(C, W, K, J)`, `(C, W, I, J)`; the first decides on the memory."""
@@ -173,15 +173,15 @@ class FreeRunLikelihood:
         found = np.empty_like(errors)
         sizes = []
         for memory in MEMORIES:
-            mean = np.abs(_innovate(errors[:1], memory)).mean((0, 1, 2)) + self.floor
+            mean = np.abs(_subtract_memory(errors[:1], memory)).mean((0, 1, 2)) + self.floor
             # The determinant of the memory, over the number of errors.
             sizes.append(np.log(mean) - 0.5 * np.log(1.0 - memory**2) / errors.shape[2])
         for j, place in enumerate(np.argmin(sizes, 0)):
-            found[..., j] = _innovate(errors[..., j : j + 1], MEMORIES[place])[..., 0]
+            found[..., j] = _subtract_memory(errors[..., j : j + 1], MEMORIES[place])[..., 0]
         return found
 
 
-def _innovate(errors: np.ndarray, memory: float) -> np.ndarray:
+def _subtract_memory(errors: np.ndarray, memory: float) -> np.ndarray:
     """Return errors `(C, W, I, J)` less what each keeps of the one before."""
     found = errors.copy()
     found[:, :, 1:] -= memory * errors[:, :, :-1]

@@ -433,7 +433,7 @@ class WindowView:
             known = self._likelihood.weigh(self.simulate(())[None], self.deviation)
             return self._factor * (self._likelihood.weigh(paths, self.deviation) - known)
         paths = np.concatenate([self.simulate(self._effects)[None], paths])
-        errors = self._likelihood.innovate(paths, self.deviation)
+        errors = self._likelihood.subtract_memory(paths, self.deviation)
         errors = errors.reshape(len(errors), -1, errors.shape[-1])
         left = self._slopes.follow(errors, self._effects)
         found = -left.shape[1] * np.log(np.abs(left).mean(1) + self._likelihood.floor)
@@ -457,7 +457,7 @@ class WindowView:
             rows[1 + number] += steps[number]
             trials[place, name] = rows
         paths = self._simulate_numbers(effects, trials)
-        errors = self._likelihood.innovate(paths, self.deviation, used)
+        errors = self._likelihood.subtract_memory(paths, self.deviation, used)
         errors = errors.reshape(len(errors), -1, errors.shape[-1])
         return NumberSlopes(spots, steps, errors[0], errors[1:] - errors[0])
 
