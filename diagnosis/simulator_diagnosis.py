@@ -25,6 +25,7 @@ from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
 from diagnosis.engine.sizes import FORM_ERROR, SIGMAS
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import describe_joints
+from diagnosis.grown_effects import GrownEffect
 from diagnosis.reference_diagnosis import (
     DIRECT_NATS,
     NAME_NATS,
@@ -38,7 +39,7 @@ from diagnosis.reference_diagnosis import (
 )
 from diagnosis.repair_proof import RepairProof
 from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
-from diagnosis.simulator_search import GrownEffect, SimulatorSearch
+from diagnosis.simulator_search import SimulatorSearch
 from diagnosis.stages import examine_gap
 
 
