@@ -379,7 +379,7 @@ class ArcDetector:
         purity = ellipse_support.measure_purity(edges, support, length)
         good &= occluded | (purity >= s.purity / slack)
         if limits.lowest_px == 0:
-            # A known size excludes the shapes that these three gates are for.
+            # A known size excludes the shapes that these two gates are for.
             size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
             faintest = (
                 # The strongest edges tell the contrast of the picture; small ellipses are blurred
@@ -388,9 +388,6 @@ class ArcDetector:
             )
             good &= ellipse_support.measure_strength(edges, support) >= faintest
             good[good] &= ~ellipse_support.find_smooth_continuations(
-                candidates[good], edges, support[good], length[good]
-            )
-            good[good] &= occluded[good] | ~ellipse_support.find_inward_outlines(
                 candidates[good], edges, support[good], length[good]
             )
         return good

@@ -188,11 +188,6 @@ normal, and part of the places that need it."""
 BOW_PX, STROKE_PX = 0.6, 4.5
 """Largest bow of the edge, and least depth within the ellipse: the second edge of a bent line
 follows the arc nearer than that."""
-SAME = 1.25
-"""The same ratio within the outline of one object."""
-CLOSED_PX, DIP_PX, BACK, AHEAD = 3.0, 1.0, 10, 60
-"""Distance of the ends of a closed outline, depth of a turn into the ellipse, and points before and
-beyond the end of an arc."""
 
 
 def find_smooth_continuations(
@@ -226,61 +221,6 @@ def find_smooth_continuations(
         goes_on = _follow_edges(edges, support[row, start], onward, reach, bend)
         result[row[goes_on & ~hidden]] = True
     return result
-
-
-def find_inward_outlines(
-    candidates: EllipseCandidates, edges: Edges, support: np.ndarray, length: np.ndarray
-) -> np.ndarray:
-    """Find candidates whose outline turns into them and out again where it leaves, `(C,)`: hearts.
-
-    The edge of an occluder also runs within the ellipse, but the edge outside has another contrast.
-    Only the outline of one object has the same strength and dark side in both.
-    """
-    result, whole = np.zeros(len(support), bool), measure_strength(edges, support)
-    for side in (1, -1):  # by increasing and by decreasing angle
-        row, end, _ = _find_open_ends(support, length, side)
-        e, last = candidates.ellipses[row], support[row, end]
-        outward = conic.measure_sampson_distance(e, edges.points[last][:, None])[1][:, 0]
-        number, known = _trace_outlines(
-            edges, last, side * np.column_stack([-outward[:, 1], outward[:, 0]])
-        )
-        off = conic.measure_sampson_distance(e, edges.points[number])[0]
-        # The median of the first points is the edge's own strength, before it leaves.
-        usual = np.median(edges.strength[number[:, : BACK // 2]], axis=1)
-        known &= (usual > whole[row] / ALIKE)[:, None]
-        # Logarithms make "twice as strong" and "half as strong" equal.
-        alike = np.abs(np.log(edges.strength[number] / usual[:, None])) < np.log(SAME)
-        way = np.gradient(edges.points[number], axis=1)
-        bright = edges.directions[number]
-        # Sign of the bright side along the way: it changes where another edge is entered.
-        hand = way[..., 0] * bright[..., 1] - way[..., 1] * bright[..., 0]
-        known &= alike & (hand * hand[:, :1] > 0)
-        # Once within, remembered for the rest of the way.
-        within = np.maximum.accumulate(known & (off < -DIP_PX), axis=1)
-        result[row[(within & known & (off > CHORD_PX)).any(1)]] = True
-    return result
-
-
-def _trace_outlines(
-    edges: Edges, last: np.ndarray, onward: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of points along the outlines through the edge points `last`, `(M,)`.
-
-    They run in the direction of `onward`, `(M, 2)`. Also return which of them exist, since an
-    outline may end; both `(M, BACK + AHEAD)`.
-    """
-    span = edges.spans[np.searchsorted(edges.spans[:, 0], last, side="right") - 1]
-    number = (span[:, 1] - span[:, 0])[:, None]
-    closed = (
-        np.linalg.norm(edges.points[span[:, 0]] - edges.points[span[:, 1] - 1], axis=1) < CLOSED_PX
-    )
-    back = span[:, 0] + (last - span[:, 0] - BACK) % number[:, 0]
-    # The outline may run either way along its chain.
-    forward = np.where(((edges.points[last] - edges.points[back]) * onward).sum(1) > 0, 1, -1)
-    place = (last - span[:, 0])[:, None] + forward[:, None] * np.arange(-BACK, AHEAD)[None]
-    known = closed[:, None] | ((place >= 0) & (place < number))
-    known &= np.abs(np.arange(-BACK, AHEAD)) < number
-    return span[:, :1] + place % number, known
 
 
 def find_occluded(
