@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -123,7 +122,6 @@ class StagedPerception:
             resolution.
         smallest_block: Smallest part of the picture that must be block.
         block_probability: Probability from which a pixel counts as block.
-        roi: Search region: the `mask` of the block, or its bounding `box`.
         apart: Holes nearer to each other than this many radii are one; the outer rim wins.
         depth: Matches pairs of frames that come without depth, and holes again where depth is coarse;
             `null` for never.
@@ -142,7 +140,6 @@ class StagedPerception:
     comfortable_px: float
     smallest_block: float
     block_probability: float
-    roi: Literal["mask", "box"]
     apart: float
     depth: PairDepth | None
     rims: RimScale | None
@@ -335,8 +332,6 @@ class StagedFinder:
         levels = search.plan_search_levels(
             frame, on_block, s.radius_m, s.size_slack, s.comfortable_px
         )
-        if s.roi == "box":
-            levels = search.merge_levels_to_box(on_block, levels)
         ellipses, wrong_size = [], []
         for level in levels:
             for ellipse in level.detect(self._detector, gray):

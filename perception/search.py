@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -225,23 +224,6 @@ def _split_region(
             prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
             found.append((part.astype(np.uint8), prior))
     return found
-
-
-def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[SearchLevel]:
-    """Return one level of full resolution: the bounding box of the mask, with all possible sizes."""
-    # The box and not the mask: a detector without depth must also see gaps of the mask.
-    x, y, wide, high = cv2.boundingRect(mask.view(np.uint8))
-    # Rounded up: the last row of cells may reach beyond the picture.
-    region = np.zeros([-(-size // STEP) for size in mask.shape], np.uint8)
-    region[y // STEP : (y + high - 1) // STEP + 1, x // STEP : (x + wide - 1) // STEP + 1] = 1
-    priors = []
-    for level in whole:
-        if level.prior:
-            priors.append(level.prior)
-    prior = None
-    if priors:
-        prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors))
-    return [SearchLevel(1, region, prior)]
 
 
 def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:

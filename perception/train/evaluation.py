@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import torch
 
-from brokk_rl.plot import make_figure, remove_frame, save_figure
 from brokk_rl.progress import ItemProgress
 from perception.segment.network import THRESHOLD
 from perception.segment.unet import CHANNELS, UNet
@@ -150,27 +149,3 @@ def draw_samples(
         [np.concatenate(rows[k : k + 2], axis=1) for k in range(0, len(rows), 2)]
     )
     cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
-
-
-def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
-    """Draw loss and overlaps over the updates; writes a PNG."""
-    figure = make_figure(9, 3.6)
-    left, right = figure.subplots(1, 2)
-    # The network that it began with was not fitted yet.
-    fitted = [entry for entry in curve if entry["loss"] is not None]
-    left.plot(
-        [entry["update"] for entry in fitted], [entry["loss"] for entry in fitted], color="black"
-    )
-    left.set(xlabel="update", ylabel="loss (cross-entropy + Dice)", yscale="log")
-    for name, colour in COLOURS.items():
-        right.plot(
-            [entry["update"] for entry in curve],
-            [entry[name] for entry in curve],
-            color=tuple(c / 255 for c in colour),
-            label=name,
-        )
-    right.set(xlabel="update", ylabel="intersection over union, unseen frames", ylim=(0, 1))
-    right.legend(frameon=False, loc="lower right")
-    for axis in (left, right):
-        remove_frame(axis)
-    save_figure(figure, path)

@@ -93,7 +93,7 @@ class SegmenterTraining:
             )
 
     def fit(self, session: Session, resume: bool) -> dict[str, Any]:
-        """Train; write network (safetensors, ONNX), curve and samples (PNG) into the session's folder.
+        """Train; write network (safetensors, ONNX) and samples (PNG) into the session's folder.
 
         Returns:
             The content of `training.json`: `conditions` (see `evaluation.compute_metrics`),
@@ -331,7 +331,6 @@ class _Training:
         # Eight pictures show a wrong export as surely as all.
         compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
         parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
-        evaluation.draw_curve(self._folder / "curve.png", self._curve)
         evaluation.draw_samples(self._folder / "samples.png", pictures, probabilities, known)
         return {
             "schema": 1,

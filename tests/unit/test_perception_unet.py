@@ -80,7 +80,7 @@ def test_a_small_network_learns_the_block_in_seconds(
     assert result["conditions"]["all"]["block"] > 0.6
     assert result["parity"] < 1e-4
     assert {path.name for path in Path("run").iterdir()} >= {
-        "segmenter.onnx", "segmenter.safetensors", "curve.png", "samples.png", "training.json",
+        "segmenter.onnx", "segmenter.safetensors", "samples.png", "training.json",
     }  # fmt: skip
 
 
