@@ -30,6 +30,9 @@ same rim. Chosen by hand: a rim found in two resolutions differs by a few percen
 STRONG_SCORE = 0.5
 """Part of the best score from which an ellipse counts as strong. Chosen by hand: among strong rims
 inside each other the larger one wins, a weak larger one does not."""
+SURE_SCORE = 0.5
+"""Score of a hole from which no rim of another size is asked: by twice the baseline a dark patch
+passed with 0.3, and the rims of 8 rendered holes have 0.7 or more."""
 MOST_CANDIDATES = 16
 """Candidates that are judged, the best first: each takes about 10 ms."""
 
@@ -194,9 +197,9 @@ class StagedFinder:
         share = cv2.countNonZero(on_block.view(np.uint8)) / on_block.size
         if share < s.smallest_block:
             reason = "part of the picture that is block"
-            rejected = [Rejection("segment", reason, share, s.smallest_block)]
-            rejected += self._name_scale(frame, ms)
-            return FrameDetections([], rejected, [], masks, ms)
+            refused = Rejection("segment", reason, share, s.smallest_block)
+            judged = self._doubt_scale(frame, _Judged([], [refused]), ms)
+            return FrameDetections([], judged.rejected, [], masks, ms)
         judged = _Judged([], [])
         with _time_stage(ms, "ellipse"):
             candidates, wrong_size = self._detect_ellipses(frame, on_block)
@@ -205,21 +208,21 @@ class StagedFinder:
             self._judge(frame, masks, candidates, judged)
         if frame.depth_shrink > 1:
             judged = self._look_again(frame, judged, ms)
-        if not judged.found:
-            judged.rejected.extend(self._name_scale(frame, ms))
+        if all(pose.score < SURE_SCORE for _, pose in judged.found):
+            judged = self._doubt_scale(frame, judged, ms)
         return self._conclude(judged, masks, frame, ms)
 
-    def _name_scale(self, frame: Frame, ms: dict[str, float]) -> list[Rejection]:
-        """Return that all rims have another size than the holes, if that is why none was found."""
+    def _doubt_scale(self, frame: Frame, judged: _Judged, ms: dict[str, float]) -> _Judged:
+        """Return that a rim of another size is surer than all holes, in place of those."""
         s = self.settings
         if s.rims is None:
-            return []
+            return judged
         with _time_stage(ms, "scale"):
-            scale = s.rims.measure_scale(frame, self._detector, s.radius_m)
-        if scale is None:
-            return []
+            found = s.rims.measure_scale(frame, self._detector, s.radius_m)
+        if found is None or any(pose.score > found[1] for _, pose in judged.found):
+            return judged
         reason = rim_scale.OF_DEPTH if frame.right is None else rim_scale.OF_PAIR
-        return [Rejection("ellipse", reason, scale, 1.0)]
+        return _Judged([], [*judged.rejected, Rejection("ellipse", reason, found[0], 1.0)])
 
     @property
     def search_every(self) -> int:

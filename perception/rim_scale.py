@@ -54,8 +54,12 @@ class RimScale:
 
     def measure_scale(
         self, frame: Frame, detector: EllipseDetector, radius_m: float
-    ) -> float | None:
-        """Return the size of the surest rim over that of the holes; `None` where nothing is in doubt."""
+    ) -> tuple[float, float] | None:
+        """Return the size of the surest rim over that of the holes, and its score.
+
+        Returns:
+            `None` where nothing is in doubt.
+        """
         shrink = max(1, round(frame.color.shape[1] / self.width_px))
         small = frame.color[::shrink, ::shrink]
         if shrink > 1:
@@ -68,7 +72,7 @@ class RimScale:
             ring_m = self._measure_depth(one, gray, depth_m)
             if one.coverage >= self.coverage and ring_m is not None:
                 scale = one.a * ring_m / (focal_px * radius_m)
-                return scale if abs(np.log(scale)) > np.log(self.least) else None
+                return (scale, one.score) if abs(np.log(scale)) > np.log(self.least) else None
         return None
 
     def _measure_depth(self, one: Ellipse, gray: np.ndarray, depth_m: np.ndarray) -> float | None:
