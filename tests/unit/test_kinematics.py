@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from brokk_rl.gravity import Gravity
-from brokk_rl.kinematics import Kinematics
+from brokk_rl.kinematics import Kinematics, compute_tool_kinematics, solve_joint_step
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.sim.model import compile_model
 
@@ -117,6 +117,26 @@ def test_any_serial_chain_agrees_with_mujoco(machine, kinds, axes):
         mujoco.mj_jacSite(model, data, reference, None, 0)
         np.testing.assert_allclose(tip[i], data.site("tip").xpos, atol=5e-6)
         np.testing.assert_allclose(jacobian[i], reference, atol=5e-6)
+
+
+def test_arrays_have_the_jacobians_of_differences_behind_slides_too(machine):
+    chain = _chain(machine, "shs", [(0, 0, 1), (0, 1, 0), (1, 0, 0)])
+    q, step = np.array([0.2, 0.3, -0.1]), 1e-6
+    tool = compute_tool_kinematics(chain, q)
+    for j, shift in enumerate(step * np.eye(3)):
+        ahead, behind = (compute_tool_kinematics(chain, q + sign * shift) for sign in (1, -1))
+        tip = (ahead.tip_in_base_m - behind.tip_in_base_m) / (2 * step)
+        turn = (ahead.axis_in_base - behind.axis_in_base) / (2 * step)
+        np.testing.assert_allclose(tool.jacobian[:, j], tip, atol=1e-8)
+        np.testing.assert_allclose(tool.turn[:, j], turn, atol=1e-8)
+
+
+def test_a_step_of_the_joints_is_the_damped_least_squares_solution(machine):
+    tool = compute_tool_kinematics(machine, np.array([0.1, 0.4, -0.3, 0.2, 0.5]))
+    wanted, scale = np.array([0.1, -0.05, 0.02, 0.0, 0.1, 0.0]), np.array([1.0, 2.0, 0.0, 0.5, 1.0])
+    rows = np.concatenate((np.vstack((tool.jacobian, tool.turn)) * scale, 0.2 * np.eye(5)))
+    expected = np.linalg.lstsq(rows, np.concatenate((wanted, np.zeros(5))), rcond=None)[0]
+    np.testing.assert_allclose(solve_joint_step(tool, wanted, scale, 0.2), expected, atol=1e-12)
 
 
 def test_jacobians_are_the_derivatives_of_the_pose(machine):
