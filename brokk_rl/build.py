@@ -73,7 +73,9 @@ def _check_keys(known: Mapping[str, bool], keys: Collection[str], given: Collect
             )
     for key, is_needed in known.items():
         if is_needed and key not in given:
-            raise ConfigError(f"the mode needs '{key}': give {key}=<option>, or leave ~{key} out")
+            raise ConfigError(
+                f"the mode needs '{key}': give {key}=<option> in place of ~{key} or none"
+            )
 
 
 def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -> dict[str, Any]:

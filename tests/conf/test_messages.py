@@ -79,7 +79,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=check", "subject.chain=[a,b]"): ("subject.model: expected the file of a robot",),
     ("mode=collect", "collect.run_minutes=-1"): ("collect.run_minutes", "above 0"),
     ("+foo=3",): ("the mode has no 'foo'", "rl"),
-    ("~task",): ("the mode needs 'task'", "leave ~task out"),
+    ("~task",): ("the mode needs 'task'", "give task=<option>"),
     ("mode=play", "preset=gpu"): ("the mode has no", "leave it out"),
     ("effect=[backlash]", "effect.backlash.joints=[q9]"): ("joints: 'q9' is no joint",),
     (*COMPARE, "+session.sed=1"): ("no field 'sed'", "did you mean 'seed'?"),
