@@ -8,7 +8,7 @@ from measurement import Measurement, Table, load_json, read_evaluation
 
 PLANTS = ("mlp", "hydraulic")
 CIRCUITS = ("load_sensing", "post_compensated", "open_center")
-LEVELS = ("borehole_insertion", "flat", "gentle", "tight")
+LEVELS = ("flat", "gentle", "tight")
 DELAYS_S = ("0.1", "0.3", "0.5")
 EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=false"
 POLICY_CODE = (
@@ -60,7 +60,7 @@ MEASUREMENTS = (
     Measurement(
         name="shipped_policy",
         title="The policy that ships",
-        conditions="The shipped policy and the classical controller (baseline) from the same random starts, one seed, MuJoCo C. An episode lasts 20 s. Boreholes, their errors, dead time and effects are random. The intervals of both overlap.",
+        conditions="The shipped policy and the classical controller (baseline) from the same random starts, one seed, MuJoCo C. An episode lasts 20 s. Boreholes, their errors, dead time and effects are random. The policy learned from nothing, on one H200 in 694 million steps on the level `flat`; the seed of the starts chose nothing.",
         commands=tuple(
             f"{EVALUATE} actuator={plant} session.out={{out}}/{plant}" for plant in PLANTS
         ),
@@ -72,9 +72,10 @@ MEASUREMENTS = (
     Measurement(
         name="other_circuits",
         title="The policy that ships, on circuits to which nothing was fitted",
-        conditions="Nothing was fitted to these plants. The baseline is the classical controller.",
+        conditions="Nothing was fitted to these plants. The baseline is the classical controller, from the same 256 starts.",
         commands=tuple(
-            f"{EVALUATE} actuator={plant} session.out={{out}}/{plant}" for plant in CIRCUITS
+            f"{EVALUATE} actuator={plant} evaluation.episodes=256 session.out={{out}}/{plant}"
+            for plant in CIRCUITS
         ),
         code=POLICY_CODE,
         read=lambda folder: read_evaluations(folder, "plant"),
@@ -84,19 +85,15 @@ MEASUREMENTS = (
     Measurement(
         name="levels",
         title="Levels of the task",
-        conditions="The shipped policy, one of `make train`, and the classical controller (baseline), from the same 256 starts. `flat`: the chisel ends flat, and 10 kN end an episode. `gentle`: 5 kN end it. `tight`: a hole of 8.4 cm. No policy was trained for them.",
-        commands=(
-            "brokk mode=train preset=laptop evaluation.video=false session.out={out}/own/train",
-            *(
-                f"{EVALUATE} policy=shipped task={level} evaluation.episodes=256 session.out={{out}}/{level} "
-                f"+policy@rivals.direct=trained rivals.direct.path={{out}}/own/train"
-                for level in LEVELS
-            ),
+        conditions="The shipped policy and the classical controller (baseline), from the same 256 starts. `flat`: the chisel ends flat, and 10 kN end an episode; the policy learned there. `gentle`: 5 kN end it. `tight`: a hole of 8.4 cm, for which nothing was trained.",
+        commands=tuple(
+            f"{EVALUATE} policy=shipped task={level} evaluation.episodes=256 session.out={{out}}/{level}"
+            for level in LEVELS
         ),
-        code=TRAINING_CODE,
+        code=POLICY_CODE,
         read=lambda folder: read_evaluations(folder, "task"),
         where="two cores",
-        minutes=15,
+        minutes=3,
     ),
     Measurement(
         name="short_training",
