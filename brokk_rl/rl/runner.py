@@ -147,7 +147,7 @@ class TrainingRunner(OnPolicyRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
-        with allow_tensor_cores(self.training.tf32 and self.env.graph_active):
+        with allow_tensor_cores(self.env.graph_active):
             super().learn(num_learning_iterations, init_at_random_ep_len)
 
     def checkpoint(self) -> None:

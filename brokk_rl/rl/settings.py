@@ -203,8 +203,6 @@ class TrainingConfig:
         fuse: Let `torch.compile` fuse the small operations around the physics, and on a GPU those of
             PPO, for half a minute of compiling and a C++ compiler. On a CPU, whose physics takes
             less than half of a control step of few worlds, it gains most.
-        tf32: Multiply matrices of captured training with ten bits of mantissa (TF32) on a GPU; false:
-            all of float32. `runner.algorithm.use_mixed_precision` takes bfloat16, with seven bits.
         random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at
             once.
         runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`,
@@ -223,7 +221,6 @@ class TrainingConfig:
     max_fault_rate: Share
     fault_steps: Index | None
     fuse: bool
-    tf32: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
 

@@ -124,16 +124,6 @@ def _teacher() -> _Teacher:
     return _Teacher(seen, GROUPS, "actor", 3, (16,), distribution_cfg=noise)
 
 
-def test_a_teacher_of_no_weight_changes_nothing() -> None:
-    alone, taught = _algorithm(DevicePPO), _algorithm(DevicePPO)
-    taught.follow(_teacher())
-    for seed in range(2):
-        _iteration(alone, seed)
-        _iteration(taught, seed)
-    for mine, other in zip(taught.actor.parameters(), alone.actor.parameters(), strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-6)
-
-
 def test_a_teacher_is_followed_to_its_command() -> None:
     """Its outputs are clamped: beyond a full stroke there is nothing to imitate."""
     algorithm, teacher = _algorithm(DevicePPO, schedule="fixed"), _teacher()
