@@ -53,58 +53,67 @@ def state() -> ToolState:
     )
 
 
+def put(**changes: float | bool) -> dict[str, torch.Tensor]:
+    """Returns changes of a state of one environment."""
+    return {name: torch.tensor([value]) for name, value in changes.items()}
+
+
+AWAY, BEYOND = {"edge": 0.25}, {"largest": 0.7}
+LIGHT, HEAVY = {"above_n": 0.0, "most_n": 1e4}, {"above_n": 1e4, "most_n": 1e5}
+
+
 @pytest.mark.parametrize(
-    ("reach_m", "expected"),
-    [(2.9, 0.25 / 1.5), (2.4, 0.25), (1.7, 0.25), (1.2, 0.25 / 1.5), (3.4, 0.25 / 2)],
-)
-def test_working_distance_falls_off_outside_the_good_range(
-    state: ToolState, reach_m: float, expected: float
+    ("name", "params", "changes", "expected"),
+    [
+        *(
+            ("working_distance", AWAY, put(positioning=True, reach_m=reach_m), expected)
+            for reach_m, expected in ((2.9, 0.25 / 1.5), (2.4, 0.25), (1.7, 0.25), (1.2, 0.25 / 1.5))
+        ),
+        ("working_distance", AWAY, {}, 0.0),  # once positioning is done
+        ("pitch", {}, put(pitch_rad=1.75), 1 / 1.25),  # both ways alike
+        ("insertion", {}, {}, 0.0),
+        ("insertion", {}, put(paper_success=True), 1.6),
+        *((name, {}, put(positioning=True, paper_success=True), 0.0)
+          for name in ("distance", "pitch", "insertion", "approach_command_change")),
+        ("far_contact", BEYOND, put(positioning=True, contact_force_n=900.0), 0.0),
+        ("approach_command_change", {}, {}, 0.75),
+        ("command_change", {}, put(positioning=True), 0.75),  # this one counts everywhere
+        ("progress", {}, {}, 0.125),
+        ("failure", {}, {}, 0.0),
+        ("failure", {}, put(failed=True), 1.5),  # one and what was gained
+        ("contact", {"most_n": 1e4}, put(contact_force_n=2500.0), 2.5),
+        ("contact", {"most_n": 1e4}, put(contact_force_n=8e4), 10.0),
+        *(
+            ("peak_contact", params, put(peak_force_n=before_n, contact_force_n=now_n), expected)
+            for params, before_n, now_n, expected in (
+                (LIGHT, 0.0, 2500.0, 2.5),
+                (LIGHT, 2500.0, 1000.0, 0.0),  # an episode pays for its hardest blow once
+                (LIGHT, 9000.0, 14000.0, 1.0),
+                (LIGHT, 12000.0, 15000.0, 0.0),
+                (HEAVY, 0.0, 9000.0, 0.0),
+                (HEAVY, 0.0, 12500.0, 2.5),
+                (HEAVY, 12000.0, 12500.0, 0.5),
+                (HEAVY, 20000.0, 12500.0, 0.0),
+                (HEAVY, 0.0, 3e5, 90.0),
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_a_term_has_the_value_worked_by_hand(
+    name: str, params: dict, changes: dict, expected: float, state: ToolState
 ) -> None:
-    positioning = replace(state, positioning=YES, reach_m=torch.tensor([reach_m]))
-    assert terms.working_distance(positioning, edge=0.25).item() == pytest.approx(
-        expected, rel=1e-5
-    )
-
-
-def test_while_positioning_only_the_working_distance_counts(state: ToolState) -> None:
-    positioning = replace(
-        state, positioning=YES, contact_force_n=torch.tensor([900.0]), paper_success=YES
-    )
-    for term in (terms.distance, terms.pitch, terms.insertion, terms.approach_command_change):
-        assert term(positioning).item() == 0.0, term.__name__
-    assert terms.far_contact(positioning, largest=0.7).item() == 0.0
-    assert terms.working_distance(state, edge=0.25).item() == 0.0, (
-        "and once it is done, all the others"
-    )
-
-
-def test_distance_is_one_over_one_plus_metres(state: ToolState) -> None:
-    assert terms.distance(state).item() == pytest.approx(1 / 1.25)
-
-
-def test_pitch_is_one_over_one_plus_radians_both_ways(state: ToolState) -> None:
-    assert terms.pitch(state).item() == pytest.approx(1 / 1.25)
-    assert terms.pitch(replace(state, pitch_rad=torch.tensor([1.75]))).item() == pytest.approx(
-        1 / 1.25
-    )
-
-
-def test_insertion_pays_both_alignments_while_the_papers_criterion_holds(state: ToolState) -> None:
-    assert terms.insertion(state).item() == 0.0
-    assert terms.insertion(replace(state, paper_success=YES)).item() == pytest.approx(0.8 + 0.8)
+    term = RewardTerm(function=f"tasks.terms:{name}", params=params, weight=1.0).resolve()
+    assert float(term(replace(state, **changes))) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("distance_m", "expected"), [(0.5, 120.0), (0.43, 120.0), (0.42, 0.0), (0.25, 0.0)]
+    ("distance_m", "expected"), [(0.43, 120.0), (0.42, 0.0)]
 )  # r^d = 0.7 at 3/7 m = 0.4286 m
 def test_contact_costs_its_force_only_far_from_the_hole(
     state: ToolState, distance_m: float, expected: float
 ) -> None:
-    touching = replace(
-        state,
-        contact_force_n=torch.tensor([120.0]),
-        target_m=state.tip_m + torch.tensor([[0.0, 0.0, distance_m]]),
-    )
+    target_m = state.tip_m + torch.tensor([[0.0, 0.0, distance_m]])
+    touching = replace(state, contact_force_n=torch.tensor([120.0]), target_m=target_m)
     assert terms.far_contact(touching, largest=0.7).item() == pytest.approx(expected)
 
 
@@ -121,13 +130,6 @@ def test_travel_of_the_valves_and_speed_of_the_tip_are_those_of_the_last_period(
     speed_m_s = moved.tip_velocity_m_s.norm().item()
     assert speed_m_s == pytest.approx(5.2 * 1e-4 / 0.05, rel=1e-2)
     assert not moved.is_first and replace(state, age=torch.tensor([1.0])).is_first
-
-
-def test_command_change_sums_over_joints(state: ToolState) -> None:
-    assert terms.approach_command_change(state).item() == pytest.approx(0.25 + 0.5)
-    assert terms.command_change(replace(state, positioning=YES)).item() == pytest.approx(0.75), (
-        "this one counts everywhere"
-    )
 
 
 def test_the_papers_total_on_one_state(state: ToolState) -> None:
@@ -149,32 +151,6 @@ def test_the_papers_total_on_one_state(state: ToolState) -> None:
     assert float(total) == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
 
 
-def test_progress_is_the_gain_of_closeness(state: ToolState) -> None:
-    assert terms.progress(state).item() == 0.125
-
-
-def test_success_and_duration_are_one(state: ToolState) -> None:
-    assert (
-        terms.success(state).item() == 0.0
-        and terms.success(replace(state, success=YES)).item() == 1.0
-    )
-    assert terms.duration(state).item() == 1.0
-
-
-def test_failing_costs_one_and_what_was_gained(state: ToolState) -> None:
-    assert terms.failure(state).item() == 0.0
-    assert terms.failure(replace(state, failed=YES)).item() == 1.5
-
-
-def test_contact_counts_kilonewtons_up_to_ten(state: ToolState) -> None:
-    forces = torch.tensor([0.0, 2500.0, 80000.0])
-    assert terms.contact(replace(state, contact_force_n=forces), most_n=1e4).tolist() == [
-        0.0,
-        2.5,
-        10.0,
-    ]
-
-
 @pytest.mark.parametrize(
     ("params", "words"),
     [
@@ -193,34 +169,6 @@ def test_params_that_the_function_does_not_take_are_refused(params: dict, words:
 def test_a_term_that_is_no_function_is_refused(function: str) -> None:
     with pytest.raises(ConfigError, match=r"expected package\.module:function"):
         RewardTerm(function=function, weight=1.0)
-
-
-@pytest.mark.parametrize(
-    ("before_n", "now_n", "expected"),
-    [(0, 2500, 2.5), (2500, 1000, 0), (9000, 14000, 1.0), (12000, 15000, 0)],
-)
-def test_an_episode_pays_for_its_hardest_blow_once(
-    state: ToolState, before_n: float, now_n: float, expected: float
-) -> None:
-    blow = replace(
-        state,
-        peak_force_n=torch.tensor([float(before_n)]),
-        contact_force_n=torch.tensor([float(now_n)]),
-    )
-    assert terms.peak_contact(blow, above_n=0.0, most_n=1e4).item() == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(
-    ("before_n", "now_n", "expected"),
-    [(0, 9_000, 0.0), (0, 12_500, 2.5), (12_000, 12_500, 0.5), (20_000, 12_500, 0.0), (0, 3e5, 90)],
-)
-def test_a_heavy_blow_pays_for_what_the_peak_grows_beyond_ten_kilonewtons(
-    state: ToolState, before_n: float, now_n: float, expected: float
-) -> None:
-    blow = replace(
-        state, peak_force_n=torch.tensor([before_n]), contact_force_n=torch.tensor([now_n])
-    )
-    assert terms.peak_contact(blow, above_n=1e4, most_n=1e5).item() == pytest.approx(expected)
 
 
 def curriculum(**changes: object) -> RewardCurriculum:
