@@ -23,7 +23,9 @@ from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.filterwarnings("ignore::DeprecationWarning:torch"),
-    pytest.mark.filterwarnings("ignore:TensorFloat32:UserWarning"),  # wanted: see brokk_rl.rl.runner
+    pytest.mark.filterwarnings(
+        "ignore:TensorFloat32:UserWarning"
+    ),  # wanted: see brokk_rl.rl.runner
 ]
 
 CUDA = torch.device("cuda")
