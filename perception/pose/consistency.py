@@ -154,6 +154,20 @@ def measure_stretch(
     return float(np.exp(logarithm)), std
 
 
+def measure_tilt_doubt(chart: PlaneChart, face: FacePlane) -> float:
+    """Return the deviation of the logarithm of `measure_stretch` that a face's own tilt leaves.
+
+    A rim is stretched by an error of the tilt times its tangent, and by that of the logarithm times
+    its squared sine.
+    """
+    ray = chart.origin / np.linalg.norm(chart.origin)
+    uphill = ray - float(ray @ face.normal) * face.normal
+    sine = float(np.linalg.norm(uphill))
+    uphill /= sine
+    tilt_std_rad = float(np.sqrt(uphill @ face.normal_cov_rad2() @ uphill))
+    return tilt_std_rad / (sine * float(np.sqrt(1.0 - sine**2)))
+
+
 def _measure_oval(
     pixels: np.ndarray, row: np.ndarray, chart: PlaneChart, face: FacePlane, logarithm: float
 ) -> tuple[np.ndarray, float]:

@@ -26,7 +26,7 @@ class FocalDoubt:
         slip_std: Standard deviation of the logarithm of the factor if it is wrong.
         gross: Probability that a measurement follows something else.
         widened: Factor on the stated deviation of a measurement.
-        least_std: Standard deviation that comes on top: of a face's tilt, which no rim shows.
+        least_std: Standard deviation that comes on top.
         sure: Probability from which a wrong one is named; it stays named while it is likelier wrong.
         factor: Least factor that is named.
     """

@@ -302,7 +302,8 @@ class PlaneConicEstimator:
         if told is None:
             return None
         if frame.right is not None:
-            self._focal.learn(row, frame.camera_matrix, float(np.log(told[0])), told[1])
+            std = float(np.hypot(told[1], consistency.measure_tilt_doubt(chart, face)))
+            self._focal.learn(row, frame.camera_matrix, float(np.log(told[0])), std)
         if abs(np.log(told[0])) <= np.log(self.settings.stretch) + 3.0 * told[1]:
             return None
         return Rejection("pose", consistency.STRETCH, told[0], 1.0)
@@ -319,8 +320,7 @@ class PlaneConicEstimator:
     ) -> tuple[Rejection | None, float]:
         """Return the gate of the appearance that a rim misses, and the factor on its score."""
         s, row = self.settings, circle.ellipse
-        # Appearance is measured in the fitted circle: the first ellipse may follow the shade
-        # within.
+        # The first ellipse may follow the shade within: the fitted circle counts.
         inside = appearance.measure_interior(light, frame.depth_m, row, frame.camera_matrix, face)
         parallax, covered = float("nan"), 0.0
         if both is not None:

@@ -9,7 +9,10 @@ import pytest
 from composed import option
 from drawn import AXIS, CENTER, K, drawn
 
+from perception.pose import consistency
 from perception.pose.focal_belief import FocalBelief, compute_focal_covariances
+from perception.pose.plane import FacePlane
+from perception.pose.rim import build_chart
 
 DOUBT = option("perception/pose", "plane_conic").focal
 
@@ -64,3 +67,18 @@ def test_the_covariance_of_a_hole_is_what_stretched_depth_does_to_it() -> None:
     turned = -longer / np.linalg.norm(longer) - AXIS
     np.testing.assert_allclose(shared_m2, np.outer(moved_m, moved_m), atol=1e-12)
     np.testing.assert_allclose(shared_rad2, np.outer(turned, turned), atol=2e-6)
+
+
+def test_a_face_whose_tilt_is_wrong_stretches_a_rim_as_a_wrong_focal_length_does() -> None:
+    tilt_rad, std_rad = 0.6, 0.01
+    normal, across = np.array([0.0, -np.sin(tilt_rad), -np.cos(tilt_rad)]), np.eye(3)[0]
+    m = normal / float(normal @ [0.0, 0.0, 2.0])
+    # The plane of such a covariance turns about the axis across the slope by `std_rad`.
+    moved = float(np.linalg.norm(m)) * std_rad * np.cross(across, normal)
+    face = FacePlane(m, np.outer(moved, moved), 1e-4, 1000, 7.0)
+    chart = build_chart(np.array([0.0, 0.0, 2.0]), m, K)
+    # As it is seen, a rim is shorter by the cosine; on a steeper plane it is longer than it is wide.
+    longer = np.cos(tilt_rad) / np.cos(tilt_rad + std_rad)
+    by_focal = np.sqrt((longer**2 - np.cos(tilt_rad) ** 2) / np.sin(tilt_rad) ** 2)
+    doubt = consistency.measure_tilt_doubt(chart, face)
+    assert doubt == pytest.approx(np.log(by_focal), rel=0.03)
