@@ -17,7 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from actuators.recordings.column_table import ColumnTable, JointGuess, read_columns
 from actuators.recordings.guess import Evidence, GivenColumns, Guess
 from actuators.recordings.log_files import Damaged, open_log
-from actuators.recordings.log_survey import GAP_PERIODS, JointSurvey, LogSurvey, measure_logs
+from actuators.recordings.log_survey import JointSurvey, LogSurvey, measure_logs
 from actuators.recordings.log_tables import index_columns
 from actuators.recordings.text_log import TextLog
 from actuators.recordings.time_guess import TimeGuess
@@ -118,7 +118,7 @@ class Draft:
     @property
     def longest_gap_s(self) -> float:
         """Time between two rows from which on a log is split."""
-        return _round_up(GAP_PERIODS * self.survey.slowest_period_s)
+        return _round_up(self.survey.gap_periods * self.survey.slowest_period_s)
 
     @property
     def shortest_s(self) -> float:
@@ -167,12 +167,7 @@ class Draft:
         folder = FileSystemLoader(Path(__file__).parent)
         environment = Environment(loader=folder, undefined=StrictUndefined)
         environment.filters |= {"quote": _quote, "explain": _explain}
-        names = {
-            "map": MAP,
-            "missing": MISSING,
-            "gap_periods": GAP_PERIODS,
-            "spare": f"{SPARE:.0%}",
-        }
+        names = {"map": MAP, "missing": MISSING, "spare": f"{SPARE:.0%}"}
         return environment.get_template(template).render(draft=self, **names)
 
 

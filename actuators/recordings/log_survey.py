@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,9 @@ from actuators.recordings.log_signals import Signal
 from actuators.recordings.time_guess import TimeGuess
 
 GAP_PERIODS = 4
-"""Periods without a sample that split a log; loggers without real time skip up to two."""
+"""Least number of periods without a sample that split a log; loggers without real time skip up to two."""
+LOST_PERIODS = 20
+"""A longer time without a sample is no row that was lost by chance."""
 REST_SPEED = 0.02
 """Part of the top speed below which a joint counts as at rest."""
 
@@ -80,6 +83,7 @@ class LogSurvey:
         joints: By joint.
         periods_s: Median periods of the positions, one a run.
         slowest_period_s: Median period of the slowest signal.
+        gap_periods: Periods without a sample that split the logs.
         num_runs: Number of runs.
         minutes: Length of all runs without their gaps.
         longest_s: Length of the longest piece without a gap.
@@ -89,6 +93,7 @@ class LogSurvey:
     joints: dict[str, JointSurvey]
     periods_s: list[float] = field(default_factory=list)
     slowest_period_s: float = 0.0
+    gap_periods: int = GAP_PERIODS
     num_runs: int = 0
     minutes: float = 0.0
     longest_s: float = 0.0
@@ -107,7 +112,8 @@ class LogSurvey:
         self.periods_s.append(period_s)
         slowest_s = max(float(np.median(np.diff(signal.t_s))) for signal in signals)
         self.slowest_period_s = max(self.slowest_period_s, slowest_s)
-        gaps = np.flatnonzero(periods_s > GAP_PERIODS * slowest_s)
+        self.gap_periods = max(self.gap_periods, count_gap_periods(periods_s / period_s))
+        gaps = np.flatnonzero(periods_s > self.gap_periods * slowest_s)
         if len(gaps):
             longest = gaps[np.argmax(periods_s[gaps])]
             self.gaps.append(
@@ -119,6 +125,22 @@ class LogSurvey:
         edges_s = np.concatenate([t_s[:1], t_s[gaps], t_s[-1:]])
         self.longest_s = max(self.longest_s, float(np.diff(edges_s).max()))
         self.num_runs += 1
+
+
+def count_gap_periods(periods: np.ndarray) -> int:
+    """Return for how many periods rows that are lost one by one, by chance, leave no sample.
+
+    Of `N` rows, each lost with probability `p`, the longest series of lost ones has about
+    `log N / log(1 / p)` (Erdős and Rényi); one row more is a gap.
+
+    Args:
+        periods: Times between rows over their median, `(N,)`.
+    """
+    steps = np.maximum(np.round(periods[periods < LOST_PERIODS]), 1.0)
+    lost = 1.0 - len(steps) / max(float(steps.sum()), 1.0)
+    if lost <= 0.0:
+        return GAP_PERIODS
+    return max(GAP_PERIODS, 2 + math.ceil(math.log(len(steps)) / math.log(1.0 / lost)))
 
 
 def measure_logs(

@@ -194,6 +194,16 @@ def test_a_gap_is_remarked_and_left_out_of_the_minutes() -> None:
     assert len(recordings) == 2
 
 
+def test_rows_that_are_lost_by_chance_do_not_cut_a_log_into_pieces() -> None:
+    rows = make_rows(2000)
+    is_kept = np.random.default_rng(2).random(len(rows)) > 0.2
+    is_kept[900:960] = False
+    write_text("a.csv", rows[is_kept])
+    done, recordings = import_log("log.input=a.csv")
+    assert "1 gaps, 1.2" in done.out
+    assert [round(one["t_s"][-1]) for one in recordings] == [18, 21]
+
+
 @pytest.mark.parametrize(
     ("kind", "modulus"), [("angle", 2 * np.pi), ("counter", 4096.0), ("position", 2 * np.pi)]
 )
