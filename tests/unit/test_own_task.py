@@ -344,7 +344,10 @@ def test_a_value_that_counts_only_at_the_beginning_is_refused_before_the_run_is_
     run = ("mode=train", "session.out=run", "session.device=cpu", "task.episode_s=1.0")
     assert brokk(*run, *small, *FEW, "evaluation.episodes=1").code == 0
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    for value in ("rl.runner.algorithm.learning_rate=0.001", "rl.random_episode_lengths=false"):
+    for value in (
+        "rl.runner.algorithm.learning_rate=0.001",
+        "rl.runner.actor.distribution_cfg.init_std=2.0",
+    ):
         done = brokk("mode=train", "policy=run", "session.out=run", value)
         assert done.code == 2 and f"{value} was asked for, but the training in run" in done.err
     done = brokk("mode=train", "policy=run/model_1.pt", "session.out=new", value)
