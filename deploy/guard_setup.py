@@ -22,6 +22,19 @@ MACHINES = ("machine: ", "capture: ", "log: ")
 """Beginnings of the sources of recordings that may be of a machine."""
 
 
+def check_command_rate(limits: GuardLimits, machine: Machine) -> None:
+    """Check that a command is not yet too old when the next one comes.
+
+    Raises:
+        ConfigError: it is.
+    """
+    if limits.request_s <= machine.period_s:
+        raise ConfigError(
+            f"guard.request_s: expected more than the control period of {machine.name}, "
+            f"{machine.period_s:g} s, got {limits.request_s:g}; give it the period and 0.03 s for lateness"
+        )
+
+
 def build_observer(
     limits: GuardLimits, machine: Machine, interface: str, commands: bool
 ) -> Observer | None:

@@ -45,7 +45,6 @@ class GuidanceEffect:
         dz: The difference over the standard deviation of a person's difference.
         p: Exact test over sequences: the one that counts. `None` where order and guidance cannot be
             told apart.
-        paired_p: Exact paired permutation test; practice is part of it.
         period: Second period minus first, by practice or fatigue.
         period_p: Student's test of it.
     """
@@ -58,7 +57,6 @@ class GuidanceEffect:
     ci95: tuple[float, float] | None = None
     dz: float | None = None
     p: float | None = None
-    paired_p: float | None = None
     period: float | None = None
     period_p: float | None = None
 
@@ -84,7 +82,6 @@ def estimate_effect(
         effect = replace(effect, guided=means[0], unguided=means[1])
     if num < 2:
         return effect
-    effect = replace(effect, paired_p=compute_paired_p(difference))
     if min(num_first, num - num_first) < 2:
         mean, error, free = float(difference.mean()), float(stats.sem(difference)), num - 1
         return replace(effect, **_describe(mean, error, free, float(difference.std(ddof=1))))
@@ -101,19 +98,6 @@ def estimate_effect(
         facts["period_p"] = float(2 * stats.t.sf(abs(period / error), free))
     p = float(compute_sequence_p(by_period[None], first, pairs[both])[0])
     return replace(effect, **facts, period=float(period), p=p)
-
-
-def compute_paired_p(difference: np.ndarray) -> float:
-    """Return the two-sided p of the paired permutation test (Fisher 1935, section 21)."""
-    found = stats.permutation_test(
-        (difference,),
-        np.mean,
-        permutation_type="samples",
-        n_resamples=MOST_DRAWS,
-        vectorized=True,
-        rng=np.random.default_rng(0),
-    )
-    return float(found.pvalue)
 
 
 def compute_sequence_p(
@@ -147,15 +131,15 @@ def compute_sequence_p(
     return (statistics >= limit).mean(1)
 
 
-def get_smallest_p(num_choices: int) -> float:
-    """Return the smallest two-sided p of an exact test over so many coins: one a person, or a pair."""
-    return min(1.0, 2.0 / 2**num_choices)
+def get_smallest_p(num_pairs: int) -> float:
+    """Return the smallest two-sided p over the draws of so many pairs of persons."""
+    return min(1.0, 2.0 / 2**num_pairs)
 
 
-def find_smallest_sizes(alpha: float) -> tuple[int, int]:
-    """Return the smallest numbers of persons with which the paired and the sequence test can reach `alpha`."""
-    num_coins = math.ceil(1 - math.log2(alpha))
-    return num_coins, 2 * num_coins - 1
+def find_smallest_size(alpha: float) -> int:
+    """Return the smallest number of persons with which the test can reach `alpha`."""
+    num_pairs = math.ceil(1 - math.log2(alpha))
+    return 2 * num_pairs - 1
 
 
 def estimate_power(num_persons: int, dz: float, alpha: float) -> float:

@@ -33,8 +33,8 @@ def build_plan_page(
     """
     num, num_trials, inside = design.num_participants, len(design.holes), design.success
     # Everything is computed for this plan, so that the page can be judged before the study.
-    paired_least, sequence_least = crossover.find_smallest_sizes(design.alpha)
-    summary, tone = _judge_design(design, sequence_least)
+    smallest_size = crossover.find_smallest_size(design.alpha)
+    summary, tone = _judge_design(design, smallest_size)
     found = Report(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
     found.add_text(notice, "warn")
     found.add_facts(
@@ -48,7 +48,7 @@ def build_plan_page(
             "seed of the draw": seed,
         }
     )
-    _add_sample_sizes(found, design, paired_least, sequence_least)
+    _add_sample_sizes(found, design, smallest_size)
     found.add_heading("Rules")
     found.add_list(RULES)
     found.add_heading("Places")
@@ -69,7 +69,7 @@ def build_plan_page(
     return found
 
 
-def _judge_design(design: Design, sequence_least: int) -> tuple[str, str]:
+def _judge_design(design: Design, smallest_size: int) -> tuple[str, str]:
     """Return a sentence on the power of the design, and whether it is good, bad or a warning."""
     num, dz = design.num_participants, crossover.LARGE_DZ
     if design.order == "fixed":
@@ -81,7 +81,7 @@ def _judge_design(design: Design, sequence_least: int) -> tuple[str, str]:
     if smallest > design.alpha:
         return (
             f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is "
-            f"{smallest:.3f}. It takes {sequence_least} to be able to.",
+            f"{smallest:.3f}. It takes {smallest_size} to be able to.",
             "bad",
         )
     power = crossover.estimate_power(num, dz, design.alpha)
@@ -92,30 +92,25 @@ def _judge_design(design: Design, sequence_least: int) -> tuple[str, str]:
     )
 
 
-def _add_sample_sizes(
-    found: Report, design: Design, paired_least: int, sequence_least: int
-) -> None:
+def _add_sample_sizes(found: Report, design: Design, smallest_size: int) -> None:
     found.add_heading("How many participants")
     found.add_text(
-        "An exact paired test cannot go below p = 0.0625 with five participants: such a study can never be significant at 0.05. "
-        f"It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from guidance. "
+        f"It takes {smallest_size} participants for the exact test to reach p = {design.alpha:g}. "
         f"Power is the share of up to {crossover.NUM_STUDIES} simulated studies that find the effect; dz is the mean difference in "
         "standard deviations of it."
     )
-    columns = ["participants", "smallest p, paired", "with the period in the model"]
+    columns = ["participants", "smallest p"]
     columns += [f"dz {dz:g}" for dz in crossover.EFFECTS_DZ]
     rows = []
     # The plan's own number stands among the usual ones.
     for num in sorted({*SIZES, design.num_participants}):
         name = Cell(str(num), note="this plan" if num == design.num_participants else "")
-        least = crossover.get_smallest_p(num), crossover.get_smallest_p((num + 1) // 2)
-        row: list[str | Cell] = [name, f"{least[0]:.2g}", f"{least[1]:.2g}"]
+        least = crossover.get_smallest_p((num + 1) // 2)
+        row: list[str | Cell] = [name, f"{least:.2g}"]
         for dz in crossover.EFFECTS_DZ:
             row.append(f"{crossover.estimate_power(num, dz, design.alpha):.2f}")
         rows.append(row)
-    found.add_table(
-        columns, rows, "smallest possible p of both tests, and power with the period in the model"
-    )
+    found.add_table(columns, rows, "smallest possible p, and power")
 
 
 def _add_schedule(found: Report, planned: list[Trial]) -> None:

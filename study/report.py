@@ -140,8 +140,7 @@ def _add_effects(page: Report, folder: Path, found: Analysis) -> None:
     page.add_heading("What guidance does")
     page.add_text(
         "Guided minus unguided, with the period in the model: what practice does between the first and the second period is not "
-        "counted as guidance. p is exact, over all ways in which the order could have been drawn; beside it stands the "
-        "usual paired test, of which practice is a part. The primary measure decides; the "
+        "counted as guidance. p is exact, over all ways in which the order could have been drawn. The primary measure decides; the "
         "others are corrected for looking at many (Holm, within the measures and within the six scales). dz is in standard "
         "deviations of a person's difference. Means of a participant are over trials; a trial without insertion has the limit as "
         "its time and no efficiency."
@@ -182,7 +181,7 @@ def _add_comparisons(page: Report, found: Analysis) -> None:
 
 def _build_table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[str | Cell]]]:
     columns = ["measure", "guided", "unguided", "difference", "dz", "p", "p, Holm"]
-    columns += ["p, paired", "second period minus first"]
+    columns.append("second period minus first")
     rows: list[list[str | Cell]] = []
     for name in names:
         # The primary measure decides alone and is not corrected.
@@ -193,7 +192,6 @@ def _build_table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list
         row.append(Cell(_format_number(effect.difference), _format_interval(effect.ci95)))
         row += [_format_number(effect.dz), _format_p(effect.p)]
         row.append("decides" if is_primary else _format_p(found.holm.get(name)))
-        row.append(_format_p(effect.paired_p))
         row.append(Cell(_format_number(effect.period), f"p {_format_p(effect.period_p)}"))
         rows.append(row)
     return columns, rows

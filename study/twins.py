@@ -278,7 +278,7 @@ class _Desk:
         self._twin.cycle(self._now_s)
         for frame in self._air.frames:
             self._receiver.take(frame, self._now_s)
-            self._remote.hear(frame, self._now_s)
+            self._remote.hear(frame)
         self._air.frames.clear()
 
     def _advise(self) -> None:

@@ -146,7 +146,7 @@ class Bridge:
         """Carry a frame."""
         name = self._names.get(frame.frame_id, "")
         if not to_gateway and hasattr(self._remote, "hear"):
-            self._remote.hear(frame, self._stage.now_s)
+            self._remote.hear(frame)
         self._counts[frame.frame_id] += 1
         if name and name == self.half and self._counts[frame.frame_id] % 2:
             frame = CanFrame(frame.frame_id, bytes([frame.data[0] ^ 1, *frame.data[1:]]))

@@ -38,9 +38,9 @@ def reboot_remote(stage: Stage, trial: int) -> None:
     stage.twin._remote = remote
     remote.is_ready = False
 
-    def boot(frame: CanFrame, now_s: float) -> None:
+    def boot(frame: CanFrame) -> None:
         if stage.now_s >= end_s:
-            RadioRemote.hear(remote, frame, now_s)
+            RadioRemote.hear(remote, frame)
 
     remote.hear = boot
 

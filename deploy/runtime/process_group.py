@@ -11,6 +11,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.bus.can_bus import BusReplay, CanBus
 from deploy.bus.description import BusDescription
+from deploy.guard_setup import check_command_rate
 from deploy.guidance import LeverGuidance, LeverMap
 from deploy.kernel.bus_process import BusProcessConfig
 from deploy.kernel.limits import GuardLimits
@@ -115,8 +116,9 @@ class BusAndPolicySettings:
 
         Raises:
             CheckpointError: the policy cannot be used on this machine.
-            ConfigError: bus description or levers do not fit the machine.
+            ConfigError: bus description, levers or the guard's limits do not fit the machine.
         """
+        check_command_rate(self.limits, machine)
         BusDescription(self.dbc, machine)
         LeverMap(self.guidance.levers or machine.levers, machine)
         PolicyBundle(self.policy, machine)

@@ -17,7 +17,6 @@ from brokk_rl.spec import spec
 from deploy.bus.can_bus import CanBus, CanFrame, OpenCanBus
 from deploy.bus.description import LEVER_AXES, STAMP, BusDescription
 from deploy.guidance import AXES, LeverMap, find_full_angles_rad
-from deploy.kernel.clock import GatewayClock
 from deploy.kernel.protection import MessageFault
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -50,7 +49,7 @@ class RadioRemote:
         self.levers: Sequence[float] = (0.0,) * len(AXES)
         self.button_right = self.deadman = False
         self.on = True
-        self._counter, self._clock = 0, GatewayClock()
+        self._counter, self._stamp_s = 0, 0.0
         self._heard = description.layouts[description.message_of("EStop")]
         self.is_ready = not self._heard.stamp_wrap_s
 
@@ -59,14 +58,14 @@ class RadioRemote:
         """Identifier of the message from which it takes the gateway's clock."""
         return [self._heard.frame_id]
 
-    def hear(self, frame: CanFrame, now_s: float) -> None:
+    def hear(self, frame: CanFrame) -> None:
         """Take the gateway's clock from its status; other frames are ignored."""
         if frame.frame_id != self._heard.frame_id or not self._heard.stamp_wrap_s:
             return
         values = self._description.decode(self._heard, frame.data)
         if not isinstance(values, MessageFault):
-            self._clock.learn(values[STAMP], self._heard.stamp_wrap_s, now_s)
-            self.is_ready = True
+            # The last one, not the largest: the gateway's clock may be set back.
+            self._stamp_s, self.is_ready = values[STAMP], True
 
     def iterate_cycles(self, stop: Stop, bus: OpenCanBus) -> Iterator[float]:
         """Yield the time at which each message is due, until told to stop; listen in between."""
@@ -75,7 +74,7 @@ class RadioRemote:
             while (left_s := timer.next_s - time.monotonic()) > 0:
                 frame = bus.recv(left_s)
                 if frame is not None:
-                    self.hear(frame, time.monotonic())
+                    self.hear(frame)
             timer.begin()
             yield time.monotonic()
 
@@ -85,7 +84,7 @@ class RadioRemote:
         for axis, value in zip(LEVER_AXES, self.levers, strict=True):
             values[f"Lever_{axis}"] = value
         values |= {"ButtonRight": self.button_right, "DeadMan": self.deadman, "RemoteOn": self.on}
-        values[STAMP] = self._clock.newest_s
+        values[STAMP] = self._stamp_s
         self._counter = self._counter + 1 if frozen is None else frozen
         return CanFrame(
             self._layout.frame_id,

@@ -328,8 +328,8 @@ class RunningTwin:
         # All stamps of the bus are readings of the gateway's clock, which is that of this process.
         data = self._description.encode(name, values | {STAMP: now_s}, counter)
         frame = CanFrame(layout.frame_id, data, layout.extended)
-        self._remote.hear(frame, now_s)
-        self._second.hear(frame, now_s)
+        self._remote.hear(frame)
+        self._second.hear(frame)
         for one in self._faults.pass_on(layout, frame, now_s):
             self._bus.send(one)
 

@@ -24,11 +24,13 @@ from hypothesis import strategies as st
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
+from deploy.bus.can_bus import CanBus
 from deploy.guidance import AXES, LeverDisplay, LeverMap
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyHistory, PolicyProcessConfig
 from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.process import CycleTimer
+from deploy.runtime.process_group import BusAndPolicySettings
 from deploy.runtime.shared_memory import Pipe, RecordLayout, Slot
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import FileTarget
@@ -198,6 +200,23 @@ def test_levers_that_do_not_do_are_refused(machine: Machine) -> None:
     with pytest.raises(ConfigError, match="share"):
         LeverMap(both, machine)
     assert len(AXES) == 4
+
+
+def test_commands_that_come_too_seldom_for_the_guard_are_refused_before_anything_starts(
+    machine: Machine,
+) -> None:
+    asked = BusAndPolicySettings(
+        wire=CanBus(interface="virtual", channel="none", bitrate=None, port=None, hops=None),
+        dbc="deploy:dbc/example_gateway.dbc",
+        limits=option("guard", "default"),
+        guidance=option("guidance", "machine"),
+        policy=SHIPPED,
+        target=option("target", "given"),
+        realtime=False,
+    )
+    asked.check_machine(machine)
+    with pytest.raises(ConfigError, match=r"guard\.request_s: expected more than the control period"):
+        asked.check_machine(replace(machine, period_s=0.1))
 
 
 @pytest.fixture

@@ -147,7 +147,7 @@ def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, n
         desk.children[name].end(1.0)
         desk.start(name)
         desk.wait_for_state()
-    assert found_s <= 0.2 + 0.02 * SLACK
+    assert found_s <= 0.1 + 0.02 * SLACK
 
 
 def test_what_is_shown_says_who_has_the_valves(desk: Desk) -> None:

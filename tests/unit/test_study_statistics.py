@@ -13,23 +13,15 @@ from study import crossover
 from study.crossover import estimate_effect
 from study.design import Design, Hole, Success, draw_sequences
 
-DARWIN = np.array([49, -67, 8, 16, 6, 23, 28, 41, 14, 29, 56, 24, 75, 60, -48], float)
-"""Darwin's maize, eighths of an inch; Fisher 1935 counted by hand that 1726 of 32768 flips are as
-extreme: p = 0.0527."""
 
-
-def test_the_paired_test_counts_what_fisher_counted() -> None:
-    assert crossover.compute_paired_p(DARWIN) == pytest.approx(1726 / 32768, abs=1e-12)
-
-
-def test_five_persons_cannot_reach_five_percent_and_six_can() -> None:
-    assert crossover.get_smallest_p(5) == 0.0625 == crossover.compute_paired_p(np.arange(1.0, 6.0))
+def test_five_pairs_cannot_reach_five_percent_and_six_can() -> None:
+    assert crossover.get_smallest_p(5) == 0.0625
     assert crossover.get_smallest_p(6) == 0.03125
     first, pairs = np.arange(8) % 2 == 0, np.arange(8) // 2
     extreme = np.where(first, 1.0, -1.0) + 0.01 * np.arange(8)
     assert crossover.compute_sequence_p(extreme[None], first, pairs)[0] == 0.125
-    assert crossover.find_smallest_sizes(0.05) == (6, 11)
-    assert crossover.find_smallest_sizes(0.0625) == (5, 9)
+    assert crossover.find_smallest_size(0.05) == 11
+    assert crossover.find_smallest_size(0.0625) == 9
 
 
 def build_design(num_participants: int) -> Design:
@@ -129,7 +121,7 @@ def test_guidance_and_period_come_apart() -> None:
 def test_with_one_sequence_nothing_is_said_about_guidance_apart_from_order() -> None:
     guided, unguided = np.arange(6.0), np.arange(6.0) ** 2
     found = estimate_effect(guided, unguided, np.ones(6, bool), np.arange(6) // 2)
-    assert found.p is None and found.period is None and found.paired_p is not None
+    assert found.p is None and found.period is None
     test = stats.ttest_1samp(guided - unguided, 0.0)
     assert found.ci95 == pytest.approx(tuple(test.confidence_interval()))
     none = estimate_effect(np.full(3, np.nan), np.ones(3), np.ones(3, bool), np.arange(3))
