@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from typing import Any
+
+import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -68,8 +71,13 @@ def read_observer_content(
         return None
     path = limits.observer.path
     content = load_observer_file(resolve_package_path(path))
-    if content["fingerprint"] != machine.fingerprint():
-        fault = f"made for machine {content['machine']}, which differs from {machine.name}"
+    if content.get("fingerprint") != machine.fingerprint():
+        fault = f"made for machine {content.get('machine')}, which differs from {machine.name}"
+    elif not _is_complete(content, machine):
+        raise ConfigError(
+            f"guard.observer.path: expected thresholds and a model of {machine.num_joints} joints in {path}, "
+            "got others; make it again by brokk mode=observe"
+        )
     elif interface not in DESKS and not all(map(is_from_machine, content["sources"])):
         fault = f"made {describe_sources(content)}, and this bus is that of a machine"
     else:
@@ -81,6 +89,20 @@ def read_observer_content(
         )
     log.warning("%s was %s: there is no observer; brokk mode=observe makes a file", path, fault)
     return None
+
+
+def _is_complete(content: dict[str, Any], machine: Machine) -> bool:
+    """Return whether an observer can be made of a file's content, and can judge a motion."""
+    still = np.zeros(machine.num_joints)
+    try:
+        json.dumps(content, allow_nan=False)
+        describe_sources(content)
+        observer = Observer(content, machine)
+        observer.update(0.0, still, still)
+        observer.update(machine.period_s, still, still)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
+        return False
+    return True
 
 
 def is_from_machine(source: str) -> bool:

@@ -108,6 +108,10 @@ class BusDescription:
             self.by_id[layout.frame_id] = layout
             for signal in message.signals:
                 self._home[signal.name] = message.name
+                if not signal.scale:
+                    raise ConfigError(
+                        f"bus: {name}: expected a factor other than 0 for '{signal.name}', got 0; mend the DBC"
+                    )
         required = []
         for kind in ("Command", "Position", "Valid", "Flow"):
             required += [f"{kind}_{joint}" for joint in machine.joint_names]

@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -86,14 +88,39 @@ def read_machine_shapes(path: Path, machine: Machine) -> MachineShapes | None:
             return None
         arm, body = [], []
         for one in content["arm"]:
-            ends_m = np.array(one["begin_m"], float), np.array(one["end_m"], float)
-            arm.append(LinkCapsule(int(one["link"]), *ends_m, float(one["radius_m"])))
+            ends_m = _read_numbers(one, "begin_m", 3), _read_numbers(one, "end_m", 3)
+            arm.append(LinkCapsule(_read_link(one, machine), *ends_m, _read_radius(one)))
         for one in content["body"]:
-            place = np.array(one["center_m"], float), np.array(one["rotation"], float)
-            half_m, radius_m = np.array(one["half_m"], float), float(one["radius_m"])
-            body.append(RoundedBox(int(one["link"]), *place, half_m, radius_m))
+            place = _read_numbers(one, "center_m", 3), _read_numbers(one, "rotation", 3, 3)
+            half_m = _read_numbers(one, "half_m", 3)
+            body.append(RoundedBox(_read_link(one, machine), *place, half_m, _read_radius(one)))
+        # Without capsules nothing would ever be near an obstacle.
+        if not arm:
+            raise ValueError("expected capsules of the arm, got none")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(
             f"guard.envelope.shapes: {path} cannot be read ({error}); brokk mode=export writes such a file"
         ) from error
     return MachineShapes(tuple(arm), tuple(body))
+
+
+def _read_numbers(part: Mapping[str, Any], name: str, *shape: int) -> np.ndarray:
+    """Return numbers of a shape's entry; one that is not finite would pass every comparison."""
+    numbers = np.array(part[name], float)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"expected finite numbers {shape} in {name}, got {part[name]}")
+    return numbers
+
+
+def _read_radius(part: Mapping[str, Any]) -> float:
+    radius_m = float(_read_numbers(part, "radius_m"))
+    if radius_m < 0.0:
+        raise ValueError(f"expected a radius_m of 0 or more, got {radius_m:g}")
+    return radius_m
+
+
+def _read_link(part: Mapping[str, Any], machine: Machine) -> int:
+    link = part["link"]
+    if link not in range(BASE, machine.num_joints):
+        raise ValueError(f"expected a link from {BASE} to {machine.num_joints - 1}, got {link}")
+    return link

@@ -19,7 +19,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
-from deploy.guard_setup import read_observer_content
+from deploy.guard_setup import build_envelope, read_observer_content
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.recorder.capture import CaptureConfig
@@ -104,6 +104,7 @@ class DeploymentLoop(BusAndPolicySettings):
         self.check_machine(machine)
         if self.commands:
             read_observer_content(self.limits, machine, self.wire.interface, commands=True)
+            build_envelope(self.limits, machine, commands=True)
         if self.video is not None:
             self.video.require_packages()
         with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:

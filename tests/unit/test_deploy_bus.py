@@ -144,9 +144,10 @@ def test_a_replay_of_nothing_is_refused(tmp_path: Path) -> None:
     [
         ("Position_q3", "Pos3", "no signal 'Position_q3'"),
         (" SG_ Crc : 56|8@1+ (1,0) [0|255] \"\" GATEWAY\n\nBO_ 2566918439", "\nBO_ 2566918439", "needs Counter, and Crc"),
+        ("(0.001,0) [0|65.535]", "(0,0) [0|65.535]", "factor other than 0"),
         ("BO_ 2365592067 JointPos1: 8", "BO_ JointPos1: 8", "no valid DBC"),
     ],
-    ids=["signal", "crc", "syntax"],
+    ids=["signal", "crc", "factor", "syntax"],
 )  # fmt: skip
 def test_a_description_that_does_not_do_is_refused(
     machine: Machine, tmp_path: Path, old: str, new: str, message: str

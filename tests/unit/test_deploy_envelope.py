@@ -655,8 +655,24 @@ def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str) -> No
     path.write_text(text)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_machine_shapes(path, MACHINE)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"link": "first"}, {"link": 17}, {"link": -2}, {"radius_m": -0.1}, {"radius_m": math.inf},
+        {"begin_m": [math.nan, 0.0, 0.0]}, {"end_m": [0.0, 0.0]}, None,
+    ],
+)  # fmt: skip
+def test_shapes_with_which_nothing_would_be_withheld_are_refused(
+    tmp_path: Path, change: dict[str, object] | None
+) -> None:
     content = json.loads(SHIPPED.read_text())
-    content["arm"][0]["link"] = "first"
+    if change is None:
+        content["arm"] = []
+    else:
+        content["arm"][0].update(change)
+    path = tmp_path / "shapes.json"
     path.write_text(json.dumps(content))
     with pytest.raises(ConfigError, match="cannot be read"):
         read_machine_shapes(path, MACHINE)

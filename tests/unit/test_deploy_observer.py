@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from deploy.checks.observer import Observer, classify_fault
 from deploy.checks.valve_model import ValvePredictor, describe_sources, load_observer_file
+from deploy.guard_setup import read_observer_content
 from deploy.kernel.guard import NOTHING_OBSERVED, GuardTrip
 from deploy.observer_file import ThresholdSettings
 
@@ -351,6 +353,25 @@ def test_the_shipped_file_is_that_of_the_machine() -> None:
     assert min(content["thresholds"]["slack_s"]) >= SLACK_S
     assert any("Hydraulic" in one for one in content["sources"])
     assert Observer(content, MACHINE).observation == NOTHING_OBSERVED
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"thresholds": None}, {"thresholds": {"share": 0.5}}, {"model": []}, {"sources": []},
+        {"thresholds": {"share": math.nan, "window_s": 1.0, "slack_s": [0.1] * 5}},
+        {"thresholds": {"share": 0.5, "window_s": 1.0, "slack_s": [0.1] * 3}},
+    ],
+)  # fmt: skip
+def test_a_file_by_which_no_motion_can_be_judged_is_refused(
+    tmp_path: Path, change: dict[str, object]
+) -> None:
+    path = tmp_path / "observer.json"
+    path.write_text(json.dumps(load_observer_file(SHIPPED) | change))
+    guard = option("guard", "default")
+    guard = replace(guard, observer=replace(guard.observer, path=str(path)))
+    with pytest.raises(ConfigError, match="make it again by brokk mode=observe"):
+        read_observer_content(guard, MACHINE, "virtual", commands=False)
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"schema": 1}', "{"])
