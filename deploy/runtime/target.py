@@ -224,10 +224,10 @@ class _WatchedFile:
             raise ConfigError(
                 f"target.path={self._path}: expected JSON with center_in_base_m: [x, y, z] ({error})"
             ) from error
-        if center_m.shape != (3,) or not np.isfinite(center_m).all():
+        if center_m.shape != (3,) or not np.isfinite([*center_m, std_m]).all():
             raise ConfigError(
-                f"target.path={self._path}: center_in_base_m is {center_m.tolist()}, expected three "
-                "numbers"
+                f"target.path={self._path}: expected three finite numbers and a finite std_m, got "
+                f"{center_m.tolist()} and {std_m:g}"
             )
         # A file that was there before has its age by the wall clock, which may be set at any time:
         # later changes are timed by the monotonic clock.

@@ -507,6 +507,9 @@ def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_pa
     )
     assert time.monotonic() - first.t_s == pytest.approx(5.0, abs=0.5)
     assert target.news([]) is None
+    path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7], "std_m": NaN}')
+    with pytest.raises(ConfigError, match="finite std_m"):
+        target.news([])
     path.write_text('{"center": 1}')
     with pytest.raises(ConfigError, match="center_in_base_m"):
         target.news([])
