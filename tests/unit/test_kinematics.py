@@ -119,6 +119,12 @@ def test_any_serial_chain_agrees_with_mujoco(machine, kinds, axes):
         np.testing.assert_allclose(jacobian[i], reference, atol=5e-6)
 
 
+def test_an_arm_that_does_not_slew_pitches_by_the_sum_of_its_joints(machine):
+    chain = _chain(machine, "hh", [(0, 1, 0), (0, 1, 0)])
+    pose = Kinematics(chain).pose(torch.tensor([0.3, 0.4]))
+    assert pose.pitch_rad.item() == pytest.approx(math.atan2(0.2, 0.4) + 0.3 + 0.4, abs=1e-5)
+
+
 def test_arrays_have_the_jacobians_of_differences_behind_slides_too(machine):
     chain = _chain(machine, "shs", [(0, 0, 1), (0, 1, 0), (1, 0, 0)])
     q, step = np.array([0.2, 0.3, -0.1]), 1e-6
