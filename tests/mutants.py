@@ -62,7 +62,7 @@ SCIENCE = {
     "diagnosis.engine.measure": ["test_diagnosis_engine.py"],
     "diagnosis.engine.rows": ["test_diagnosis_engine.py"],
     "diagnosis.engine.sizes": ["test_diagnosis_engine.py"],
-    "exam.answer_scoring": ["test_exam_marks.py"],
+    "exam.answer_scoring": ["test_exam_marks.py", "test_exam.py"],
     "exam.score": ["test_exam_marks.py"],
 }
 """Modules on which figures rest, and the tests of each."""
