@@ -139,7 +139,8 @@ def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
     command(run.parent, "mode=export", f"policy={run}", "session.out=export")
     made = run.parent / "export"
     assert {path.name for path in made.iterdir()} == {
-        "golden.json", "policy.json", "policy.onnx", "policy.safetensors", "resolved.yaml", "session.json",
+        "golden.json", "policy.json", "policy.onnx", "policy.safetensors", "resolved.yaml",
+        "session.json", "shapes.json",
     }  # fmt: skip
     assert (made / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
     assert read(made / "policy.json")["observation"] == read(run / "policy.json")["observation"]
