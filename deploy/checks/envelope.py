@@ -110,16 +110,6 @@ class Envelope:
         slowdown = self._find_slowdown(wanted, at, poses[0], faces_in_base_m if is_seen else ())
         return tuple((wanted * slowdown).tolist()), False
 
-    def measure_clearance(self, q: np.ndarray) -> np.ndarray:
-        """Return the distance between arm and obstacles, `(B,)`, in m; negative where they overlap.
-
-        Infinite without obstacles.
-
-        Args:
-            q: Joint positions, `(B, J)`.
-        """
-        return self._measure_pairs(q, np.inf).min(1, initial=np.inf)
-
     def _measure_pairs(self, q: np.ndarray, near_m: float) -> np.ndarray:
         """Return the distances of the pairs that may be nearer than `near_m`, `(B, P)`, in m.
 
