@@ -194,9 +194,11 @@ class ReferenceDiagnosis:
             return describe_detected(one.detected, machine)
         finding = one.finding
         assert finding is not None, "an effect was found one way or the other"
-        parameters = describe_numbers(one.kind, proof.sizes[finding.effect], finding.hold, machine)
+        # A clock that is late was simulated as a dead time.
+        simulated = {kind.name: kind for kind in self.kinds}.get(finding.name, one.kind)
+        parameters = describe_numbers(simulated, proof.sizes[finding.effect], finding.hold, machine)
         if one.kind.name == "clock_offset":
-            parameters = {"offset_s": parameters.get("dead_time_s", {})}
+            parameters = {"offset_s": parameters["dead_time_s"]}
         part = proof.parts.get(finding.effect)
         like, decided_by = list_alike(one.kind.name, finding.joints, self.case, self.kinds)
         return Selected(

@@ -154,7 +154,7 @@ class RepairProof(ABC):
 
     @cached_property
     def parts(self) -> dict[str, dict[str, Any]]:
-        """Part of each effect: its Shapley value, and what its removal restores."""
+        """Part of each effect: its Shapley value, what its removal restores, and how much of the error is then new."""
         names = list(self._effects)
         every = frozenset(names)
         before, after = self.measure_errors(self.before), self.measure_errors(self.after)
@@ -164,10 +164,16 @@ class RepairProof(ABC):
             reduced = summarise_draws(fewer / np.maximum(before, 1e-12))
             without = self.measure_errors(self.run(every - {name}))
             rise = summarise_draws((without - after) / np.maximum(before, 1e-12))
+            needed = summarise_draws((without - after) / np.maximum(without, 1e-12))
             restored, identified = judge_edit(reduced, rise)
             edit = {"restored": restored, "reduced": reduced.mean, "rise_without": rise.mean}
             closed = summarise_draws(self._share(fewer))
-            found[name] = {"closed": closed, "identified": identified, "edit": edit}
+            found[name] = {
+                "closed": closed,
+                "identified": identified,
+                "edit": edit,
+                "needed": needed,
+            }
         return found
 
     @cached_property

@@ -42,6 +42,10 @@ from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
 from diagnosis.simulator_search import SimulatorSearch
 from diagnosis.stages import examine_gap
 
+LEAST_NEED = 0.05
+"""Least share of the error without an effect that the effect takes away, on the half of the field that its
+size was not fitted to. Chosen by hand."""
+
 
 class SimulatorProof(RepairProof):
     """The proof of what a search found: free runs of the simulator with effects around it.
@@ -149,7 +153,7 @@ class SimulatorDiagnosis:
         if not failed:
             on_tool = geometry.find_geometry_errors(case, self.kinds, DIRECT_NATS, NAME_NATS).found
         tell("sizes and proof", 0.85)
-        proof = SimulatorProof(case, search, found, reference, self.generator)
+        proof, found = self._prove(search, found, reference)
         judged = [] if failed else self._judge(proof, found)
         if not failed and (failed := gates.list_failures(judged)):
             found = []
@@ -163,6 +167,28 @@ class SimulatorDiagnosis:
 
     def _cut(self, recordings: Sequence[Any]) -> SimulatorRuns:
         return cut_simulator_runs(self.base, recordings, self.case.machine, self.seed)
+
+    def _prove(
+        self,
+        search: SimulatorSearch,
+        effects: Sequence[GrownEffect],
+        reference: SimulatorRuns | None,
+    ) -> tuple[SimulatorProof, list[GrownEffect]]:
+        """Return the proof and the effects without which the error on the other half surely rises."""
+        found = list(effects)
+        while True:
+            proof = SimulatorProof(self.case, search, found, reference, self.generator)
+            if not found:
+                return proof, found
+            needs = [proof.parts[one.kind.name]["needed"] for one in found]
+            weak = []
+            for place, need in enumerate(needs):
+                if need.mean < LEAST_NEED or need.ci95[0] <= 0.0:
+                    weak.append((need.mean, place))
+            if not weak:
+                return proof, found
+            _, worst = min(weak)
+            found = search.fit([one for place, one in enumerate(found) if place != worst])
 
     def _judge(self, proof: SimulatorProof, found: Sequence[GrownEffect]) -> list[Gate]:
         """Return the gates of what was found; a simulator without effects has to keep up with an ARX too."""
