@@ -24,7 +24,7 @@ from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_units, stack_side
 from diagnosis.engine.valve import VALVE
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
-from diagnosis.repair_proof import RepairProof
+from diagnosis.repair_proof import EngineProof
 
 RATE_HZ = 20.0
 
@@ -240,7 +240,7 @@ def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machin
     # The second joint goes the other way: a simulator without this errs by twice its motion.
     case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, -1.0]))
     reference, field = (stack_side(side, two_joints) for side in (case.reference, case.field))
-    proof = RepairProof(case, Decider(reference, field), [], np.random.default_rng(0))
+    proof = EngineProof(case, Decider(reference, field), [], np.random.default_rng(0))
     assert [one.passed for one in proof.judge()] == [True, False]
     assert diagnose(case).verdict == "unknown"
 
