@@ -39,9 +39,6 @@ POLL_S, STOP_POLL_S = 0.003, 0.05
 """Between looks for a new picture, a fifth of a screen's frame; and between looks whether to stop."""
 LONGEST_OFFER = 1 << 16
 """Bytes of an offer; a browser's has 10 kB for two cameras."""
-AGAIN_SHARE, AGAIN_MOST = 0.25, 20.0
-"""Packets that may be sent again: as a share of those sent, and at once. Browsers ask twice for each
-lost packet over 120 ms of round trip, and for late ones in vain: this is enough for 5 % of losses."""
 ANY_ADDRESS = ("0.0.0.0", "::")
 RTP_TIMES = 1 << 32
 """Times of RTP have 32 bits."""
@@ -79,29 +76,6 @@ class CameraTrack(MediaStreamTrack):
         return frame
 
 
-class RetransmissionBudget:
-    """Bounds how much of what a page has not received is sent again.
-
-    aiortc answers every request. A link that carries less than is sent loses many packets, and the
-    answers, lost too, would fill it for good.
-
-    Args:
-        sender: Sends the pictures of one camera.
-    """
-
-    def __init__(self, sender: Any) -> None:
-        self._sender, self._answer, self._balance, self._sent = sender, sender._retransmit, 0.0, 0
-        sender._retransmit = self._retransmit
-
-    async def _retransmit(self, sequence_number: int) -> None:
-        sent = getattr(self._sender, "_RTCRtpSender__packet_count", 0)
-        self._balance += AGAIN_SHARE * (sent - self._sent)
-        self._balance, self._sent = min(self._balance, AGAIN_MOST), sent
-        if self._balance >= 1.0:
-            self._balance -= 1.0
-            await self._answer(sequence_number)
-
-
 class VideoPeer:
     """One page that watches.
 
@@ -124,7 +98,6 @@ class VideoPeer:
         for index, (transceiver, reader) in enumerate(zip(waiting, self._readers, strict=False)):
             track = CameraTrack(reader, self._make_report(index))
             track.sender = transceiver.sender
-            RetransmissionBudget(track.sender)
             transceiver.sender.replaceTrack(track)
             transceiver.direction = "sendonly"
         await self._connection.setLocalDescription(await self._connection.createAnswer())

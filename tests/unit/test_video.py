@@ -111,35 +111,6 @@ def test_who_has_no_token_does_not_reach_the_video_process(tmp_path: Path) -> No
         assert reached == [TOKEN]
 
 
-class Sender:
-    """A sender that remembers what it sends again."""
-
-    def __init__(self) -> None:
-        self.again: list[int] = []
-        self._RTCRtpSender__packet_count = 0
-
-    async def _retransmit(self, sequence_number: int) -> None:
-        self.again.append(sequence_number)
-
-
-def test_what_is_sent_again_is_a_share_of_what_is_sent() -> None:
-    pytest.importorskip("aiortc", reason="the extra video is not installed")
-    from deploy.video.video_process import AGAIN_MOST, AGAIN_SHARE, RetransmissionBudget
-
-    async def ask(sender: Any, sent: int, requests: int) -> int:
-        sender._RTCRtpSender__packet_count += sent
-        before = len(sender.again)
-        for number in range(requests):
-            await sender._retransmit(number)
-        return len(sender.again) - before
-
-    sender = Sender()
-    RetransmissionBudget(sender)
-    assert asyncio.run(ask(sender, 60, 5)) == 5, "few losses are all answered"
-    assert asyncio.run(ask(sender, 0, 500)) == round(60 * AGAIN_SHARE) - 5
-    assert asyncio.run(ask(sender, 10_000, 500)) == AGAIN_MOST, "a pause saves up no flood"
-
-
 @pytest.mark.parametrize("bitrate", [200_000, 2_000_000])
 def test_the_encoder_keeps_the_rate_and_bounds_key_pictures(bitrate: int) -> None:
     pytest.importorskip("aiortc", reason="the extra video is not installed")
