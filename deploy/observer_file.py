@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Interval
@@ -28,14 +28,6 @@ from deploy.kernel.limits import GuardLimits
 FILE, COUNTS = "observer.json", "observed.json"
 SHIFT_S = 8 * 3600.0
 """A shift, to which alarms are extrapolated."""
-
-
-class ModelTables(Protocol):
-    """An actuator whose numbers can be exported; `actuator=valve` can."""
-
-    def export_tables(self, machine: Machine) -> dict[str, Any]:
-        """Return all numbers by joint, as plain data."""
-        ...
 
 
 @dataclass
@@ -98,8 +90,13 @@ class ObserverCalibration:
     thresholds: ThresholdSettings
     limits: GuardLimits
 
-    def run(self, machine: Machine, actuator: ModelTables, session: Session) -> list[str]:
+    def run(self, machine: Machine, actuator: Any, session: Session) -> list[str]:
         """Write the files into the session's folder; return the result in words.
+
+        Args:
+            machine: The machine.
+            actuator: The model; one whose numbers can be exported, such as `actuator=valve`.
+            session: Folder.
 
         Raises:
             ConfigError: the model or the file is not one of this machine.
@@ -109,7 +106,7 @@ class ObserverCalibration:
             raise ConfigError(
                 "mode=observe: expected limits of the observer, got guard.observer=null"
             )
-        recordings = read_recordings(list(_list_patterns(self.recordings)), machine)
+        recordings = read_recordings(self.recordings, machine)
         if self.path is None:
             if not hasattr(actuator, "export_tables"):
                 raise ConfigError(
@@ -128,16 +125,11 @@ class ObserverCalibration:
         if self.path is None:
             write_json(session.folder / FILE, content)
             return _describe_file(content, machine, minutes)
-        lines = [
-            f"{minutes}: {counts.faults.total()} false alarms, {counts.faults_a_shift:.1f} a shift of 8 h"
-        ]
+        told = f"{counts.faults.total()} false alarms, {counts.faults_a_shift:.1f} a shift of 8 h"
+        lines = [f"{minutes}: {told}"]
         lines += [f"  {name}: {number}" for name, number in counts.faults.most_common()]
-        found = {
-            "minutes": counts.seconds / 60,
-            "runs": counts.num_runs,
-            "faults": dict(counts.faults),
-        }
-        found["faults_a_shift"] = counts.faults_a_shift
+        found = {"minutes": counts.seconds / 60, "runs": counts.num_runs}
+        found |= {"faults": dict(counts.faults), "faults_a_shift": counts.faults_a_shift}
         write_json(session.folder / COUNTS, found)
         return lines
 
@@ -159,9 +151,8 @@ def find_thresholds(
         seconds += recording.duration_s
         for _ in _replay(observer, recording, machine):
             seen = observer.window
-            needed = np.maximum(
-                needed, np.abs(seen.moved - seen.wanted) - settings.share * seen.way
-            )
+            off = np.abs(seen.moved - seen.wanted) - settings.share * seen.way
+            needed = np.maximum(needed, off)
     needed_s = np.maximum(settings.margin * needed / machine.max_speed, settings.least_slack_s)
     slack_s = [round(one, 4) for one in needed_s.tolist()]
     return thresholds | {"slack_s": slack_s, "minutes": round(seconds / 60, 1)}
@@ -211,7 +202,3 @@ def _describe_file(content: Mapping[str, Any], machine: Machine, minutes: str) -
     for name, slack in zip(machine.joint_names, slack_s, strict=True):
         lines.append(f"  {name}: {slack:g} s of full speed")
     return [*lines, f"count its alarms in other recordings: observe.path={FILE}"]
-
-
-def _list_patterns(patterns: str | tuple[str, ...]) -> tuple[str, ...]:
-    return (patterns,) if isinstance(patterns, str) else tuple(patterns)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich.console import Console
 
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.observer_file import ModelTables, ObserverCalibration
+from deploy.observer_file import ObserverCalibration
 
 
 @spec
@@ -16,7 +18,7 @@ class ObserveMode:
 
     session: Session
     machine: Machine
-    actuator: ModelTables
+    actuator: Any
     observe: ObserverCalibration
 
     def run(self) -> None:

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.contracts.vision import CameraView
-from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
@@ -30,7 +29,6 @@ from deploy.kernel.bus_process import TEXT
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
-    InsertionReading,
     LoopHealth,
     OperatorRequest,
     PageState,
@@ -40,11 +38,11 @@ from deploy.page.protocol import (
     Vector,
     read_view,
 )
-from deploy.page.scene import locate_borehole, measure_insertion, plan_approach, to_vector
+from deploy.page.scene import locate_borehole, place_tool, to_vector
 from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
 from deploy.page.video_relay import VideoRelay
-from deploy.runtime.operator_state import LoopSnapshot, OperatorState, PageSignal, PolicyAdvice
+from deploy.runtime.operator_state import LoopSnapshot, PageSignal, PolicyAdvice
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LOG_BYTES, VIEW, LoopMemory
@@ -172,7 +170,10 @@ class LoopFeed:
         targets = self._list_targets(aim)
         chosen = next((one for one in targets if one.chosen), None)
         state, advice = snapshot.state, snapshot.advice
-        path, insertion = self._place_tool(state, chosen)
+        q = None if state is None else state.q
+        path, insertion = place_tool(self._config.machine, q, chosen)
+        if not self._guiding:
+            path = ()
         return PageState(
             t_s=snapshot.t_s,
             alive=snapshot.alive,
@@ -378,17 +379,3 @@ class LoopFeed:
         # A hole that perception knows is better measured than one touch.
         known = find_nearest(read_holes(self._memory.holes), found[0])
         return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
-
-    def _place_tool(
-        self, state: OperatorState | None, chosen: BoreholeChoice | None
-    ) -> tuple[tuple[Vector, ...], InsertionReading | None]:
-        """Return the way of the tool into the chosen borehole, and where it is relative to it."""
-        machine = self._config.machine
-        if state is None or chosen is None or not machine.has_bodies:
-            return (), None
-        tool = compute_tool_kinematics(machine, state.q)
-        insertion = measure_insertion(tool, chosen)
-        if not self._guiding:
-            return (), insertion
-        center_m, axis = np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base)
-        return plan_approach(tool.tip_in_base_m, center_m, axis), insertion

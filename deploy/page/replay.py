@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.errors import CheckpointError, RecordingError
-from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
@@ -26,7 +25,6 @@ from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
-    InsertionReading,
     LoopHealth,
     OperatorRequest,
     PageState,
@@ -38,7 +36,7 @@ from deploy.page.protocol import (
     Vector,
     read_view,
 )
-from deploy.page.scene import measure_insertion, plan_approach, to_vector
+from deploy.page.scene import place_tool, to_vector
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
 from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import ALIVE_S, AdviceStatus, OperatorState
@@ -155,7 +153,8 @@ class ReplayFeed:
         state, ages_s = self._build_state(at_s)
         advice = self._find("advice", at_s)
         targets = self._list_targets(at_s, None if advice is None else advice[2])
-        path, insertion = self._place_tool(state, targets)
+        chosen = next((one for one in targets if one.chosen), None)
+        path, insertion = place_tool(self._machine, state.q, chosen)
         view = self._find("view", at_s)
         replay, heard_s = self._replay, min(ages_s["positions"], ages_s["levers"])
         streams = [
@@ -305,17 +304,6 @@ class ReplayFeed:
         if goal_m is not None and not is_chosen:
             found.append(BoreholeChoice(UNNAMED, to_vector(goal_m), UP, RADIUS_M, None, None, True))
         return tuple(found)
-
-    def _place_tool(
-        self, state: OperatorState, targets: tuple[BoreholeChoice, ...]
-    ) -> tuple[tuple[Vector, ...], InsertionReading | None]:
-        chosen = next((one for one in targets if one.chosen), None)
-        if chosen is None or not self._machine.has_bodies:
-            return (), None
-        tool = compute_tool_kinematics(self._machine, state.q)
-        center_m, axis = np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base)
-        path = plan_approach(tool.tip_in_base_m, center_m, axis)
-        return path, measure_insertion(tool, chosen)
 
 
 class _Topic:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.kinematics import ToolKinematics
+from brokk_rl.kinematics import ToolKinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from deploy.page.protocol import BoreholeChoice, InsertionReading, Vector
@@ -57,6 +57,17 @@ def describe_geometry(machine: Machine) -> dict[str, Any] | None:
         origin_m = [dimension.value for dimension in body.origin_m]
         links.append({"kind": joint.kind, "axis": list(body.axis), "origin_m": origin_m})
     return {"links": links, "tip_m": machine.tip_m.tolist()}
+
+
+def place_tool(
+    machine: Machine, q: np.ndarray | None, chosen: BoreholeChoice | None
+) -> tuple[tuple[Vector, ...], InsertionReading | None]:
+    """Return the way of the tool into the chosen borehole, and where it is relative to it."""
+    if q is None or chosen is None or not machine.has_bodies:
+        return (), None
+    tool = compute_tool_kinematics(machine, q)
+    center_m, axis = np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base)
+    return plan_approach(tool.tip_in_base_m, center_m, axis), measure_insertion(tool, chosen)
 
 
 def measure_insertion(tool: ToolKinematics, hole: BoreholeChoice) -> InsertionReading:

@@ -396,14 +396,9 @@ def _to_quaternion(rotation: np.ndarray) -> np.ndarray:
     is the eigenvector of the largest eigenvalue.
     """
     r = rotation
-    k = np.array(
-        [
-            [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
-            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
-            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r.trace()],
-        ]
-    )
+    k = np.zeros((4, 4))
+    k[:3, :3] = r + r.T - r.trace() * np.eye(3)
+    k[3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r.trace()
     return np.linalg.eigh(k)[1][:, -1]  # it reads the lower half alone
 
 
@@ -446,9 +441,7 @@ def _sample_box(pose: np.ndarray, size: np.ndarray) -> np.ndarray:
 def _sample_cylinder(pose: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return points on the mantle of a cylinder along z, `(SURFACE_POINTS, 3)`, likewise."""
     chance = np.random.default_rng(SEED)
-    angle, height = (
-        chance.uniform(0.0, 2.0 * np.pi, SURFACE_POINTS),
-        chance.uniform(-0.5, 0.5, SURFACE_POINTS),
-    )
+    angle = chance.uniform(0.0, 2.0 * np.pi, SURFACE_POINTS)
+    height = chance.uniform(-0.5, 0.5, SURFACE_POINTS)
     points = np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), height], 1)
     return (points * size) @ pose[:3, :3].T + pose[:3, 3]

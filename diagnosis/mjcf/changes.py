@@ -190,9 +190,19 @@ def _add_friction(to: _Editor) -> None:
     )
 
 
-def _add_damping(to: _Editor) -> None:
+def _add_damping(to: _Editor) -> str | None:
     index = 0 if np.ndim(to.joint.damping) else None
-    to.write("joint", "damping", index, "part", lambda old, new: old + new * to.unit["damping"])
+    held = float(np.ravel(to.joint.damping)[0])
+    unit = to.unit["damping"]
+    if held + to.get("part") * unit >= 0.0:
+        to.write("joint", "damping", index, "part", lambda old, new: old + new * unit)
+        return None
+    if to.machine.interface == "torque":
+        return "less damping than the joint has in the file was found, and the drive has none"
+    # A joint has no damping below 0; the drive has the rest of it.
+    gear = float(to.drive.gear[0])
+    to.write("actuator", "biasprm", 2, "part", lambda old, new: old - new * unit / gear**2)
+    return None
 
 
 def _add_armature(to: _Editor) -> None:

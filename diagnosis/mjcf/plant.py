@@ -28,6 +28,10 @@ QUANTITIES = ("friction", "damping", "armature", "gain", "limit")
 """Numbers that a row may change; see `MjcfPlant.read_references`."""
 
 
+MAX_DAMPING_LOSS = 0.95
+"""Largest share of the damping of joint and drive that an effect takes away."""
+
+
 class MjcfPlant:
     """Joints and drives of an MJCF file, named as those of a machine.
 
@@ -171,7 +175,7 @@ class MjcfPlant:
         if "friction" in changes:
             model.dof_frictionloss[dofs] += changes["friction"] * unit["friction"]
         if "damping" in changes:
-            extra = changes["damping"] * unit["damping"]
+            extra = np.maximum(changes["damping"] * unit["damping"], self._measure_least_damping())
             if model.dof_damping.ndim > 1:  # MuJoCo 4: linear and higher orders
                 model.dof_damping[dofs, 0] += extra
             else:
@@ -195,6 +199,14 @@ class MjcfPlant:
                 model.actuator_forcelimited[drive] = True
         mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by
         return model
+
+    def _measure_least_damping(self) -> np.ndarray:
+        """Return the largest damping that can be taken away, `(J,)`, negative: a rest keeps joints stable."""
+        held = self.model.dof_damping[self.dofs]
+        held = held[:, 0] if held.ndim > 1 else held
+        gear = self.model.actuator_gear[self.drives, 0]
+        held = held - self.model.actuator_biasprm[self.drives, 2] * gear**2
+        return -MAX_DAMPING_LOSS * np.maximum(held, 0.0)
 
     def _list_models(
         self, count: int, changes: Mapping[str, np.ndarray] | None

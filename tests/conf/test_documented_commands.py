@@ -88,6 +88,9 @@ def list_jobs(arguments: list[str]) -> list[list[Override]]:
     words = [word for word in arguments if not word.startswith("-")]
     write_option_files(words)
     extensions.register_options(words)
+    known = {f"{one.group}={one.name}" for one in registry.list_options()}
+    # As the command does: a group without an option `none` is left out by it.
+    words = [w if w in known else re.sub(r"^(\w+)=none$", r"~\1", w) for w in words]
     parser = OverridesParser.create()
     first, last = [], []
     for override in parser.parse_overrides(words):

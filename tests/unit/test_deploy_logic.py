@@ -336,10 +336,10 @@ def test_at_the_end_zero_goes_out_once_more_at_once(loop: Loop) -> None:
 
 
 def test_requests_reach_the_guard_with_their_age(loop: Loop) -> None:
-    loop.request_age_s = 0.149
+    loop.request_age_s = 0.079
     loop.go(0.05)
     assert loop.state is GuardState.ACTIVE
-    loop.request_age_s = 0.151
+    loop.request_age_s = 0.081
     loop.cycle()
     assert loop.trip is GuardTrip.REQUEST_STALE
     loop.request_age_s = 0.0

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from axis import driven, make_axis
 
 from brokk_rl import record
@@ -30,8 +29,6 @@ from diagnosis.answer import (
     Where,
 )
 from diagnosis.case import GapCase
-
-CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")

@@ -224,8 +224,11 @@ FEW = ("evaluation.num_recorded=1", "evaluation.video=false", "actuator=lag", "s
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("task.action.kind=direct",), "task.action.kind=direct was asked for, the policy has res"),
-        (("task.action={kind: direct}",), "task.action.kind=direct was asked for"),
+        (
+            ("task.action.kind=residual",),
+            "task.action.kind=residual was asked for, the policy has dir",
+        ),
+        (("task.action={kind: residual}",), "task.action.kind=residual was asked for"),
         (("task.memory=1",), "task.memory=1 was asked for, the policy has 13"),
         (("task=goal_pose",), "for task=borehole_insertion, but task=goal_pose was asked for"),
     ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from browser import SHOWN, Scripted
 from sitting import FACTS, Arm, conductor, in_trial, machine, plan, saved
 
 from brokk_rl import record
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, StorageError
 from deploy.page.protocol import OperatorRequest
 from study import analysis, study_folder, tlx
 from study.conductor import Conductor
@@ -266,7 +265,7 @@ def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(
     arm.later(lead, 2.0)
 
     def full(*_: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise StorageError("cannot write: No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(study_folder, "write_json", full)
