@@ -333,7 +333,7 @@ def estimate_numbers(
             at_bound = np.isclose(value, least) | np.isclose(value, most)
             rows = zip(value.tolist(), low.tolist(), high.tolist(), at_bound.tolist(), strict=True)
             every = [Estimate(mean, (lower, upper), end) for mean, lower, upper, end in rows]
-            if len(value) == 1:
+            if not one.kind.numbers[name].per_joint:
                 numbers[name] = {"machine": every[0]}
                 continue
             own = {}
