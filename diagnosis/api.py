@@ -180,8 +180,8 @@ def diagnose(
             its name `module:function`, or the path of an MJCF file; not needed with a reference.
         reference: Recordings that the simulator was built from; it is fitted to them.
         unseen: More of the field, to which nothing is fitted.
-        fit: Option of `fit`: the simulator with a reference, else the flexible model of the floor;
-            `None`: `valve`, or `servo` for joints commanded by position.
+        fit: Option of `fit` that makes the simulator of joints commanded by torque from a reference;
+            `None`: `force`.
         effects: Names to choose among; `None`: all that the machine may have.
         seed: Of all random numbers.
         workers: Processes that share the work, on Linux.

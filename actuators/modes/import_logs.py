@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 MAP_FILE, MACHINE_FILE = "column_map.yaml", "machine.yaml"
 GUESS_FILE, PICTURE_FILE, PAGE_FILE = "import.json", "import.png", "import.html"
 SIMULATORS = {
-    "position": "actuator=servo fit=servo",
-    "torque": "actuator=force actuator.mass_kg=<of your simulator> fit=force",
+    "position": "actuator=servo",
+    "torque": "actuator=force actuator.mass_kg=<of your simulator>",
     "speed": "actuator=ideal",
 }
 """Ideal simulator of each command interface, by which recordings are diagnosed first."""

@@ -26,7 +26,6 @@ from brokk_rl.spec import spec
 from diagnosis import report, why_answer, why_report
 from diagnosis.deployment.contract import load_policy
 from diagnosis.own_simulator import OwnSimulator
-from diagnosis.request import FITS
 from diagnosis.story import HANDED_ON_FOLDER, StoryStage, run_story, write_groups
 from diagnosis.why_answer import (
     ALL_EFFECTS,
@@ -165,11 +164,8 @@ class Why:
         return _make_stage("Is the code, the task or the actuator to blame?", command, ("machine",))
 
     def _diagnose(self) -> StoryStage:
-        command = [
-            "mode=diagnose", f"diagnosis.field={json.dumps(self.log)}", *self._choose_simulator()
-        ]  # fmt: skip
-        if self.machine.interface != "speed":
-            command.append(f"fit={FITS[self.machine.interface]}")
+        field = f"diagnosis.field={json.dumps(self.log)}"
+        command = ["mode=diagnose", field, *self._choose_simulator()]
         return _make_stage("Which effect does the simulator lack?", command, ("machine", "device"))
 
     def _list_evaluations(self, folder: Path, effects: Mapping[str, Any]) -> dict[str, StoryStage]:
