@@ -87,6 +87,9 @@ class SimulatorSearch:
             if is_settled:
                 break
             # Without what was taken away, others may show.
+        # A deviation that was taken beside wrong numbers explains their error, and holds them there.
+        self._whole.settle(())
+        found = self.improve(found, rounds=LAST_ROUNDS)
         self._whole.settle(found)
         return self.improve(found, rounds=LAST_ROUNDS)
 
