@@ -9,8 +9,8 @@ import numpy as np
 from perception.ellipse.edges import Edges
 from perception.ellipse.support import STROKE_PX, EllipseCandidates
 
-# A quarter more or less of each changed no count of 8 drawn patterns, 3 pictures of hidden discs and
-# 6 negatives.
+# Each of these times 0.8 or 1.25 left every count of 8 drawn patterns, 3 pictures of hidden discs and
+# 6 negatives as it was.
 SAME_AREA = 0.6
 """Least ratio of areas of the two edges of one thin line."""
 

@@ -101,8 +101,8 @@ REACH_RELATIVE = 0.03
 """Reach of an ellipse per px of its geometric mean semi-axis."""
 FLATTEST = 0.18
 """Least ratio of the semi-axes where the size is unknown."""
-# A quarter more or less of each changed no count of 8 drawn patterns, 3 pictures of hidden discs and
-# 6 negatives.
+# Each of these times 0.8 or 1.25 left every count of 8 drawn patterns, 3 pictures of hidden discs and
+# 6 negatives as it was. SMALLEST_PICTURE_PX, ROUNDING_PX, PRECISE_PX and ROUGH_PX were not varied.
 NO_ELLIPSES = np.empty((0, 5))
 SMALLEST_PICTURE_PX = 8
 """Smallest side of a picture that can hold an ellipse with its edges."""

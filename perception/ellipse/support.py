@@ -164,8 +164,8 @@ def compute_evidence(
         )
 
 
-# A quarter more or less of each changed no count of 8 drawn patterns, 3 pictures of hidden discs and
-# 6 negatives.
+# Each of these times 0.8 or 1.25 left every count of 8 drawn patterns, 3 pictures of hidden discs and
+# 6 negatives as it was. CHORD was not varied.
 OPEN = 0.12
 """Part of the circumference without support from which its ends are examined."""
 BACK_PX, STRIDE_PX = 4.0, 2.0

@@ -24,8 +24,8 @@ from perception.pose.plane import (
 )
 from perception.robust_fit import TUKEY, compute_biweight
 
-# A quarter more or less of each changed no count of holes and discs in 8 rendered frames, and their
-# median error by 0.4 mm at most.
+# Each of these times 0.8 or 1.25 left every count of holes and discs in 8 rendered frames as it was,
+# and changed their median error by 0.4 mm at most. MOST, WIDE_PX, ROUNDS, SETTLED_PX and SATURATED were not varied.
 SMOOTH_PX = 1.0
 """Blur of both pictures, px: noise would bias the gradient."""
 WINDOW_PX = 31

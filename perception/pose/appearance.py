@@ -10,8 +10,8 @@ import numpy as np
 from perception.ellipse import conic
 from perception.pose.plane import FacePlane
 
-# A quarter more or less of each changed no count of holes and discs in 8 rendered frames, and their
-# median error by 0.4 mm at most.
+# Each of these times 0.8 or 1.25 left every count of holes and discs in 8 rendered frames as it was,
+# and changed their median error by 0.4 mm at most. RING was not varied.
 INSIDE, RING = 0.8, (1.15, 1.8)
 """Radii of the inside without the rim's blur, and of the ring that shows the brightness of the
 face."""

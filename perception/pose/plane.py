@@ -15,8 +15,8 @@ from brokk_rl.signals import Frame
 from perception.ellipse import conic
 from perception.robust_fit import TUKEY, compute_biweight, guess_plane
 
-# A quarter more or less of each changed no count of holes and discs in 8 rendered frames, and their
-# median error by 0.4 mm at most.
+# Each of these times 0.8 or 1.25 left every count of holes and discs in 8 rendered frames as it was,
+# and changed their median error by 0.4 mm at most. DEGENERATE and USUAL_PULL_PX_M were not varied.
 GROWING = 3.0
 """Limit of the biweight, standard deviations, while the plane is grown: beyond an edge of the block
 another face begins at the same depth, and a wider limit would follow it."""

@@ -13,8 +13,8 @@ import numpy as np
 
 from perception.ellipse import conic
 
-# A quarter more or less of each changed no count of holes and discs in 8 rendered frames, and their
-# median error by 0.4 mm at most.
+# Each of these times 0.8 or 1.25 left every count of holes and discs in 8 rendered frames as it was,
+# and changed their median error by 0.4 mm at most. STEP_PX, PEAKS, TRIPLES, DEGENERATE and WAVES were not varied.
 SIGMA_PX, SIGMA_Y, STEP_PX = 0.5, 2.0, 0.5
 """Blur along a profile, px, and across profiles, in profiles; distance of samples, px."""
 PEAKS = 3
