@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnosis.effect_library import EffectType
+from diagnosis.engine.decide import EffectFinding
 
 SIZES = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0, 7.0)
 """Sizes that are tried, over the typical one; less is within what a machine repeats."""
@@ -40,6 +41,11 @@ class GrownEffect:
     def repeat(self, count: int) -> dict[str, np.ndarray]:
         """Return its numbers for some candidates, `(C, J)` or `(C, 1)` each."""
         return {name: np.repeat(value[None], count, 0) for name, value in self.values.items()}
+
+    def summarise(self) -> EffectFinding:
+        """Return its name and its joints, and what it earned."""
+        joints = tuple(np.flatnonzero(self.joints).tolist())
+        return EffectFinding(self.kind.name, joints, self.nats)
 
     def keep(self, joints: np.ndarray) -> GrownEffect:
         """Return the effect on some of its joints only."""

@@ -168,7 +168,7 @@ class ReferenceDiagnosis:
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
-            ranking=rank_effects(selected, _list_rivals(decision, machine), verdict),
+            ranking=rank_effects(selected, decision.rivals, verdict, machine),
             where=survey.where(),
             gap=proof.measure_gap(bool(named)),
             rivals=proof.rivals,
@@ -203,7 +203,7 @@ class ReferenceDiagnosis:
         like, decided_by = list_alike(one.kind.name, finding.joints, self.case, self.kinds)
         return Selected(
             effect=one.kind.name,
-            joints=tuple(machine.joint_names[j] for j in finding.joints),
+            joints=name_joints(finding.joints, machine),
             probability=estimate_probability(finding.nats),
             parameters=parameters,
             gap_closed=None if part is None else part["closed"],
@@ -321,14 +321,15 @@ def measure_clock_shift(recordings: Sequence[Recording], machine: Machine) -> fl
 
 
 def rank_effects(
-    selected: Sequence[Selected], rivals: Sequence[Ranked], verdict: str
+    selected: Sequence[Selected], rivals: Sequence[EffectFinding], verdict: str, machine: Machine
 ) -> tuple[Ranked, ...]:
     """Return all that is worth naming, the most probable first.
 
     Args:
         selected: What is named.
-        rivals: Other effects with what they earn, nats, in place of a probability.
+        rivals: All effects with what they earn, the best first.
         verdict: `effects`, `none` or `unknown`.
+        machine: Gives the joints' names.
     """
     found = [Ranked(one.effect, one.joints, one.probability) for one in selected]
     left = 1.0 - max([one.probability for one in selected], default=0.0)
@@ -337,11 +338,25 @@ def rank_effects(
         left = 0.2
     names = {one.effect for one in selected}
     for one in rivals[:MAX_RIVALS]:
-        if one.effect not in names and one.probability > 0.0:
-            chance = left * float(np.clip(one.probability / 100.0, 0.01, 0.5))
-            found.append(replace(one, probability=chance))
-            names.add(one.effect)
+        if one.name not in names and one.nats > 0.0:
+            chance = left * float(np.clip(one.nats / 100.0, 0.01, 0.5))
+            found.append(Ranked(one.name, name_joints(one.joints, machine), chance))
+            names.add(one.name)
     return tuple(sorted(found, key=lambda one: -one.probability))
+
+
+def name_joints(joints: Sequence[int], machine: Machine) -> tuple[str, ...]:
+    """Return the names of joints by their places."""
+    return tuple(machine.joint_names[j] for j in joints)
+
+
+def describe_rivals(rivals: Sequence[EffectFinding], machine: Machine) -> list[dict[str, Any]]:
+    """Return what each effect earns, plain JSON data."""
+    rows = []
+    for one in rivals:
+        told = {"name": one.name, "effect": one.name, "score": one.nats}
+        rows.append(told | {"joints": list(name_joints(one.joints, machine))})
+    return rows
 
 
 def propose_measurement(selected: Sequence[Selected]) -> NextExperiment | None:
@@ -368,27 +383,11 @@ def _explain(verdict: str, selected: Sequence[Selected], decision: Decision, fai
     )
 
 
-def _list_rivals(decision: Decision, machine: Machine) -> list[Ranked]:
-    """Return the effects of the first table with what they earn, nats, in place of a probability."""
-    found = []
-    for finding in decision.rivals:
-        joints = tuple(machine.joint_names[j] for j in finding.joints)
-        found.append(Ranked(finding.name, joints, finding.nats))
-    return found
-
-
 def _describe_evidence(decision: Decision, machine: Machine) -> dict[str, Any]:
     """Return what each effect earns, plain JSON data."""
-    rows = []
-    for finding in decision.rivals:
-        joints = [machine.joint_names[j] for j in finding.joints]
-        rows.append(
-            {"name": finding.name, "effect": finding.name, "joints": joints}
-            | {"score": finding.nats}
-        )
     outside = decision.outside
     return {
-        "rivals": rows,
+        "rivals": describe_rivals(decision.rivals, machine),
         "second": [{"effect": one.name, "score": one.nats} for one in decision.seconds[:5]],
         "outside": None if outside is None else {"cause": outside.effect, "score": outside.nats},
         "generic": {"group": decision.generic[0], "score": decision.generic[1]},

@@ -33,8 +33,10 @@ from diagnosis.reference_diagnosis import (
     ProgressCallback,
     accept_named_joints,
     describe_detected,
+    describe_rivals,
     estimate_probability,
     list_alike,
+    name_joints,
     propose_measurement,
     rank_effects,
 )
@@ -147,8 +149,8 @@ class SimulatorDiagnosis:
         # A search takes minutes, and most findings end in "cannot tell" whatever it names.
         if all(gate.passed or gate.name in ACCEPTED_FINDINGS for gate in told):
             found = search.run(lambda done: tell("simulating every effect", 0.05 + 0.75 * done))
-        joints = np.flatnonzero(np.any([one.joints for one in found], 0)) if found else []
-        told = accept_named_joints(told, [machine.joint_names[j] for j in joints])
+        named = {j for one in found for j in one.summarise().joints}
+        told = accept_named_joints(told, name_joints(sorted(named), machine))
         if failed := gates.list_failures(told):
             found = []
         on_tool: Sequence[DetectedEffect] = ()
@@ -208,7 +210,7 @@ class SimulatorDiagnosis:
         like, decided_by = list_alike(one.kind.name, joints, self.case, self.kinds)
         return Selected(
             effect=one.kind.name,
-            joints=tuple(machine.joint_names[j] for j in joints),
+            joints=name_joints(joints, machine),
             probability=estimate_probability(one.nats),
             parameters=numbers,
             gap_closed=part["closed"],
@@ -237,18 +239,15 @@ class SimulatorDiagnosis:
         verdict = "effects" if selected else "none"
         if failed and not selected:
             verdict = "unknown"
-        rivals = [_rank(one, machine) for one in search.rivals]
-        rows = []
-        for one in rivals:
-            rows.append({"name": one.effect, "effect": one.effect, "joints": list(one.joints)})
-            rows[-1]["score"] = one.probability
-        more: dict[str, Any] = {"evidence": {"rivals": rows, "unit": "log likelihood"}}
+        rivals = [one.summarise() for one in search.rivals]
+        evidence = {"rivals": describe_rivals(rivals, machine), "unit": "log likelihood"}
+        more: dict[str, Any] = {"evidence": evidence}
         if self.case.unseen:
             more["unseen"] = self._evaluate_unseen(found)
         answer = Answer(
             verdict=verdict,
             selected=tuple(sorted(selected, key=lambda one: -one.probability)),
-            ranking=rank_effects(selected, rivals, verdict),
+            ranking=rank_effects(selected, rivals, verdict, machine),
             where=survey.where(),
             gap=proof.measure_gap(bool(selected)),
             rivals=proof.rivals,
@@ -304,11 +303,6 @@ class StandStill:
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> StationaryModel:
         """Return a model whose joints stay where they are."""
         return StationaryModel()
-
-
-def _rank(one: GrownEffect, machine: Machine) -> Ranked:
-    names = [name for name, has in zip(machine.joint_names, one.joints, strict=True) if has]
-    return Ranked(one.kind.name, tuple(names), one.nats)
 
 
 def _explain(verdict: str, selected: Sequence[Selected], failed: str) -> str:

@@ -7,9 +7,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from actuators.effects.composition import ActuatorWithEffects
 from actuators.models.lag import FirstOrderLag
-from brokk_rl.contracts.actuator import Effect
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -33,20 +31,10 @@ def make_axis(machine: Machine) -> Machine:
     )
 
 
-def driven(
-    machine: Machine,
-    effects: dict[str, Effect],
-    count: int,
-    seconds: float,
-    seed: int,
-    least: float = -0.9,
-) -> list[Recording]:
-    """Returns recordings of the plant with effects under levels and rests, its speed wandering by a percent or two.
-
-    Levels lie between `least` and 0.9.
-    """
+def driven(machine: Machine, count: int, seconds: float, seed: int) -> list[Recording]:
+    """Returns recordings of the plant under levels and rests, its speed wandering by a percent or two."""
     random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
-    model = ActuatorWithEffects(actuator=PLANT, effects=effects).build(machine, count, CPU)
+    model = PLANT.build(machine, count, CPU)
     shape = (count, machine.num_history, machine.num_joints)
     history = History(q=torch.zeros(shape), u=torch.zeros(shape))
     history.reset(
@@ -57,7 +45,7 @@ def driven(
     commands, positions, margin = [], [], 0.2 * (machine.upper - machine.lower)
     for _ in range(steps):
         q = history.q[:, -1].numpy()
-        fresh = random.uniform(least, 0.9, level.shape) * (random.random(level.shape) > 0.2)
+        fresh = random.uniform(-0.9, 0.9, level.shape) * (random.random(level.shape) > 0.2)
         level = np.where(left <= 0, fresh, level)
         left = np.where(left <= 0, random.uniform(0.4, 2.5, level.shape), left) - machine.period_s
         level = np.where((q > machine.upper - margin) & (level > 0), -0.6, level)

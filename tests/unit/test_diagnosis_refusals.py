@@ -10,53 +10,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Done
+from gaps import recording
 
 from brokk_rl import record
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 Brokk = Callable[..., Done]
-LONG_S = 120.0
-
-
-def driven(
-    machine: Machine, seconds: float = LONG_S, level: float = 0.4, alternating: bool = True
-) -> Recording:
-    """Returns a recording in which all joints but q2 go to and fro, or are given one command all the time."""
-    steps = round(seconds / machine.period_s)
-    turns = (
-        np.array([0.0, 1.0, 0.0, -1.0])[(np.arange(steps) // 60) % 4]
-        if alternating
-        else np.ones(steps)
-    )
-    u = np.outer(turns, level * np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
-    q = machine.home + np.cumsum(u * machine.max_speed * machine.period_s * alternating, 0)
-    return Recording(
-        machine=machine.name, joints=machine.joint_names, units=tuple(joint.unit for joint in machine.joints), rate_hz=20.0,
-        t_s=np.arange(steps) * machine.period_s, u=u.astype(np.float32), q=q.astype(np.float32), metadata={},
-    )  # fmt: skip
 
 
 def given(folder: Path, *recordings: Recording) -> str:
     """Writes recordings and returns what `diagnosis.field` takes."""
-    for number, recording in enumerate(recordings):
-        record.write_recording(recording, folder / f"{number}.parquet")
+    for number, one in enumerate(recordings):
+        record.write_recording(one, folder / f"{number}.parquet")
     return f"diagnosis.field={folder}/*.parquet"
 
 
 @pytest.mark.parametrize(
     ("change", "count", "reason"),
     [
-        ({"seconds": 14.0}, 2, "28 s in all; 60 s or more are needed"),
-        ({}, 1, "one recording only"),
-        ({"level": 0.0}, 2, "no joint is ever commanded"),
-        ({"alternating": False}, 2, "the commands never change"),
+        (lambda r: replace(r, t_s=r.t_s[:280], u=r.u[:280], q=r.q[:280]), 2, "28 s in all; 60 s or more are needed"),
+        (lambda r: r, 1, "one recording only"),
+        (lambda r: replace(r, u=np.zeros_like(r.u)), 2, "no joint is ever commanded"),
+        (lambda r: replace(r, u=np.full_like(r.u, 0.4)), 2, "the commands never change"),
     ],
-)
+)  # fmt: skip
 def test_recordings_that_can_tell_nothing_get_no_name_but_a_reason(
-    machine: Machine, brokk: Brokk, tmp_path: Path, change: dict, count: int, reason: str
+    machine: Machine, brokk: Brokk, tmp_path: Path, change: Callable, count: int, reason: str
 ) -> None:
-    field = given(tmp_path / "field", *[driven(machine, **change)] * count)
+    field = given(tmp_path / "field", *[change(recording(machine))] * count)
     done = brokk("mode=diagnose", field, "actuator=lag", "session.out=out", "session.device=cpu")
     assert done.code == 0, done.err
     found = json.loads(Path("out/diagnosis.json").read_text())
@@ -70,7 +52,7 @@ def test_recordings_that_can_tell_nothing_get_no_name_but_a_reason(
 def test_neither_a_simulator_nor_a_reference_is_refused(
     machine: Machine, brokk: Brokk, tmp_path: Path
 ) -> None:
-    done = brokk("mode=diagnose", given(tmp_path / "field", driven(machine)), "session.out=out")
+    done = brokk("mode=diagnose", given(tmp_path / "field", recording(machine)), "session.out=out")
     assert done.code != 0 and "add actuator=<name>" in done.err
     done = brokk("mode=diagnose", f"diagnosis.case={tmp_path}", "session.out=out2")
     assert done.code != 0 and "no reference/*.parquet" in done.err
@@ -83,7 +65,9 @@ def test_recordings_of_another_machine_are_refused_by_name(
 ) -> None:
     stretched = replace(machine.joints[2], upper=replace(machine.joints[2].upper, value=2.5))
     other = replace(machine, joints=(*machine.joints[:2], stretched, *machine.joints[3:]))
-    stamped = replace(driven(machine), metadata={"fingerprint": record.format_fingerprint(other)})
+    stamped = replace(
+        recording(machine), metadata={"fingerprint": record.format_fingerprint(other)}
+    )
     done = brokk(
         "mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag", "session.out=out"
     )
@@ -103,7 +87,7 @@ def test_a_position_that_is_no_number_is_refused_by_name(
 ) -> None:
     import pyarrow.parquet as pq
 
-    given(tmp_path / "field", driven(machine), driven(machine))
+    given(tmp_path / "field", recording(machine), recording(machine))
     path = tmp_path / "field" / "1.parquet"
     table = pq.read_table(path)
     place = table.column_names.index("q_q3_rad")
