@@ -173,7 +173,7 @@ class Desk:
         return found
 
     def moves(self) -> bool:
-        """Says whether the valves get anything now."""
+        """Returns whether the valves get anything now."""
         return any(abs(values["Flow_q1"]) > 0 for _, values in self.heard("ValveFeedback", 0.06))
 
     def set_moving(self, patience_s: float = 20.0) -> None:

@@ -25,7 +25,7 @@ def composed(*overrides: str) -> DictConfig:
 
 
 def stands_alone(part: registry.Option) -> bool:
-    """Says whether an option names a place in the configuration, or has others beside it."""
+    """Returns whether an option names a place in the configuration, or has others beside it."""
     text = part.path.read_text()
     return "@package _global_" in text.partition("\n")[0] or "\ndefaults:" in text
 

@@ -121,7 +121,7 @@ def imports(tree: ast.Module) -> list[Import]:
 
 
 def is_for_types(node: ast.AST) -> bool:
-    """Says whether a statement is a block that only a type checker reads."""
+    """Returns whether a statement is a block that only a type checker reads."""
     return (
         isinstance(node, ast.If)
         and isinstance(node.test, ast.Name)
@@ -135,7 +135,7 @@ def floor(module: str) -> int | None:
 
 
 def within(module: str, package: str) -> bool:
-    """Says whether `module` is `package` or lies in it."""
+    """Returns whether `module` is `package` or lies in it."""
     return module == package or module.startswith(f"{package}.")
 
 

@@ -50,7 +50,7 @@ def count_code_lines(source: str) -> int:
 
 
 def is_text(node: ast.expr) -> bool:
-    """Says whether an expression is a string: where one stands alone, it explains something."""
+    """Returns whether an expression is a string: where one stands alone, it explains something."""
     return isinstance(node, ast.Constant) and isinstance(node.value, str)
 
 

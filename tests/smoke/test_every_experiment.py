@@ -31,7 +31,7 @@ TRAINED = (
 CHANGES_OF_BEHAVIOUR = ("follower=person", "task.memory=1", "task.action.mask=false")
 """Words that change what a policy learns with, and so the fingerprint of its task."""
 QUICK = ("experiment=direct", "experiment=paper", "task.memory=1")
-"""What `make test` takes, beside the other task: each goes a way of its own through the code."""
+"""Experiments of `make test`, beside the other task: each runs code that no other one does."""
 
 
 def read_options(group: str) -> dict[str, dict[str, Any]]:
