@@ -55,10 +55,8 @@ def driven(machine: Machine, count: int, seconds: float, seed: int) -> list[Reco
         history.push_u(torch.as_tensor(level, dtype=torch.float32))
         wander = 0.99 * wander + 0.003 * random.standard_normal(wander.shape)
         before = history.q[:, -1].clone()
-        history.push_q(
-            before
-            + (model.step(history) - before) * torch.as_tensor(1.0 + wander, dtype=torch.float32)
-        )
+        moved = model.step(history) - before
+        history.push_q(before + moved * torch.as_tensor(1.0 + wander, dtype=torch.float32))
     u, q = (np.stack(rows, 1).astype(np.float32) for rows in (commands, positions))
     return [
         Recording(

@@ -26,11 +26,8 @@ def recording(
         obeyed[ignored, 2] = 0.0
     moved = np.zeros((steps, 5))
     moved[DELAY:] = obeyed[:-DELAY] * machine.max_speed * PERIOD_S
-    q = (
-        machine.home
-        + np.cumsum(moved, 0)
-        + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
-    )
+    noise = NOISE * np.random.default_rng(0).standard_normal((steps, 5))
+    q = machine.home + np.cumsum(moved, 0) + noise
     return Recording(
         machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(steps) * PERIOD_S,
         u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": "planted"},

@@ -68,17 +68,10 @@ def test_recordings_of_another_machine_are_refused_by_name(
     stamped = replace(
         recording(machine), metadata={"fingerprint": record.format_fingerprint(other)}
     )
-    done = brokk(
-        "mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag", "session.out=out"
-    )
+    words = ("mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag")
+    done = brokk(*words, "session.out=out")
     assert done.code != 0 and "limits differ" in done.err and "0.parquet" in done.err
-    done = brokk(
-        "mode=diagnose",
-        f"diagnosis.field={tmp_path}/field/*",
-        "machine=mini_excavator",
-        "actuator=lag",
-        "session.out=out2",
-    )
+    done = brokk(*words, "machine=mini_excavator", "session.out=out2")
     assert done.code != 0 and "brokk170" in done.err
 
 
@@ -97,9 +90,5 @@ def test_a_position_that_is_no_number_is_refused_by_name(
     done = brokk(
         "mode=diagnose", f"diagnosis.field={tmp_path}/field/*", "actuator=lag", "session.out=out"
     )
-    assert (
-        done.code != 0
-        and "1.parquet" in done.err
-        and "q_q3_rad" in done.err
-        and not Path("out/diagnosis.json").exists()
-    )
+    assert done.code != 0 and "1.parquet" in done.err and "q_q3_rad" in done.err
+    assert not Path("out/diagnosis.json").exists()

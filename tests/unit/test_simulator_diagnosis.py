@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,14 +24,15 @@ Diagnosis = Callable[..., Answer]
 def diagnose(machine: Machine) -> Diagnosis:
     axis = make_axis(machine)
     field = driven(axis, 4, 60.0, 3)
-    names = ("dead_time", "flow_gain", "lag", "backlash", "dead_band")
+    every = ("dead_time", "flow_gain", "lag", "backlash", "dead_band")
 
-    def run(turn: bool = False, **numbers: float) -> Answer:
+    def run(names: Sequence[str] = every, turn: bool = False, **numbers: float) -> Answer:
         seen: list[Recording] = [replace(one, u=-one.u) if turn else one for one in field]
-        base, draw = replace(PLANT, **numbers), np.random.default_rng(0)
-        kinds, thresholds = load_effects(axis, names, base), load_part("thresholds")
-        case = GapCase(axis, [], seen)
-        work = SimulatorDiagnosis(case, base, kinds, thresholds, draw, 0)
+        base = replace(PLANT, **numbers)
+        kinds = load_effects(axis, names, base)
+        case = GapCase(axis, [], seen[:3], seen[3:])
+        draw = np.random.default_rng(0)
+        work = SimulatorDiagnosis(case, base, kinds, load_part("thresholds"), draw, 0)
         return work.run(lambda doing, done: None).answer
 
     return run
@@ -50,11 +51,24 @@ def test_what_the_simulator_lacks_is_named_with_its_size(
 ) -> None:
     answer = diagnose(**numbers)
     (one,) = answer.selected
-    estimate, gap = one.parameters[name]["q3"], answer.gap
+    estimate = one.parameters[name]["q3"]
+    gap = answer.gap
     assert (answer.verdict, one.effect, one.joints) == ("effects", effect, ("q3",))
     assert estimate.mean == pytest.approx(size, rel=0.05)
     assert estimate.ci95[0] <= size <= estimate.ci95[1] and one.identified
     assert gap and gap.closed and gap.closed.mean > 0.9 and gap.floor_of == "field"
+    assert answer.reason == f"{effect} on q3"
+    unseen = answer.more["unseen"]
+    # Of 60 s, a second and the history come before the first of the free runs of 5 s.
+    assert (unseen["recordings"], unseen["seconds"]) == (1, 55.0)
+    errors = unseen["joints"]["q3"]
+    assert errors["before"] == pytest.approx(gap.before, rel=0.3)
+    assert errors["after"] < 0.3 * errors["before"]
+
+
+def test_two_effects_are_named_together(diagnose: Diagnosis) -> None:
+    answer = diagnose(dead_time_s=0.2, gain=0.7)
+    assert {one.effect for one in answer.selected} == {"dead_time", "flow_gain"}
 
 
 def test_nothing_is_named_where_nothing_is_lacking(diagnose: Diagnosis) -> None:
@@ -64,3 +78,9 @@ def test_nothing_is_named_where_nothing_is_lacking(diagnose: Diagnosis) -> None:
 
 def test_a_turned_axis_is_explained_by_no_effect(diagnose: Diagnosis) -> None:
     assert diagnose(turn=True).verdict == "unknown"
+
+
+def test_nothing_named_is_no_health_where_an_arx_errs_far_less(diagnose: Diagnosis) -> None:
+    answer = diagnose(("saturation",), gain=0.7)
+    failed = [one.name for one in answer.gates if not one.passed]
+    assert (answer.verdict, failed) == ("unknown", ["near_arx"])
