@@ -334,7 +334,7 @@ class Stage:
             self.meddle()
         if self.ms % 10 == 0:
             self.twin.cycle(self.machine_s)
-        if self.ms % 50 == 1 and self.supervised:
+        if self.ms % 20 == 1 and self.supervised:
             self._write("controls", t_s=self.now_s, **self._switches)
         if self.mode != "collect" and self.ms % 50 == 3 and self.adviser is not None:
             self.adviser.run_cycle(0, self.now_s)

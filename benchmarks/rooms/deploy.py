@@ -58,7 +58,7 @@ MEASUREMENTS = (
     Measurement(
         name="injections",
         title="Faults on the way between gateway and computer",
-        conditions="The same parts on a simulated clock; each trial begins at another phase of all cycles. A gateway's clock that is 1 % too fast is the one kind that moves on; 1 % too slow stops after 10 s.",
+        conditions="The same parts on a simulated clock; each trial begins at another phase of all cycles. A gateway's clock that is 1 % wrong is noticed after 5 s (too fast) or 10 s (too slow).",
         commands=("python benchmarks/deploy/injections.py {out}/injections.json 4",),
         code=CODE,
         read=read_injections,

@@ -8,8 +8,9 @@ The PC does not share the gateway's clock. It takes the shortest transit that it
 and lets that grow by `DRIFT` at most: the two crystals cannot differ by more. A delay that grows is
 seen and stays seen; a delay that was there from the beginning shows in `RoundTrip`.
 
-A stamp from the future is one wrong message, and teaches nothing. Where many in a row agree, the
-gateway's clock was set ahead, and is learned anew. A clock that was set back looks like a delay of
+A stamp from the future is one wrong message, and teaches nothing. Stamps that get ahead step by step
+are from the future as soon as the steps come to as much: no crystal goes so fast. Where many in a row
+agree, the gateway's clock was set ahead, and is learned anew. A clock that was set back looks like a delay of
 all messages: only a person lets it be learned anew (`accept_delay`).
 """
 
@@ -24,7 +25,7 @@ controllers have them (AEC-Q200 parts are sold as 20 to 50 ppm)."""
 SILENCE_S = 1.0
 """Silence after which the gateway may have started anew, with another clock. By hand."""
 FUTURE_S = 0.05
-"""By which a stamp may seem to come from the future. Chosen by hand: above the resolution of stamps
+"""By which stamps may seem to come from the future, all steps together. Chosen by hand: above the resolution of stamps
 and the shortest transit, far below the delays that are looked for."""
 NUM_AGREEING = 25
 """Messages in a row whose delays differ by less than `FUTURE_S`, from which a clock is learned anew:
@@ -40,12 +41,14 @@ class GatewayClock:
 
     def __init__(self) -> None:
         self._offset_s, self._heard_s, self.newest_s = math.nan, -math.inf, 0.0
+        # By which stamps were ahead of what two crystals explain, all steps together.
+        self._ahead_s = 0.0
         # Delays of the last messages, and of those from the future, by the present offset.
         self._delays_s = deque[float](maxlen=NUM_AGREEING)
         self._early_s = deque[float](maxlen=NUM_AGREEING)
 
-    def learn(self, stamp_s: float, modulus_s: float, now_s: float) -> None:
-        """Learn from a message of the gateway itself that came at `now_s`.
+    def learn(self, stamp_s: float, modulus_s: float, now_s: float) -> bool:
+        """Learn from a message of the gateway itself; return whether it is from the future.
 
         Args:
             stamp_s: Its stamp.
@@ -54,24 +57,29 @@ class GatewayClock:
         """
         elapsed_s, self._heard_s = now_s - self._heard_s, now_s
         if elapsed_s > SILENCE_S:
-            self._offset_s, self.newest_s = now_s - stamp_s, stamp_s
-            self._delays_s.clear()
-            return
+            self._offset_s = now_s - stamp_s
+            self._begin_anew(stamp_s, 0.0)
+            return False
         # The shortest transit can only seem to have grown because the clocks differ.
         self._offset_s += DRIFT * elapsed_s
+        # By DRIFT the other clock may be the faster one, and by DRIFT the offset has just grown.
+        self._ahead_s = max(0.0, self._ahead_s - 2 * DRIFT * elapsed_s)
         delay_s = self._wrap(now_s - stamp_s, modulus_s)
-        if delay_s < -FUTURE_S:
+        step_s = max(0.0, -delay_s)
+        if self._ahead_s + step_s > FUTURE_S:
             self._early_s.append(delay_s)
             if _agree(self._early_s):
                 self._begin_anew(stamp_s, min(self._early_s))
-            return
+            return True
         self._early_s.clear()
         self._delays_s.append(max(0.0, delay_s))
         # Messages may overtake each other. Around a clock's turn a very late one looks newer.
         is_newer = (stamp_s - self.newest_s) % modulus_s < modulus_s / 2
         if is_newer and delay_s < modulus_s / 4:
             self.newest_s = stamp_s
-        self._offset_s += min(0.0, delay_s)
+        self._offset_s -= step_s
+        self._ahead_s += step_s
+        return False
 
     def accept_delay(self, stamp_s: float, least_s: float) -> None:
         """Take the present delay as none, where all messages have it alike and it exceeds `least_s`.
@@ -89,7 +97,7 @@ class GatewayClock:
 
     def _begin_anew(self, stamp_s: float, delay_s: float) -> None:
         self._offset_s += delay_s
-        self.newest_s = stamp_s
+        self.newest_s, self._ahead_s = stamp_s, 0.0
         self._delays_s.clear()
         self._early_s.clear()
 

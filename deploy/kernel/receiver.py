@@ -280,10 +280,11 @@ class BusReceiver:
         wrap_s = layout.stamp_wrap_s
         if not wrap_s:
             return None
-        is_early = self._clock.is_early(stamp_s, wrap_s, now_s)
         if layout.sender == GATEWAY and wrap_s == self._longest_wrap_s:
-            self._clock.learn(stamp_s, wrap_s, now_s)
+            is_early = self._clock.learn(stamp_s, wrap_s, now_s)
             self._stamp_s = stamp_s
+        else:
+            is_early = self._clock.is_early(stamp_s, wrap_s, now_s)
         return MessageFault.EARLY if is_early else None
 
     def _use(self, values: dict[str, float], sent_s: float, now_s: float) -> None:

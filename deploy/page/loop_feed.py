@@ -58,7 +58,7 @@ LOG_BEHIND_BYTES = LOG_BYTES // 32
 """Bytes that wait for the log process from which it counts as stuck: about 4 s of a full bus. It
 looks 20 times a second. Chosen by hand."""
 SUPERVISOR_S = 1.0
-"""Age of the supervisor's switches from which it counts as silent: 20 of its cycles. Chosen by
+"""Age of the supervisor's switches from which it counts as silent: 50 of its cycles. Chosen by
 hand."""
 BEAT_S = 0.01
 """Between two signals of the page: a cycle of the bus process."""

@@ -1,6 +1,6 @@
 """Requests of the operator at the page: arm sending, record, choose a borehole.
 
-The supervisor carries them out, some twenty times a second.
+The supervisor carries them out, some fifty times a second.
 """
 
 from __future__ import annotations

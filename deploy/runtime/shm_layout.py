@@ -25,7 +25,7 @@ LOG_BYTES = 8 << 20
 VISION_LOG_BYTES = 1 << 20
 """Of perception's pipe to the log, a short text a frame. Chosen by hand."""
 REQUEST_BYTES = 1 << 12
-"""Of the page's requests; the supervisor takes them 20 times a second. Chosen by hand."""
+"""Of the page's requests; the supervisor takes them 50 times a second. Chosen by hand."""
 REPORT_BYTES = 1 << 16
 """Of the processes' reports on their timing, one each. Chosen by hand."""
 MOST_HOLES = 8

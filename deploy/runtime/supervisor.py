@@ -36,11 +36,11 @@ log = logging.getLogger(__name__)
 
 PROCESSES, TIMING = "processes.json", "timing.json"
 """Files in the run folder: process ids, and how each process kept its time."""
-WATCH_S = 0.05
-"""Between looks at requests and processes. Chosen by hand: quick for a person."""
+WATCH_S = 0.02
+"""Between looks at requests and processes: a quarter of the guard's limit for the switches."""
 SUPERVISOR_PRIORITY = 30
 """Priority of the supervisor under SCHED_FIFO, below all that depend on it. The guard latches when
-the supervisor's switches are older than 0.2 s, so it must not wait for other work. Its children do
+the supervisor's switches are older than 0.08 s, so it must not wait for other work. Its children do
 not inherit it."""
 
 

@@ -346,6 +346,6 @@ def test_a_stop_needs_no_supervisor_and_a_supervisor_that_hangs_ends_the_motion(
     assert not stage.moves and len(stage.air.sent) == sent, "it is still the arming of before"
     stage.get_going()
     stage.supervised = False
-    assert stage.stops_within_s() <= 0.2 + 0.011
+    assert stage.stops_within_s() <= 0.08 + 0.011
     state = stage.view.state
     assert state is not None and state.guard.name == "LATCHED"

@@ -270,7 +270,7 @@ def test_the_newest_stamp_stays_when_an_older_one_comes_and_a_clock_that_begins_
     None
 ):
     clock = GatewayClock()
-    for stamp_s, newest_s in ((65.5, 65.5), (0.01, 0.01), (65.53, 0.01), (0.02, 0.02)):
+    for stamp_s, newest_s in ((65.5, 65.5), (0.01, 0.01), (65.53, 0.01), (0.012, 0.012)):
         clock.learn(stamp_s, CLOCK_WRAP_S, 10.0)
         assert clock.newest_s == newest_s
     clock.learn(50.0, CLOCK_WRAP_S, 11.0)
@@ -317,6 +317,24 @@ def test_one_stamp_of_the_future_teaches_nothing_and_a_clock_that_was_set_ahead_
     now_s = hear(clock, [15.3 + 0.003 * NUM_AGREEING], now_s)
     assert clock.newest_s == pytest.approx(15.375)
     assert clock.find_sent_s(15.375, CLOCK_WRAP_S, now_s) == pytest.approx(now_s, abs=1e-6)
+
+
+@pytest.mark.parametrize(("rate", "early_s"), [(1e-2, 5.05), (1e-3, 55.56), (-1e-2, math.inf)])
+def test_a_clock_that_goes_faster_than_a_crystal_is_from_the_future(
+    rate: float, early_s: float
+) -> None:
+    clock, found_s = GatewayClock(), math.inf
+    for k in range(21_000):
+        now_s = 0.003 * k
+        if clock.learn((1.0 + rate) * now_s, CLOCK_WRAP_S, now_s):
+            found_s = now_s
+            break
+    assert found_s == pytest.approx(early_s, abs=0.05)
+    # Heard on and on it is learned anew, and gets ahead once more.
+    again = [
+        clock.learn((1.0 + rate) * 0.003 * j, CLOCK_WRAP_S, 0.003 * j) for j in range(k, k + 100)
+    ]
+    assert sum(again) == (NUM_AGREEING - 1 if found_s < math.inf else 0)
 
 
 def test_random_stamps_teach_nothing() -> None:
