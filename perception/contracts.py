@@ -94,15 +94,6 @@ class Overlay(Protocol):
 
 
 @runtime_checkable
-class WholePictureFinder(Protocol):
-    """Optional ability of a finder, for `perceive.until=ellipses`."""
-
-    def find_ellipses(self, frame: Frame) -> list[Ellipse]:
-        """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
-        ...
-
-
-@runtime_checkable
 class RejectionExplainer(Protocol):
     """Optional ability of a finder, for `explain.txt` of `mode=perceive`."""
 

@@ -14,8 +14,8 @@ NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is 
 
 from __future__ import annotations
 
+import io
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ import numpy as np
 import yaml
 
 from brokk_rl.errors import FrameError, StorageError
+from brokk_rl.session import write_bytes, write_json, write_text
 
 BLOCK, HOLE_MASK, ARM = 1, 2, 4
 CAMERA, COLOR, RIGHT, DEPTH, DEPTH_MM, TRUTH, MASK = (
@@ -177,7 +178,7 @@ def write_camera(
         told["gamma"] = float(gamma)
     if base_from_camera is not None:
         told["T_base_cam"] = np.asarray(base_from_camera).tolist()
-    _write(folder / CAMERA, yaml.safe_dump(told, sort_keys=False, default_flow_style=None).encode())
+    write_text(folder / CAMERA, yaml.safe_dump(told, sort_keys=False, default_flow_style=None))
 
 
 def write_frame(
@@ -200,14 +201,13 @@ def write_frame(
         if picture is not None:
             write_picture(_build_path(stem, ending), picture)
     if depth_m is not None:
-        _write(_build_path(stem, DEPTH), depth_m.astype(np.float32))
+        content = io.BytesIO()
+        np.save(content, depth_m.astype(np.float32))
+        write_bytes(_build_path(stem, DEPTH), content.getvalue())
     if label is not None:
         write_picture(_build_path(stem, MASK), encode_mask(label))
     if truth is not None:
-        _write(
-            _build_path(stem, TRUTH),
-            (json.dumps(asdict(truth), indent=1, allow_nan=False) + "\n").encode(),
-        )
+        write_json(_build_path(stem, TRUTH), asdict(truth))
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
@@ -219,7 +219,7 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
     done, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not done:
         raise StorageError(f"{path}: a picture of shape {picture.shape} cannot be encoded")
-    _write(path, data.tobytes())
+    write_bytes(path, data.tobytes())
 
 
 def is_whole(stem: Path) -> bool:
@@ -229,18 +229,3 @@ def is_whole(stem: Path) -> bool:
 
 def _build_path(stem: Path, ending: str) -> Path:
     return stem.with_name(stem.name + ending)
-
-
-def _write(path: Path, value: bytes | np.ndarray) -> None:
-    """Write a file in one step, so that a reader finds the whole file or none."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            file.write(value) if isinstance(value, bytes) else np.save(file, value)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise StorageError(
-            f"{path} could not be written: {error.strerror or error}; nothing was left behind"
-        ) from error

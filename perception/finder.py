@@ -273,10 +273,6 @@ class StagedFinder:
             again.found.extend((ellipse, replace(one, score=pose.score)) for _, one in near.found)
         return again
 
-    def find_ellipses(self, frame: Frame) -> list[Ellipse]:
-        """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
-        return self._detector.detect(convert_to_gray(rectify(frame)), None, None)
-
     def explain(self, rejection: Rejection) -> str:
         """Return a sentence: the refused candidate, the reason, and a remedy."""
         return explain_rejection(rejection)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +10,9 @@ import numpy as np
 from annotated_types import Ge
 
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose
-from brokk_rl.errors import StorageError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
+from perception import dataset
 
 # Colours in OpenCV's order, blue first.
 BLOCK = (255, 180, 60)
@@ -43,17 +42,7 @@ class OverlayDrawing:
 
     def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
         """Write the picture in one step; see `perception.contracts.Overlay`."""
-        done, data = cv2.imencode(".png", self.draw(frame, detections))
-        part = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            part.write_bytes(data.tobytes() if done else b"")
-            part.replace(path)
-        except OSError as error:
-            raise StorageError(
-                f"cannot write {path}: {error.strerror or error}; nothing was left behind"
-            ) from error
-        finally:
-            part.unlink(missing_ok=True)
+        dataset.write_picture(path, self.draw(frame, detections))
 
     def draw(self, frame: Frame, detections: FrameDetections) -> np.ndarray:
         """Return the picture, `(h, w, 3)` uint8, blue first."""

@@ -5,8 +5,7 @@
 # FRAMES is kept: what lies there from before is learned from too (RENDER_S=0: that alone), and while the network learns the cores go
 # on rendering into it for the next call, by another SEED. Without it pictures lie in $TMPDIR meanwhile, some 0.2 MB each.
 # Leaves in $OUT: segmenter.{safetensors,onnx} (for perception/weights), training.json, samples.png, log.
-# NEGATIVES holds pictures without a block: they are learned from, and
-# are surfaces of things in every other call of the renderer.
+# NEGATIVES holds pictures without a block: they are learned from.
 # To try it: CORES=1 RENDER_S=90 TRAIN_S=40 SMALL=1 GPU= .
 set -u
 CORES=${CORES:-$(nproc)} RENDER_S=${RENDER_S:-600} TRAIN_S=${TRAIN_S:-600} GPU=${GPU-0} SMALL=${SMALL:-}
@@ -44,7 +43,7 @@ render() {  # scene, size, seed, folder, first, count, until
     render.first="$5" render.count="$6" studio.depth=none studio.pair=false >>"$work/render.log" 2>&1
 }
 draw() {  # number of the process, until when
-  local k=$1 until=$2 round=0 scene lens real
+  local k=$1 until=$2 round=0 scene lens
   if [ -z "$judged" ] && (( k % each == each - 1 || CORES < each && k == 0 )); then
     for scene in clean varied hidden decoy haze dark empty; do
       render $scene "$full" 900 test/$scene/$k $(( k * 100 )) $(( CORES < each ? 2 : 8 )) $until
@@ -52,8 +51,7 @@ draw() {  # number of the process, until when
   fi
   while (( until - $(date +%s) > 6 )); do
     IFS=: read -r scene lens <<<"${drawn[(4 * k + round) % ${#drawn[@]}]}"
-    real=; (( round % 2 )) && [ -n "$NEGATIVES" ] && real="studio.surfaces.folder=$NEGATIVES"
-    render $scene "${!lens} $real" $(( SEED + k )) train/$SEED.$k/$round $(( round * 100 )) 100 $until
+    render $scene "${!lens}" $(( SEED + k )) train/$SEED.$k/$round $(( round * 100 )) 100 $until
     round=$(( round + 1 ))
   done
 }

@@ -1,1 +1,1 @@
-"""Camera extrinsics: from a board on the arm or touched points."""
+"""Camera extrinsics from a board on the arm."""

@@ -31,7 +31,7 @@ from perception.calibrate.hand_eye import (
     predict_board_poses,
     solve_hand_eye,
 )
-from perception.label.camera_pose import Charuco, TagGrid
+from perception.label.camera_pose import Charuco
 
 log = logging.getLogger(__name__)
 
@@ -184,7 +184,7 @@ class BoardCalibration:
     """
 
     source: FrameSourceSpec
-    board: Charuco | TagGrid
+    board: Charuco
     joints: str
     corner_px: Positive
     max_error_px: Positive

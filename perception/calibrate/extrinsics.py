@@ -157,7 +157,7 @@ def build_calibration(
     """Return the content of `calibration.yaml`.
 
     Args:
-        kind: `board`, `poses` or `touched`.
+        kind: `board`.
         machine: Whose base it is.
         base_from_camera: The camera, `(4, 4)`.
         cov: Covariance of a small motion of it in its own frame, `(6, 6)`.

@@ -1,1 +1,1 @@
-"""Labels for real footage from a board in view, clicks and touched points."""
+"""Labels for real footage from a board in view and clicks."""

@@ -16,11 +16,10 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception.pose.plane_conic import convert_to_gray, linearize
+from perception.sources.validation import check_pose
 
 MIN_CORNERS = 4
 """Corners that determine a pose."""
-ROTATION_TOLERANCE = 1e-3
-"""Largest error of a given rotation matrix's products: matrices rounded to three digits pass."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +134,9 @@ def _count_corners(found: Sequence[np.ndarray], numbers: np.ndarray | None) -> i
 
 
 class GivenPoseTracker:
-    """Looks poses up by the frame's stem; without a table, takes each frame's own pose."""
+    """Looks poses up by the frame's stem."""
 
-    def __init__(self, poses: dict[str, np.ndarray] | None) -> None:
+    def __init__(self, poses: dict[str, np.ndarray]) -> None:
         self._poses = poses
 
     def locate(self, frame: Frame) -> CameraPose:
@@ -147,10 +146,9 @@ class GivenPoseTracker:
             FrameError: none is given for this frame.
         """
         stem = Path(frame.name).name
-        pose = frame.base_from_camera if self._poses is None else self._poses.get(stem)
-        if pose is None:
+        if stem not in self._poses:
             raise FrameError(f"{frame.name}: no pose of the camera is given for '{stem}'")
-        return CameraPose(np.asarray(pose, float), 0.0)
+        return CameraPose(self._poses[stem], 0.0)
 
 
 @spec
@@ -193,51 +191,14 @@ class Charuco:
 
 
 @spec
-class TagGrid:
-    """The camera's pose from a grid of AprilTags or ArUco markers beside the block.
-
-    Attributes:
-        dictionary: Markers, a name of OpenCV's: `DICT_APRILTAG_36h11`, …
-        columns: Markers across.
-        rows: Markers down.
-        marker_m: Side of a marker.
-        gap_m: Between two markers.
-        min_corners: Corners of markers that must be seen, four each.
-        max_error_px: Largest error of a pose that is used.
-    """
-
-    dictionary: str
-    columns: int
-    rows: int
-    marker_m: float
-    gap_m: float
-    min_corners: Annotated[int, Ge(MIN_CORNERS)]
-    max_error_px: float
-
-    def check(self) -> None:
-        _check_dictionary(self.dictionary)
-
-    def build(self) -> BoardTracker:
-        """Return a tracker."""
-        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        board = cv2.aruco.GridBoard((self.columns, self.rows), self.marker_m, self.gap_m, markers)
-        parameters = cv2.aruco.DetectorParameters()
-        # Corners of tags are found to the pixel only, unless refined.
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        detect = cv2.aruco.ArucoDetector(markers, parameters).detectMarkers
-        return BoardTracker(board, detect, self.min_corners, self.max_error_px)
-
-
-@spec
 class GivenPoses:
-    """Camera poses from a file, or from the frames themselves.
+    """Camera poses from a file.
 
     Attributes:
-        poses: YAML file: stem of a frame to its pose `T_world_cam`, 4 x 4; `null` takes each
-            frame's own, `T_base_cam`.
+        poses: YAML file: stem of a frame to its pose `T_world_cam`, 4 x 4.
     """
 
-    poses: str | None
+    poses: str
 
     def build(self) -> CameraTracker:
         """Return a tracker.
@@ -245,20 +206,14 @@ class GivenPoses:
         Raises:
             ConfigError: the file cannot be read.
         """
-        if self.poses is None:
-            return GivenPoseTracker(None)
         try:
             table = yaml.safe_load(Path(self.poses).read_text())
-            poses = {str(stem): np.asarray(pose, float) for stem, pose in table.items()}
-        except (OSError, yaml.YAMLError, AttributeError, ValueError, TypeError) as error:
+            poses = {str(stem): check_pose(pose, str(stem)) for stem, pose in table.items()}
+        except (OSError, yaml.YAMLError, AttributeError, FrameError) as error:
             raise ConfigError(
                 f"camera_pose.poses={self.poses}: expected YAML of '<stem>: 4 x 4 numbers' "
                 f"({error})"
             ) from error
-        if wrong := [stem for stem, pose in poses.items() if not _is_pose(pose)]:
-            raise ConfigError(
-                f"camera_pose.poses={self.poses}: '{wrong[0]}' is no rigid 4 x 4 transform"
-            )
         return GivenPoseTracker(poses)
 
 
@@ -266,12 +221,3 @@ def _check_dictionary(dictionary: str) -> None:
     if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
         known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
         raise ConfigError(f"dictionary: OpenCV has no '{dictionary}'; choices: {', '.join(known)}")
-
-
-def _is_pose(pose: np.ndarray) -> bool:
-    if pose.shape != (4, 4) or not np.allclose(pose[3], [0, 0, 0, 1]):
-        return False
-    rotation = pose[:3, :3]
-    # Rounded matrices pass; a reflection has determinant -1 and does not.
-    is_orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
-    return bool(is_orthonormal and np.linalg.det(rotation) > 0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -217,10 +216,10 @@ def build_cuboid(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray) -
 
 EXAMPLE = """expected YAML such as
   frame: "00012"   # where it was clicked
-  # a corner of the drilled face, then its two neighbours; or corners_m, touched
+  # a corner of the drilled face, then its two neighbours
   corners_px: [[512, 300], [840, 310], [505, 560]]
   thickness_m: 0.6 # of the block behind the face
-  mouths: [{center_px: [660, 420], radius_m: 0.05}]  # or center_m"""
+  mouths: [{center_px: [660, 420], radius_m: 0.05}]"""
 # Robust fit of the face's plane; all chosen by hand.
 MIN_FACE_PIXELS = 50
 """Pixels with depth that the plane needs."""
@@ -233,15 +232,14 @@ class BlockPlacing:
     """Placing of the block by a person.
 
     Attributes:
-        frame: Stem of the frame that was clicked in; `None` where everything was touched.
-        corners: A corner of the face and its two neighbours, `(3, 2)` px or `(3, 3)` m in the
-            world.
+        frame: Stem of the frame that was clicked in.
+        corners_px: A corner of the face and its two neighbours, `(3, 2)`.
         thickness_m: Of the block behind the face.
-        mouths: Centre, `(2,)` px or `(3,)` m, and radius in m of each mouth.
+        mouths: Centre, `(2,)` px, and radius in m of each mouth.
     """
 
-    frame: str | None
-    corners: np.ndarray
+    frame: str
+    corners_px: np.ndarray
     thickness_m: float
     mouths: tuple[tuple[np.ndarray, float], ...]
 
@@ -254,28 +252,23 @@ def read_placing(path: Path) -> BlockPlacing:
     """
     try:
         data = yaml.safe_load(path.read_text())
-        key = "corners_px" if "corners_px" in data else "corners_m"
-        corners = np.asarray(data[key], float)
-        mouths = tuple(
-            (_parse_center(one), float(one["radius_m"])) for one in data.get("mouths", ())
+        corners_px = np.asarray(data["corners_px"], float)
+        mouths = []
+        for one in data.get("mouths", ()):
+            mouths.append((np.asarray(one["center_px"], float), float(one["radius_m"])))
+        placing = BlockPlacing(
+            str(data["frame"]), corners_px, float(data["thickness_m"]), tuple(mouths)
         )
-        frame = None if data.get("frame") is None else str(data["frame"])
-        placing = BlockPlacing(frame, corners, float(data["thickness_m"]), mouths)
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
             f"label.placing={path}: {type(error).__name__} {error}; {EXAMPLE}"
         ) from error
     smallest = min([placing.thickness_m, *(radius_m for _, radius_m in mouths)])
-    if corners.shape not in ((3, 2), (3, 3)) or smallest <= 0:
+    has_pixels = all(center_px.shape == (2,) for center_px, _ in mouths)
+    if corners_px.shape != (3, 2) or not has_pixels or smallest <= 0:
         raise ConfigError(
-            f"label.placing={path}: corners of shape {corners.shape}, sizes above 0 are needed; "
-            f"{EXAMPLE}"
-        )
-    has_pixels = corners.shape[1] == 2 or any(len(center) == 2 for center, _ in mouths)
-    if frame is None and has_pixels:
-        raise ConfigError(
-            f"label.placing={path}: pixels are given, but not the frame they were clicked in; "
-            f"{EXAMPLE}"
+            f"label.placing={path}: corners of shape {corners_px.shape}; three corners and centres "
+            f"of two numbers, and sizes above 0 are needed; {EXAMPLE}"
         )
     return placing
 
@@ -285,44 +278,30 @@ def place_cuboid(placing: BlockPlacing, frame: Frame, world_from_camera: np.ndar
 
     Args:
         placing: Corners, thickness, mouths.
-        frame: The frame that was clicked in, any frame that shows the face where everything was
-            touched.
+        frame: The frame that was clicked in.
         world_from_camera: Its camera, `(4, 4)`.
 
     Raises:
         FrameError: there is too little depth between the clicked corners.
     """
-    corners = placing.corners
-    if corners.shape[1] == 2:
-        lines = compute_rays(frame, corners)
-        local = lines / (lines @ _fit_face_plane(frame, corners))[:, None]
-        corners = local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-    return build_cuboid(corners, placing.thickness_m, world_from_camera[:3, 3])
+    lines = compute_rays(frame, placing.corners_px)
+    local = lines / (lines @ _fit_face_plane(frame, placing.corners_px))[:, None]
+    corners_m = local @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+    return build_cuboid(corners_m, placing.thickness_m, world_from_camera[:3, 3])
 
 
 def place_mouths(
     cuboid: Cuboid, placing: BlockPlacing, frame: Frame, world_from_camera: np.ndarray
 ) -> Cuboid:
-    """Return the block with its mouths: at touched points, or where clicked rays meet the face."""
+    """Return the block with its mouths where clicked rays meet the face."""
     eye = cuboid.own(world_from_camera[:3, 3])
     mouths = []
-    for center, radius_m in placing.mouths:
-        if len(center) == 2:
-            ray = compute_rays(frame, center[None])[0]
-            along = ray @ world_from_camera[:3, :3].T @ cuboid.rotation
-            point = eye - along * eye[2] / along[2]
-        else:
-            point = cuboid.own(center)
+    for center_px, radius_m in placing.mouths:
+        ray = compute_rays(frame, center_px[None])[0]
+        along = ray @ world_from_camera[:3, :3].T @ cuboid.rotation
+        point = eye - along * eye[2] / along[2]
         mouths.append(Mouth(float(point[0]), float(point[1]), radius_m))
     return replace(cuboid, mouths=tuple(mouths))
-
-
-def _parse_center(entry: dict[str, Any]) -> np.ndarray:
-    key, size = ("center_px", 2) if "center_px" in entry else ("center_m", 3)
-    center = np.asarray(entry[key], float)
-    if center.shape != (size,):
-        raise ValueError(f"a centre of {center.size} numbers")
-    return center
 
 
 def _fit_face_plane(frame: Frame, corners_px: np.ndarray) -> np.ndarray:

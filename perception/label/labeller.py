@@ -168,7 +168,7 @@ class BlockLabelling:
                 if names is None or frame.name in names:
                     yield frame
 
-    def _locate_cameras(self, tracker: CameraTracker, clicked_in: str | None) -> _Footage:
+    def _locate_cameras(self, tracker: CameraTracker, clicked_in: str) -> _Footage:
         """Return the cameras of all frames, and the frame that was clicked in."""
         poses: dict[str, CameraPose] = {}
         entries: dict[str, dict[str, Any]] = {}
@@ -185,10 +185,10 @@ class BlockLabelling:
                 entry["left_out"] = str(error)
                 continue
             poses[frame.name], entry["board_px"] = pose, pose.error_px
-            if clicked is None and clicked_in in (None, stem):
+            if stem == clicked_in:
                 clicked = frame, pose.world_from_camera
         if clicked is None:
-            why = entries.get(str(clicked_in), {}).get("left_out")
+            why = entries.get(clicked_in, {}).get("left_out")
             if not why:
                 why = f"there is none; frames: {', '.join(list(entries)[:5]) or 'none'}, …"
             raise ConfigError(f"label.placing: frame '{clicked_in}' cannot be used: {why}")

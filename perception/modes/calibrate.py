@@ -13,7 +13,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.spec import spec
 from perception.calibrate.board import BoardCalibration
-from perception.calibrate.touched_points import TouchCalibration
 from perception.calibrate.verdict import GOOD
 
 log = logging.getLogger(__name__)
@@ -30,12 +29,12 @@ class Calibrate:
     Attributes:
         session: Folder to write into.
         machine: Whose base it is.
-        calibration: Method and its data.
+        calibration: The frames of a board, and the joint positions there.
     """
 
     session: Session
     machine: Machine
-    calibration: BoardCalibration | TouchCalibration
+    calibration: BoardCalibration
 
     def run(self) -> float:
         """Write `calibration.yaml`, which sources of frames take as `base_from_camera`.

@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +27,12 @@ from brokk_rl.contracts.vision import (
     TrackedHole,
     TrackerSpec,
 )
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, spec
-from perception.contracts import Overlay, RejectionExplainer, WholePictureFinder
+from perception.contracts import Overlay, RejectionExplainer
 from perception.tracking.steered_search import SteeredSearch
 
 log = logging.getLogger(__name__)
@@ -44,14 +43,12 @@ class PerceiveOptions:
     """Input and extent of a perceive run.
 
     Attributes:
-        input: Folder of frames, or of any pictures with `until: ellipses`.
-        until: `holes`, or `ellipses` of the whole picture, which need neither depth nor a camera.
+        input: Folder of frames.
         frames: Number of frames; `null` for all, which a live camera has no end of.
         pictures: Write an overlay for each frame.
     """
 
     input: str | None
-    until: Literal["holes", "ellipses"]
     frames: Count | None
     pictures: bool
 
@@ -72,7 +69,7 @@ class FrameEntry:
     target: tuple[TrackedHole, float] | None
     refused: str | None
 
-    def as_json(self, until: str) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Return it as plain JSON data."""
         if self.found is None:
             return {"name": self.name, "refused": self.refused}
@@ -80,8 +77,6 @@ class FrameEntry:
             "name": self.name,
             "ms": {stage: round(value, 3) for stage, value in self.found.ms.items()},
         }
-        if until == "ellipses":
-            return plain | {"ellipses": [_describe_ellipse(one) for one in self.found.ellipses]}
         plain["holes"] = [_describe_hole(one) for one in self.found.holes]
         plain["rejected"] = [_describe_rejection(one) for one in self.found.rejected]
         plain["target"] = None
@@ -105,7 +100,6 @@ class Perceive:
         perception: Finder of boreholes.
         tracker: Follows the boreholes over the frames.
         source: Source of the frames.
-        gallery: Source of the pictures with `perceive.until: ellipses`.
         overlay: Draws the detections.
         perceive: Input and extent.
     """
@@ -114,7 +108,6 @@ class Perceive:
     perception: FinderSpec
     tracker: TrackerSpec
     source: FrameSourceSpec
-    gallery: FrameSourceSpec
     overlay: Overlay
     perceive: PerceiveOptions
 
@@ -122,16 +115,11 @@ class Perceive:
         """Write `holes.json`, `explain.txt` and `overlays/<name>.png` into the run folder.
 
         Raises:
-            ConfigError: `perceive.until=ellipses` with a finder that cannot list ellipses.
             FrameError: there is no frame at all, or none that can be used.
             StorageError: a file could not be written.
         """
         finder = self.perception.build()
-        # Refused before the first frame is read.
-        if self.perceive.until == "ellipses":
-            results = self._list_ellipses(_require_whole_picture_finder(finder))
-        else:
-            results = self._find_holes(finder, self.tracker.build())
+        results = self._find_holes(finder, self.tracker.build())
         folder = self.session.folder
         entries: list[FrameEntry] = []
         try:
@@ -159,7 +147,7 @@ class Perceive:
     ) -> Iterator[tuple[FrameEntry, Frame | None]]:
         """Yield the result of each frame of the source."""
         search = SteeredSearch(finder, tracker)
-        for name, frame, refused in self._read_frames(self.source):
+        for name, frame, refused in self._read_frames():
             if frame is None:
                 yield FrameEntry(name, None, None, refused), None
                 continue
@@ -172,25 +160,10 @@ class Perceive:
             target = _choose_target(tracked, frame.t_s)
             yield FrameEntry(name, found, target, None), frame
 
-    def _list_ellipses(
-        self, finder: WholePictureFinder
-    ) -> Iterator[tuple[FrameEntry, Frame | None]]:
-        """Yield the ellipses of each picture of the gallery."""
-        for name, frame, refused in self._read_frames(self.gallery):
-            if frame is None:
-                yield FrameEntry(name, None, None, refused), None
-                continue
-            start = time.perf_counter()
-            ellipses = finder.find_ellipses(frame)
-            ms = {"ellipse": 1000.0 * (time.perf_counter() - start)}
-            yield FrameEntry(name, FrameDetections([], [], ellipses, None, ms), None, None), frame
-
-    def _read_frames(
-        self, source_spec: FrameSourceSpec
-    ) -> Iterator[tuple[str, Frame | None, str | None]]:
+    def _read_frames(self) -> Iterator[tuple[str, Frame | None, str | None]]:
         """Yield name, frame and, in place of a frame that cannot be used, the reason."""
         with contextlib.ExitStack() as stack:
-            source = stack.enter_context(source_spec.build())
+            source = stack.enter_context(self.source.build())
             # A live source has no number of frames.
             counts = [source.num_frames, self.perceive.frames]
             total = min((count for count in counts if count is not None), default=None)
@@ -211,11 +184,9 @@ class Perceive:
                 progress.reach(number)
 
     def _write(self, folder: Path, entries: list[FrameEntry], finder: BoreholeFinder) -> None:
-        """Write `holes.json`, and `explain.txt` unless only ellipses were asked for."""
-        frames = [entry.as_json(self.perceive.until) for entry in entries]
+        """Write `holes.json` and `explain.txt`."""
+        frames = [entry.as_json() for entry in entries]
         write_json(folder / "holes.json", {"schema": 1, "frames": frames})
-        if self.perceive.until == "ellipses":
-            return
         lines = []
         for entry in entries:
             lines.append(f"{entry.name}: {entry.refused or _count_holes(entry.found)}")
@@ -230,39 +201,20 @@ class Perceive:
             if entry.found:
                 used.append(entry.found)
         rows = [("frames", f"{len(used)} used, {len(entries) - len(used)} refused")]
-        if self.perceive.until == "ellipses":
-            rows.append(("ellipses", str(sum(len(one.ellipses) for one in used))))
-        else:
-            num_holes = sum(len(one.holes) for one in used)
-            rows.append(("holes", f"{num_holes} in {sum(bool(one.holes) for one in used)} frames"))
-            counts: Counter[str] = Counter()
-            for one in used:
-                counts.update(
-                    f"{rejection.stage}: {rejection.reason}" for rejection in one.rejected
-                )
-            for reason, count in counts.most_common():
-                rows.append(("refused", f"{count} × {reason}"))
-            target = next((entry.target for entry in reversed(entries) if entry.target), None)
-            if target is not None:
-                rows.append(("target", _format_target(target[0])))
+        num_holes = sum(len(one.holes) for one in used)
+        rows.append(("holes", f"{num_holes} in {sum(bool(one.holes) for one in used)} frames"))
+        counts: Counter[str] = Counter()
+        for one in used:
+            counts.update(f"{rejection.stage}: {rejection.reason}" for rejection in one.rejected)
+        for reason, count in counts.most_common():
+            rows.append(("refused", f"{count} × {reason}"))
+        target = next((entry.target for entry in reversed(entries) if entry.target), None)
+        if target is not None:
+            rows.append(("target", _format_target(target[0])))
         stages = dict.fromkeys(stage for one in used for stage in one.ms)
         for stage in stages:
             rows.append((f"ms, {stage}", f"{median(one.ms.get(stage, 0.0) for one in used):.0f}"))
         print_table((), rows)
-
-
-def _require_whole_picture_finder(finder: BoreholeFinder) -> WholePictureFinder:
-    """Return a finder that can list ellipses.
-
-    Raises:
-        ConfigError: this one cannot.
-    """
-    if not isinstance(finder, WholePictureFinder):
-        raise ConfigError(
-            f"perceive.until=ellipses: {type(finder).__name__} has no method find_ellipses(frame); "
-            "choose perception=plane_conic or paper, or perceive.until=holes"
-        )
-    return finder
 
 
 def _explain(finder: BoreholeFinder, rejection: Rejection) -> str:

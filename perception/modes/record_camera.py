@@ -83,7 +83,7 @@ class RecordCamera:
         """Write the lens of both cameras, by the pairs that show the board."""
         tracker = self.board.build()
         if not isinstance(tracker, BoardTracker):
-            raise ConfigError("board: expected perception/camera_pose@board=charuco or apriltag")
+            raise ConfigError("board: expected perception/camera_pose@board=charuco")
         pairs, num_frames, size_px = [], 0, (0, 0)
         for frame in self._read_kept():
             num_frames += 1

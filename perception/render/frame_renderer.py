@@ -15,7 +15,6 @@ from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.render.board_on_arm import BoardOnArm
 from perception.render.camera_sensor import draw_dust, take_picture
-from perception.render.photographed_surfaces import PhotographedSurfaces
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
 from perception.render.scene_sequence import RandomScenes, SceneSequence, StagedScene
@@ -54,14 +53,12 @@ class FrameRenderer:
         stereo: Makes the depth.
         depth: `matched` makes depth of the two pictures; `exact` writes the mathematical one;
             `none` leaves it to the reader.
-        surfaces: Photographs on surfaces.
         pair: Whether the right picture is taken; left alone, in half the time, is enough to train a
             segmenter on.
     """
 
     rig: StereoRig
     scene: SceneRanges | BoardOnArm
-    surfaces: PhotographedSurfaces
     stereo: Stereo
     depth: Literal["matched", "exact", "none"]
     pair: bool
@@ -111,8 +108,7 @@ class FrameRenderer:
         Raises:
             StorageError: a file could not be written.
         """
-        scene = self.surfaces.paint(view.scene, view.generator)
-        shot = self.shot(scene, view.generator, view.base_from_camera)
+        shot = self.shot(view.scene, view.generator, view.base_from_camera)
         depth = {"matched": shot.depth_m, "exact": shot.exact_depth_m, "none": None}[self.depth]
         dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
 

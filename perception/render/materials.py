@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import cv2
 import numpy as np
-
-from brokk_rl.errors import FrameError
 
 TEXTURE_SIDE = 1024
 """Texels of a texture along each side; it repeats beyond."""
@@ -17,49 +14,6 @@ NUM_TEXTURES = 4
 _FINEST_OCTAVE, _COARSEST_OCTAVE = 10, 3
 _ROW = 1024
 """Points are handed to OpenCV in rows of this length, as it takes no longer ones."""
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """A photographed surface.
-
-    Attributes:
-        levels: Colours relative to the mean brightness, `(s, s, 3)` float32, and their reductions
-            by two to one texel; periodic.
-        texel_m: Size of a texel of the first.
-    """
-
-    levels: tuple[np.ndarray, ...]
-    texel_m: float
-
-    def sample(self, uv_m: np.ndarray, pixel_m: np.ndarray) -> np.ndarray:
-        """Return the colours at places, `(M, 3)`; see `Material.albedo`."""
-        level = np.log2(np.maximum(pixel_m / self.texel_m, 1.0))
-        return _sample_pyramid(self.levels, uv_m / np.float32(self.texel_m), level)
-
-
-def read_photograph(path: Path) -> Photograph:
-    """Return a photograph as a surface; its mirror images stand beside it, so that it has no seam.
-
-    Raises:
-        FrameError: it cannot be read.
-    """
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise FrameError(f"{path}: no picture that OpenCV can read")
-    side = min(picture.shape[:2])
-    top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
-    square = picture[top : top + side, left : left + side, ::-1]
-    half = TEXTURE_SIDE // 2
-    small = cv2.resize(square, (half, half), interpolation=cv2.INTER_AREA).astype(np.float32)
-    # Linear light, about: a picture is stored with a gamma of 2.2.
-    small = (small / 255.0) ** 2.2
-    wide = np.concatenate([small, small[:, ::-1]], 1)
-    levels: list[np.ndarray] = [np.concatenate([wide, wide[::-1]]) / max(float(small.mean()), 1e-3)]
-    while levels[-1].shape[0] > 1:
-        shrunk = cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        levels.append(shrunk.reshape(shrunk.shape[0], shrunk.shape[1], 3))
-    return Photograph(tuple(levels), 1.0 / half)
 
 
 @dataclass(frozen=True)
@@ -74,7 +28,6 @@ class Material:
         shift: Where the pattern begins, texels.
         marks: Brightness painted over it, `(h, w)` float32, 1 for none, and the size of its texels
             in m; repeats beyond.
-        photograph: A photographed surface instead of the grain; its mean brightness is `color`'s.
     """
 
     color: tuple[float, float, float]
@@ -83,7 +36,6 @@ class Material:
     texture: int = 0
     shift: tuple[float, float] = (0.0, 0.0)
     marks: tuple[np.ndarray, float] | None = None
-    photograph: Photograph | None = None
 
     def albedo(self, uv_m: np.ndarray, pixel_m: np.ndarray) -> np.ndarray:
         """Return the reflected part of the light, `(M, 3)`.
@@ -92,13 +44,10 @@ class Material:
             uv_m: Where on the surface, `(M, 2)`.
             pixel_m: Size of a pixel there, `(M,)`.
         """
-        if self.photograph is None:
-            uv = uv_m / np.float32(self.texel_m) + np.asarray(self.shift, np.float32)
-            level = np.log2(np.maximum(pixel_m / self.texel_m, 1.0))
-            grain = _sample_pyramid(_build_pyramid(self.texture), uv, level)
-            bright = np.clip(1.0 + self.contrast * grain, 0.15, 1.9)[:, None]
-        else:
-            bright = np.clip(self.photograph.sample(uv_m, pixel_m), 0.05, 1.9)
+        uv = uv_m / np.float32(self.texel_m) + np.asarray(self.shift, np.float32)
+        level = np.log2(np.maximum(pixel_m / self.texel_m, 1.0))
+        grain = _sample_pyramid(_build_pyramid(self.texture), uv, level)
+        bright = np.clip(1.0 + self.contrast * grain, 0.15, 1.9)[:, None]
         if self.marks is not None:
             picture, size_m = self.marks
             center = uv_m / np.float32(size_m) + np.array(picture.shape[::-1], np.float32) / 2
@@ -150,14 +99,12 @@ def _sample_pyramid(
 ) -> np.ndarray:
     """Return the pattern at `uv`, `(M, 2)` finest texels, blended between the levels at `level`."""
     level = np.minimum(level, len(pyramid) - 1.001)
-    channels = pyramid[0].shape[2:]
-    total = np.zeros((len(uv), *channels), np.float32)
+    total = np.zeros(len(uv), np.float32)
     for number in range(int(level.min()), int(level.max()) + 2):
         weight = 1.0 - np.abs(level - number)
         rows = np.flatnonzero(weight > 0)
         if len(rows):
-            part = weight[rows].reshape(-1, *(1 for _ in channels))
-            total[rows] += part * _interpolate_bilinear(
+            total[rows] += weight[rows] * _interpolate_bilinear(
                 pyramid[number], (uv[rows] + 0.5) / np.float32(1 << number) - 0.5
             )
     return total
@@ -179,4 +126,4 @@ def _interpolate_bilinear(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_WRAP,
     )
-    return found.reshape(rows * _ROW, *picture.shape[2:])[:count]
+    return found.ravel()[:count]

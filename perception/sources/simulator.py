@@ -16,7 +16,6 @@ from perception.render.block_sampler import build_frame, draw_block_materials
 from perception.render.drilled_block import FRONT, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer, RenderedFrame
 from perception.render.materials import Material
-from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.scene_ranges import Scene, SceneRanges, view_from
 from perception.render.scene_sampler import add_surroundings
 from perception.render.solids import Cylinder, Solid, SolidPose
@@ -142,7 +141,6 @@ class SimulatedSource:
             rig=rig or settings.rig,
             scene=settings.surroundings,
             stereo=settings.stereo,
-            surfaces=NO_PHOTOGRAPHS,
             depth="matched",
             pair=True,
         )

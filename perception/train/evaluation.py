@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,12 @@ import cv2
 import numpy as np
 import torch
 
-from brokk_rl.progress import ItemProgress
 from perception.segment.network import THRESHOLD
 from perception.segment.unet import CHANNELS, UNet
 from perception.segment.window import center_window, cover_picture
 from perception.train.samples import LOOKS, ROOM, TrainingViews
 
 BATCH = 32
-ALIKE = 0.5
-"""Overlap from which on a mouth counts as found."""
 SHOWN = 12
 """Frames in the picture of samples."""
 COLOURS = {"block": (0, 114, 178), "mouth": (213, 94, 0)}
@@ -71,25 +67,18 @@ def compute_metrics(
     """Return figures for each condition, and for all frames under `all`.
 
     `block`: intersection over union of the block, seen as a whole. `mouth`: that of mouths, in the
-    closer view; both over all pixels of all frames, `None` where there is nothing to find. `found`:
-    part of the mouths that one piece of the prediction covers with an overlap above one half.
-    `false`: predicted pieces per frame that touch no mouth. `frames`: how many.
+    closer view; both over all pixels of all frames, `None` where there is nothing to find.
+    `frames`: how many.
     """
     said = probabilities > THRESHOLD
     block, mouth = (said[:, 0, 0], known[:, 0, 0]), (said[:, 1, 1], known[:, 1, 1])
-    counts = np.array(
-        [match_pieces(a.numpy(), b.numpy()) for a, b in zip(*mouth, strict=True)]
-    ).reshape(-1, 3)
     table = {}
     for name in ("all", *sorted(set(conditions))):
         chosen = np.array([name in ("all", condition) for condition in conditions])
         index = torch.from_numpy(chosen)
-        found, there, false = counts[chosen].sum(0)
         table[name] = {
             "block": _compute_iou(block[0][index], block[1][index]),
             "mouth": _compute_iou(mouth[0][index], mouth[1][index]),
-            "found": float(found / there) if there else None,
-            "false": float(false / chosen.sum()),
             "frames": int(chosen.sum()),
         }
     return table
@@ -97,31 +86,6 @@ def compute_metrics(
 
 def _compute_iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
     return float((said & known).sum() / (said | known).sum()) if known.any() else None
-
-
-def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
-    """Return the numbers of mouths found, of mouths, and of predicted pieces that touch none."""
-    num_said, said_labels = cv2.connectedComponents(said.astype(np.uint8))
-    num_known, known_labels = cv2.connectedComponents(known.astype(np.uint8))
-    found = 0
-    for label in range(1, num_known):
-        there = known_labels == label
-        touching = said_labels[there]
-        best = (
-            np.bincount(touching[touching > 0], minlength=1).argmax() if (touching > 0).any() else 0
-        )
-        piece = said_labels == best
-        found += bool(best and (there & piece).sum() / (there | piece).sum() > ALIKE)
-    false = sum(not known[said_labels == label].any() for label in range(1, num_said))
-    return found, num_known - 1, false
-
-
-@contextmanager
-def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
-    """Show the progress of a training; yield the function that advances it by one update."""
-    with ItemProgress("training", total) as progress:
-        progress.skip(done)
-        yield progress.advance
 
 
 def draw_samples(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-import os
 import warnings
 from collections.abc import Mapping
 from contextlib import redirect_stdout
@@ -16,7 +15,8 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
-from brokk_rl.errors import CheckpointError, StorageError
+from brokk_rl.errors import CheckpointError
+from brokk_rl.session import write_bytes
 from perception.segment.network import PREFIX, SCHEMA
 from perception.segment.unet import CHANNELS, Probabilities, UNet
 
@@ -103,20 +103,3 @@ def write_onnx(
         )
     write_bytes(path, model.SerializeToString())
     return largest
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file in one step.
-
-    Raises:
-        StorageError: it could not be written; one that was there before is untouched.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(content)
-        part.replace(path)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)

@@ -1,14 +1,13 @@
 """Training samples: each frame as the segmenter's two views, with room to crop.
 
-A batch is a function of the seed and its number alone, so a training goes on exactly where it
-stopped. All of it is made by torch where the network is: a processor's cores took five times as
-long to make a batch as a graphics card takes to learn from it.
+All of a batch is made by torch where the network is: a processor's cores took five times as long to
+make a batch as a graphics card takes to learn from it.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,6 @@ from brokk_rl.spec import PositiveRange, spec
 from perception import dataset
 from perception.segment.network import SMALLEST_PIECE, THRESHOLD
 from perception.segment.window import Window, bound_block, center_window, cover_picture
-from perception.train.augmentation import Augmentation, apply_augmentations
 
 ROOM = 1.5
 """Size of a stored view over the network's picture: room that a crop can use without loss of
@@ -63,9 +61,7 @@ class Crop:
     roll_rad: float
     mirror: float
 
-    def windows(
-        self, seen: torch.Tensor, shape: tuple[int, int], generator: torch.Generator
-    ) -> torch.Tensor:
+    def windows(self, seen: torch.Tensor, shape: tuple[int, int]) -> torch.Tensor:
         """Return random parts of views, `(B, 2, 3)`: maps from a sample's places to the view's.
 
         Both run from -1 to 1 from border to border, as `torch.nn.functional.affine_grid` wants
@@ -74,9 +70,8 @@ class Crop:
         Args:
             seen: Part of each view's width that the segmenter would see, `(B,)`.
             shape: Height and width of the views.
-            generator: Draws them.
         """
-        draw = torch.rand((5, len(seen)), device=generator.device, generator=generator)
+        draw = torch.rand((5, len(seen)), device=seen.device)
         scale = seen * (self.width[0] + (self.width[1] - self.width[0]) * draw[0])
         shift = 2.0 * self.shift * seen * (2.0 * draw[1:3] - 1.0)
         roll_rad, slant = self.roll_rad * (2.0 * draw[3] - 1.0), shape[1] / shape[0]
@@ -113,16 +108,15 @@ class TrainingViews:
 
 
 class Samples:
-    """Endless batches by number, cut and changed where the network is trained.
+    """Endless batches, cut and changed where the network is trained.
 
     Args:
         views: They are cut from these; kept on the device where it has room for them, else in the
             computer's memory.
         crop: How.
-        steps: Augmentations, in order.
+        change: Changes pictures, `(B, 3, h, w)`.
         size_px: Width and height of a sample.
         closer: How often a sample is cut from the closer view.
-        seed: Of all draws.
         device: Where samples are made.
     """
 
@@ -130,10 +124,9 @@ class Samples:
         self,
         views: TrainingViews,
         crop: Crop,
-        steps: Mapping[str, Augmentation],
+        change: torch.nn.Module,
         size_px: tuple[int, int],
         closer: float,
-        seed: int,
         device: torch.device,
     ) -> None:
         layers = views.layers
@@ -142,24 +135,20 @@ class Samples:
             and layers.nbytes < PART_OF_MEMORY * torch.cuda.mem_get_info(device)[0]
         ):
             layers = layers.to(device)
-        self._layers, self._crop, self._steps, self._size_px = layers, crop, steps, size_px
-        self._closer, self._seed, self._device = closer, seed, device
+        self._layers, self._crop, self._change, self._size_px = layers, crop, change, size_px
+        self._closer, self._device = closer, device
 
-    def batch(self, number: int, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+    def draw(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return pictures, `(count, 3, h, w)`, and shares of block and mouth, `(count, 2, h, w)`."""
-        seed = (self._seed * 0x9E3779B97F4A7C15 + number) % 2**63
-        chance = torch.Generator().manual_seed(seed)
-        frame = torch.randint(len(self._layers), (count,), generator=chance)
-        look = (torch.rand(count, generator=chance) < self._closer).long()
-        generator = torch.Generator(self._device).manual_seed(seed)
-        # nothing here asks the device for an answer, nor waits until it has taken something: it is
-        # to be told of the next batch while it works at this one
+        frame = torch.randint(len(self._layers), (count,))
+        look = (torch.rand(count) < self._closer).long()
+        # Nothing here waits until the device has taken something.
         place = (index.to(self._layers.device, non_blocking=True) for index in (frame, look))
         taken = self._layers[tuple(place)].to(self._device, non_blocking=True)
         seen = torch.tensor(SEEN)[look].to(self._device, non_blocking=True)
-        windows = self._crop.windows(seen, (taken.shape[2], taken.shape[3]), generator)
+        windows = self._crop.windows(seen, (taken.shape[2], taken.shape[3]))
         layers = cut_windows(taken, windows, self._size_px)
-        return apply_augmentations(layers[:, :3], self._steps, chance, generator), layers[:, 3:]
+        return self._change(layers[:, :3]).clamp(0.0, 1.0), layers[:, 3:]
 
 
 def cut_windows(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 import logging
 import math
 import time
@@ -13,6 +11,7 @@ import torch
 from annotated_types import Ge
 
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import Count, Positive, spec
 from perception.segment.network import LEAST_BLOCK, THRESHOLD, find_weights
@@ -21,11 +20,6 @@ from perception.train import evaluation, export
 from perception.train import samples as training_data
 from perception.train.augmentation import Augmentation
 from perception.train.samples import Crop, Samples, TrainingViews
-
-STATE = "training.pt"
-"""State of an interrupted training."""
-FREE = ("frames", "negatives", "validation", "hold_out", "max_seconds", "validate_every")
-"""Settings that may differ on resuming; frames and validation are compared by content."""
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +40,8 @@ class SegmenterTraining:
         start: Checkpoint whose weights it begins with, to go on with other frames: a path, or the
             name of one that ships with the package; `null` begins with chance.
         updates: Steps of the optimiser.
-        max_seconds: It ends after as many seconds too, those before a resume included; `null` for
-            no such end. The result then depends on the speed of the machine.
+        max_seconds: It ends after as many seconds too; `null` for no such end. The result then
+            depends on the speed of the machine.
         batch: Samples a step.
         rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a
             cosine to nothing.
@@ -58,10 +52,9 @@ class SegmenterTraining:
             card or a processor that can.
         closer: How often a sample is cut from the closer view of the block.
         margin: Room around the block in that view, as a part of its box; that of the segmenter.
-        validate_every: Updates between two judgements, after each of which the training can go on
-            if it is stopped.
+        validate_every: Updates between two judgements; the best network so far is kept then.
         crop: Random crop around the segmenter's view.
-        augment: Augmentations by name, in this order.
+        augment: Changes of the pictures.
     """
 
     frames: str | tuple[str, ...]
@@ -82,7 +75,7 @@ class SegmenterTraining:
     margin: float
     validate_every: Count
     crop: Crop
-    augment: dict[str, Augmentation]
+    augment: Augmentation
 
     def check(self) -> None:
         multiple = 2 ** (len(self.widths) - 1)
@@ -92,8 +85,10 @@ class SegmenterTraining:
                 f"{multiple}, got {list(self.size_px)}"
             )
 
-    def fit(self, session: Session, resume: bool) -> dict[str, Any]:
+    def fit(self, session: Session) -> dict[str, Any]:
         """Train; write network (safetensors, ONNX) and samples (PNG) into the session's folder.
+
+        One that is stopped leaves the best network so far, with which `start` goes on.
 
         Returns:
             The content of `training.json`: `conditions` (see `evaluation.compute_metrics`),
@@ -101,16 +96,15 @@ class SegmenterTraining:
 
         Raises:
             FrameError: frames or masks cannot be used.
-            CheckpointError: there is nothing to go on from, it is another training, or the export
-                says something else.
+            CheckpointError: there is nothing to start with, or the export says something else.
         """
-        return _Training(self, session, resume).run()
+        return _Training(self, session).run()
 
 
 class _Training:
     """A training under way."""
 
-    def __init__(self, settings: SegmenterTraining, session: Session, resume: bool) -> None:
+    def __init__(self, settings: SegmenterTraining, session: Session) -> None:
         self._settings, self._session, self._folder = settings, session, session.folder
         self._device = session.torch_device()
         # Before anything random: weights, views and samples follow from the session's seed.
@@ -126,10 +120,7 @@ class _Training:
         self._mean = {name: value.clone() for name, value in self._network.state_dict().items()}
         self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
         self._seconds = 0.0
-        self._best_tensors: dict[str, torch.Tensor] = {}
-        self._stamp = self._identity()
-        if resume:
-            self._load()
+        self._best_network = self._network
 
     def run(self) -> dict[str, Any]:
         settings = self._settings
@@ -141,34 +132,30 @@ class _Training:
             len(self._unseen),
             self._device,
         )
-        # Seconds of earlier runs count too.
-        begun = time.monotonic() - self._seconds
+        begun = time.monotonic()
+        change = settings.augment.build()
         samples = Samples(
-            self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples"),
-            self._device,
-        )  # fmt: skip
+            self._train, settings.crop, change, settings.size_px, settings.closer, self._device
+        )
         # The start itself is judged, so that a training that only harms is noticed.
-        if settings.start is not None and self._update == 0:
-            self._validate(pictures, known, None)  # a training may make a good network worse
-        with evaluation.show_progress(self._update, settings.updates) as advance:
+        if settings.start is not None:
+            self._validate(pictures, known, None)
+        with ItemProgress("training", settings.updates) as progress:
             while self._spent() < 1.0:
                 before = self._spent()
-                total += self._step(*samples.batch(self._update, settings.batch))
+                total += self._step(*samples.draw(settings.batch))
                 self._update += 1
                 # The clock is read before judging: validation is part of the training's time.
                 self._seconds = time.monotonic() - begun
                 # The part that is spent, not the number of steps: the mean spans the same share
                 # however long it runs.
                 self._remember(1.0 - math.exp((before - self._spent()) / settings.average))
-                advance()
+                progress.advance()
                 over = self._spent() >= 1.0
                 if self._update % settings.validate_every == 0 or over:
-                    # Updates since the last point of the curve, which may lie before an
-                    # interruption.
                     since = self._update - (self._curve[-1]["update"] if self._curve else 0)
                     self._validate(pictures, known, float(total) / since)
                     total.zero_()
-                    self._save()
         return self._finish(pictures, known)
 
     def _build_network(self) -> UNet:
@@ -294,7 +281,9 @@ class _Training:
         if score > self._best["score"]:
             self._best = {"score": score, "update": self._update}
             # On the processor: the best weights must not occupy the card twice.
-            self._best_tensors = {name: value.cpu().clone() for name, value in self._mean.items()}
+            self._best_network = network.cpu().eval().requires_grad_(False)
+            header = self._build_header(block, mouth)
+            export.write_checkpoint(self._folder / export.TENSORS, self._best_network, header)
         passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
         log.info(
             "update %d: %soverlap of blocks %.3f, of mouths %.3f",
@@ -312,22 +301,22 @@ class _Training:
         named = (probabilities[:, :, 0] > THRESHOLD).float().mean((2, 3)).amax(1)
         return float((named < LEAST_BLOCK).float().mean())
 
+    def _build_header(self, block: float, mouth: float) -> dict[str, Any]:
+        """Return the header of the network's files, with its overlaps on unseen frames."""
+        facts = {
+            "overlap": {"block": block, "mouth": mouth},
+            "frames": len(self._train),
+            "update": self._update,
+            "margin": self._settings.margin,
+        }
+        return export.build_header(self._network, self._settings.size_px, facts)
+
     def _finish(self, pictures: torch.Tensor, known: torch.Tensor) -> dict[str, Any]:
-        network = UNet(self._settings.widths)
-        network.load_state_dict(self._best_tensors)
-        network.eval().requires_grad_(False)
+        network = self._best_network
         probabilities = evaluation.predict(network.to(self._device), pictures, self._device)
         conditions = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)
         network.cpu()
-        facts = {
-            "overlap": {name: conditions["all"][name] for name in ("block", "mouth")},
-            "frames": len(self._train),
-            "update": self._best["update"],
-            "margin": self._settings.margin,
-            "data": self._stamp["data"],
-        }
-        header = export.build_header(network, self._settings.size_px, facts)
-        export.write_checkpoint(self._folder / export.TENSORS, network, header)
+        _, header = read_checkpoint(self._folder / export.TENSORS)
         # Eight pictures show a wrong export as surely as all.
         compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
         parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
@@ -345,60 +334,3 @@ class _Training:
             "device": str(self._device),
             "curve": self._curve,
         }
-
-    def _identity(self) -> dict[str, str]:
-        """Return fingerprints of settings and data, which must be the same to resume."""
-        same = {}
-        for name, value in vars(self._settings).items():
-            if name not in FREE:
-                same[name] = value
-        data = hashlib.sha256()
-        for views in (self._train, self._unseen):
-            # About 50 views stand for the data: a fingerprint of all would take seconds.
-            data.update(views.layers[:: max(1, len(views) // 50)].numpy().tobytes())
-        return {
-            "settings": hashlib.sha256(repr((same, self._session.seed)).encode()).hexdigest()[:16],
-            "data": data.hexdigest()[:16],
-        }
-
-    def _save(self) -> None:
-        content = io.BytesIO()
-        torch.save(
-            {
-                "stamp": self._stamp, "update": self._update, "best": self._best, "curve": self._curve, "seconds": self._seconds,
-                "network": self._network.state_dict(), "optimizer": self._optimizer.state_dict(), "mean": self._mean,
-                "best_tensors": self._best_tensors,
-            },
-            content,
-        )  # fmt: skip
-        # Written beside and renamed: an interruption leaves the old state.
-        export.write_bytes(self._folder / STATE, content.getvalue())
-
-    def _load(self) -> None:
-        path = self._folder / STATE
-        if not path.is_file():
-            log.info("%s: nothing was kept yet, the training begins anew", path)
-            return
-        try:
-            state = torch.load(path, map_location=self._device, weights_only=True)
-        except Exception as error:  # torch passes on any error of its unpickler
-            raise CheckpointError(
-                f"{path}: corrupt ({error}); delete it to begin the training again"
-            ) from error
-        if state["stamp"] != self._stamp:
-            differing = []
-            for name, value in self._stamp.items():
-                if state["stamp"].get(name) != value:
-                    differing.append(name)
-            raise CheckpointError(
-                f"{path}: an interrupted training that cannot go on: its {' and '.join(differing)} differ. Train with what it "
-                "began with, or choose another folder (session.out=…)."
-            )
-        self._network.load_state_dict(state["network"])
-        self._mean = state["mean"]
-        self._optimizer.load_state_dict(state["optimizer"])
-        self._update = state["update"]
-        self._best = state["best"]
-        self._curve = state["curve"]
-        self._seconds = state["seconds"]
-        self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}

@@ -47,7 +47,6 @@ WITHOUT_VALUES = {
     "diagnosis.case=": "the folder is the reader's",
     "subject.model=arm.urdf": "the file is the reader's",
     "effect@stand_in": "the file of the reader holds effects by name",
-    "surfaces.folder=": "the photographs are the reader's",
     '"$': "a variable of the shell holds a value that must be given",
 }
 """Parts of commands that leave out such values: groups and fields are checked alone."""

@@ -23,7 +23,7 @@ from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from perception import dataset
-from perception.calibrate import arm, clock_offset, hand_eye, touched_points, transforms, verdict
+from perception.calibrate import arm, clock_offset, hand_eye, transforms, verdict
 from perception.calibrate.extrinsics import compute_point_std_m, load_extrinsics
 from perception.sources.folder import FrameFolder
 
@@ -196,37 +196,6 @@ def test_an_arm_that_rests_tells_nothing_about_clocks(machine: Machine) -> None:
     )
 
 
-@settings(deadline=None, max_examples=25)
-@given(seed=st.integers(0, 10_000), count=st.integers(6, 20), wrong=st.integers(0, 2))
-def test_touched_points_give_the_camera_though_some_are_wrong(
-    seed: int, count: int, wrong: int
-) -> None:
-    chance = np.random.default_rng(seed)
-    there = np.array([2.3, 0.0, 0.5]) + chance.uniform(-1, 1, (count, 3)) * [0.6, 0.7, 0.4]
-    # Well apart
-    there[:4] = np.array([[1.8, -0.7, 0.2], [2.8, 0.7, 0.2], [1.9, 0.6, 0.9], [2.8, -0.6, 0.8]])
-    seen = (there - board.CAMERA[:3, 3]) @ board.CAMERA[:3, :3] + 0.002 * chance.standard_normal(
-        (count, 3)
-    )
-    there = there + 0.002 * chance.standard_normal(there.shape)
-    there[-wrong or count :] += chance.normal(0, 0.2, (wrong, 3)) + 0.1
-    found = touched_points.fit_camera_to_points(
-        touched_points.PointPairs(
-            seen, there, np.broadcast_to(0.002**2 * np.eye(3), (count, 3, 3))
-        ),
-        0.002,
-    )
-    assert found is not None
-    if count - wrong >= 6:
-        assert not found.used[count - wrong :].any()
-        away = transforms.compute_motion(found.base_from_camera, board.CAMERA)
-        # One in ten million of six degrees of freedom, were they normal.
-        assert away @ np.linalg.solve(found.cov, away) < 45.0
-    np.testing.assert_allclose(
-        found.base_from_camera[:3, :3] @ found.base_from_camera[:3, :3].T, np.eye(3), atol=1e-9
-    )
-
-
 def test_uncertainty_at_a_distance_is_that_worked_by_hand() -> None:
     # 3 mm in each direction, and turns of 1 mrad about x and y that move a point 2 m ahead by 2 mm
     # each, about z by nothing
@@ -355,54 +324,6 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
     assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(0.62, abs=0.01)
     mm, degrees = off(np.array(told["T_base_cam"]))
     assert mm < 4.0 and degrees < 0.1
-
-
-def test_the_command_takes_touched_points(
-    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
-) -> None:
-    chance, points = np.random.default_rng(4), []
-    height, width = 360, 640
-    matrix = board.MATRIX / 2
-    matrix[2, 2] = 1.0
-    dataset.write_camera(tmp_path, matrix, (640, 360), None, None)
-    for number in range(8):
-        while True:
-            q = board.MIDDLE + chance.uniform(-1, 1, 5) * [0.4, 0.2, 0.4, 0.4, 0.4]
-            tip = arm.compute_link_poses(machine, q[None]).tip_in_base_m[0]
-            seen = (tip - board.CAMERA[:3, 3]) @ board.CAMERA[:3, :3]
-            pixel = (matrix @ seen / seen[2])[:2]
-            if seen[2] > 0.8 and 20 < pixel[0] < width - 20 and 20 < pixel[1] < height - 20:
-                break
-        # a wall through the touched point, square to the sight of the camera's axis
-        depth = np.full((height, width), seen[2], np.float32) + 0.002 * chance.standard_normal(
-            (height, width)
-        ).astype(np.float32)
-        dataset.write_frame(
-            tmp_path / f"{number:02d}", np.zeros((height, width, 3), np.uint8), depth
-        )
-        points.append({"frame": f"{number:02d}", "pixel": pixel.tolist(), "q": q.tolist()})
-    points[3]["pixel"] = [50, 50]
-    (tmp_path / "points.yaml").write_text(yaml.safe_dump({"points": points}))
-    command = (
-        "mode=calibrate",
-        "calibration=touched",
-        f"calibration.source.folder={tmp_path}",
-        "calibration.click_px=0.5",
-    )
-    done = brokk(*command, f"calibration.points={tmp_path / 'points.yaml'}", "session.out=run")
-    assert done.code == 0, done.err
-    told = yaml.safe_load(Path("run/calibration.yaml").read_text())
-    mm, degrees = off(np.array(told["T_base_cam"]))
-    assert mm < 6.0 and degrees < 0.3 and told["num_left_out"] == 1
-    line = [
-        {"camera_m": [0.1 * k, 0.2 * k, 2.0], "base_m": [2.0, 0.1 * k, 0.2 * k]} for k in range(6)
-    ]
-    (tmp_path / "line.yaml").write_text(yaml.safe_dump({"points": line}))
-    done = brokk(*command, f"calibration.points={tmp_path / 'line.yaml'}", "session.out=other")
-    assert done.code == 2 and "of a line" in done.err
-    (tmp_path / "bad.yaml").write_text("points: [{pixel: [1, 2], q: [0, 0]}]")
-    done = brokk(*command, f"calibration.points={tmp_path / 'bad.yaml'}", "session.out=other")
-    assert done.code == 2 and "q has 2 numbers, expected 5" in done.err
 
 
 def judged(machine: Machine, poses: board.Posed, q: np.ndarray, seed: int) -> verdict.Verdict:

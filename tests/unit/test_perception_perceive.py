@@ -50,25 +50,6 @@ def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) 
     assert "1 hole" in Path("out/explain.txt").read_text()
 
 
-def test_ellipses_of_any_pictures_need_no_depth(tmp_path: Path, brokk: Callable) -> None:
-    picture = np.full((120, 160), 200, np.uint8)
-    cv2.ellipse(picture, (80, 60), (30, 20), 10, 0, 360, 30, -1, cv2.LINE_AA)
-    (tmp_path / "photos").mkdir()
-    cv2.imwrite(str(tmp_path / "photos" / "grey.pgm"), picture)
-    (tmp_path / "photos" / "empty.jpg").write_bytes(b"")
-    done = brokk(
-        "mode=perceive", "perceive.input=photos", "perceive.until=ellipses", "session.out=out"
-    )
-    assert done.code == 0, done.err
-    frames = {
-        frame["name"]: frame for frame in json.loads(Path("out/holes.json").read_text())["frames"]
-    }
-    found = frames["grey"]["ellipses"]
-    assert len(found) == 1
-    assert [found[0][key] for key in "xyab"] == pytest.approx([80, 60, 30, 20], abs=0.7)
-    assert found[0]["theta_rad"] == pytest.approx(np.radians(10), abs=0.05)
-
-
 def test_a_finder_that_only_finds_holes_is_enough(folder: Path, brokk: Callable) -> None:
     done = brokk("mode=perceive", f"perceive.input={folder}", "perception=truth", "session.out=out")
     assert done.code == 0, done.err

@@ -34,7 +34,6 @@ from perception.render.hole_light import (
     measure_sunlight,
 )
 from perception.render.materials import Material
-from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
@@ -79,12 +78,7 @@ def studio(
     name: str, rig: StereoRig, depth: Literal["matched", "exact", "none"] = "exact"
 ) -> FrameRenderer:
     return FrameRenderer(
-        rig=rig,
-        scene=kind(name),
-        stereo=load_part("stereo"),
-        depth=depth,
-        pair=True,
-        surfaces=NO_PHOTOGRAPHS,
+        rig=rig, scene=kind(name), stereo=load_part("stereo"), depth=depth, pair=True
     )  # type: ignore[arg-type]
 
 

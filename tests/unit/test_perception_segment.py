@@ -19,7 +19,6 @@ from brokk_rl.signals import Frame
 from perception import dataset
 from perception.dataset import FrameLabel
 from perception.render.frame_renderer import FrameRenderer
-from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.scene_sampler import compose_scene
 from perception.segment import network as segment_network
 from perception.segment.network import NetworkSegmenter
@@ -203,12 +202,7 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
     for seed in (101, 102, 103):
         chance, kind = np.random.default_rng(seed), option("scene", "clean")
         studio = FrameRenderer(
-            rig=rig,
-            scene=kind,
-            stereo=load_part("stereo"),
-            depth="none",
-            pair=False,
-            surfaces=NO_PHOTOGRAPHS,
+            rig=rig, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
         )
         shot = studio.shot(compose_scene(kind, rig, chance), chance)
         frame = Frame(

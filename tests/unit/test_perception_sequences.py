@@ -20,7 +20,6 @@ from perception.calibrate.arm import compute_link_poses
 from perception.label.camera_pose import Charuco
 from perception.render.board_on_arm import BoardOnArm
 from perception.render.frame_renderer import FrameRenderer
-from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.stereo_camera import StereoRig
 
 SESSION = Session(out=".", seed=4, device="cpu")
@@ -44,12 +43,7 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     kind: BoardOnArm = option("scene", "board_on_arm")
     scenes = kind.open(rig, SESSION)
     studio = FrameRenderer(
-        rig=rig,
-        scene=kind,
-        stereo=load_part("stereo"),
-        depth="none",
-        pair=False,
-        surfaces=NO_PHOTOGRAPHS,
+        rig=rig, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
     )
     corners_m, corners_px, view, _ = find_corners(kind.board, studio, scenes, 3)
     assert len(corners_m) > 20

@@ -19,8 +19,6 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception.label.camera_pose import CameraPose
 from perception.modes.score_camera import ScoreCamera, ScoreOptions, read_measured
-from perception.render.materials import Material, read_photograph
-from perception.render.photographed_surfaces import PhotographedSurfaces
 from perception.segment.network import NetworkSegmenter
 from perception.sources.lens_file import read_pair_lens
 
@@ -160,23 +158,6 @@ def test_a_speck_is_no_block(side: int, named: bool) -> None:
     masks = NetworkSegmenter(infer, (64, 32), None).segment(frame)
     assert bool((masks.block > 0.5).any()) is named
     assert bool((np.asarray(masks.hole_mask) > 0.5).any()) is named
-
-
-def test_a_photograph_keeps_brightness_and_colour(tmp_path: Path) -> None:
-    picture = np.zeros((64, 64, 3), np.uint8)
-    picture[:, :32] = (40, 80, 160)  # blue first: a reddish half, a dark half
-    picture[:, 32:] = (20, 40, 80)
-    cv2.imwrite(str(tmp_path / "rust.png"), picture)
-    photograph = read_photograph(tmp_path / "rust.png")
-    surface = Material((0.4, 0.4, 0.4), 0.2, 0.001, photograph=photograph)
-    places = np.array([[0.1, 0.2], [0.9, 0.2]], np.float32)
-    fine = surface.albedo(places, np.full(2, 1e-4, np.float32))
-    assert fine[0, 0] > fine[0, 1] > fine[0, 2], "red stays red"
-    assert fine[0, 1] > 3.0 * fine[1, 1], "gamma 2.2: half of the code is a fifth of the light"
-    far = surface.albedo(places, np.full(2, 10.0, np.float32))
-    np.testing.assert_allclose(far[0], far[1], rtol=0.01)
-    with pytest.raises(ConfigError, match="found none"):
-        PhotographedSurfaces(folder=str(tmp_path / "no"), share=1.0, block_share=0.0, size_m=(1, 2))
 
 
 def test_a_gate_drops_the_blocks_that_it_does_not_see() -> None:
