@@ -16,8 +16,8 @@ from functools import partial
 import numpy as np
 
 from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm
-from diagnosis.deployment.orders import Order, list_orders, match_order
-from diagnosis.deployment.replay import Change, Transform
+from diagnosis.deployment.orders import Order, invert_order, list_orders, match_order
+from diagnosis.deployment.replay import Change, Network, Transform
 from diagnosis.deployment.transforms import (
     arrange_columns,
     arrange_scaled,
@@ -251,20 +251,34 @@ def _list_timings(
 
 
 def make_orders(
-    terms: Sequence[ObservationTerm], names: list[str], order: Order
+    terms: Sequence[ObservationTerm], names: list[str], order: Order, network: Network | None = None
 ) -> list[Distortion]:
     """Return the mistake that terms of the observation are in another order.
 
     The mean that is subtracted may be in that order too, or in the one of the contract.
+
+    Args:
+        terms: The terms.
+        names: Names of their columns.
+        order: The other order.
+        network: The policy's network, where its commands are taken to be in that order too.
     """
     *others, last = [term.name for term in terms]
     listed = f"{', '.join(others)} and {last}" if others else last
     verb, place = ("are", "joints") if others else ("is", last)
-    text = f"{listed} {verb} in another order: {describe_order(names, order)}"
-    raw = Change(signals={term.name: arrange_columns(order) for term in terms})
+    shown = describe_order(names, order)
+    text = f"{listed} {verb} in another order: {shown}"
+    answer = None
+    if network is not None:
+        listed = ", ".join([*others, last])
+        text = f"{listed} and the commands are in another order: {shown}"
+        back = list(invert_order(order))
+        answer = lambda vectors: network(vectors)[:, back]  # noqa: E731
+    raw = Change(signals={term.name: arrange_columns(order) for term in terms}, network=answer)
     found = [make_fixed("order", place, text, raw)]
     if any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms):
-        scaled = Change(windows={term.name: arrange_scaled(term, order) for term in terms})
+        windows = {term.name: arrange_scaled(term, order) for term in terms}
+        scaled = Change(windows=windows, network=answer)
         found.append(make_fixed("order", place, text, scaled))
     return found
 
@@ -327,6 +341,7 @@ def _list_joint_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
     if len(by_joint) > 1:
         for order in list_orders(names):
             yield from make_orders(by_joint, names, order)
+            yield from make_orders(by_joint, names, order, policy.network.answer)
 
         def change_all(transform: Transform) -> Change:
             return Change(signals={term.name: transform for term in by_joint})
@@ -438,7 +453,7 @@ def list_network_distortions(
     found = []
     for name, other in others.items():
         if other.contract.size == policy.contract.size:
-            change = Change(network=other.network)
+            change = Change(network=other.network.answer)
             text = f"the network is that of {name}"
             found.append(make_fixed("network", "network", text, change))
     return found

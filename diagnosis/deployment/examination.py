@@ -175,7 +175,7 @@ def decide_verdict(
     if motion.blamed and not outside:
         joints = ", ".join(motion.blamed)
         return "actuator", (
-            f"{code}Under the recorded commands {joints} moved otherwise than nearly all machines that the "
+            f"{code}Under the recorded commands {joints} moved otherwise than all machines that the "
             "training draws."
         )
     if outside:
@@ -289,7 +289,7 @@ class _Answered:
         commands = self._own
         for change in changes:
             if change.network is not None:
-                commands = change.network.answer(self._observed)
+                commands = change.network(self._observed)
         for change in changes:
             if change.command is not None:
                 commands = change.command(commands)

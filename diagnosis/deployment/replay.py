@@ -16,10 +16,12 @@ from functools import cached_property
 
 import numpy as np
 
-from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm, PolicyNetwork
+from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm
 from diagnosis.deployment.run_log import RunLog
 
 Transform = Callable[[np.ndarray], np.ndarray]
+Network = Callable[[np.ndarray], np.ndarray]
+"""Commands, `(B, J)`, of observation vectors, `(B, O)`."""
 NUM_DRAWS = 24
 """Draws of the log's rounding by which its effect on the command is measured. Chosen by hand."""
 SPREAD_FACTOR = 3.0
@@ -48,7 +50,7 @@ class Change:
     windows: Mapping[str, Transform] = field(default_factory=dict)
     vector: Transform | None = None
     command: Transform | None = None
-    network: PolicyNetwork | None = None
+    network: Network | None = None
     before: str | None = None
 
     @property
@@ -164,8 +166,8 @@ class PolicyReplay:
 
     def _network(self, changes: Sequence[Change], vectors: np.ndarray) -> np.ndarray:
         others = [change.network for change in changes if change.network is not None]
-        network = others[-1] if others else self.policy.network
-        return network.answer(vectors)
+        network = others[-1] if others else self.policy.network.answer
+        return network(vectors)
 
 
 def cut_history(

@@ -67,7 +67,7 @@ class RangeEvidence:
 
 
 def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidence:
-    """Compare the newest values of a log with the range of training."""
+    """Compare what the task gave in a log with the range of training."""
     if contract.training is None:
         is_own = "order" in contract.data["observation"]
         advice = "export it again by mode=export" if is_own else "add training_observations"
@@ -77,7 +77,7 @@ def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidenc
     table: RangeTable = dict(contract.training["ranges"])
     margin_share = measure_margin(contract.training.get("count", EXPORTED_ROWS), len(table))
     found = []
-    for name, values in list_newest_values(log, contract).items():
+    for name, values in list_given_values(log, contract).items():
         if name not in table:
             continue
         low, high = table[name]
@@ -117,8 +117,12 @@ def measure_margin(count: int, num_values: int) -> float:
     return max(float(rarest - extreme) / (2.0 * float(extreme)), LEAST_MARGIN)
 
 
-def list_newest_values(log: RunLog, contract: PolicyContract) -> dict[str, np.ndarray]:
-    """Return the values that training has ranges of, by name, each `(T,)`."""
+def list_given_values(log: RunLog, contract: PolicyContract) -> dict[str, np.ndarray]:
+    """Return the values that a task gives and training has ranges of, by name, each `(T,)`; positions `(1,)`.
+
+    A task gives targets and the pose at the start. Later poses follow from them by code and machine, which
+    are judged by themselves, and one run stays long where samples of all runs seldom are.
+    """
     found = {}
     for name, values in log.signals.items():
         if name == "target":
@@ -129,5 +133,5 @@ def list_newest_values(log: RunLog, contract: PolicyContract) -> dict[str, np.nd
             found["pitch"] = values[:, 0]
         elif name == "q":
             for column, joint in enumerate(contract.joints):
-                found[f"q.{joint}"] = values[:, column]
+                found[f"q.{joint}"] = values[:1, column]
     return found

@@ -218,6 +218,19 @@ def test_a_target_out_of_the_training_is_the_task(policy: LoadedPolicy, machine:
     assert "target.distance" in found.reason
 
 
+@pytest.mark.parametrize(("margin_rad", "verdict"), [(0.05, "nothing"), (-0.05, "task")])
+def test_only_the_pose_at_the_start_is_part_of_the_task(
+    policy: LoadedPolicy, machine: Machine, margin_rad: float, verdict: str
+) -> None:
+    recording = run_loop(policy, machine)
+    start = float(recording.q[0, 1])
+    assert np.abs(recording.q[:, 1] - start).max() > 0.2
+    ranges = {"q.q2": [start - 0.1 - margin_rad, start + margin_rad]}
+    contract = replace(policy.contract, training={"count": 2048, "ranges": ranges})
+    found = ask(replace(policy, contract=contract), recording, machine)
+    assert found.verdict == verdict
+
+
 def test_a_log_without_the_target_cannot_tell(policy: LoadedPolicy, machine: Machine) -> None:
     found = ask(policy, replace(run_loop(policy, machine), extra={}), machine)
     assert found.verdict == "cannot_tell"

@@ -78,6 +78,7 @@ ALL = dict.fromkeys(("q", "dq", "u"), BY_LEG)
     ("inputs", "outputs", "observed", "text"),
     [
         (ALL, SAME, False, "q, dq and u are in another order: FR_hip, FR_thigh, FR_calf"),
+        (ALL, list(invert_order(tuple(BY_LEG))), False, "q, dq, u and the commands are in another order: FR_hip, FR_thigh"),
         ({"q": [1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10]}, SAME, False, "q is in another order: FR_hip, FL_hip"),
         ({"dq": SHUFFLED}, SAME, True, "dq is in another order: " + ", ".join(BY_KIND[k] for k in SHUFFLED)),
         ({}, SHUFFLED, False, "commands reach the joints in another order: " + BY_KIND[SHUFFLED[0]]),
