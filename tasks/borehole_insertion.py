@@ -7,10 +7,19 @@ from typing import TYPE_CHECKING, ClassVar
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import Finite, NonNegativeRange, Positive, Range, spec
-from tasks.settings import CandidateTargets, PoseJudgement, ToolPoseTask, Uniform
+from tasks.settings import (
+    CandidateTargets,
+    PoseJudgement,
+    ToolPoseTask,
+    Uniform,
+    find_tool_direction,
+)
 
 if TYPE_CHECKING:
     import torch
+
+RADIUS = 5
+"""Column of a scene with the radius of its hole; see `brokk_rl.sim.scene`, which loads torch."""
 
 
 @spec
@@ -23,7 +32,9 @@ class BoreholeRanges:
         rim_z_m: Height of the rim above the ground.
         yaw_rad: Orientation of the block.
         block_scale: Scale of the block's footprint.
-        radius_m: Radius of the hole.
+        radius_m: Radius of the hole, or the range in which it lies.
+        lean_rad: Tilt of the hole's axis in the plane through the slew axis, away from the machine;
+            `null`: every hole is vertical.
     """
 
     distance_m: NonNegativeRange
@@ -31,7 +42,8 @@ class BoreholeRanges:
     rim_z_m: Range
     yaw_rad: Range
     block_scale: NonNegativeRange
-    radius_m: Positive
+    radius_m: Positive | NonNegativeRange
+    lean_rad: Range | None
 
 
 @spec
@@ -78,10 +90,15 @@ class BoreholeInsertion(ToolPoseTask):
 
     def check(self) -> None:
         super().check()
-        if self.hole.radius_m <= self.success.chisel_radius_m:
+        if self._smallest_radius_m <= self.success.chisel_radius_m:
             raise ConfigError(
                 f"hole.radius_m: expected more than the chisel's {self.success.chisel_radius_m:g} m "
-                f"(success.chisel_radius_m), got {self.hole.radius_m:g}; change one of them"
+                f"(success.chisel_radius_m), got {self._smallest_radius_m:g}; change one of them"
+            )
+        if self.leans and self.scaling.pitch_rad is None:
+            raise ConfigError(
+                "scaling.pitch_rad: expected [mean, std], since holes lean (hole.lean_rad) and the "
+                "policy must observe by how much, got null"
             )
 
     @property
@@ -105,10 +122,14 @@ class BoreholeInsertion(ToolPoseTask):
             "rim_z_m": z_m,
             "yaw_rad": bearing + uniform(hole.yaw_rad),
             "block_scale": uniform(hole.block_scale),
-            "hole_radius_m": hole.radius_m,
         }
-        down = distance.new_full(distance.shape, self.fixed_pitch_rad)
-        return CandidateTargets((x_m, y_m, z_m), down, columns, z_m)
+        radius_m = hole.radius_m
+        columns["hole_radius_m"] = uniform(radius_m) if isinstance(radius_m, tuple) else radius_m
+        pitch_rad = distance.new_full(distance.shape, self.fixed_pitch_rad)
+        if hole.lean_rad:
+            columns["lean_rad"] = uniform(hole.lean_rad)
+            pitch_rad = pitch_rad + columns["lean_rad"]
+        return CandidateTargets((x_m, y_m, z_m), pitch_rad, columns, z_m)
 
     def judge(
         self,
@@ -119,11 +140,17 @@ class BoreholeInsertion(ToolPoseTask):
     ) -> PoseJudgement:
         """Judge tool poses; see `ToolPoseTask`."""
         rules, rim = self.success, start["target_m"]
-        lateral = (tip_m - rim)[:, :2].norm(dim=1)
-        below = rim[:, 2] - tip_m[:, 2]
-        inside = lateral <= self._clearance_m
         target = rim.clone()
-        target[:, 2] -= self.depth_m
+        if self.leans:
+            axis = find_tool_direction(rim, start["target_pitch_rad"])
+            below = ((tip_m - rim) * axis).sum(1)
+            lateral = (tip_m - rim - below[:, None] * axis).norm(dim=1)
+            target += self.depth_m * axis
+        else:
+            lateral = (tip_m - rim)[:, :2].norm(dim=1)
+            below = rim[:, 2] - tip_m[:, 2]
+            target[:, 2] -= self.depth_m
+        inside = lateral <= start["scene"][:, RADIUS] + (rules.slack_m - rules.chisel_radius_m)
         distance = (target - tip_m).norm(dim=1)
         turn = (start["target_pitch_rad"] - pitch_rad).abs()
         near = 1 / (1 + distance) >= rules.paper_alignment
@@ -141,13 +168,22 @@ class BoreholeInsertion(ToolPoseTask):
 
     def describe_success(self) -> dict[str, float]:
         """Return depth and lateral error; see `ToolPoseTask`."""
-        depth_m = self.success.strict_depth_m
-        return {"least_depth_below_target_m": depth_m, "largest_lateral_m": self._clearance_m}
+        rules = self.success
+        clearance_m = self._smallest_radius_m - rules.chisel_radius_m + rules.slack_m
+        return {
+            "least_depth_below_target_m": rules.strict_depth_m,
+            "largest_lateral_m": clearance_m,
+        }
 
     @property
-    def _clearance_m(self) -> float:
-        """Distance from the hole's axis up to which the tip is inside."""
-        return self.hole.radius_m - self.success.chisel_radius_m + self.success.slack_m
+    def leans(self) -> bool:
+        """True where holes lean; see `ToolPoseTask`."""
+        return self.hole.lean_rad is not None
+
+    @property
+    def _smallest_radius_m(self) -> float:
+        radius_m = self.hole.radius_m
+        return radius_m[0] if isinstance(radius_m, tuple) else radius_m
 
 
 def _measure_closeness(

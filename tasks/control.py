@@ -22,7 +22,13 @@ from brokk_rl.kinematics import Kinematics, ToolPose, multiply_small_matrices
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET, ObservationEncoder, list_pose_parts
 from tasks.advice import LeverAdviser
-from tasks.settings import ClassicalConfig, CommandBase, ControllerGuidance, ToolPoseTask
+from tasks.settings import (
+    ClassicalConfig,
+    CommandBase,
+    ControllerGuidance,
+    ToolPoseTask,
+    find_tool_direction,
+)
 
 ERROR_SCALES_M = (0.1, 0.02)
 """Distances at which the saturated copies of position errors resolve: approach and insertion.
@@ -98,6 +104,7 @@ class ClassicalController:
         pitch_rad: torch.Tensor,
         reach_m: tuple[float, float],
         coming: torch.Tensor | None = None,
+        along: torch.Tensor | None = None,
     ) -> ControllerGuidance:
         """Return commands and errors.
 
@@ -109,6 +116,7 @@ class ClassicalController:
             reach_m: Good working range (nearest, farthest); positioning aims at its middle.
             coming: Commands that will be given whatever is asked for now, `(N, F, J)`; `None` where
                 nobody stands between.
+            along: Direction in which the tool goes in, `(N, 3)`; `None`: straight down.
         """
         config = self.config
         now = q[:, -1]
@@ -121,12 +129,16 @@ class ClassicalController:
 
         error = target_m - tip
         outer, inner = config.funnel_m
-        lateral = error[:, :2].norm(dim=1)
-        goal_up = (
-            error[:, 2] + ((lateral - inner) / (outer - inner)).clamp(0.0, 1.0) * config.hover_m
-        )
+        up = error[:, 2] if along is None else -(error * along).sum(1)
+        across = error[:, :2] if along is None else error + up[:, None] * along
+        lateral = across.norm(dim=1)
+        goal_up = up + ((lateral - inner) / (outer - inner)).clamp(0.0, 1.0) * config.hover_m
+        if along is None:
+            wanted = torch.cat((across, goal_up[:, None]), 1)
+        else:
+            wanted = across - goal_up[:, None] * along
         pitch_error = pitch_rad - pitch
-        share = self.approach(jacobian.tip[0], jacobian.pitch[0], error, goal_up, pitch_error)
+        share = self.approach(jacobian.tip[0], jacobian.pitch[0], wanted, pitch_error)
 
         reach, reach_slope, reach_3d = self._reach(both, target_m)
         left = (
@@ -166,16 +178,21 @@ class ClassicalController:
         self,
         tip_jacobian: torch.Tensor,
         pitch_jacobian: torch.Tensor,
-        error: torch.Tensor,
-        up: torch.Tensor,
+        way: torch.Tensor,
         turn: torch.Tensor,
     ) -> torch.Tensor:
         """Return joint speeds that bring the tool closer, as shares of full speed, `(N, J)`.
 
         Exclusive joints rest.
+
+        Args:
+            tip_jacobian: Slopes of the tool point over the joints.
+            pitch_jacobian: Slopes of its pitch.
+            way: Where the tool point has yet to go, `(N, 3)`.
+            turn: By how much the tool has yet to turn, `(N,)`.
         """
         config = self.config
-        wanted = torch.cat((error[:, :2], up[:, None]), 1) * config.gain_1_s
+        wanted = way * config.gain_1_s
         wanted = wanted * (
             config.top_speed_m_s / wanted.norm(dim=1, keepdim=True).clamp(min=config.top_speed_m_s)
         )
@@ -246,7 +263,7 @@ class ToolPoseControl:
         self.adviser = LeverAdviser(task.advice, machine, device) if task.advice else None
         parts = list_pose_parts(machine, task.scaling, with_proposals=self.adviser is not None)
         self.encoder = ObservationEncoder(parts, to_constant, torch.cat)
-        self.down = to_constant([0.0, 0.0, task.aim_below_m])
+        self._down = to_constant([0.0, 0.0, task.aim_below_m])
         self.exclusive = to_constant(machine.is_exclusive).bool()
         self.num_forgotten = max(0, machine.num_history - task.memory)
 
@@ -271,6 +288,12 @@ class ToolPoseControl:
             reach_m=self.task.switch.reach(guidance),
         )
 
+    def aim(self, target_m: torch.Tensor, pitch_rad: torch.Tensor) -> torch.Tensor:
+        """Return where the tool point shall end up for targets `(N, 3)` and pitches `(N,)`."""
+        if not self.task.leans:
+            return target_m - self._down
+        return target_m + self.task.aim_below_m * find_tool_direction(target_m, pitch_rad)
+
     def _guide(
         self,
         q: torch.Tensor,
@@ -280,8 +303,9 @@ class ToolPoseControl:
         coming: torch.Tensor | None = None,
     ) -> tuple[ControllerGuidance, CommandBase]:
         switch = self.task.switch
-        aim_m = target_m - self.down
-        guidance = self.controller.guide(q, u, aim_m, pitch_rad, switch.reach_m, coming)
+        along = find_tool_direction(target_m, pitch_rad) if self.task.leans else None
+        aim_m = self.aim(target_m, pitch_rad)
+        guidance = self.controller.guide(q, u, aim_m, pitch_rad, switch.reach_m, coming, along)
         positioning = switch.positioning(guidance)
         bounds = (guidance.command, guidance.lowest, guidance.highest)
         return guidance, CommandBase(*bounds, positioning)

@@ -372,6 +372,11 @@ class ToolPoseTask(EpisodeTask):
         return 0.0
 
     @property
+    def leans(self) -> bool:
+        """True where the tool goes in along its own direction instead of straight down."""
+        return False
+
+    @property
     def fixed_pitch_rad(self) -> float:
         """Wanted pitch, where the policy does not observe it."""
         raise NotImplementedError
@@ -400,6 +405,13 @@ class ToolPoseTask(EpisodeTask):
     def describe_success(self) -> dict[str, float]:
         """Return the bounds of the strict criterion by name, with units, for `policy.json`."""
         raise NotImplementedError
+
+
+def find_tool_direction(place_m: torch.Tensor, pitch_rad: torch.Tensor) -> torch.Tensor:
+    """Return the direction of a tool at `place_m`, `(N, 3)`, that has a pitch, `(N,)`."""
+    direction = place_m / place_m[:, :2].norm(dim=1, keepdim=True) * pitch_rad.cos()[:, None]
+    direction[:, 2] = -pitch_rad.sin()
+    return direction
 
 
 def take_middle(value: float | tuple[float, float]) -> float:

@@ -18,7 +18,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.sim import scene
 from tasks.control import REACH_DAMPING, ClassicalController
-from tasks.settings import ToolPoseTask
+from tasks.settings import ToolPoseTask, find_tool_direction
 
 Starts = dict[str, torch.Tensor]
 
@@ -285,7 +285,11 @@ class StartSearch:
             Joint positions, `(M, J)`, and whether the tool is there, `(M,)` bool.
         """
         target_m, pitch_rad = start["target_m"].clone(), start["target_pitch_rad"]
-        target_m[:, 2] += up_m
+        if self._task.leans:
+            back = torch.as_tensor(up_m).expand(len(q))[:, None]
+            target_m -= back * find_tool_direction(target_m, pitch_rad)
+        else:
+            target_m[:, 2] += up_m
         lower, upper = self._lower + POSE_MARGIN, self._upper - POSE_MARGIN
         damping = POSE_DAMPING**2 * torch.eye(4)
         q = torch.where(self._exclusive, q, q.clamp(lower, upper))
@@ -326,6 +330,9 @@ class StartSearch:
         hole_m = torch.stack((columns["hole_x_m"], columns["hole_y_m"]), 1)
         around_m = scene.OUTER_RADIUS_M * columns["block_scale"] + PATH_CLEARANCE_M
         beside = (points[..., :2] - hole_m[:, None]).norm(dim=-1) > around_m[:, None]
-        above = points[..., 2] > columns["rim_z_m"][:, None] + PATH_CLEARANCE_M
+        # the face rises towards the machine where the hole leans away from it
+        outward_m = points[..., :2].norm(dim=-1) - hole_m.norm(dim=1)[:, None]
+        face_z_m = columns["rim_z_m"][:, None] - columns["lean_rad"].tan()[:, None] * outward_m
+        above = points[..., 2] > face_z_m + PATH_CLEARANCE_M
         off_ground = points[..., 2] > PATH_CLEARANCE_M
         return ((beside | above) & off_ground).all(2).all(0)

@@ -39,6 +39,8 @@ FAR_M = 30.0
 NEAR_M, DEPTH_M = 0.06, 0.02
 """Spread of the block's place around the tool, and its height above it at most. Chosen by hand: about
 half of these worlds touch the block at once."""
+MAX_LEAN_RAD = 0.3
+"""Tilt of the holes, more than any task has."""
 
 
 @dataclass(frozen=True)
@@ -166,5 +168,7 @@ def _draw_states(
     column["yaw_rad"][:] = draw(-np.pi, np.pi, num_worlds - half)
     column["block_scale"][:] = draw(*SCALE_BOUNDS, num_worlds - half)
     column["hole_radius_m"][:] = draw(*HOLE_RADIUS_BOUNDS_M, num_worlds - half)
+    # every other block leans, and one that leans stands on no ground
+    column["lean_rad"][::2] = draw(-MAX_LEAN_RAD, MAX_LEAN_RAD, len(column["lean_rad"][::2]))
     scene[:half, COLUMNS.index("hole_x_m")] = FAR_M
     return q, scene

@@ -21,9 +21,11 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.spec import name_spec
 
-COLUMNS = ("hole_x_m", "hole_y_m", "rim_z_m", "yaw_rad", "block_scale", "hole_radius_m")
+COLUMNS = ("hole_x_m", "hole_y_m", "rim_z_m", "yaw_rad", "block_scale", "hole_radius_m", "lean_rad")
 """Columns of a scene, `S` of them: centre of the rim in the base frame, turn of the block about the
-vertical, factor on its footprint, radius of the circle that the borehole's walls inscribe."""
+hole's axis, factor on its footprint, radius of the circle that the borehole's walls inscribe, tilt
+of that axis away from the machine, in the plane through the slew axis. A block that leans stands on
+nothing: `GROUND` would lean with it."""
 SIZE = len(COLUMNS)
 
 HALF_LENGTH_M, HALF_WIDTH_M, HEIGHT_M = 0.5, 0.4, 0.75
@@ -85,7 +87,7 @@ class BlockGeoms:
 
 def make_nominal_scenes(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor:
     """Return scenes with the nominal block in front of the machine, `(N, S)`."""
-    scene = [NOMINAL_DISTANCE_M, 0.0, HEIGHT_M, 0.0, 1.0, HOLE_RADIUS_M]
+    scene = [NOMINAL_DISTANCE_M, 0.0, HEIGHT_M, 0.0, 1.0, HOLE_RADIUS_M, 0.0]
     return torch.tensor(scene, device=device).repeat(num_worlds, 1)
 
 
@@ -311,12 +313,18 @@ class ScenePlacement:
         scene = scene.to(self._table.dtype)
         shape = torch.minimum(torch.maximum(scene[:, 4:6], self._lower), self._upper)
         both = torch.addmm(self._table[:1], shape, self._table[1:]).unflatten(1, (-1, 6))
-        both[:, -1, 5] = -scene[:, 2].clamp(min=HOLE_DEPTH_M)
+        ground_m = scene[:, 2].clamp(min=HOLE_DEPTH_M)
+        both[:, -1, 5] = -ground_m.where(scene[:, 6] == 0.0, FAR_M)
         return both[..., :3], both[..., 3:]
 
     def pose(self, scene: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return position `(N, 3)` and quaternion `(N, 4)` of the block for scenes `(N, S)`."""
-        half = scene[:, 3:4].to(self._table.dtype) / 2
-        zero = torch.zeros_like(half)
-        quaternion = torch.cat((half.cos(), zero, zero, half.sin()), 1)
-        return scene[:, :3].to(self._table.dtype), quaternion
+        scene = scene.to(self._table.dtype)
+        turn, lean = scene[:, 3:4] / 2, scene[:, 6:7] / 2
+        across = torch.stack((-scene[:, 1], scene[:, 0]), 1)
+        across = across / across.norm(dim=1, keepdim=True).clamp(min=1e-6) * lean.sin()
+        # the block turns about its own axis, then leans about the horizontal across the arm's plane
+        x = across[:, :1] * turn.cos() + across[:, 1:] * turn.sin()
+        y = across[:, 1:] * turn.cos() - across[:, :1] * turn.sin()
+        quaternion = torch.cat((lean.cos() * turn.cos(), x, y, lean.cos() * turn.sin()), 1)
+        return scene[:, :3], quaternion

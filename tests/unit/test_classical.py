@@ -85,7 +85,7 @@ def test_exclusive_joints_rest_in_the_approach(machine: Machine) -> None:
     q = arms(machine, 64)
     pose, jacobian = classical.kinematics.pose_and_jacobian(q)
     error = torch.randn(64, 3)
-    share = classical.approach(jacobian.tip, jacobian.pitch, error, error[:, 2], torch.randn(64))
+    share = classical.approach(jacobian.tip, jacobian.pitch, error, torch.randn(64))
     assert (
         (share[:, 1] == 0).all()
         and (share[:, [0, 2, 3, 4]].abs().amax(1) > 0).all()
@@ -100,7 +100,7 @@ def test_the_approach_moves_the_tool_straight_to_the_target(machine: Machine) ->
     q = torch.tensor([[0.3, -0.9, 0.6, 1.1, 0.6]])
     jacobian = classical.kinematics.jacobian(q)
     error = torch.tensor([[0.1, -0.05, 0.08]])
-    share = classical.approach(jacobian.tip, jacobian.pitch, error, error[:, 2], torch.zeros(1))
+    share = classical.approach(jacobian.tip, jacobian.pitch, error, torch.zeros(1))
     velocity = (jacobian.tip @ (share * classical.speed)[..., None])[0, :, 0]
     cosine = torch.nn.functional.cosine_similarity(velocity, error[0], dim=0)
     assert cosine.item() > 0.9999

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
@@ -168,7 +169,7 @@ def test_scenes_become_the_geoms_of_their_block(machine):
     model = compile_model(machine, 0.01)
     placement = ScenePlacement(model, "cpu", torch.float64)
     scene = make_nominal_scenes(2)
-    scene[1, 3:] = torch.tensor([0.3, 1.1, 0.06])
+    scene[1, 3:6] = torch.tensor([0.3, 1.1, 0.06])
     size, pos = placement.geoms(scene)
     for row, (scale, radius_m) in enumerate([(1.0, 0.05), (1.1, 0.06)]):
         block = build_collision_geoms(scale, radius_m)
@@ -180,11 +181,23 @@ def test_scenes_become_the_geoms_of_their_block(machine):
     np.testing.assert_allclose(turn[1], [np.cos(0.15), 0, 0, np.sin(0.15)], atol=1e-7)
 
 
+def test_a_block_that_leans_turns_its_hole_away_from_the_machine_and_stands_on_nothing(machine):
+    placement = ScenePlacement(compile_model(machine, 0.01), "cpu", torch.float64)
+    scene = make_nominal_scenes(1)
+    hole_m, yaw_rad, lean_rad = [1.5, 2.0], 0.4, 0.2
+    scene[0, :2], scene[0, 3], scene[0, 6] = torch.tensor(hole_m), yaw_rad, lean_rad
+    _, turn = placement.pose(scene)
+    across = np.array([-0.8, 0.6, 0.0])  # horizontal, at right angles to the bearing of the hole
+    leaning = Rotation.from_rotvec(lean_rad * across) * Rotation.from_rotvec([0.0, 0.0, yaw_rad])
+    np.testing.assert_allclose(turn[0], leaning.as_quat(scalar_first=True), atol=1e-7)
+    assert placement.geoms(scene)[1][0, -1, 2] < -5.0
+
+
 def test_bounding_volumes_hold_every_block(machine):
     model = compile_model(machine, 0.01)
     placement = ScenePlacement(model, "cpu", torch.float64)
     scene = make_nominal_scenes(4)
-    scene[:, 4:] = torch.tensor([[0.5, 0.01], [1.25, 0.01], [0.5, 0.08], [9.0, 9.0]])
+    scene[:, 4:6] = torch.tensor([[0.5, 0.01], [1.25, 0.01], [0.5, 0.08], [9.0, 9.0]])
     size, _ = placement.geoms(scene)
     assert (size.norm(dim=-1) <= torch.tensor(model.geom_rbound)[placement.geom_ids] + 1e-9).all()
     assert (size <= torch.tensor(model.geom_aabb[:, 3:])[placement.geom_ids] + 1e-9).all()

@@ -16,11 +16,12 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.sim.scene import COLUMNS, make_nominal_scenes
 from tasks import starts
 from tasks.term_task import ObservedTerm, RewardCurriculum, RewardTerm
 
 CPU = torch.device("cpu")
-TASKS = ("borehole_insertion", "goal_pose")
+TASKS = ("borehole_insertion", "slanted", "goal_pose")
 
 
 class Stage:
@@ -64,7 +65,7 @@ def test_starts_lie_within_the_limits_and_in_the_open(name: str, machine: Machin
     margin = task.arms.margin_rad - 1e-5
     assert ((start["q"] >= lower + margin) & (start["q"] <= upper - margin)).all()
     tip = Kinematics(machine).pose(start["q"]).tip_in_base_m
-    top = start["scene"][:, 2] if name == "borehole_insertion" else torch.zeros(256)
+    top = torch.zeros(256) if name == "goal_pose" else start["scene"][:, 2]
     assert (tip[:, 2] > top + task.arms.clearance_m).all() and (tip[:, 2] > task.arms.floor_m).all()
 
 
@@ -184,9 +185,10 @@ def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
     assert [part.shape for part in passed] == [(0,)] * (len(starts.CONDITIONS) - 1)
 
 
-def test_a_pitch_that_varies_must_be_told_to_the_policy() -> None:
-    task = option("task", "goal_pose")
-    with pytest.raises(ConfigError, match="policy must observe it"):
+@pytest.mark.parametrize("name", ["goal_pose", "slanted"])
+def test_a_pitch_that_varies_must_be_told_to_the_policy(name: str) -> None:
+    task = option("task", name)
+    with pytest.raises(ConfigError, match="policy must observe"):
         replace(task, scaling=replace(task.scaling, pitch_rad=None))
 
 
@@ -200,6 +202,7 @@ def judged(
     start = {
         "target_m": torch.tensor([[2.5, 0.5, 0.75]]),
         "target_pitch_rad": torch.tensor([torch.pi / 2]),
+        "scene": make_nominal_scenes(1),
     }
     verdict = option("task", name).judge(
         start["target_m"] + torch.tensor([at_m]),
@@ -226,6 +229,22 @@ def test_strict_insertion_needs_depth_inside_the_hole(
     at_m: tuple[float, float, float], strict: bool
 ) -> None:
     assert judged("borehole_insertion", at_m)[:2] == (strict, strict)
+    assert judged("slanted", at_m)[:2] == (strict, strict)  # this hole is vertical
+
+
+def test_an_insertion_is_measured_along_the_axis_and_by_the_radius_of_its_own_hole() -> None:
+    """Three holes straight ahead that lean 0.2 rad away from the machine, the last one narrower."""
+    task, lean_rad = option("task", "slanted"), torch.full((3,), 0.2)
+    axis = torch.tensor([-0.19867, 0.0, -0.98007])  # sin and cos of 0.2: back and down
+    across = torch.tensor([0.98007, 0.0, -0.19867])
+    target_m = torch.tensor([[2.5, 0.0, 0.75]]).repeat(3, 1)
+    scenes = make_nominal_scenes(3)
+    scenes[2, COLUMNS.index("hole_radius_m")] = 0.042
+    start = {"target_m": target_m, "target_pitch_rad": torch.pi / 2 + lean_rad, "scene": scenes}
+    aside_m = torch.tensor([[0.012], [0.014], [0.012]])
+    tip_m = target_m + 0.11 * axis + aside_m * across
+    verdict = task.judge(tip_m, start["target_pitch_rad"], torch.zeros(3), start)
+    assert verdict.success.tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize(
@@ -291,12 +310,12 @@ def test_a_pose_is_reached_within_three_centimetres_and_a_twentieth_of_a_radian(
 
 @pytest.mark.parametrize("name", TASKS)
 def test_closeness_grows_on_the_way_from_none_to_one(name: str) -> None:
-    depth_m = 0.14 if name == "borehole_insertion" else 0.0
+    depth_m = 0.0 if name == "goal_pose" else 0.14
     height_m = torch.linspace(2.0, -depth_m, 50)
     target = torch.tensor([[2.5, 0.0, 0.7]]).repeat(50, 1)
     tip = target + torch.stack((0 * height_m, 0 * height_m, height_m), 1)
     down = torch.full((50,), torch.pi / 2)
-    start = {"target_m": target, "target_pitch_rad": down}
+    start = {"target_m": target, "target_pitch_rad": down, "scene": make_nominal_scenes(50)}
     closeness = option("task", name).judge(tip, down, 0 * down, start).closeness
     assert (
         (closeness.diff() > 0).all()
