@@ -281,6 +281,16 @@ class EngineProof(RepairProof):
         """True if a named effect acts on the free runs; one that shows by itself need not."""
         return any(one.rows or one.hold for one in self._findings)
 
+    def judge(self) -> list[Gate]:
+        """Return the gates of all repairs, and one that fails for each effect without a number in the library."""
+        found = super().judge()
+        for one in self._findings:
+            if one.hold is None and not self.sizes[one.effect]:
+                joints = ", ".join(self.machine.joint_names[j] for j in one.joints)
+                text = f"{joints} moves as by {one.name}, but bears no weight, from which the library takes it where masses are known"
+                found.append(Gate("in_library", False, None, None, text))
+        return found
+
     def _list_used(self, half: int) -> np.ndarray:
         """Return the samples outside the windows of a half, `(T,)` bool."""
         used = np.ones(self._field.num_samples, dtype=bool)

@@ -100,7 +100,11 @@ def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
     """Write all answers into one file, a line a case, with their notes and what is left out."""
     lines = []
     for case, one in sorted(given.items()):
-        row: dict[str, Any] = {"case": case, "note": dict(one.note), "answer": None}
+        note = dict(one.note)
+        if note.get("error"):
+            # The lines before name folders of the computer that answered.
+            note["error"] = note["error"].strip().splitlines()[-1]
+        row: dict[str, Any] = {"case": case, "note": note, "answer": None}
         if one.content is not None:
             row["answer"] = {key: one.content[key] for key in PUBLISHED}
             row["left_out"] = sorted({*one.left_out, *one.content} - {*PUBLISHED})

@@ -77,15 +77,14 @@ def is_plain(row: Row, model: JointModel) -> bool:
 
 
 def is_possible(row: Row, joint: FieldJoint) -> bool:
-    """Return whether the registry has a row for a joint: creep follows the weight where that is known."""
+    """Return whether the registry has a row for a joint: with known masses creep and sag follow the weight."""
     names = {name for name, _, _ in row.changes}
+    has_bodies = joint.side.machine.has_bodies
     is_loaded = bool(np.abs(joint.side.loads[joint.joint]).max() > 1e-3)
-    if "creep" in names:
-        return not is_loaded
-    if "sag" in names:
-        return not is_loaded
+    if names & {"creep", "sag"}:
+        return not has_bodies
     if names & {"creep_by_load", "load_both", "load_opposing", "sag_load"}:
-        return is_loaded
+        return has_bodies and is_loaded
     return True
 
 

@@ -236,6 +236,17 @@ def test_a_changed_joint_is_named_sized_and_proven(
     assert answer.selected[0].identified
 
 
+def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine) -> None:
+    joints = (machine.joints[0], machine.joints[2])
+    pair = replace(machine, joints=joints, exclusive=(), levers=(), name="two")
+    case = make_case(pair, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
+    for recording in case.field:
+        recording.q[:, 0] += 0.004 * recording.t_s
+    answer = diagnose(case)
+    assert answer.verdict == "unknown"
+    assert "in_library" in [gate.name for gate in answer.gates if not gate.passed]
+
+
 def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machine) -> None:
     # The second joint goes the other way: a simulator without this errs by twice its motion.
     case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, -1.0]))

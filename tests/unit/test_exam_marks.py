@@ -263,8 +263,11 @@ def test_published_answers_have_the_published_score(monkeypatch: pytest.MonkeyPa
 def test_a_published_answer_says_what_it_leaves_out(tmp_path: Path) -> None:
     said = answered(chosen("lag")).to_json() | {"curves": [1.0]}
     path = tmp_path / "answers.jsonl"
-    publish_answers({"0001": GivenAnswer({"seconds": 1.0, "error": None}, said)}, path)
-    (row,) = map(json.loads, path.read_text().splitlines())
+    ended = GivenAnswer({"seconds": 1.0, "error": "in /home/me/run.py\nKeyError: 'x'"}, None)
+    answers = {"0001": GivenAnswer({"seconds": 1.0, "error": None}, said), "0002": ended}
+    publish_answers(answers, path)
+    row, second = map(json.loads, path.read_text().splitlines())
+    assert second["note"]["error"] == "KeyError: 'x'"
     assert "curves" in row["left_out"] and "curves" not in row["answer"]
     assert {*row["left_out"], *row["answer"]} == {*said}
     again = tmp_path / "again.jsonl"
