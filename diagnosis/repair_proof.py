@@ -287,7 +287,7 @@ class EngineProof(RepairProof):
         for one in self._findings:
             if one.hold is None and not self.sizes[one.effect]:
                 joints = ", ".join(self.machine.joint_names[j] for j in one.joints)
-                text = f"{joints} moves as by {one.name}, but bears no weight, from which the library takes it where masses are known"
+                text = f"{joints} moves as by {one.name}, which the library takes from the weight, and bears none"
                 found.append(Gate("in_library", False, None, None, text))
         return found
 
