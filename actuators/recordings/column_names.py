@@ -17,7 +17,7 @@ def _split(text: str) -> frozenset[str]:
 
 TIME_WORDS = _split("""
     t time timestamp stamp clock sec secs seconds nanosec nanosecs nsec epoch ts tout
-    datetime date zeit zeitstempel uhrzeit datum temps tiempo elapsed millis micros
+    datetime date zeit zeitstempel uhrzeit datum temps tiempo tempo ipoc elapsed millis micros
 """)
 COUNT_WORDS = _split("""
     index idx row frame sample seq sequence step counter id no nr episode
@@ -26,25 +26,26 @@ COUNT_WORDS = _split("""
 COMMAND_WORDS = _split("""
     u cmd cmds command commands commanded control ctrl action actions target targets tgt
     goal set setpoint setpoints sp desired des ref reference demand request valve flow pwm duty
-    soll sollwert sollwinkel sollposition stellwert vorgabe consigne input joystick lever
+    soll sollwert sollwinkel sollposition stellwert vorgabe consigne consigna comando aspos input
+    joystick lever
 """)
 MEASURED_WORDS = _split("""
     q state states actual act meas measured ms feedback fb obs observation encoder enc
-    present status sensor ist istwert istwinkel istposition mesure output
+    present status sensor ist istwert istwinkel istposition aipos mesure output
 """)
 TARGET_WORDS = _split("""
     target targets tgt goal setpoint setpoints sp desired des ref reference soll sollwert
-    consigne
+    consigne consigna aspos
 """)
 """Words for commands that are positions unless another word says velocity or effort."""
 QUANTITY_WORDS: dict[Quantity, frozenset[str]] = {
     "position": _split("""
         q pos position positions angle angles length stroke ms ticks counts winkel weg hub
-        lage sollwinkel istwinkel sollposition istposition
+        lage sollwinkel istwinkel sollposition istposition aspos aipos posizione posicion
     """),
     "velocity": _split("""
         qd dq vel vels velocity velocities speed speeds rate geschwindigkeit drehzahl
-        vitesse
+        vitesse velocidad
     """),
     "effort": _split("""
         tau torque torques effort efforts load loads current force pressure temp moment

@@ -147,7 +147,12 @@ class Draft:
             if full.neutral == 0.0:
                 largest = max(abs(full.full_plus or 0.0), abs(full.full_minus or 0.0))
                 return joint.speed_scale * largest
-        return _round_up(abs(joint.scale) * self.survey.joints[joint.name].top_speed)
+        numbers = self.survey.joints[joint.name]
+        speed = abs(joint.scale) * numbers.top_speed
+        if joint.kind == "position" and not self.has_targets:
+            # beside joints commanded by speed the speed of the target is the command
+            speed = max(speed, abs(joint.target_scale) * numbers.target_speed)
+        return _round_up(speed)
 
     def scale_command(self, joint: JointGuess) -> CommandDraft:
         """Return neutral and full commands of a joint whose command sets its speed, or a force."""

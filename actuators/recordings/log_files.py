@@ -30,6 +30,19 @@ SIGNATURES = {
     b"MATLAB 5.0": (".mat", "a MATLAB file"),
 }
 """First bytes of files, with the ending and the name of their kind."""
+FOREIGN = {
+    ".gz": "is compressed; unpack it, gunzip <file>",
+    ".zip": "is compressed; unpack it, unzip <file>",
+    ".xlsx": "is a workbook; save its sheet as CSV",
+    ".xls": "is a workbook; save its sheet as CSV",
+    ".mf4": "is an MDF file; asammdf exports it as CSV or Parquet",
+    ".mdf": "is an MDF file; asammdf exports it as CSV or Parquet",
+    ".h5": "is an HDF5 file; save its arrays by numpy.savez, or as CSV",
+    ".hdf5": "is an HDF5 file; save its arrays by numpy.savez, or as CSV",
+    ".json": "is one JSON document; write a record a line into a .jsonl file, jq -c '.[]' <file>",
+    ".pkl": "is a pickle, which can run code; save its arrays by numpy.savez",
+}
+"""Files that are no logs yet, and what makes logs of them, by their ending."""
 CANDUMP_LINE = re.compile(rb"^\s*\([-\d:. ]+\)\s+\S+\s+[0-9A-Fa-f]+(#|\s+\[\d+\])", re.MULTILINE)
 """A line of candump, as a file (`candump -l`) or as printed on a terminal (`candump -t a`)."""
 Damaged = Literal["refuse", "skip"]
@@ -119,6 +132,8 @@ def _open_file(
     if not path.exists():
         raise RecordingError(f"{path}: no such log")
     ending = path.suffix.lower()
+    if ending in FOREIGN:
+        raise RecordingError(f"{path}: {FOREIGN[ending]}")
     _check_ending(path, ending)
     if ending in FORMATS:
         return TableLog(path)
@@ -193,6 +208,8 @@ def expand_logs(paths: list[Path]) -> list[Path]:
                 inside.append(entry)
         if not inside:
             there = sorted({entry.suffix for entry in path.iterdir()} - {""})
+            if len(there) == 1 and there[0].lower() in FOREIGN:
+                raise RecordingError(f"{path}: each file {FOREIGN[there[0].lower()]}")
             ends = f" (its files end in {', '.join(there)})" if there else ""
             raise RecordingError(
                 f"{path}: no log in this folder{ends}; logs end in {', '.join(ENDINGS)} or are folders of their own"

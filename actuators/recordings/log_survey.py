@@ -34,6 +34,7 @@ class JointSurvey:
         lowest: Smallest position.
         highest: Largest position.
         top_speed: Fastest change of the position over a tenth of a second, per second.
+        target_speed: Fastest change of the command from row to row, per second.
         rest: Most frequent command at rest; NaN where the joint never rests.
         rest_share: Share of all rows that are at rest with it, in the log with the most.
     """
@@ -43,6 +44,7 @@ class JointSurvey:
     lowest: float = np.inf
     highest: float = -np.inf
     top_speed: float = 0.0
+    target_speed: float = 0.0
     rest: float = np.nan
     rest_share: float = 0.0
 
@@ -63,6 +65,8 @@ class JointSurvey:
         self.lowest_command = min(self.lowest_command, float(u.min()))
         self.highest_command = max(self.highest_command, float(u.max()))
         self.lowest, self.highest = min(self.lowest, q.min()), max(self.highest, q.max())
+        target_speed = np.abs(np.diff(u) / np.diff(command.t_s)).max()
+        self.target_speed = max(self.target_speed, float(target_speed))
         step = max(1, int(0.1 / float(np.median(np.diff(t_s)))))
         if len(q) <= step:
             return

@@ -39,9 +39,15 @@ MISSING = ("", *MISSING_WORDS.split())
 """Cells without a value."""
 FLAGS = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0}
 ISO_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[+-]\d\d:?\d\d)?")
-DAY_TIME = re.compile(r"\d\d?[./]\d\d?[./]\d{4}[T ]+\d\d?:\d\d(:\d\d([.,]\d+)?)?")
+DAY_TIME = re.compile(
+    r"\d\d?[./-](\d\d?|[A-Za-z]{3})[./-]\d{4}[T ]+\d\d?:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?"
+)
 """Day, month, year and time of day."""
 CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
+NUMBER_SIGNS = str.maketrans({"D": "E", "d": "e", "'": None, "’": None, "\u00a0": None})
+"""Exponents of Fortran, and signs between thousands."""
+FIRST_ROWS = 3
+"""Rows on end from which data begin; a block of describing lines may hold some numbers too."""
 
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
@@ -188,7 +194,7 @@ class TextLog(LogFile):
         with self.path.open("rb") as file:
             file.seek(-min(self.path.stat().st_size, SNIFFED_BYTES), 2)
             tail = file.read().decode(self.layout.encoding, errors="replace")
-        cells = split_line(tail.rstrip("\r\n").rpartition("\n")[2], self.layout.delimiter)
+        cells = split_line((tail.splitlines() or [""])[-1], self.layout.delimiter)
         if not len(frame) or (len(cells) >= width and tail.endswith(("\n", "\r"))):
             return frame
         text = f"is cut off or lacks its end ({len(cells)} of {width} cells): left out"
@@ -218,6 +224,7 @@ def convert_cells(cells: Any, kind: CellKind, length: int, decimal: str) -> np.n
         if cells.dtype.kind in "fiu":
             return cells.to_numpy(dtype=float)
         texts = cells.astype(str).str.strip().str.replace(decimal, ".", regex=False)
+        texts = texts.str.translate(NUMBER_SIGNS)
         numbers: Any = pd.to_numeric(texts, errors="coerce")
         return numbers.to_numpy(dtype=float)
     texts = cells.fillna("").str.strip()
@@ -273,7 +280,9 @@ def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayou
             for row in samples
             for cell in row
         )
-        first = next(i for i in good if len(rows[i]) == width)
+        fitting = {i for i in good if len(rows[i]) == width}
+        begins = [i for i in fitting if all(i + k in fitting for k in range(FIRST_ROWS))]
+        first = min(begins or fitting)
         candidates.append((score, delimiter, decimal, first, width, samples))
     if not candidates:
         num_lines = sum(bool(line.strip()) for line in head)
@@ -364,6 +373,8 @@ def _find_names(
             cells = split_line(plain, ",")
         if len(cells) == width - 1 and is_padded:
             cells.append("")
+        if len(cells) == width + 1 and cells[-1] == "Comment":  # LabVIEW leaves empty ones out
+            cells.pop()
         if len(cells) != width:
             is_near = line is filled[-1] and not is_comment and width <= 2 * len(cells) <= 4 * width
             if is_near and len(cells) > 1:
@@ -407,7 +418,8 @@ def tell_kind(text: str, decimal: str) -> CellKind:
         return "time"
     if text.lower() in FLAGS:
         return "flag"
-    is_number = text in MISSING or ("_" not in text and _is_number(text.replace(decimal, ".")))
+    plain = text.replace(decimal, ".").translate(NUMBER_SIGNS)
+    is_number = text in MISSING or ("_" not in text and _is_number(plain))
     return "number" if is_number else "text"
 
 

@@ -157,6 +157,8 @@ def _judge_clock(
     wraps = _find_time_wrap(values) if is_named else None
     values = unwrap(values, wraps)
     later = is_later(values)
+    if is_named and is_later(-values).all():
+        return f"'{text}' only decreases: the newest row comes first; sort the rows, oldest first"
     if not later.all():
         if later.mean() < (0.02 if is_named else 0.9) or not (skip or np.isfinite(values).all()):
             return None

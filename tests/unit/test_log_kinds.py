@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +88,21 @@ for stamp_s, hip_target, hip, knee_target, knee in make_rows().tolist():
     }
     NESTED.append(json.dumps({"stamp": stamp_s, **pair}))
 PLAIN = [" ".join(f"{v:.6f}" for v in row) for row in make_rows()]
+FORTRAN = [" ".join(f"{v:.8e}".replace("e", "D") for v in row) for row in make_rows()]
+GROUPED = [";".join(f"{1e3 * v:,.3f}".replace(",", "'") for v in row) for row in make_rows()]
+GROUPED_NAMES = ["time [ms]", *(f"{name.removesuffix('_rad')} [mrad]" for name in NAMES[1:])]
+LABVIEW = ["LabVIEW Measurement", "***End_of_Header***", "Samples\t600\t600\t600\t600"]
+TABBED = [line.replace(" ", "\t") for line in PLAIN]
+
+
+def write_dates(form: str) -> list[str]:
+    """Returns rows with dates; the run passes noon."""
+    noon = datetime(2026, 11, 27, 11, 59, 58, tzinfo=UTC)
+    lines = ["Time," + ",".join(NAMES[1:])]
+    for row in make_rows():
+        stamp = (noon + timedelta(seconds=float(row[0]))).strftime(form)
+        lines.append(",".join([stamp, *(f"{v:.6f}" for v in row[1:])]))
+    return lines
 
 
 @pytest.mark.parametrize(
@@ -102,10 +117,17 @@ PLAIN = [" ".join(f"{v:.6f}" for v in row) for row in make_rows()]
         ("marked.dat", ["# " + " ".join(NAMES), *PLAIN], "utf-8"),
         ("quotes.csv", [",".join(NAMES), *QUOTED], "utf-8"),
         ("lines.jsonl", NESTED, "utf-8"),
+        ("fortran.dat", [" ".join(NAMES), *FORTRAN], "utf-8"),
+        ("grouped.csv", [";".join(GROUPED_NAMES), *GROUPED], "utf-8"),
+        ("labview.lvm", [*LABVIEW, "\t".join([*NAMES, "Comment"]), *TABBED], "utf-8"),
+        ("american.csv", write_dates("%m/%d/%Y %I:%M:%S.%f %p"), "utf-8"),
+        ("matlab.csv", write_dates("%d-%b-%Y %H:%M:%S.%f"), "utf-8"),
+        ("returns.csv", [",".join(NAMES), *COMMAS], "utf-8"),
     ],
 )  # fmt: skip
 def test_every_layout_of_text_gives_both_joints(name: str, lines: list[str], encoding: str) -> None:
-    Path(name).write_text("\r\n".join(lines) + "\r\n", encoding=encoding)
+    end = "\r" if name == "returns.csv" else "\r\n"
+    Path(name).write_bytes((end.join(lines) + end).encode(encoding))
     done, recordings = import_log(f"log.input={name}")
     assert done.code == 0, done.err
     assert "No guess is unsure" in done.out
@@ -138,6 +160,35 @@ def test_a_unit_that_is_not_known_is_never_sure() -> None:
     done = try_draft("log.input=a.csv")
     assert "its unit 'furlong' is not known" in done.out
     assert "No guess is unsure" not in done.out
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.csv.gz", "unpack it"), ("a.xlsx", "save its sheet as CSV"), ("a.json", ".jsonl"), ("a.mf4", "asammdf")],
+)  # fmt: skip
+def test_a_file_that_is_no_log_yet_is_refused_with_what_makes_one_of_it(
+    name: str, text: str
+) -> None:
+    Path("raw").mkdir()
+    Path("raw", name).write_bytes(b"PK\x03\x04")
+    for given in ("raw", f"raw/{name}"):
+        assert text in try_draft(f"log.input={given}").err
+
+
+def test_rows_with_the_newest_first_are_named() -> None:
+    write_text("a.csv", make_rows()[::-1])
+    assert "the newest row comes first" in try_draft("log.input=a.csv").err
+
+
+def test_targets_beside_joints_commanded_by_speed_fit_into_the_draft() -> None:
+    rows = make_rows()
+    rows[:, 1] = np.where(rows[:, 0] % 4 < 2, 0.4, -0.4)  # steps of a target
+    rows[:, 2] = np.convolve(rows[:, 1], np.full(20, 0.05))[: len(rows)]
+    rows[:, 3] = np.gradient(rows[:, 3], rows[:, 0])
+    names = ("time_s", "hip_target_rad", "hip_pos_rad", "knee_cmd_rad_s", "knee_pos_rad")
+    write_text("a.csv", rows, names)
+    done, recordings = import_log("log.input=a.csv")
+    assert "No guess is unsure" in done.out and len(recordings) == 1
 
 
 def test_a_comma_that_is_delimiter_and_decimal_sign_is_named(brokk: Callable[..., Done]) -> None:
