@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -13,6 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from composed import option
+from websockets import Origin
+from websockets.sync.client import connect
 
 from actuators.excite.player import NominalMachine
 from brokk_rl.machine import Machine
@@ -22,7 +26,9 @@ from deploy.bus.description import BusDescription
 from deploy.kernel.bus_process import BusProcessConfig
 from deploy.kernel.limits import GuardLimits
 from deploy.kernel.protection import MessageFault
-from deploy.runtime.operator_state import OperatorControls, PageSignal, RequestedCommand
+from deploy.page.loop_feed import PageProcessConfig
+from deploy.page.settings import LINK
+from deploy.runtime.operator_state import OperatorControls, RequestedCommand
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import request_fault
@@ -106,7 +112,7 @@ class Desk:
         self._description = BusDescription(DBC, machine)
         # The observer's file is of the hydraulic plant, not of the nominal machine of this desk.
         limits = replace(limits, observer=None)
-        self._setting = BusProcessConfig(self.wire, DBC, machine, limits, needs_page=False)
+        self._setting = BusProcessConfig(self.wire, DBC, machine, limits, needs_page=commands)
         twin = Twin(
             wire=self.wire,
             dbc=DBC,
@@ -119,14 +125,21 @@ class Desk:
         )
         session = Session(out=str(folder), seed=0, device="cpu")
         self._twin_arguments = (twin, machine, NominalMachine(), session, None)
+        page = replace(option("page", "local"), port=0)
+        ages_s = (limits.joints_s, limits.levers_s, limits.round_trip_s, 600.0)
+        self._page = PageProcessConfig(
+            page, machine, option("guidance", "machine"), session, *ages_s
+        )
+        self._link, self._browser = session.folder / LINK, contextlib.ExitStack()
         self.children: dict[str, ChildProcess] = {}
         self.bus = self.wire.open()
 
     def start(self, name: str) -> None:
-        """Starts `twin`, `bus` or `commander`."""
+        """Starts `twin`, `bus`, `page` or `commander`."""
         what: dict[str, tuple[str, tuple[Any, ...], int | None]] = {
             "twin": ("deploy.twin.twin:run", self._twin_arguments, 60),
             "bus": ("deploy.kernel.bus_process:run", (self._setting, self.memory), 55),
+            "page": ("deploy.page.loop_feed:run", (self._page, self.memory), None),
             "commander": ("desk:command", (self.machine.home, self.memory), 50),
         }
         target, arguments, priority = what[name]
@@ -155,9 +168,17 @@ class Desk:
         self.memory.controls.write(controls)
 
     def press_stop(self) -> float:
-        """Presses the page's stop, straight to the bus process; returns when."""
+        """Presses STOP as a browser does; returns when."""
+        origin, _, token = self._link.read_text().strip().partition("/#token=")
+        address = origin.replace("http", "ws") + "/control"
+        self._browser.close()
+        socket = connect(address, origin=Origin(origin), proxy=None, close_timeout=0.1)
+        self._browser.enter_context(socket)
+        socket.send(json.dumps({"token": token}))
+        socket.recv()
         now_s = time.monotonic()
-        self.memory.page.write(PageSignal(now_s, stopped_s=now_s, present_s=0.0))
+        # Its answer is not waited for: the bus is listened to meanwhile.
+        socket.send(json.dumps({"kind": "stop", "value": ""}))
         return now_s
 
     def heard(self, message: str, seconds: float) -> list[tuple[float, dict[str, float]]]:
@@ -249,5 +270,6 @@ class Desk:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(child.pid, signal.SIGCONT)
             child.end(2.0)
+        self._browser.close()
         self.bus.close()
         self.memory.close()

@@ -28,6 +28,7 @@ from brokk_rl.session import Session
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.bus_process import BusProcess, BusProcessConfig
+from deploy.kernel.limits import StayOutBox
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
 from deploy.runtime.operator_state import LoopSnapshot
@@ -244,6 +245,9 @@ class Stage:
         folder: Where a session may write.
         again_s: When the operator who is not followed presses the dead-man again.
         watched: Whether the guard has its envelope and its observer.
+        stay_out: Boxes that the envelope knows.
+        dbc: Description by which the PC goes.
+        twin_dbc: Description by which the gateway goes.
 
     Attributes:
         meddle: Called each millisecond, for what else goes wrong.
@@ -257,6 +261,9 @@ class Stage:
         folder: Path,
         again_s: float | None = None,
         watched: bool = True,
+        stay_out: dict[str, StayOutBox] | None = None,
+        dbc: str = DBC,
+        twin_dbc: str = DBC,
     ) -> None:
         self.machine, self.mode, self.ms = machine, mode, 0
         self.memory = LoopMemory.new(machine.num_joints, commands=mode != "listen")
@@ -268,7 +275,7 @@ class Stage:
         with self._time():
             self._twin_settings = Twin(
                 wire=NO_WIRE,
-                dbc=DBC,
+                dbc=twin_dbc,
                 remote=True,
                 deadman=True,
                 again_s=again_s,
@@ -285,7 +292,10 @@ class Stage:
             limits = replace(limits, observer=observer)
             if not watched:
                 limits = replace(limits, observer=None, envelope=None)
-            config = BusProcessConfig(wire, DBC, machine, limits, needs_page=False)  # type: ignore[arg-type]
+            if stay_out:
+                envelope = replace(limits.envelope, stay_out=stay_out, ground_m=None)
+                limits = replace(limits, envelope=envelope)
+            config = BusProcessConfig(wire, dbc, machine, limits, needs_page=False)  # type: ignore[arg-type]
             self.bus_process = BusProcess(config, self.memory)
             policy = "tasks:policies/borehole_insertion"
             counsel = PolicyProcessConfig(

@@ -27,12 +27,8 @@ from desk import Desk, Stop  # noqa: E402
 
 from deploy.runtime.process import ask_for_priority  # noqa: E402
 
-KILLS = (
-    ("commander", signal.SIGKILL),
-    ("commander", signal.SIGSTOP),
-    ("bus", signal.SIGKILL),
-    ("bus", signal.SIGSTOP),
-)
+KILLED = ("commander", "bus", "page")
+NUMBERS = (signal.SIGKILL, signal.SIGSTOP)
 FAULTS = (
     ("estop", ""), ("deadman_released", ""), ("remote_off", ""), ("drop", "JointPos1"), ("drop", "LeverState"),
     ("drop", "MachineStatus"), ("corrupt", "JointPos2"), ("freeze_counter", "JointPos1"), ("masquerade", "MachineStatus"),
@@ -50,11 +46,11 @@ def main(path: Path, trials: int) -> None:
         tempfile.TemporaryDirectory() as folder,
         Desk(option("machine", "brokk170"), option("guard", "default"), Path(folder)) as desk,
     ):
-        for name in ("twin", "bus", "commander"):
+        for name in ("twin", "bus", "page", "commander"):
             desk.start(name)
         desk.wait_for_state()
         for trial in range(trials):
-            name, number = KILLS[trial % len(KILLS)]
+            name, number = KILLED[trial % len(KILLED)], NUMBERS[trial // len(KILLED) % 2]
             desk.set_moving(60.0)
             key = f"{name} {signal.Signals(number).name}"
             found.setdefault(key, []).append(desk.still_after(desk.signal(name, number)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 from measurement import Measurement, Table, load_json
 
@@ -44,7 +45,61 @@ def read_lateness(folder: Path) -> Table:
     return rows
 
 
+BEFORE = {
+    "processes": "page dead or hung with auto: flow for all 20 s",
+    "sensors": "no alarm, advice valid",
+    "valves": "no alarm of its own in any; flow for 4 s with the dead-man released",
+    "description": "not noticed; a narrower range killed the bus process",
+    "borehole": "1.7 to 5.9 s of motion; 0.47 m/s at the face; jumps followed",
+    "envelope": "0.25 to 2.43 rad deeper",
+    "stops": "0.20 and 0.23 rad beyond",
+    "clock": "stopped until a restart",
+    "capture": "7,093 of 78,503 messages read, exit code 0",
+    "pulses": "30 in 3 s, 50 in 5 s, no alarm",
+    "vigilance": "flow for 88 s, not asked",
+    "files": "hung, 30 s, 4 GB or a traceback; empty golden answers passed",
+    "page": "STOP unconfirmed: not said; 8 px beside it; forwarded port: 421; page.url: 666",
+}
+"""Figures of the same injections before these checks were built."""
+FOUND = (
+    "tests/unit/test_deploy_found.py", "tests/unit/test_deploy_processes.py", "tests/unit/test_deploy_recorder.py",
+    "tests/unit/test_deploy_loop.py", "tests/unit/test_page_browser.py", "tests/unit/test_page_rules.py",
+)  # fmt: skip
+NOTING = (
+    "found or dies_or_hangs or wrong_byte or other_tools or no_file_of_a_policy or that_are_none "
+    "or hung_or_dead_server or words_follow or stays_in_sight or forwarded_port or owners_alone"
+)
+
+
+def read_found(folder: Path) -> Table:
+    """Return the figures that tests have noted, by injection: the least and the largest."""
+    noted: dict[str, list[str]] = {}
+    for one in ElementTree.parse(folder / "found.xml").iter("property"):
+        noted.setdefault(one.attrib["name"], []).append(one.attrib["value"])
+    rows: Table = []
+    before = dict(BEFORE)
+    for name, values in sorted(noted.items()):
+        kind, _, injection = name.partition(": ")
+        ordered = sorted(set(values), key=lambda one: (len(one.partition(".")[0]), one))
+        now = ordered[0] if len(ordered) == 1 else f"{ordered[0]} to {ordered[-1]}"
+        row = {"what": kind, "injection; figure": injection, "trials": len(values)}
+        rows.append(row | {"before": before.pop(kind, ""), "now": now})
+    return rows
+
+
 MEASUREMENTS = (
+    Measurement(
+        name="found",
+        title="What was found, injected again",
+        conditions="Each injection by which a fault of the loop was found, into the running twin and loop: on a simulated clock, by real processes (processes) or in a browser (page). *Before* is the figure of the same injection when it was found.",
+        commands=(
+            f"python -m pytest -q -o junit_family=xunit1 --junitxml={{out}}/found.xml -k '{NOTING}' {' '.join(FOUND)}",
+        ),
+        code=(*CODE, "deploy/page", "deploy/policy", "deploy/recorder"),
+        read=read_found,
+        where="two cores",
+        minutes=4,
+    ),
     Measurement(
         name="reactions",
         title="Reaction times of real processes",

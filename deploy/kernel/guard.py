@@ -309,6 +309,8 @@ class Guard:
         checks = (
             (seen.bus_up, GuardTrip.BUS_DOWN),
             (0.0 <= elapsed_s <= limits.gap_s, GuardTrip.TIME_GAP),
+            # Before the emergency stop, which is shown all the same.
+            (seen.observed is GuardTrip.NONE, seen.observed),
             (not seen.estop, GuardTrip.ESTOP),
             (seen.trusted, GuardTrip.CHANNEL_INVALID),
             (seen.described is not False, GuardTrip.DESCRIPTION),
@@ -316,7 +318,6 @@ class Guard:
             (seen.levers_age_s <= limits.levers_s, GuardTrip.LEVERS_STALE),
             (seen.joints_age_s <= limits.joints_s, GuardTrip.JOINTS_STALE),
             (seen.joints_plausible and all(map(math.isfinite, seen.q)), GuardTrip.JOINTS_INVALID),
-            (seen.observed is GuardTrip.NONE, seen.observed),
             (seen.alone, GuardTrip.SECOND_SENDER),
             (seen.lever <= limits.neutral, GuardTrip.LEVER),
         )

@@ -73,7 +73,8 @@ def _check_guard(shown: PageState) -> Iterator[Alarm]:
         yield Alarm("alarm", state.cause.value, _name_joint(state.observed_joint))
     if state.target is not GuardTrip.NONE and state.target is not state.cause:
         yield Alarm("alarm", state.target.value)
-    if state.guard is not GuardState.LATCHED and state.trip in FAULTS:
+    is_told = state.guard is GuardState.LATCHED and state.trip is state.cause
+    if state.trip in FAULTS and not is_told:
         yield Alarm("alarm", state.trip.value, _name_joint(state.observed_joint))
     if state.prompt:
         yield Alarm("alarm", "are you there")

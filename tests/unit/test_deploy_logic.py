@@ -232,10 +232,10 @@ def test_the_fault_of_a_message_is_told(loop: Loop) -> None:
 
 
 def test_switches_that_grow_old_latch_and_have_to_be_left_by_hand(loop: Loop) -> None:
-    loop.controls_age_s = 0.19
+    loop.controls_age_s = 0.07
     loop.go(0.05)
     assert loop.state is GuardState.ACTIVE
-    loop.controls_age_s = 0.21
+    loop.controls_age_s = 0.09
     loop.cycle()
     assert loop.state is GuardState.LATCHED and loop.trip is GuardTrip.CONTROLS_STALE
     loop.controls_age_s = 0.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -39,7 +39,7 @@ def desk(
         patch.setenv("PYTHONPATH", os.pathsep.join(folders))
         limits, folder = option("guard", "default"), tmp_path_factory.mktemp("desk")
         with Desk(machine, limits, folder, kind=request.param) as made:
-            for name in ("twin", "bus", "commander"):
+            for name in ("twin", "bus", "page", "commander"):
                 made.start(name)
             made.wait_for_state()
             yield made
@@ -133,9 +133,11 @@ def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero_but_is_never_used
     assert bool(state.q_plausible)
 
 
-@pytest.mark.parametrize(("name", "number"), [("commander", signal.SIGKILL), ("commander", signal.SIGSTOP), ("bus", signal.SIGSTOP),
-                                              ("bus", signal.SIGKILL)])  # fmt: skip
-def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, number: int) -> None:
+@pytest.mark.parametrize("name", ["commander", "bus", "page"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_process_that_dies_or_hangs_stops_the_machine(
+    desk: Desk, name: str, number: signal.Signals, record_property: Callable[[str, object], None]
+) -> None:
     desk.set_moving()
     since_s = desk.signal(name, number)
     found_s = desk.still_after(since_s).flow_s
@@ -147,6 +149,7 @@ def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, n
         desk.children[name].end(1.0)
         desk.start(name)
         desk.wait_for_state()
+    record_property(f"processes: {name} {number.name}; no flow, ms", round(1e3 * found_s, 1))
     assert found_s <= 0.1 + 0.02 * SLACK
 
 

@@ -170,7 +170,10 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
 
 
 def test_a_wrong_byte_anywhere_costs_at_most_its_chunk(
-    machine: Machine, tmp_path: Path, brokk: Callable[..., Any]
+    machine: Machine,
+    tmp_path: Path,
+    brokk: Callable[..., Any],
+    record_property: Callable[[str, object], None],
 ) -> None:
     write(tmp_path, machine, seconds=6.0)
     path, draw = tmp_path / MCAP, random.Random(5)
@@ -200,6 +203,8 @@ def test_a_wrong_byte_anywhere_costs_at_most_its_chunk(
         lost = num_messages - sum(map(len, found.messages.values()))
         assert lost <= num_messages / len(chunks) * 2.5, place
         assert found.facts == whole.facts and (lost == 0 or found.num_damaged)
+        share = round(lost / num_messages, 3)
+        record_property(f"capture: a wrong byte, {len(chunks)} chunks; part lost", share)
     # Bytes that are missing or too many shift all that follows, the index at the end included.
     for begin, end in (
         (0, 1000),
@@ -228,6 +233,7 @@ def test_a_wrong_byte_anywhere_costs_at_most_its_chunk(
         "session.out=mended",
     )
     assert done.code == 2 and f"{found.num_lost} messages or more are lost in 1 places" in done.err
+    record_property("capture: a wrong byte; exit code of mode=convert", done.code)
     assert list((tmp_path / "mended/recordings").glob("*.parquet"))
 
 

@@ -241,7 +241,10 @@ def list_alarms(page: Any) -> list[str]:
 
 
 def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_shown(
-    feed: Scripted, opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    feed: Scripted,
+    opened: Callable[..., Any],
+    monkeypatch: pytest.MonkeyPatch,
+    record_property: Callable[[str, object], None],
 ) -> None:
     active = change_state(SHOWN, guard=GuardState.ACTIVE, trip=GuardTrip.NONE)
     feed.now = replace(active, commands=True)
@@ -254,6 +257,8 @@ def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_sho
         page.keyboard.press("Escape")
         pressed_s = time.monotonic()
         until(page, NOT_CONFIRMED, 1.0)
+        told_s = round(time.monotonic() - pressed_s, 2)
+        record_property("page: STOP at a hung server; NOT CONFIRMED after, s", told_s)
         page.wait_for_selector("body.lost", timeout=1500)
         assert time.monotonic() - pressed_s < 1.0
         assert page.locator("#safety").inner_text() == "Unknown"
@@ -270,13 +275,20 @@ def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_sho
     until(page, NOT_CONFIRMED, 1.0)
 
 
-def test_words_follow_the_mode(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+def test_words_follow_the_mode(
+    feed: Scripted,
+    port: int,
+    opened: Callable[..., Any],
+    record_property: Callable[[str, object], None],
+) -> None:
     page = opened(port)
     start, advice = page.locator("#start b"), page.locator("#advice")
     assert (start.inner_text(), advice.inner_text()) == ("Guide me", "Bring your levers to green")
     feed.now = replace(SHOWN, commands=True)
     eventually(lambda: start.inner_text() == "Arm")
     assert advice.inner_text() == "The machine moves by itself: hands off the levers"
+    words = f"{start.inner_text()}; {advice.inner_text()}"
+    record_property("page: auto; its button and words", words)
     feed.now = replace(SHOWN, commands=True, guiding=False)
     eventually(lambda: advice.inner_text() == "Nothing is sent")
 
@@ -563,7 +575,12 @@ SIZES += [(640, 1000), (390, 844)]
 @pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_nothing_overlaps_and_stop_stays_in_sight(
-    feed: Scripted, port: int, opened: Callable[..., Any], size: tuple[int, int], language: str
+    feed: Scripted,
+    port: int,
+    opened: Callable[..., Any],
+    size: tuple[int, int],
+    language: str,
+    record_property: Callable[[str, object], None],
 ) -> None:
     streams = (*SHOWN.streams, SourceAge("camera", 0.0, 1e6))
     failed = replace(SHOWN, commands=True, streams=streams, recording=FAILED, insertion=READING)
@@ -583,6 +600,8 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
             other["y"] - stop["y"] - stop["height"], stop["y"] - other["y"] - other["height"]
         )
         assert max(aside, above) >= 20
+        apart_px = round(max(aside, above))
+        record_property("page: STOP; apart from the next button, px", apart_px)
     if size[0] <= 600:
         assert page.locator("#view #along").count() == 0, "it would cover the machine"
     cut = page.evaluate(

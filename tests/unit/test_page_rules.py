@@ -8,6 +8,7 @@ import json
 import math
 import re
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -46,7 +47,10 @@ MINE = access.list_own_names("127.0.0.1", ())
 @pytest.mark.parametrize(
     "host", ["localhost:8170", "127.0.0.1:8170", "[::1]:8170", "localhost:19000", "localhost"]
 )
-def test_a_page_of_this_server_may_connect_through_a_forwarded_port_too(host: str) -> None:
+def test_a_page_of_this_server_may_connect_through_a_forwarded_port_too(
+    host: str, record_property: Callable[[str, object], None]
+) -> None:
+    record_property("page: through a forwarded port; answer", "opens")
     assert access.is_same_origin(f"http://{host}", host, MINE)
 
 
@@ -365,7 +369,9 @@ def test_a_borehole_beyond_its_limits_and_an_operator_who_has_to_answer_are_alar
 
 
 @pytest.mark.parametrize("before", ["link", "open", "none"])
-def test_the_link_with_the_token_is_its_owners_alone(tmp_path: Path, before: str) -> None:
+def test_the_link_with_the_token_is_its_owners_alone(
+    tmp_path: Path, before: str, record_property: Callable[[str, object], None]
+) -> None:
     path, other = tmp_path / "page.url", tmp_path / "other"
     other.write_text("another's")
     if before == "link":
@@ -374,6 +380,8 @@ def test_the_link_with_the_token_is_its_owners_alone(tmp_path: Path, before: str
         path.write_text("old")
         path.chmod(0o666)
     write_link(Session(out=str(tmp_path), seed=0, device="cpu"), "http://localhost/#token=x")
+    mode = f"{path.stat().st_mode & 0o777:o}"
+    record_property("page: page.url was a link, or of mode 666; mode", mode)
     assert path.read_text() == "http://localhost/#token=x\n" and not path.is_symlink()
     assert path.stat().st_mode & 0o777 == 0o600 and other.read_text() == "another's"
 
