@@ -8,12 +8,17 @@ module needs neither torch nor MuJoCo.
 import hashlib
 import json
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.registry import find_packages, resolve_package_path
 from brokk_rl.spec import Count, NonNegative, Positive, spec
+
+ASSETS = Path(__file__).parent / "sim/assets"
+"""Folder of the MJCF files of this package."""
 
 JointPart = Literal["slew", "arm_1", "arm_2", "arm_3", "boom", "stick", "bucket", "tool"]
 """Parts of demolition machines and excavators; the operator's page has a word and an icon for each."""
@@ -177,6 +182,11 @@ class Machine:
                 f"{self.dead_time_s} s; raise num_history"
             )
 
+    def check_sim(self, sim: object) -> None:
+        """Refuse an MJCF that there is not, before a simulator looks for it."""
+        if self.mjcf is not None:
+            find_mjcf(self)
+
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Joint names in machine order."""
@@ -299,6 +309,30 @@ class Machine:
                 f"{what} was made for another machine: {', '.join(differing)} differ from machine '{self.name}'. "
                 "Choose the machine it was made for (machine=…) or make it again for this one."
             )
+
+
+def find_mjcf(machine: Machine) -> Path:
+    """Return the path of the machine's MJCF.
+
+    A file name is looked up in this package, then beside the machines of installed extensions.
+
+    Raises:
+        ConfigError: The machine names none, or there is no such file.
+    """
+    if machine.mjcf is None:
+        raise ConfigError(
+            f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose "
+            "another machine=…"
+        )
+    beside = [folder / "machine" for folder in find_packages().values()]
+    for folder in (ASSETS, *beside):
+        path = folder / resolve_package_path(machine.mjcf)
+        if path.is_file():
+            return path
+    raise ConfigError(
+        f"machine {machine.name}: there is no MJCF '{machine.mjcf}'; set `mjcf` to the name of a file "
+        "beside the machine's YAML in a config package, to package:path, or to an absolute path"
+    )
 
 
 def _name_family(command: CommandInterface) -> Literal["speed", "position", "torque"]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from brokk_rl import distributed
 from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
-from brokk_rl.spec import Index, spec
+from brokk_rl.spec import Seed, spec
 
 if TYPE_CHECKING:
     import torch
@@ -52,7 +52,7 @@ class Session:
     """
 
     out: str
-    seed: Index
+    seed: Seed
     device: str
 
     def check(self) -> None:

@@ -63,7 +63,9 @@ Count = Annotated[int, Ge(1)]
 WorldCount = Annotated[int, Interval(ge=1, le=10**7)]
 """Worlds side by side; the largest that was measured is 65,536."""
 Index = Annotated[int, Ge(0)]
-"""A whole number of 0 or more: an index, a seed, a count that may be none."""
+"""A whole number of 0 or more: an index, a count that may be none."""
+Seed = Annotated[int, Interval(ge=0, le=10**9)]
+"""Seed of random numbers; numpy takes it below 2**32."""
 Range = Annotated[tuple[Finite, Finite], Ordered()]
 """Lowest and highest value."""
 PositiveRange = Annotated[tuple[Positive, Positive], Ordered()]

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
 from brokk_rl.play.checkpoint_watch import CheckpointWatch
 from brokk_rl.play.levers import GamepadLevers
@@ -65,7 +64,10 @@ class Play(SimulatedPlant):
         """
         from brokk_rl.play.page import PlayPage, require_free_port
 
-        gamepad = self._open_gamepad()
+        gamepad = None
+        if self.play.gamepad is not None:
+            pad = Gamepad(Path(self.play.gamepad), "play.gamepad")
+            gamepad = GamepadLevers(pad, self.play.gamepad_axes)
         port = self.play.port
         require_free_port(port)
         session, watch = self._build_session()
@@ -78,18 +80,6 @@ class Play(SimulatedPlant):
             page.close()
             if gamepad is not None:
                 gamepad.close()
-
-    def _open_gamepad(self) -> GamepadLevers | None:
-        """Return the gamepad; `None` where none is configured."""
-        path, axes = self.play.gamepad, self.play.gamepad_axes
-        if path is None:
-            return None
-        if len(axes) != self.machine.num_joints:
-            raise ConfigError(
-                f"play.gamepad_axes: expected an axis for each of "
-                f"{', '.join(self.machine.joint_names)}, got {len(axes)}: {list(axes)}"
-            )
-        return GamepadLevers(Gamepad(Path(path), "play.gamepad"), axes)
 
     def _build_session(self) -> tuple[PlaySession, CheckpointWatch | None]:
         """Return the session, and the watch of the training that is followed, if any."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from brokk_rl.spec import Count, Index, Positive, spec
+from brokk_rl.errors import ConfigError
+from brokk_rl.gamepad import Gamepad
+from brokk_rl.machine import Machine
+from brokk_rl.spec import Count, Positive, Seed, spec
 
 SPEEDS = (0.1, 10.0)
 """Slowest and fastest time; chosen by hand."""
@@ -38,6 +42,19 @@ class PlaySettings:
     neutral: bool
     gamepad: str | None
     gamepad_axes: tuple[int, ...]
-    seed: Index
+    seed: Seed
     device: str
     seconds: Positive | None
+
+    def check(self) -> None:
+        if self.gamepad is not None:
+            Gamepad(Path(self.gamepad), "play.gamepad").close()
+
+    def check_machine(self, machine: Machine) -> None:
+        """Refuse a gamepad without an axis for each joint."""
+        if self.gamepad is not None and len(self.gamepad_axes) != machine.num_joints:
+            raise ConfigError(
+                f"play.gamepad_axes: expected an axis for each of "
+                f"{', '.join(machine.joint_names)}, got {len(self.gamepad_axes)}: "
+                f"{list(self.gamepad_axes)}"
+            )

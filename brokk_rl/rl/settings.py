@@ -19,6 +19,7 @@ from brokk_rl.spec import (
     Ordered,
     Positive,
     Range,
+    Seed,
     Share,
     WorldCount,
     require_value,
@@ -330,7 +331,7 @@ class Evaluation:
     """
 
     episodes: Count
-    seed: Index
+    seed: Seed
     num_recorded: Count
     video: bool
 

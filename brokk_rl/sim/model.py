@@ -30,12 +30,10 @@ import numpy as np
 import torch
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine
-from brokk_rl.registry import find_packages, resolve_package_path
+from brokk_rl.machine import ASSETS, Machine, find_mjcf
 from brokk_rl.sim.frames import check_frames
 from brokk_rl.sim.scene import add_block, add_site
 
-ASSETS = Path(__file__).parent / "assets"
 VISUAL_GROUP = 2
 """Geoms of this group are for the eye only."""
 DAMPING_RATIO = 0.7
@@ -100,30 +98,6 @@ def compile_machine(machine: Machine) -> mujoco.MjModel:
     spec = _read_mjcf(machine)
     _write_machine(spec, machine)
     return spec.compile()
-
-
-def find_mjcf(machine: Machine) -> Path:
-    """Return the path of the machine's MJCF.
-
-    A file name is looked up in this package, then beside the machines of installed extensions.
-
-    Raises:
-        ConfigError: The machine names none, or there is no such file.
-    """
-    if machine.mjcf is None:
-        raise ConfigError(
-            f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose "
-            "another machine=…"
-        )
-    beside = [folder / "machine" for folder in find_packages().values()]
-    for folder in (ASSETS, *beside):
-        path = folder / resolve_package_path(machine.mjcf)
-        if path.is_file():
-            return path
-    raise ConfigError(
-        f"machine {machine.name}: there is no MJCF '{machine.mjcf}'; set `mjcf` to the name of a file "
-        "beside the machine's YAML in a config package, to package:path, or to an absolute path"
-    )
 
 
 def mask_normal_forces(model: mujoco.MjModel) -> np.ndarray:

@@ -248,11 +248,11 @@ def _load_database(name: str) -> Database:
         check_plain_file(path, MOST_BYTES)
         database = cantools.database.load_file(path)
     except OSError as error:
-        raise ConfigError(f"bus.dbc={name}: cannot be read ({error.strerror or error})") from error
+        raise ConfigError(f"dbc={name}: cannot be read ({error.strerror or error})") from error
     except (cantools.database.Error, ValueError) as error:
-        raise ConfigError(f"bus.dbc={name}: no valid DBC ({error})") from error
+        raise ConfigError(f"dbc={name}: no valid DBC ({error})") from error
     if not isinstance(database, Database):
-        raise ConfigError(f"bus.dbc={name}: no CAN database")
+        raise ConfigError(f"dbc={name}: no CAN database")
     return database
 
 

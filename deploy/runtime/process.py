@@ -23,6 +23,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Literal
 
+from brokk_rl.errors import BrokkError
 from deploy.runtime.detached_log import DetachedHandler
 
 log = logging.getLogger(__name__)
@@ -119,7 +120,11 @@ def enter_child() -> None:
     arguments, function = pickle.load(sys.stdin.buffer), resolve_name(target)
     if realtime is not None:
         keep_in_memory()
-    function(lambda: bool(asked), *arguments)
+    try:
+        function(lambda: bool(asked), *arguments)
+    except BrokkError as error:
+        log.error("%s", error)
+        raise SystemExit(1) from None
 
 
 def keep_in_memory() -> None:

@@ -34,6 +34,8 @@ BAD = {
     ("+rl.runner.algorithm.rnd_cfg={weight:1}",): "rl.runner.algorithm.rnd_cfg",
     ("evaluation.episodes=0",): "evaluation.episodes",
     ("evaluation.seed=-1",): "evaluation.seed",
+    ("session.seed=1e30",): "session.seed: expected a whole number from 0 to",
+    ("machine.mjcf=nowhere.xml",): "there is no MJCF 'nowhere.xml'",
     ("task.episode_s=0.01",): "task.episode_s: expected at least a control step",
     ("task.episode_s=nan",): "task.episode_s: expected a finite number above 0, got nan",
     ("task.memory=14",): "task.memory: expected at most the 13 samples of the history of machine",
@@ -55,6 +57,8 @@ BAD = {
     ("mode=identify", "identify.recordings=x", "identify.folds=1"): "identify.folds: expected",
     ("mode=collect", "collect.num_runs=0"): "collect.num_runs: expected",
     ("mode=collect", "excitation.sine.share=[2.0,1.0]"): "excitation.sine.share: expected a number",
+    ("mode=play", "play.gamepad=nowhere"): "play.gamepad=nowhere: No such file",
+    ("mode=play", "play.gamepad=/dev/null", "play.gamepad_axes=[1]"): "an axis for each of q1",
     ("mode=play", "play.port=0"): "port: expected a whole number from 1024 to 65535, got 0",
     (
         "mode=bench",

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
+from pathlib import Path
 
+import pytest
+
+from brokk_rl.errors import FrameError
 from deploy.runtime.detached_log import MOST_RECORDS, DetachedHandler, detach_logging
+from deploy.runtime.process import ChildProcess
 
 
 class Frozen(logging.Handler):
@@ -51,3 +57,22 @@ def test_the_handlers_of_before_get_the_records_and_come_back() -> None:
         assert "below its level" not in terminal.written
     finally:
         root.removeHandler(terminal)
+
+
+def refuse(stop: object) -> None:
+    """Child process that cannot begin."""
+    raise FrameError("there is no camera")
+
+
+def test_a_child_that_is_refused_says_why_in_one_line(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
+    child = ChildProcess("camera", "test_deploy_logging:refuse", (), ())
+    while child.code is None:
+        time.sleep(0.05)
+    assert child.code == 1
+    told = capfd.readouterr().err
+    assert "camera: there is no camera" in told
+    assert "Traceback" not in told
