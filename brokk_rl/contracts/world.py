@@ -94,23 +94,12 @@ class LoadedWorld(Protocol):
     caller, and kept until written again."""
 
 
-TRACE = ("q", "speed", "reference")
-"""States of a world that can be recorded: joint positions and speeds, references of the drives."""
-
-
 @runtime_checkable
-class TracedWorld(Protocol):
-    """A world whose states can be recorded (`brokk_rl.sim.faults`); optional."""
+class ExplainedWorld(Protocol):
+    """A world that says why others of its kind diverged; optional."""
 
-    trace: dict[str, torch.Tensor]
-    """States by their names in `TRACE`, each `(N, J)`, of one type; refreshed in place."""
-    faults: torch.Tensor
-    """As in `World`."""
-    alarm_names: dict[int, str]
-    """Meaning of each bit of `read_alarms`."""
-
-    def read_alarms(self) -> torch.Tensor:
-        """Return bits that say why a world is a fault, `(N,)` int64; no host synchronisation."""
+    def explain_faults(self) -> str:
+        """Return why worlds became faults since the last call, in one line; waits for the device."""
         ...
 
 

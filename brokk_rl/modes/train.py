@@ -37,8 +37,6 @@ from brokk_rl.statistics import CONFIDENCE
 
 log = logging.getLogger(__name__)
 
-FAULTS = "faults"
-"""Folder of recorded faults in a run folder."""
 TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 """Files of the run folder that a tracker gets at the end."""
 
@@ -88,7 +86,6 @@ class Train(SimulatedPlant):
         if self.rl.near_starts:
             loop.bring_near(self.rl.near_starts, stream)
         folder = self.session.folder
-        loop.record_faults(self.rl.count_fault_steps(device.type), folder / FAULTS)
         loop.capture(self.rl.fuse)
         group = TrainingGroup(device)
         is_first = group.rank.first

@@ -11,7 +11,6 @@ import contextlib
 import logging
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -30,8 +29,7 @@ from brokk_rl.contracts.actuator import (
 )
 from brokk_rl.contracts.target import TargetSensor, TargetSensorSpec
 from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
-from brokk_rl.contracts.world import Simulator, TracedWorld, World
-from brokk_rl.distributed import read_rank
+from brokk_rl.contracts.world import ExplainedWorld, Simulator, World
 from brokk_rl.errors import SimulationError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -39,16 +37,12 @@ from brokk_rl.policy_folder import TaskDescription, describe_task
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
 from brokk_rl.sim.events import Event, build_varied_world
-from brokk_rl.sim.faults import FaultRecorder
 from brokk_rl.sim.scene import find_site
 from brokk_rl.spec import spec
 
 Starts = dict[str, torch.Tensor]
 
 log = logging.getLogger(__name__)
-
-MAX_FAULT_FILES = 8
-"""Faults that one process writes, 100 kB each. Chosen by hand: later ones tell little more."""
 
 
 @spec
@@ -189,7 +183,9 @@ class ControlLoop(VecEnv):
             name: torch.zeros_like(value) for name, value in task.observe(self.history).items()
         }
         self._graph: torch.cuda.CUDAGraph | None = None
-        self.recorder: FaultRecorder | None = None
+        self._is_odd = torch.zeros(1 + len(task.episode), dtype=torch.bool, device=self.device)
+        """Figures of the episode, and last the reward, that were not finite since `statistics` was
+        last asked."""
         self.begin()
 
     @property
@@ -221,26 +217,6 @@ class ControlLoop(VecEnv):
             self._reset_worlds(start)
             self._perceive(start)
             self.done.fill_(False)
-
-    def record_faults(self, num_steps: int, folder: Path) -> None:
-        """Keep the last steps of worlds that diverge, before `capture`; see `FaultRecorder`.
-
-        Args:
-            num_steps: Control steps kept of each world; 0 keeps none.
-            folder: Where `statistics` writes them; made where there is a fault.
-        """
-        if num_steps == 0:
-            return
-        if not isinstance(self.world, TracedWorld):
-            log.info("%s shows no states: faults are not recorded", type(self.world).__name__)
-            return
-        terms = {}
-        for name, value in self.task.episode.items():
-            if name.startswith(REWARD):
-                terms[name.removeprefix(REWARD)] = value
-        self.recorder = FaultRecorder(self.world, self.machine, num_steps, terms)
-        self._fault_folder = folder
-        self.begin()
 
     def bring_near(self, near: NearStarts, seed: int) -> None:
         """Move part of the starts near their targets, before `capture`.
@@ -323,37 +299,36 @@ class ControlLoop(VecEnv):
     def statistics(self) -> dict[str, float]:
         """Return figures of the episodes that finished since the last call: means, endings, number.
 
-        Reads back from the device once, and writes the faults recorded since.
+        Reads back from the device once.
 
         Raises:
             SimulationError: A reward was not finite: the next update would spoil the policy.
         """
-        num_held = self.recorder.is_held.sum() if self.recorder else self._totals.new_zeros(())
-        *totals, held = torch.cat((self._totals, num_held[None].float())).tolist()  # one read-back
-        if self.recorder and held:
-            self._write_faults(self.recorder)
-        values = dict(zip(self._total_names, totals, strict=True))
-        episodes = sum(totals[len(self.task.episode) :])
+        num = len(self._total_names)
+        found = torch.cat((self._totals, self._is_odd.to(self._totals.dtype))).tolist()
+        self._require_finite_rewards(found[num:])
+        values = dict(zip(self._total_names, found[:num], strict=True))
+        episodes = sum(found[len(self.task.episode) : num])
         fault_rate = values[f"end/{FAULT}"] / max(1, self._steps * self.num_envs)
+        if fault_rate and isinstance(self.world, ExplainedWorld):
+            log.warning("worlds diverged: %s", self.world.explain_faults())
         self._totals.zero_()
         self._steps = 0
         means = {name: value / max(1.0, episodes) for name, value in values.items()}
         return means | {"episodes": episodes, "fault_rate": fault_rate}
 
-    def _write_faults(self, recorder: FaultRecorder) -> None:
-        """Write the faults that are held, and release their worlds."""
-        prefix = f"rank{read_rank().index}_"  # several processes write into one folder
-        num = len(list(self._fault_folder.glob(f"{prefix}*.npz")))
-        for number, fault in enumerate(recorder.fetch(MAX_FAULT_FILES - num), num):
-            self._fault_folder.mkdir(exist_ok=True)
-            path = self._fault_folder / f"{prefix}{number}.npz"
-            fault.save(path)
-            log.warning("a world diverged: %s; its last states: %s", fault.cause, path)
-            if fault.is_reward:
-                raise SimulationError(
-                    f"{fault.cause}: expected finite rewards; change task.reward. The last states "
-                    f"stand in {path}; the newest checkpoint is from before."
-                )
+    def _require_finite_rewards(self, is_odd: list[float]) -> None:
+        """Refuse rewards that were not finite, by the name of their terms."""
+        terms = []
+        for name, odd in zip(self.task.episode, is_odd, strict=False):
+            if odd and name.startswith(REWARD):
+                terms.append(name.removeprefix(REWARD))
+        if terms or is_odd[-1]:
+            what = f"the reward term {', '.join(terms)}" if terms else "the reward"
+            raise SimulationError(
+                f"{what} was not finite: expected finite rewards; change task.reward. The newest "
+                "checkpoint is from before."
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all that is needed to go on exactly, but for random generators."""
@@ -366,14 +341,10 @@ class ControlLoop(VecEnv):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a copy that `state_dict` returned."""
         tensors = dict(state["tensors"])
-        if self.recorder:  # perhaps of a run on a GPU, which records nothing
-            tensors.setdefault("recorder.scene", self.recorder.scene)
         for part, values in self._list_parts().items():
             for name, value in values.items():
                 value.copy_(tensors[f"{part}.{name}"])
         self.world.load_state_dict(state["world"])
-        if self.recorder:  # steps before are unknown
-            self.recorder.begin(torch.ones_like(self.done), self.recorder.scene)
 
     def _list_parts(self) -> dict[str, dict[str, torch.Tensor]]:
         """Return all tensors that are needed to go on exactly, by part and name."""
@@ -385,7 +356,6 @@ class ControlLoop(VecEnv):
             "actuator": self.actuator.state,
             "follower": self.follower.state,
             "group": self._groups,
-            "recorder": {"scene": self.recorder.scene} if self.recorder else {},
         }
 
     @contextlib.contextmanager
@@ -403,16 +373,12 @@ class ControlLoop(VecEnv):
         increment = self._command()
         self.world.step(increment)
         start = self._judge()
-        if self.recorder:
-            self.recorder.record(increment, self.reward)
         self._reset_worlds(start)
         self._perceive(start)
 
     def _reset_worlds(self, start: Starts) -> None:
         """Put the worlds of finished environments to their starts."""
         self.world.reset(self.done, start["q"], start["scene"])
-        if self.recorder:
-            self.recorder.begin(self.done, start["scene"])
 
     def _command(self) -> torch.Tensor:
         """Apply the action; return the motion that the drive is to make of each joint, `(N, J)`."""
@@ -442,6 +408,8 @@ class ControlLoop(VecEnv):
         self.end_force_n.copy_(self.world.contact_force_n)
         finished = torch.stack(tuple(self.task.episode.values()))
         self._finished.copy_(finished)
+        summed = torch.cat((finished, transition.reward[None]))
+        self._is_odd.logical_or_(~summed.isfinite().all(1))
         reasons = torch.arange(len(self.task.reasons), device=self.device)
         ending = reasons[:, None] == transition.reason
         self._totals.add_((torch.cat((finished, ending)) * done).sum(1))

@@ -13,7 +13,6 @@ from annotated_types import Interval, MinLen
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import (
     Count,
-    Index,
     NonNegative,
     NonNegativeRange,
     Ordered,
@@ -173,10 +172,6 @@ class NearStarts:
     way: Annotated[tuple[Share, Share], Ordered()]
 
 
-FAULT_STEPS = 100
-"""Control steps that a training on a CPU keeps of each world: 5 s at 20 Hz."""
-
-
 @spec
 class TrainingConfig:
     """Numbers of a training with rsl-rl's PPO.
@@ -198,9 +193,6 @@ class TrainingConfig:
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
-        fault_steps: Control steps kept of each world; those of worlds that diverge are written into
-            `faults` of the run folder. 0 records nothing; `None`: 100 on a CPU, 0 on a GPU, where
-            100 slow the control step by 8 % (one H100, 16,384 worlds).
         fuse: Let `torch.compile` fuse the small operations around the physics, and on a GPU those of
             PPO, for half a minute of compiling and a C++ compiler. On a CPU, whose physics takes
             less than half of a control step of few worlds, it gains most.
@@ -220,16 +212,9 @@ class TrainingConfig:
     teacher: Teacher | None
     near_starts: NearStarts | None
     max_fault_rate: Share
-    fault_steps: Index | None
     fuse: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
-
-    def count_fault_steps(self, device_type: str) -> int:
-        """Return how many control steps of each world a training on `cpu` or `cuda` keeps."""
-        if self.fault_steps is None:
-            return FAULT_STEPS if device_type == "cpu" else 0
-        return self.fault_steps
 
     def check(self) -> None:
         for path, allowed in RUNNER_VALUES.items():

@@ -11,7 +11,7 @@ from __future__ import annotations
 import inspect
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from brokk_rl.contracts.world import LoadedWorld, Property, Simulator, TracedWorld, VariedWorld
+from brokk_rl.contracts.world import ExplainedWorld, LoadedWorld, Property, Simulator, VariedWorld
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Finite, Interval, Ordered, name_spec, spec
@@ -95,9 +95,8 @@ class EventWorld:
         self.faults, self.supports_graphs = world.faults, world.supports_graphs
         if isinstance(world, LoadedWorld):
             self.joint_load = world.joint_load
-        if isinstance(world, TracedWorld):
-            self.trace, self.alarm_names = world.trace, world.alarm_names
-            self.read_alarms = world.read_alarms
+        if isinstance(world, ExplainedWorld):
+            self.explain_faults = world.explain_faults
         self._left_s = torch.zeros(len(events), world.num_worlds, device=world.device)
         everywhere = torch.ones_like(world.faults)
         for event in events:

@@ -13,7 +13,6 @@ from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.sim.faults import FaultRecorder
 from brokk_rl.sim.model import FASTEST_MODE, find_fastest_mode
 from brokk_rl.sim.scene import make_empty_scenes
 
@@ -62,8 +61,7 @@ def try_machine(
     history.reset(everywhere, q)
     if actuator is not None:
         actuator.reset(everywhere)
-    recorder = FaultRecorder(world, machine, num_steps=5)
-    recorder.begin(everywhere, scene)
+    cause = ""
     stride = torch.tensor(machine.max_speed * machine.period_s, dtype=torch.float32)
     is_touching = torch.zeros(num_worlds, dtype=torch.bool)
     held = torch.randn(q.shape, generator=generator).sign()
@@ -79,14 +77,14 @@ def try_machine(
             world.step(increment)
             if step == 0:
                 is_touching = world.contact_force_n > 0.0
-            recorder.record(increment, torch.zeros(num_worlds))
+            if not cause and world.faults.any():
+                cause = world.explain_faults()
             history.push_q(world.q)
-    if not recorder.is_held.any():
+    if not cause:
         return None, True
-    num_faults, is_inside = int(recorder.is_held.sum()), is_touching[recorder.is_held]
+    num_faults, is_inside = int(world.faults.sum()), is_touching[world.faults]
     is_endured = num_faults <= MOST_FAULTS * num_worlds * math.ceil(TRIAL_S / machine.period_s)
-    (fault,) = recorder.fetch(1)
-    said = f"{num_faults} of {num_worlds} worlds diverged in a simulated second: {fault.cause}. "
+    said = f"{num_faults} of {num_worlds} worlds diverged in a simulated second: {cause}. "
     if is_inside[0]:
         said += (
             "It began in contact with the block, the ground or itself: let the task draw other starts, "

@@ -373,16 +373,16 @@ class DriveReferences:
         reference.add_(increment)
 
     def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
-        """Return diverged worlds, `(N,)` bool: absurd or NaN joint speeds, infinite references.
+        """Return diverged worlds, `(N,)` bool: absurd or NaN joint speeds, infinite references."""
+        return (self.measure_speeds(qvel).amax(1) <= self._max_speed).logical_not_()
 
-        Args:
-            qvel: Joint speeds, `(N, J)`.
-
+    def measure_speeds(self, qvel: torch.Tensor) -> torch.Tensor:
+        """Return sizes of joint speeds `(N, J)`, NaN also where a reference is not finite.
 
         The references count because the cut-off at the yield force turns NaN into a force that
         looks sound.
         """
-        return (self.reference.mul(0.0).add_(qvel).abs_().amax(1) <= self._max_speed).logical_not_()
+        return self.reference.mul(0.0).add_(qvel).abs_()
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor) -> None:
         """Put the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""

@@ -84,7 +84,6 @@ class NativeWorld(StoredWorld):
         self._properties = (
             WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
         )
-        self.trace = {"q": self._qpos, "speed": self._qvel, "reference": self._drive.reference}
         # contacts are felt in every substep; recording them all catches a peak between two control
         # steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
@@ -93,6 +92,9 @@ class NativeWorld(StoredWorld):
         self.q = torch.zeros(num_worlds, machine.num_joints)
         self.contact_force_n = torch.zeros(num_worlds)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool)
+        self._machine = machine
+        self._alarms = torch.zeros(num_worlds, dtype=torch.int64)
+        self._fastest = torch.zeros(machine.num_joints, dtype=torch.float64)
         home = torch.tensor(machine.home, dtype=torch.float32).expand(num_worlds, -1)
         self.reset(~self.faults, home, make_nominal_scenes(num_worlds))
 
@@ -108,10 +110,9 @@ class NativeWorld(StoredWorld):
         self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(
             self._warning.flatten(1).any(1)
         )
-
-    def read_alarms(self) -> torch.Tensor:
-        """Return bits of MuJoCo's warnings; see `brokk_rl.contracts.world.TracedWorld`."""
-        return (self._warning[:, :, 1] > 0).long() @ torch.tensor(list(self.alarm_names))
+        if self.faults.any():
+            bits = torch.tensor(list(self.alarm_names))
+            self._note_faults(self._qvel, (self._warning[:, :, 1] > 0).long() @ bits)
 
     def bare_step(self) -> None:
         """Run the substeps of `mujoco.batch` alone, without drive and read-out.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import mujoco
@@ -113,8 +114,17 @@ class WorldProperties:
 
 
 class StoredWorld:
-    """Base of the worlds of both simulators: properties that vary, and a state that is stored."""
+    """Base of the worlds of both simulators: state that is stored, properties that vary, faults."""
 
+    alarm_names: dict[int, str]
+    """Meaning of each bit of an alarm of the simulator."""
+    faults: torch.Tensor
+    _machine: Machine
+    _drive: DriveReferences
+    _alarms: torch.Tensor
+    """Alarms of worlds at fault since they were last explained, `(N,)`."""
+    _fastest: torch.Tensor
+    """Largest speed of each joint in worlds at fault since then, `(J,)`."""
     _properties: WorldProperties | None
     """Properties that vary from world to world, if any do."""
 
@@ -136,6 +146,24 @@ class StoredWorld:
         """Go on from a state of these worlds."""
         for name, tensor in self._stored().items():
             tensor.copy_(state[name])
+
+    def explain_faults(self) -> str:
+        """See `brokk_rl.contracts.world.ExplainedWorld`."""
+        alarms, speeds = self._alarms.unique().tolist(), self._fastest.tolist()
+        self._alarms.zero_()
+        self._fastest.zero_()
+        said = [text for bit, text in self.alarm_names.items() if any(bit & one for one in alarms)]
+        speed, joint = max(zip(speeds, self._machine.joints, strict=True), key=lambda one: one[0])
+        if math.isinf(speed):
+            return "; ".join([*said, f"the motion of {joint.name} was not finite"])
+        return "; ".join([*said, f"the speed of {joint.name} came to {speed:,.3g} {joint.unit}/s"])
+
+    def _note_faults(self, speed: torch.Tensor, alarms: torch.Tensor) -> None:
+        """Note alarms, `(N,)`, and joint speeds, `(N, J)`, of the worlds at fault."""
+        speed = self._drive.measure_speeds(speed).nan_to_num(nan=torch.inf)
+        fastest = speed.masked_fill_(~self.faults[:, None], 0.0).amax(0)
+        torch.maximum(self._fastest, fastest, out=self._fastest)
+        self._alarms.bitwise_or_(alarms.masked_fill(~self.faults, 0))
 
     def _stored(self) -> dict[str, torch.Tensor]:
         raise NotImplementedError

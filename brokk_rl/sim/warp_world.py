@@ -135,14 +135,12 @@ class WarpWorld(StoredWorld):
         }
         self._placement = ScenePlacement(self.model, device, torch.float32)
         self._drive = DriveReferences(self.model, machine, num_worlds, device, torch.float32)
-        self.trace = {
-            "q": self._views["qpos"],
-            "speed": self._views["qvel"],
-            "reference": self._drive.reference,
-        }
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._machine = machine
+        self._alarms = torch.zeros_like(self._views["overflow"])
+        self._fastest = torch.zeros(machine.num_joints, device=device)
         peak = wp.from_torch(self.contact_force_n)
         self._substep = make_substep(self.model, model, data, peak)
         fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(varied)}
@@ -164,6 +162,7 @@ class WarpWorld(StoredWorld):
         self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_(
             (view["overflow"] & _LOST) != 0
         )
+        self._note_faults(view["qvel"], view["overflow"] & _LOST)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
@@ -191,10 +190,6 @@ class WarpWorld(StoredWorld):
         for name, value in (("geom_size", size), ("geom_pos", pos)):
             ids = self._placement.geom_ids
             view[name].index_copy_(1, ids, torch.where(rows[..., None], value, view[name][:, ids]))
-
-    def read_alarms(self) -> torch.Tensor:
-        """Return bits of full buffers; see `brokk_rl.contracts.world.TracedWorld`."""
-        return (self._views["overflow"] & _LOST).long()
 
     def _stored(self) -> dict[str, torch.Tensor]:
         own = {"q": self.q, "contact_force_n": self.contact_force_n, "faults": self.faults}
