@@ -5,16 +5,12 @@ Axes: `N` environments, `J` joints, `H` samples of history (oldest first).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     import torch
 
     from brokk_rl.machine import Machine
-
-Property = Literal["mass", "friction", "stiffness", "yield_force"]
-PROPERTIES: tuple[Property, ...] = ("mass", "friction", "stiffness", "yield_force")
-"""Properties of the machine that a `VariedWorld` can change from world to world."""
 
 
 class World(Protocol):
@@ -73,18 +69,6 @@ class World(Protocol):
         ...
 
 
-class VariedWorld(World, Protocol):
-    """A world whose machines differ; optional, for events (`brokk_rl.sim.events`)."""
-
-    properties: dict[str, torch.Tensor]
-    """Factors on the nominal properties that vary, `(N, J)`, friction `(N, 1)`; written in place by
-    the caller."""
-
-    def apply_properties(self) -> None:
-        """Make `properties` count from the next step on; in place, without a host synchronisation."""
-        ...
-
-
 @runtime_checkable
 class LoadedWorld(Protocol):
     """A world in which somebody can push the machine; optional."""
@@ -106,8 +90,8 @@ class ExplainedWorld(Protocol):
 class Simulator(Protocol):
     """A spec in `conf/sim`: builds a world.
 
-    `build` may take two more arguments. With `varied: tuple[Property, ...]` it returns a
-    `VariedWorld`, and events can be used with it. With `site: Path | None` it builds what
+    `build` may take two more arguments. With `events: tuple[Event, ...]`
+    (`brokk_rl.sim.events`) its machines differ as they say. With `site: Path | None` it builds what
     an MJCF file holds beside the block.
     """
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -36,7 +35,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import TaskDescription, describe_task
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
-from brokk_rl.sim.events import Event, build_varied_world
+from brokk_rl.sim.events import Event, list_events
 from brokk_rl.sim.scene import find_site
 from brokk_rl.spec import spec
 
@@ -86,12 +85,12 @@ class SimulatedPlant:
             starts: Starts of another control loop, in the place of drawn ones.
             target: How the loop comes to know its target; `None`: the task draws errors.
         """
-        site = find_site(getattr(self.task, "scene", None), self.sim)
-        more: dict[str, Any] = {"site": site} if site else {}
-        build_world = self.sim.build
-        if self.event:
-            build_world = partial(build_varied_world, self.sim, self.event)
-        world: World = build_world(self.machine, device, num_envs, **more)
+        more: dict[str, Any] = {}
+        if site := find_site(getattr(self.task, "scene", None), self.sim):
+            more["site"] = site
+        if events := list_events(self.event, self.sim):
+            more["events"] = events
+        world: World = self.sim.build(self.machine, device, num_envs, **more)
         num = world.num_worlds
         model = self.actuator.build(self.machine, num, device)
         for effect in self.effect.values():

@@ -9,8 +9,8 @@ import mujoco
 import torch
 from mujoco.batch import Batch, SimulationError
 
-from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
+from brokk_rl.sim.events import Event
 from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model, mask_normal_forces
 from brokk_rl.sim.properties import StoredWorld, WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
@@ -37,7 +37,7 @@ class NativeWorld(StoredWorld):
         num_worlds: `N`.
         substeps: Physics steps per control period.
         num_threads: Threads; 0 takes all cores.
-        varied: Properties of the machine that differ from world to world.
+        events: Changes of the machine from world to world.
         site: MJCF of what stands beside the block.
     """
 
@@ -52,7 +52,7 @@ class NativeWorld(StoredWorld):
         num_worlds: int,
         substeps: int,
         num_threads: int,
-        varied: tuple[Property, ...] = (),
+        events: tuple[Event, ...] = (),
         site: Path | None = None,
     ) -> None:
         self.num_worlds, self.device = num_worlds, torch.device("cpu")
@@ -79,10 +79,10 @@ class NativeWorld(StoredWorld):
         self._placement = ScenePlacement(self.model, self.device, torch.float64)
         self._drive = DriveReferences(self.model, machine, num_worlds, self.device, torch.float64)
         fields = {}
-        for name in list_fields(varied):
+        for name in list_fields(events):
             fields[name] = torch.from_numpy(self._batch.expand(name))
         self._properties = (
-            WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
+            WorldProperties(self.model, machine, self._drive, fields, events) if events else None
         )
         # contacts are felt in every substep; recording them all catches a peak between two control
         # steps
@@ -100,6 +100,8 @@ class NativeWorld(StoredWorld):
 
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
+        if self._properties:
+            self._properties.advance()
         self._drive.step(self._qpos, increment, self._act, self._ctrl)
         try:
             self._batch.rollout(self.substeps, record=("sensordata",), out=self._recorded)
@@ -126,6 +128,8 @@ class NativeWorld(StoredWorld):
         rows = mask.nonzero()[:, 0]
         if not len(rows):
             return
+        if self._properties:
+            self._properties.begin(mask)
         start, placed = q[rows], scene[rows]
         self._state[rows] = self._first_state
         self._qpos[rows] = self._act[rows] = start.double()

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import torch
 
-from brokk_rl.contracts.world import PROPERTIES, Property
 from brokk_rl.machine import Machine
+from brokk_rl.sim.events import Event, Property
 from brokk_rl.sim.model import DriveReferences
 
 FIELDS: dict[Property, tuple[str, ...]] = {
@@ -23,30 +23,29 @@ FIELDS: dict[Property, tuple[str, ...]] = {
 softness of contacts (`body_invweight0`, `dof_invweight0`) stays nominal."""
 
 
-def list_fields(varied: Iterable[Property]) -> tuple[str, ...]:
-    """Return the fields of the model that differ from world to world.
-
-    Raises:
-        KeyError: There is no such property.
-    """
+def list_fields(events: Iterable[Event]) -> tuple[str, ...]:
+    """Return the fields of the model that differ from world to world."""
     found: list[str] = []
-    for name in varied:
-        found.extend(FIELDS[name])
+    for event in events:
+        found.extend(FIELDS[event.property])
     return tuple(found)
 
 
 class WorldProperties:
-    """Factors on the machine's properties, and the model's fields that follow from them.
+    """Factors on the machine's properties, drawn by events, and the model's fields that follow.
+
+    Nothing synchronises with the host, so that a CUDA graph can hold the draws.
 
     Args:
         model: Gives the nominal numbers.
         machine: Gives joints and links.
         drive: Its lead and leash follow from stiffness and yield force.
         fields: The model's fields of all worlds by name, `(N, …)`, written in place.
-        varied: Properties that vary.
+        events: One a property.
 
     Attributes:
-        factors: By property, `(N, J)`, friction `(N, 1)`; 1 at first.
+        factors: By property, `(N, J)`, friction `(N, 1)`.
+        left_s: Time until the next draw of each event, `(E, N)`, s.
     """
 
     def __init__(
@@ -55,9 +54,10 @@ class WorldProperties:
         machine: Machine,
         drive: DriveReferences,
         fields: dict[str, torch.Tensor],
-        varied: tuple[Property, ...],
+        events: tuple[Event, ...],
     ) -> None:
         self._fields, self._drive = fields, drive
+        self._events, self._period_s = events, machine.period_s
         some = next(iter(fields.values()))
         num, device, dtype = len(some), some.device, some.dtype
 
@@ -66,10 +66,10 @@ class WorldProperties:
 
         self._nominal = {name: constant(getattr(model, name)) for name in fields}
         self.factors: dict[str, torch.Tensor] = {}
-        for name in PROPERTIES:
-            if name in varied:
-                width = 1 if name == "friction" else machine.num_joints
-                self.factors[name] = torch.ones(num, width, dtype=dtype, device=device)
+        for event in events:
+            width = 1 if event.property == "friction" else machine.num_joints
+            self.factors[event.property] = torch.ones(num, width, dtype=dtype, device=device)
+        self.left_s = torch.zeros(len(events), num, device=device)
         links = [int(model.joint(name).bodyid[0]) for name in machine.joint_names]
         self._links = torch.tensor(links, device=device)
         carried = np.zeros((model.nbody, model.nbody))
@@ -84,6 +84,40 @@ class WorldProperties:
         self._stiffness = constant(model.actuator_gainprm[:, 0])
         self._damping = constant(-model.actuator_biasprm[:, 2])
         self._yield_force = constant(model.actuator_forcerange[:, 1])
+        everywhere = torch.ones(num, dtype=torch.bool, device=device)
+        for event in events:
+            self._draw(event, everywhere)
+
+    def begin(self, mask: torch.Tensor) -> None:
+        """Draw anew for the worlds of `mask`, `(N,)` bool, what an episode changes."""
+        for left_s, event in zip(self.left_s, self._events, strict=True):
+            if event.when != "startup":
+                self._draw(event, mask)
+            if event.when == "interval":
+                left_s.copy_(self._draw_interval(event).where(mask, left_s))
+        self.apply()
+
+    def advance(self) -> None:
+        """Let a control period pass; draw where an interval is over."""
+        self.left_s.sub_(self._period_s)
+        for left_s, event in zip(self.left_s, self._events, strict=True):
+            if event.when == "interval":
+                due = left_s <= 0
+                self._draw(event, due)
+                left_s.copy_(self._draw_interval(event).where(due, left_s))
+        self.apply()
+
+    def _draw(self, event: Event, mask: torch.Tensor) -> None:
+        value = self.factors[event.property]
+        low, high = event.factor
+        width = 1 if event.joints_alike else value.shape[1]
+        drawn = low + (high - low) * torch.rand(len(mask), width, device=mask.device)
+        value.copy_(drawn.to(value.dtype).expand_as(value).where(mask[:, None], value))
+
+    def _draw_interval(self, event: Event) -> torch.Tensor:
+        assert event.interval_s is not None, "checked by the spec"
+        low, high = event.interval_s
+        return low + (high - low) * torch.rand_like(self.left_s[0])
 
     def apply(self) -> None:
         """Write the fields that follow from `factors`; everything is in place."""
@@ -128,24 +162,25 @@ class StoredWorld:
     _properties: WorldProperties | None
     """Properties that vary from world to world, if any do."""
 
-    @property
-    def properties(self) -> dict[str, torch.Tensor]:
-        """See `brokk_rl.contracts.world.VariedWorld`."""
-        return self._properties.factors if self._properties else {}
-
-    def apply_properties(self) -> None:
-        """See `brokk_rl.contracts.world.VariedWorld`."""
-        if self._properties:
-            self._properties.apply()
-
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return a copy of all that `load_state_dict` needs to go on exactly."""
-        return {name: tensor.clone() for name, tensor in self._stored().items()}
+        return {name: tensor.clone() for name, tensor in self._list_tensors().items()}
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Go on from a state of these worlds."""
-        for name, tensor in self._stored().items():
+        for name, tensor in self._list_tensors().items():
             tensor.copy_(state[name])
+        if self._properties:
+            self._properties.apply()
+
+    def _list_tensors(self) -> dict[str, torch.Tensor]:
+        """Return the simulator's tensors, and those of the events."""
+        tensors = self._stored()
+        if self._properties:
+            tensors = tensors | {"event.left_s": self._properties.left_s}
+            for name, value in self._properties.factors.items():
+                tensors[f"event.{name}"] = value
+        return tensors
 
     def explain_faults(self) -> str:
         """See `brokk_rl.contracts.world.ExplainedWorld`."""

@@ -17,7 +17,8 @@ from brokk_rl.spec import Count, Index, Positive, WorldCount, spec
 if TYPE_CHECKING:
     import torch
 
-    from brokk_rl.contracts.world import Property, World
+    from brokk_rl.contracts.world import World
+    from brokk_rl.sim.events import Event
     from brokk_rl.sim.native_world import NativeWorld
     from brokk_rl.sim.parity import ParityResult
     from brokk_rl.sim.warp_world import WarpWorld
@@ -42,7 +43,7 @@ class NativeSimulator:
         machine: Machine,
         device: torch.device | str,
         num_worlds: int | None = None,
-        varied: tuple[Property, ...] = (),
+        events: tuple[Event, ...] = (),
         site: Path | None = None,
     ) -> NativeWorld:
         """Return the worlds; see `brokk_rl.contracts.world.Simulator`.
@@ -58,7 +59,7 @@ class NativeSimulator:
                 "choose sim=warp, or the CPU"
             )
         num = self.num_worlds if num_worlds is None else num_worlds
-        return NativeWorld(machine, num, self.substeps, self.num_threads, varied, site)
+        return NativeWorld(machine, num, self.substeps, self.num_threads, events, site)
 
 
 @spec
@@ -93,7 +94,7 @@ class WarpSimulator:
         machine: Machine,
         device: torch.device | str,
         num_worlds: int | None = None,
-        varied: tuple[Property, ...] = (),
+        events: tuple[Event, ...] = (),
         site: Path | None = None,
     ) -> WarpWorld:
         """Return the worlds; see `brokk_rl.contracts.world.Simulator`.
@@ -120,7 +121,7 @@ class WarpSimulator:
         if self.parity_worlds:
             _check_parity(self, machine, device, site)
         num = self.num_worlds if num_worlds is None else num_worlds
-        return WarpWorld(machine, device, num, self, varied, site)
+        return WarpWorld(machine, device, num, self, events, site)
 
 
 @spec
@@ -140,12 +141,12 @@ class AutoSimulator:
         machine: Machine,
         device: torch.device | str,
         num_worlds: int | None = None,
-        varied: tuple[Property, ...] = (),
+        events: tuple[Event, ...] = (),
         site: Path | None = None,
     ) -> World:
         """Return the worlds on `device`; see `brokk_rl.contracts.world.Simulator`."""
         chosen = self.native if _is_cpu(device) else self.warp
-        return chosen.build(machine, device, num_worlds, varied, site)
+        return chosen.build(machine, device, num_worlds, events, site)
 
 
 @functools.lru_cache(maxsize=8)

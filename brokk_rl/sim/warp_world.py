@@ -19,8 +19,8 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
-from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
+from brokk_rl.sim.events import Event
 from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model
 from brokk_rl.sim.properties import StoredWorld, WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
@@ -81,7 +81,7 @@ class WarpWorld(StoredWorld):
         device: A CUDA device or the CPU.
         num_worlds: `N`.
         simulator: Their spec, a `brokk_rl.sim.simulator.WarpSimulator`, which imports this module.
-        varied: Properties of the machine that differ from world to world.
+        events: Changes of the machine from world to world.
         site: MJCF of what stands beside the block.
     """
 
@@ -91,7 +91,7 @@ class WarpWorld(StoredWorld):
         device: torch.device,
         num_worlds: int,
         simulator: Any,
-        varied: tuple[Property, ...] = (),
+        events: tuple[Event, ...] = (),
         site: Path | None = None,
     ) -> None:
         self.num_worlds, self.device = num_worlds, device
@@ -111,7 +111,7 @@ class WarpWorld(StoredWorld):
             self._model = mjw.put_model(
                 self.model,
                 batch_sizes=dict.fromkeys(
-                    ("geom_size", "geom_pos", *list_fields(varied)), num_worlds
+                    ("geom_size", "geom_pos", *list_fields(events)), num_worlds
                 ),
             )
             sizes = {"nconmax": simulator.num_contacts, "njmax": simulator.num_constraints}
@@ -143,9 +143,9 @@ class WarpWorld(StoredWorld):
         self._fastest = torch.zeros(machine.num_joints, device=device)
         peak = wp.from_torch(self.contact_force_n)
         self._substep = make_substep(self.model, model, data, peak)
-        fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(varied)}
+        fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(events)}
         self._properties = (
-            WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
+            WorldProperties(self.model, machine, self._drive, fields, events) if events else None
         )
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
         self.reset(torch.ones_like(self.faults), home, make_nominal_scenes(num_worlds, device))
@@ -153,6 +153,8 @@ class WarpWorld(StoredWorld):
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
         view = self._views
+        if self._properties:
+            self._properties.advance()
         self._drive.step(view["qpos"], increment, view["act"], view["ctrl"])
         self.contact_force_n.zero_()
         with self._on_torch_stream():
@@ -167,6 +169,8 @@ class WarpWorld(StoredWorld):
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
         view = self._views
+        if self._properties:
+            self._properties.begin(mask)
         rows, zero = mask[:, None], q.new_zeros(())
         for name in ("qpos", "act"):
             torch.where(rows, q, view[name], out=view[name])

@@ -13,7 +13,7 @@ from composed import every, option
 from brokk_rl.checks import check_world
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.sim.events import Event, EventWorld, build_varied_world
+from brokk_rl.sim.events import Event, list_events
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator
@@ -34,10 +34,14 @@ def event(name: str, **changes: Any) -> Event:
     return dataclasses.replace(option("event", name), **changes)
 
 
+FIXED = tuple(event(name, when="startup", interval_s=None, factor=(1.0, 1.0)) for name in ALL)
+"""Events that change nothing by themselves."""
+
+
 def vary(world: Any) -> Any:
     for name, factor in FACTORS.items():
-        world.properties[name].copy_(factor)
-    world.apply_properties()
+        world._properties.factors[name].copy_(factor)
+    world._properties.apply()
     return world
 
 
@@ -55,7 +59,7 @@ def drive_into_the_ground(machine: Machine, worlds: list[Any]) -> list[list[np.n
 
 
 def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> None:
-    world: Any = vary(NATIVE.build(machine, "cpu", None, varied=ALL))
+    world: Any = vary(NATIVE.build(machine, "cpu", None, events=FIXED))
     world.reset(
         torch.ones(NUM, dtype=torch.bool),
         torch.tensor(machine.home).float().repeat(NUM, 1),
@@ -83,17 +87,19 @@ def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> Non
 
 def test_factors_of_one_change_nothing(machine: Machine) -> None:
     plain = NATIVE.build(machine, "cpu")
-    varied: Any = NATIVE.build(machine, "cpu", None, varied=ALL)
-    varied.apply_properties()
+    varied: Any = NATIVE.build(machine, "cpu", None, events=FIXED)
+    varied._properties.apply()
     paths = drive_into_the_ground(machine, [plain, varied])
     np.testing.assert_allclose(paths[0], paths[1], atol=1e-7)
 
 
 def test_a_saturated_drive_accelerates_by_yield_force_over_mass(machine: Machine) -> None:
-    world: Any = NATIVE.build(machine, "cpu", None, varied=("yield_force", "mass"))
-    world.properties["yield_force"][:] = torch.tensor([[1.0], [0.5], [0.25], [1.0]]).expand(-1, 5)
-    world.properties["mass"][:] = torch.tensor([[1.0], [1.0], [1.0], [2.0]]).expand(-1, 5)
-    world.apply_properties()
+    world: Any = NATIVE.build(machine, "cpu", None, events=FIXED)
+    world._properties.factors["yield_force"][:] = torch.tensor(
+        [[1.0], [0.5], [0.25], [1.0]]
+    ).expand(-1, 5)
+    world._properties.factors["mass"][:] = torch.tensor([[1.0], [1.0], [1.0], [2.0]]).expand(-1, 5)
+    world._properties.apply()
     before = world.q.clone()
     turn = torch.zeros(NUM, machine.num_joints)
     turn[:, 0] = 0.05  # rad in a period: far more than any relief valve lets the slew do
@@ -106,7 +112,7 @@ def test_a_saturated_drive_accelerates_by_yield_force_over_mass(machine: Machine
 @pytest.mark.slow
 def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(machine: Machine) -> None:
     sim = dataclasses.replace(option("sim", "warp"), num_worlds=NUM)
-    worlds = [vary(spec.build(machine, "cpu", NUM, varied=ALL)) for spec in (NATIVE, sim)]
+    worlds = [vary(spec.build(machine, "cpu", NUM, events=FIXED)) for spec in (NATIVE, sim)]
     native, warp = (np.array(path) for path in drive_into_the_ground(machine, worlds))
     assert native[..., -1].max() > 0
     free = native[:12]
@@ -120,20 +126,17 @@ def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(machine: M
 def test_every_event_keeps_a_world_a_world(name: str, machine: Machine) -> None:
     class Varied:
         def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any:
-            return build_varied_world(
-                NATIVE, {name: option("event", name)}, machine, CPU, num_worlds
-            )
+            return NATIVE.build(machine, CPU, num_worlds, events=(option("event", name),))
 
     check_world(Varied(), machine, make_nominal_scenes(8), "cpu")
 
 
 def test_an_event_draws_when_it_says(machine: Machine) -> None:
-    def build(**changes: Any) -> EventWorld:
-        events = {"mass": event("mass", **changes)}
-        return build_varied_world(NATIVE, events, machine, CPU, NUM)
+    def build(**changes: Any) -> Any:
+        return NATIVE.build(machine, CPU, NUM, events=(event("mass", **changes),))
 
-    def look(world: EventWorld) -> torch.Tensor:
-        return world._world.properties["mass"].clone()
+    def look(world: Any) -> torch.Tensor:
+        return world._properties.factors["mass"].clone()
 
     still = torch.zeros(NUM, machine.num_joints)
     home = torch.tensor(machine.home).float().repeat(NUM, 1)
@@ -160,24 +163,21 @@ def test_an_event_draws_when_it_says(machine: Machine) -> None:
 
 
 def test_a_restored_state_keeps_its_properties(machine: Machine) -> None:
-    events = {"mass": event("mass"), "yield_force": event("yield_force")}
-    world = build_varied_world(NATIVE, events, machine, CPU, NUM)
+    world: Any = NATIVE.build(machine, CPU, NUM, events=(event("mass"), event("yield_force")))
     state = world.state_dict()
-    kept = world._world.properties["mass"].clone()
+    kept = world._properties.factors["mass"].clone()
     home = torch.tensor(machine.home).float().repeat(NUM, 1)
     world.reset(torch.ones(NUM, dtype=torch.bool), home, make_nominal_scenes(NUM))
-    assert not torch.equal(world._world.properties["mass"], kept)
+    assert not torch.equal(world._properties.factors["mass"], kept)
     world.load_state_dict(state)
-    assert torch.equal(world._world.properties["mass"], kept)
+    assert torch.equal(world._properties.factors["mass"], kept)
 
 
-def test_what_cannot_be_varied_is_refused_by_name(machine: Machine) -> None:
+def test_what_cannot_be_varied_is_refused_by_name() -> None:
     class Plain:
-        def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any:
-            return NATIVE.build(machine, "cpu", 1)
+        def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any: ...
 
     with pytest.raises(ConfigError, match=r"event=mass: sim=.*cannot vary"):
-        build_varied_world(Plain(), {"mass": event("mass")}, machine, CPU, 1)
-    twice = {"mass": event("mass"), "heavy": event("mass")}
+        list_events({"mass": event("mass")}, Plain())
     with pytest.raises(ConfigError, match="two of mass, heavy change mass"):
-        build_varied_world(NATIVE, twice, machine, CPU, 1)
+        list_events({"mass": event("mass"), "heavy": event("mass")}, NATIVE)
