@@ -74,5 +74,5 @@ def test_a_child_that_is_refused_says_why_in_one_line(
         time.sleep(0.05)
     assert child.code == 1
     told = capfd.readouterr().err
-    assert "camera: there is no camera" in told
+    assert "there is no camera" in told
     assert "Traceback" not in told
