@@ -13,12 +13,10 @@ import pytest
 import torch
 from composed import option
 
-from brokk_rl.checks import check_actuator, check_excitation, check_finder, check_link, check_task
-from brokk_rl.contracts.actuator import Segment
+from brokk_rl.checks import check_actuator, check_finder, check_task
 from brokk_rl.contracts.vision import FrameDetections, HolePose
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.signals import Command, JointState
 
 
 class Filter:
@@ -189,54 +187,3 @@ def test_a_finder_that_answers_something_else_is_found() -> None:
     unsorted = FrameDetections([replace(HOLE, score=0.2), HOLE])
     with pytest.raises(AssertionError, match="surest first"):
         check_finder(finder_of(unsorted))
-
-
-class Loopback:
-    """A link to a machine that stands still."""
-
-    def __init__(self, num_joints: int, guarded: bool) -> None:
-        self._num_joints, self._guarded, self._t_s = num_joints, guarded, 0.0
-
-    def read(self) -> JointState:
-        self._t_s += 0.05
-        return JointState(self._t_s, np.zeros(self._num_joints))
-
-    def send(self, command: Command) -> Command:
-        return Command(np.nan_to_num(command.u)) if self._guarded else command
-
-    def __enter__(self) -> Loopback:
-        return self
-
-    def __exit__(self, *exc: Any) -> None:
-        pass
-
-
-def test_a_link_must_not_send_what_is_no_number(machine: Machine) -> None:
-    check_link(Loopback(machine.num_joints, guarded=True), machine)
-    with pytest.raises(AssertionError, match="no number"):
-        check_link(Loopback(machine.num_joints, guarded=False), machine)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"u": np.ones((10, 5))}, "exclusive joint"),
-        ({"u": np.full((10, 5), 1.5)}, "outside"),
-        ({"u": np.zeros((10, 4))}, "shape"),
-        ({"u": np.zeros((100_000, 5))}, "over 300 s"),
-        ({"start": np.full(5, 9.0)}, "outside the limits"),
-        ({"repeat_of": "nothing"}, "repeats 'nothing'"),
-        ({"name": "before_00"}, "names repeat"),
-    ],
-)
-def test_a_broken_excitation_is_found(
-    change: dict[str, Any], message: str, machine: Machine
-) -> None:
-    segment = Segment(
-        name="a_00", start=machine.home, u=np.zeros((10, 5)), stops="home", stop_margin=0.1
-    )
-    broken: Any = SimpleNamespace(
-        weight=lambda before: 1.0, segments=lambda *_: [replace(segment, **change)]
-    )
-    with pytest.raises(AssertionError, match=message):
-        check_excitation(broken, machine)

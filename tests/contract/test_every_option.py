@@ -7,18 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 from composed import every, names, option
+from promises import check_excitation, check_follower, check_link, check_world
 
-from brokk_rl.checks import (
-    NUM_ENVS,
-    check_actuator,
-    check_effect,
-    check_excitation,
-    check_finder,
-    check_follower,
-    check_link,
-    check_task,
-    check_world,
-)
+from brokk_rl.checks import NUM_ENVS, check_actuator, check_effect, check_finder, check_task
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.sim.link import SimulatedMachines

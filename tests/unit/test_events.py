@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from composed import every, option
+from promises import check_world
 
-from brokk_rl.checks import check_world
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.events import Event, list_events

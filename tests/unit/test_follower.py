@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,10 +14,10 @@ from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from promises import check_follower
 
 from actuators.person import HumanFollower
 from brokk_rl.build import describe_spec
-from brokk_rl.checks import check_follower
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
@@ -253,65 +252,6 @@ def test_a_person_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         person(**numbers).build(machine, 1, CPU)
-
-
-class Direct:
-    """A follower that keeps every promise; each test breaks one."""
-
-    def __init__(self) -> None:
-        self.state = {"last": torch.zeros(4, 5)}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        self.state["last"].masked_fill_(mask[:, None], 0.0)
-
-    def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        self.state["last"].copy_(proposed)
-        return proposed.clone()
-
-
-class KeepsItsHand(Direct):
-    def reset(self, mask: torch.Tensor) -> None:
-        pass
-
-    def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        given = self.state["last"].clone()
-        self.state["last"].copy_(torch.where((proposed != 0).any(1, keepdim=True), proposed, given))
-        return given
-
-
-class HoldsOn(Direct):
-    def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        given = (self.state["last"] + proposed) / 2
-        super().step(proposed)
-        return given
-
-
-class Overdoes(Direct):
-    def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        return 1.5 * proposed
-
-
-class Writes(Direct):
-    def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        return proposed.mul_(0.5)
-
-
-@pytest.mark.parametrize(
-    ("broken", "message"),
-    [
-        (KeepsItsHand, "nobody has proposed"),
-        (HoldsOn, "together with others"),
-        (Overdoes, "leave"),
-        (Writes, "changed the proposal"),
-    ],
-)
-def test_a_broken_follower_is_found(broken: type[Direct], message: str, machine: Machine) -> None:
-    def spec_of(kind: type[Direct]) -> Any:
-        return SimpleNamespace(build=lambda machine, num_envs, device: kind())
-
-    check_follower(spec_of(Direct), machine)
-    with pytest.raises(AssertionError, match=message):
-        check_follower(spec_of(broken), machine)
 
 
 def test_a_step_asks_the_host_nothing_and_has_fixed_shapes(machine: Machine) -> None:
