@@ -11,36 +11,37 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
 from study import study_folder as folders
-from study.form import Form
-from study.steps import Step, find_next_step, progress
+from study.steps import Step, find_next_step, list_progress
 from study.study_folder import StudyData
-from study.trial import Attempt, Times, keep
+from study.tlx import Form
+from study.trial import Attempt, Times, keep_recording
 from study.twin_control import Stage
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Words:
-    """Texts of a lab for its participants, by language.
+@spec
+class Consent:
+    """Consent text for participants; a lab replaces it with its own.
 
     Attributes:
-        version: Of the text, kept with each consent.
-        consent: Text of the consent, one paragraph each.
+        version: Kept with each consent.
+        text: Paragraphs by language, `en` and `de`.
     """
 
     version: str
-    consent: dict[str, tuple[str, ...]]
+    text: dict[str, tuple[str, ...]]
+
+    def check(self) -> None:
+        if missing := {"en", "de"} - set(self.text):
+            raise ConfigError(f"text: expected en and de, got no {' and '.join(sorted(missing))}")
 
 
 class Conductor:
@@ -50,7 +51,7 @@ class Conductor:
         folder: The study's.
         machine: The machine.
         stage: Where trials take place.
-        words: Texts of the lab.
+        consent: Text of the lab.
         times: Countdown and the like.
         facts: Further fields of every trial: `simulated`, `twin`.
         seed: From which the order of pairs comes: of participant and period.
@@ -62,24 +63,19 @@ class Conductor:
         folder: Path,
         machine: Machine,
         stage: Stage,
-        words: Words,
+        consent: Consent,
         times: Times,
         facts: dict[str, Any],
         seed: Callable[[str], int],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._folder, self._machine, self._stage, self._words, self._times = (
-            folder,
-            machine,
-            stage,
-            words,
-            times,
-        )
-        self._facts, self._seed, self._clock = facts, seed, clock
+        self._folder, self._machine, self._stage = folder, machine, stage
+        self._consent, self._times, self._facts = consent, times, facts
+        self._seed, self._clock = seed, clock
         # Trials that an interruption left half saved.
         for path in sorted((folder / folders.TRIALS).glob("*.json")):
             with suppress(ValueError):  # a file that cannot be read is said in the report
-                keep(folder, path, machine, stage)
+                keep_recording(folder, path, machine, stage)
         # Read after the repair above, so that the repaired trials count.
         self._data: StudyData = folders.read_study(folder)
         self._who: str | None = None
@@ -92,11 +88,8 @@ class Conductor:
     @property
     def shows_advice(self) -> bool:
         """True during a guided trial."""
-        return (
-            self._attempt is not None
-            and self._attempt.running
-            and self._attempt.trial.condition == "guided"
-        )
+        attempt = self._attempt
+        return attempt is not None and attempt.running and attempt.trial.condition == "guided"
 
     @property
     def running(self) -> bool:
@@ -109,17 +102,13 @@ class Conductor:
         Raises:
             ConfigError: the plan knows no such participant, or they were erased.
         """
-        plan = self._data.plan
-        # An erased participant keeps a place in the plan, but nobody may fill it again.
-        if who is not None and (who not in plan["participants"] or who in plan.get("erased", {})):
-            raise ConfigError(
-                f"study.participant={who}: no participant of the plan; {list_choices(who, plan['participants'])}"
-            )
+        if who is not None:
+            self._data.require_participant(who)
         # Leaving is an abort: the trial under way is kept and done again.
         if self._attempt is not None:
             self._attempt.abort("the sitting was left")
-            self._attempt.close()
-        self._who, self._attempt, self._form = who, None, None
+        self._close_attempt()
+        self._who = who
         self._go_on()
 
     def tick(self) -> None:
@@ -133,97 +122,76 @@ class Conductor:
 
     def take(self, said: dict[str, Any]) -> str:
         """Take a message of a page; return the reason of a refusal, else an empty string."""
-        do, step = said.get("do"), self._step
         try:
-            # During a trial the only way out is to stop it.
-            if do == "choose" and isinstance(said.get("who"), str) and not self.running:
-                self.choose(said["who"])
-            elif do == "leave" and not self.running:
-                self.choose(None)
-            elif self._who is None or step is None:
-                return "nobody"
-            elif do == "stop_sitting":
-                # A reason is a short text; the page's own limit may be circumvented.
-                self._stop(str(said.get("reason", ""))[:200])
-            elif do == "go_on" and step.kind == "stopped":
-                self._note({"stopped": False, "went_on": _format_now()})
-            elif do == "consent" and step.kind == "consent":
-                self._consent(said)
-            elif (
-                do == "end_practice"
-                and step.kind == "trial"
-                and not step.period
-                and not self.running
-            ):
-                self._close_attempt()
-                self._note({"practice_ended": True})
-            elif step.kind == "trial" and self._attempt is not None:
-                return self._in_trial(str(do), self._attempt)
-            elif step.kind == "questionnaire" and self._form is not None:
-                if refused := self._form.take(said):
-                    return refused
-                if self._form.finished:
-                    self._go_on()
-            else:
-                return "not now"
+            return self._take(str(said.get("do")), said)
         except BrokkError as error:
             self._fall_back(error)
             return "failed"
-        return ""
 
     def view(self) -> dict[str, Any]:
         """Return the view of the pages, as plain data."""
-        found: dict[str, Any] = {
-            "kind": "choose",
-            "who": self._who,
-            "problem": self.problem,
-            "simulated": self._facts["simulated"],
-        }
-        # Nobody is chosen: the list of participants is shown.
-        if self._who is None or self._step is None:
-            return found | {"participants": progress(self._data)}
+        simulated = self._facts["simulated"]
+        found = {"who": self._who, "problem": self.problem, "simulated": simulated}
         step = self._step
-        found |= {
-            "kind": step.kind,
-            "period": step.period,
-            "condition": step.condition,
-            "done": step.done,
-            "of": step.of,
-        }
+        # Nobody is chosen: the list of participants is shown.
+        if self._who is None or step is None:
+            return {**found, "kind": "choose", "participants": list_progress(self._data)}
+        found |= {"kind": step.kind, "period": step.period, "condition": step.condition}
+        found |= {"done": step.done, "of": step.of}
         if step.kind == "consent":
-            return found | {"text": self._words.consent, "version": self._words.version}
-        if self._attempt is not None:
-            return found | self._attempt.view()
-        return found | (self._form.view() if self._form is not None else {})
+            return {**found, "text": self._consent.text, "version": self._consent.version}
+        shown = self._attempt or self._form
+        return found if shown is None else {**found, **shown.view()}
 
     def close(self) -> None:
         """End trial or questionnaire at once."""
         if self._attempt is not None:
             self._attempt.leave()
 
+    def _take(self, do: str, said: dict[str, Any]) -> str:
+        step, attempt, form = self._step, self._attempt, self._form
+        # During a trial the only way out is to stop it.
+        if do == "choose" and isinstance(said.get("who"), str) and not self.running:
+            self.choose(said["who"])
+        elif do == "leave" and not self.running:
+            self.choose(None)
+        elif self._who is None or step is None:
+            return "nobody"
+        elif do == "stop_sitting":
+            # A reason is a short text; the page's own limit may be circumvented.
+            self._stop(str(said.get("reason", ""))[:200])
+        elif do == "go_on" and step.kind == "stopped":
+            self._note({"stopped": False, "went_on": folders.format_now()})
+        elif do == "consent" and step.kind == "consent":
+            self._take_consent(said)
+        elif do == "end_practice" and attempt and not step.period and not self.running:
+            self._close_attempt()
+            self._note({"practice_ended": True})
+        elif do == "next" and attempt and attempt.over:
+            self._close_attempt()
+            self._go_on()
+        elif do == "begin" and attempt:
+            return attempt.begin()
+        elif do == "stop_trial" and attempt:
+            return attempt.stop()
+        elif do == "abort" and attempt:
+            return attempt.abort("by the experimenter")
+        elif form:
+            refused = form.take(said)
+            if form.finished:
+                self._go_on()
+            return refused
+        else:
+            return "not now"
+        return ""
+
     def _fall_back(self, error: BrokkError) -> None:
         """Go back to the list of participants, and show the error there; the files on the disk are continued later."""
         log.error("%s", error)
         # No recording may go on behind the list of participants.
         self._stage.record(None)
-        self._who, self._step, self._attempt, self._form, self.problem = (
-            None,
-            None,
-            None,
-            None,
-            str(error),
-        )
-
-    def _in_trial(self, do: str, attempt: Attempt) -> str:
-        if do == "begin":
-            return attempt.begin()
-        if do in ("stop_trial", "abort"):
-            return attempt.stop() if do == "stop_trial" else attempt.abort("by the experimenter")
-        if do == "next" and attempt.over:
-            self._close_attempt()
-            self._go_on()
-            return ""
-        return "not now"
+        self._who = self._step = self._attempt = self._form = None
+        self.problem = str(error)
 
     def _go_on(self) -> None:
         """Read the folder again, and begin the next step."""
@@ -237,60 +205,41 @@ class Conductor:
             "%s: %s %s", self._who, step.kind, step.trial.name if step.trial else step.period or ""
         )
         if step.trial is not None:
-            hole = self._data.plan["design"]["holes"][step.trial.hole]
-            start = np.array(self._data.plan["design"]["starts"][step.trial.start])
             self._attempt = Attempt(
-                self._folder, self._data.plan["design"], step.trial, hole, start, self._machine, self._stage, self._times,
-                self._facts, self._clock,
+                self._data, step.trial, self._machine, self._stage, self._times, self._facts, self._clock
             )  # fmt: skip
         elif step.kind == "questionnaire":
             # Seeded by participant and period, so that a resumed questionnaire asks the same
             # pairs.
             seed = self._seed(f"pairs {self._who} {step.period}")
-            self._form = Form(
-                self._folder, self._who, step.period, seed, {"simulated": self._facts["simulated"]}
-            )
+            simulated = {"simulated": self._facts["simulated"]}
+            self._form = Form(self._folder, self._who, step.period, seed, simulated)
 
     def _close_attempt(self) -> None:
         if self._attempt is not None:
             self._attempt.close()
         self._attempt = None
 
-    def _consent(self, said: dict[str, Any]) -> None:
-        agreed = said.get("agreed") is True
+    def _take_consent(self, said: dict[str, Any]) -> None:
         consent = {
-            "agreed": agreed,
-            "version": self._words.version,
+            "agreed": said.get("agreed") is True,
+            "version": self._consent.version,
             # A language tag is short; longer text is no tag.
             "language": str(said.get("language", ""))[:5],
-            "at": _format_now(),
+            "at": folders.format_now(),
         }
-        self._note(
-            {"consent": consent}
-            if agreed
-            else {"consent": consent, "stopped": True, "reason": "no consent"}
-        )
+        refusal = {} if consent["agreed"] else {"stopped": True, "reason": "no consent"}
+        self._note({"consent": consent, **refusal})
 
     def _stop(self, reason: str) -> None:
         if self._attempt is not None:
             self._attempt.stop()
-            self._close_attempt()
-        self._note(
-            {"stopped": True, "reason": reason or "no reason given", "stopped_at": _format_now()}
-        )
+        self._close_attempt()
+        at = folders.format_now()
+        self._note({"stopped": True, "reason": reason or "no reason given", "stopped_at": at})
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
-        # The record is written whole, so that earlier facts stay.
-        known = {}
-        for key, value in self._data.participants.get(self._who, {}).items():
-            if key != "participant":
-                known[key] = value
-        folders.write_participant(
-            self._folder, self._who, known | facts | {"simulated": self._facts["simulated"]}
-        )
+        simulated = {"simulated": self._facts["simulated"]}
+        folders.write_participant(self._folder, self._who, facts | simulated)
         self._go_on()
-
-
-def _format_now() -> str:
-    return datetime.now().astimezone().isoformat(timespec="seconds")

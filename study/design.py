@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Interval
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, spec
 
 CONDITIONS = ("guided", "unguided")
 PERIODS = (1, 2)
@@ -56,13 +56,10 @@ class Design:
 
     Attributes:
         num_participants: Participants to invite.
-        order: `counterbalanced`, or `fixed` with guidance first for all, as in the paper; then
-            order and guidance cannot be told apart.
         holes: Boreholes by name, one trial each in each period.
         starts: Joint positions from which trials begin, by name, as many as holes; rad or m.
         practice_trials: Trials before the first period that do not count, half of them with
             guidance, until two in a row succeed.
-        practice_minutes: Time for it.
         limit_s: Time after which a trial ends; a trial without insertion counts with this time.
         success: When the tool is in.
         primary: The one measure that decides, named beforehand.
@@ -70,11 +67,9 @@ class Design:
     """
 
     num_participants: Annotated[int, Ge(2)]
-    order: Literal["counterbalanced", "fixed"]
     holes: dict[str, Hole]
     starts: dict[str, tuple[float, ...]]
-    practice_trials: int
-    practice_minutes: float
+    practice_trials: Index
     limit_s: float
     success: Success
     primary: str
@@ -104,7 +99,7 @@ class Design:
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial to be done.
+    """One trial to be done: a row of the plan.
 
     Attributes:
         participant: Pseudonym.
@@ -128,23 +123,20 @@ class Trial:
         return f"{self.participant}_{self.period}_{self.number:02d}"
 
 
-def make_pseudonyms(count: int) -> list[str]:
-    """Return `P01`, `P02`, …, by which all files name the participants."""
-    width = max(2, len(str(count)))
-    return [f"P{number:0{width}d}" for number in range(1, count + 1)]
-
-
-def draw_sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple[str, str]]:
+def draw_sequences(
+    num_participants: int, generator: np.random.Generator
+) -> dict[str, tuple[str, str]]:
     """Return the two conditions of each participant in order, drawn in blocks of two."""
     drawn: list[tuple[str, str]] = []
-    # Pairs of participants, so that at no time one sequence is two ahead.
-    for _ in range(math.ceil(design.num_participants / 2)):
-        guided_first = bool(generator.integers(2)) or design.order == "fixed"
+    for _ in range(math.ceil(num_participants / 2)):
+        pair = [CONDITIONS, CONDITIONS[::-1]]
         # The second of a pair gets the other sequence.
-        second_first = guided_first if design.order == "fixed" else not guided_first
-        for first in (guided_first, second_first):
-            drawn.append(CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0]))
-    return dict(zip(make_pseudonyms(design.num_participants), drawn, strict=False))
+        drawn += pair if generator.integers(2) else pair[::-1]
+    width = max(2, len(str(num_participants)))
+    found = {}
+    for number in range(num_participants):
+        found[f"P{number + 1:0{width}d}"] = drawn[number]
+    return found
 
 
 def make_latin_squares(size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -168,38 +160,32 @@ def make_latin_squares(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def plan_trials(design: Design, generator: np.random.Generator) -> list[Trial]:
     """Return every trial in the order in which it is to be done, practice first."""
-    holes, starts = list(design.holes), list(design.starts)
-    hole_square, start_square = make_latin_squares(len(holes))
+    num = len(design.holes)
+    hole_square, start_square = make_latin_squares(num)
     # Which name stands for which letter of the squares; holes are drawn first.
-    shuffle = generator.permutation(len(holes)), generator.permutation(len(holes))
+    holes = np.array(list(design.holes))
+    starts = np.array(list(design.starts))
+    drawn_holes = holes[generator.permutation(num)]
+    drawn_starts = starts[generator.permutation(num)]
+    sequences = draw_sequences(design.num_participants, generator)
     found = []
-    for index, (participant, conditions) in enumerate(draw_sequences(design, generator).items()):
+    for index, (participant, conditions) in enumerate(sequences.items()):
+        rows = []
         for number in range(design.practice_trials):
-            condition = CONDITIONS[number % 2]
-            place = (index + number) % len(holes)
             # Practice goes through the holes in another order for each participant.
-            found.append(
-                Trial(
-                    participant,
-                    0,
-                    condition,
-                    number + 1,
-                    holes[place],
-                    starts[(place + 1) % len(starts)],
-                )
-            )
+            place = (index + number) % num
+            start = starts[(place + 1) % num]
+            rows.append((0, CONDITIONS[number % 2], number, holes[place], start))
         for period, condition in zip(PERIODS, conditions, strict=True):
-            # both of a pair have the same rows, one with each sequence; the second period has
-            # another row than the first
-            row = (index // 2 + (period - 1) * (len(holes) // 2)) % len(holes)
-            for place in range(len(holes)):
-                hole, start = (
-                    shuffle[0][hole_square[row, place]],
-                    shuffle[1][start_square[row, place]],
-                )
-                found.append(
-                    Trial(participant, period, condition, place + 1, holes[hole], starts[start])
-                )
+            # Both of a pair have the same rows, one with each sequence; the second period has
+            # another row than the first.
+            row = (index // 2 + (period - 1) * (num // 2)) % num
+            for number in range(num):
+                hole = drawn_holes[hole_square[row, number]]
+                start = drawn_starts[start_square[row, number]]
+                rows.append((period, condition, number, hole, start))
+        for period, condition, number, hole, start in rows:
+            found.append(Trial(participant, period, condition, number + 1, str(hole), str(start)))
     return found
 
 
@@ -207,20 +193,17 @@ def format_plan(
     design: Design, machine: Machine, seed: int, planned: list[Trial]
 ) -> dict[str, Any]:
     """Return the plan as plain data for `plan.json`."""
-    # The order of participants is that of the plan.
-    conditions = {trial.participant: {} for trial in planned}
+    # Participants in the order of the plan, each with the conditions of both periods.
+    participants: dict[str, list[str]] = {}
     for trial in planned:
-        if trial.period:
-            conditions[trial.participant][trial.period] = trial.condition
-    ordered = {}
-    for name, found in conditions.items():
-        ordered[name] = [found[period] for period in PERIODS]
+        if trial.period and trial.number == 1:
+            participants.setdefault(trial.participant, []).append(trial.condition)
     return {
-        "schema": 1,
+        "schema": 2,
         "machine": machine.name,
         "fingerprint": machine.fingerprint(),
         "seed": seed,
         "design": asdict(design),
-        "participants": ordered,
+        "participants": participants,
         "trials": [asdict(trial) for trial in planned],
     }

@@ -67,9 +67,10 @@ MEASURES = (
 )
 GUIDED_ONLY = ("advice_error", "advice_lag_s")
 """Measures that say something only where advice was shown, and so cannot be compared."""
+COMPARED = tuple(each.name for each in MEASURES if each.name not in GUIDED_ONLY)
 
 
-def measure(
+def measure_trial(
     recording: Recording, machine: Machine, hole: Hole, success: Success, limit_s: float
 ) -> dict[str, float]:
     """Return every measure of `MEASURES` of one trial.

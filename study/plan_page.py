@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from brokk_rl.report import Cell, Report
-from study import crossover
+from brokk_rl.report import Cell, Report, Tone
+from study import guidance_effect
 from study.design import Design, Trial
 
-SIZES = (5, 6, 8, 12, 16, 20, 24)
+SIZES = (8, 12, 16, 20, 24)
 """Numbers of participants in the table of a plan."""
+EFFECTS_DZ = (0.5, guidance_effect.LARGE_DZ, 1.2)
+"""A medium, a large and a very large effect, in standard deviations of a person's difference."""
 RULES = (
     "Names are pseudonyms (P01, …). Who is who is written on paper, kept apart, and destroyed after the study; "
     "study.do=erase deletes a participant on request.",
@@ -20,7 +22,7 @@ RULES = (
 
 
 def build_plan_page(
-    design: Design, machine: str, seed: int, planned: list[Trial], notice: str = ""
+    design: Design, machine: str, seed: int, planned: list[Trial], notice: str
 ) -> Report:
     """Return the page.
 
@@ -29,110 +31,82 @@ def build_plan_page(
         machine: Name of the machine.
         seed: Seed of the draw.
         planned: All trials.
-        notice: Said on top.
+        notice: Said on top; empty for nothing.
     """
-    num, num_trials, inside = design.num_participants, len(design.holes), design.success
-    # Everything is computed for this plan, so that the page can be judged before the study.
-    smallest_size = crossover.find_smallest_size(design.alpha)
-    summary, tone = _judge_design(design, smallest_size)
-    found = Report(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
-    found.add_text(notice, "warn")
-    found.add_facts(
+    num_trials, inside = len(design.holes), design.success
+    summary, tone = _judge_size(design)
+    page = Report(f"Plan of a study on {machine}", summary, tone)
+    page.add_text(notice, "warn")
+    page.add_facts(
         {
-            "participants": num,
+            "participants": design.num_participants,
             "trials each": f"{num_trials} with guidance, {num_trials} without, {design.practice_trials} of practice before",
-            "order": design.order,
             "primary measure": design.primary,
             "time limit of a trial": f"{design.limit_s:g} s",
             "inserted": f"{inside.depth_m:g} m below the rim, within {1000 * inside.clearance_m:.0f} mm of the axis",
             "seed of the draw": seed,
         }
     )
-    _add_sample_sizes(found, design, smallest_size)
-    found.add_heading("Rules")
-    found.add_list(RULES)
-    found.add_heading("Places")
-    found.add_table(
-        ["hole", "x, m", "y, m", "rim z, m", "radius, m"],
-        [[n, *h.center_in_base_m, h.radius_m] for n, h in design.holes.items()],
-    )
-    num_joints = len(next(iter(design.starts.values())))
-    found.add_table(
-        ["start", *(f"joint {i + 1}" for i in range(num_joints))],
-        [[n, *q] for n, q in design.starts.items()],
-    )
-    found.add_heading("Order of trials")
-    found.add_text(
-        "A hole and a start a trial, in this order; tick what is done, write down what went otherwise."
-    )
-    _add_schedule(found, planned)
-    return found
+    _add_sizes(page, design)
+    page.add_heading("Rules")
+    page.add_list(RULES)
+    page.add_heading("Places")
+    holes = [[name, *hole.center_in_base_m, hole.radius_m] for name, hole in design.holes.items()]
+    page.add_table(["hole", "x, m", "y, m", "rim z, m", "radius, m"], holes)
+    starts = [[name, *q] for name, q in design.starts.items()]
+    page.add_table(["start", *(f"joint {i}" for i in range(1, len(starts[0])))], starts)
+    page.add_heading("Order of trials")
+    page.add_text("Tick what is done, write down what went otherwise.")
+    for participant in dict.fromkeys(trial.participant for trial in planned):
+        page.add_heading(participant, 3)
+        _add_schedule(page, [trial for trial in planned if trial.participant == participant])
+    return page
 
 
-def _judge_design(design: Design, smallest_size: int) -> tuple[str, str]:
+def _judge_size(design: Design) -> tuple[str, Tone]:
     """Return a sentence on the power of the design, and whether it is good, bad or a warning."""
-    num, dz = design.num_participants, crossover.LARGE_DZ
-    if design.order == "fixed":
-        return (
-            "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.",
-            "bad",
-        )
-    smallest = crossover.get_smallest_p((num + 1) // 2)
+    num, dz = design.num_participants, guidance_effect.LARGE_DZ
+    smallest = guidance_effect.get_smallest_p((num + 1) // 2)
     if smallest > design.alpha:
-        return (
-            f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is "
-            f"{smallest:.3f}. It takes {smallest_size} to be able to.",
-            "bad",
-        )
-    power = crossover.estimate_power(num, dz, design.alpha)
-    tone = "good" if power >= crossover.SUFFICIENT_POWER else "warn"
-    return (
-        f"{num} participants find an effect of dz {dz:g} in {100 * power:.0f} of 100 studies.",
-        tone,
-    )
+        size = guidance_effect.find_smallest_size(design.alpha)
+        text = f"{num} participants cannot reach p = {design.alpha:g}: the smallest possible p is {smallest:.3f}. It takes {size}."
+        return text, "bad"
+    power = guidance_effect.estimate_power(num, dz, design.alpha)
+    text = f"{num} participants find an effect of dz {dz:g} in {100 * power:.0f} of 100 studies."
+    return text, "good" if power >= guidance_effect.SUFFICIENT_POWER else "warn"
 
 
-def _add_sample_sizes(found: Report, design: Design, smallest_size: int) -> None:
-    found.add_heading("How many participants")
-    found.add_text(
-        f"It takes {smallest_size} participants for the exact test to reach p = {design.alpha:g}. "
-        f"Power is the share of up to {crossover.NUM_STUDIES} simulated studies that find the effect; dz is the mean difference in "
-        "standard deviations of it."
-    )
-    columns = ["participants", "smallest p"]
-    columns += [f"dz {dz:g}" for dz in crossover.EFFECTS_DZ]
+def _add_sizes(page: Report, design: Design) -> None:
+    page.add_heading("How many participants")
     rows = []
     # The plan's own number stands among the usual ones.
     for num in sorted({*SIZES, design.num_participants}):
         name = Cell(str(num), note="this plan" if num == design.num_participants else "")
-        least = crossover.get_smallest_p((num + 1) // 2)
-        row: list[str | Cell] = [name, f"{least:.2g}"]
-        for dz in crossover.EFFECTS_DZ:
-            row.append(f"{crossover.estimate_power(num, dz, design.alpha):.2f}")
+        row: list[str | float | Cell | None] = [name]
+        row.append(guidance_effect.get_smallest_p((num + 1) // 2))
+        for dz in EFFECTS_DZ:
+            row.append(f"{guidance_effect.estimate_power(num, dz, design.alpha):.2f}")
         rows.append(row)
-    found.add_table(columns, rows, "smallest possible p, and power")
+    page.add_table(
+        ["participants", "smallest p", *(f"power, dz {dz:g}" for dz in EFFECTS_DZ)],
+        rows,
+        f"share of {guidance_effect.NUM_STUDIES} simulated studies that find the effect at p = {design.alpha:g}; "
+        "dz is the mean difference in its standard deviations",
+        digits=2,
+    )
 
 
-def _add_schedule(found: Report, planned: list[Trial]) -> None:
-    # In the order of the plan, without repetition.
-    for participant in dict.fromkeys(trial.participant for trial in planned):
-        mine = []
-        for trial in planned:
-            if trial.participant == participant:
-                mine.append(trial)
-        found.add_heading(participant, 3)
-        largest = max(trial.number for trial in mine)
-        columns = ["", *map(str, range(1, largest + 1))]
-        rows = []
-        for period in sorted({trial.period for trial in mine}):
-            here = [trial for trial in mine if trial.period == period]
-            title = "practice" if not period else f"period {period}: {here[0].condition}"
-            cells: list[str | Cell] = []
-            for trial in here:
-                text = f"{trial.hole} from {trial.start}"
-                # In practice the condition changes from trial to trial.
-                cells.append(text if period else Cell(text, trial.condition))
-            # Empty cells leave room for notes by hand.
-            rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
-            rows.append(["notes", *[""] * (len(columns) - 1)])
-        found.add_table(columns, rows)
+def _add_schedule(page: Report, mine: list[Trial]) -> None:
+    columns = ["", *map(str, range(1, max(trial.number for trial in mine) + 1))]
+    rows = []
+    for period in sorted({trial.period for trial in mine}):
+        here = [trial for trial in mine if trial.period == period]
+        title = f"period {period}: {here[0].condition}" if period else "practice"
+        # In practice the condition changes from trial to trial.
+        cells = [
+            Cell(f"{one.hole} from {one.start}", "" if period else one.condition) for one in here
+        ]
+        # Empty cells leave room for notes by hand.
+        rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
+        rows.append(["notes", *[""] * (len(columns) - 1)])
+    page.add_table(columns, rows)

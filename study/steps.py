@@ -1,7 +1,8 @@
 """The state of a participant's sitting, read from the study's folder alone: the next step after any interruption stands there.
 
-Consent, practice, the trials of the first period, its questionnaire, the trials of the second, its
-questionnaire.
+A sitting is the participant's rows of the plan: consent, practice, the trials of the first period,
+its questionnaire, the trials of the second, its questionnaire. The next step is the first one that
+is not in the folder.
 """
 
 from __future__ import annotations
@@ -43,61 +44,41 @@ def find_next_step(data: StudyData, who: str) -> Step:
     known = data.participants.get(who, {})
     if known.get("stopped"):
         return Step("stopped")
-    if not (known.get("consent") or {}).get("agreed"):
+    if not known.get("consent", {}).get("agreed"):
         return Step("consent")
     for period in (0, *PERIODS):
-        planned = []
-        for trial in data.plan["trials"]:
-            if trial["participant"] == who and trial["period"] == period:
-                planned.append(Trial(**trial))
-        lacking = [trial for trial in planned if (who, period, trial.number) not in data.trials]
+        planned = [one for one in data.planned if (one.participant, one.period) == (who, period)]
+        lacking = [one for one in planned if (who, period, one.number) not in data.trials]
         if lacking and not (period == 0 and is_practised(data, who)):
-            return Step(
-                "trial",
-                lacking[0],
-                period,
-                lacking[0].condition,
-                len(planned) - len(lacking),
-                len(planned),
-            )
-        if period and not data.questionnaires.get((who, period), {"finished": False}).get(
-            "finished", True
-        ):
-            return Step("questionnaire", None, period, data.plan["participants"][who][period - 1])
+            num_done, first = len(planned) - len(lacking), lacking[0]
+            return Step("trial", first, period, first.condition, num_done, len(planned))
+        # A questionnaire that was typed in from paper says nothing about being finished.
+        begun = data.questionnaires.get((who, period), {"finished": False})
+        if period and not begun.get("finished", True):
+            condition = data.plan["participants"][who][period - 1]
+            return Step("questionnaire", None, period, condition)
     return Step("done")
 
 
 def is_practised(data: StudyData, who: str) -> bool:
-    """Return whether practice is over before all of it was done: by success, by time, or because the experimenter said so."""
-    done = []
-    for (name, period, _), trial in sorted(data.trials.items()):
-        if name == who and not period:
-            done.append(trial)
-    row = [trial.get("outcome") == "inserted" for trial in done[-ENOUGH:]]
-    minutes = sum(float(trial.get("seconds", 0.0)) for trial in done) / 60.0
+    """Return whether practice is over before all of it was done: by success, or because the experimenter said so."""
+    practice = [key for key in sorted(data.trials) if key[:2] == (who, 0)]
+    last = [data.trials[key].get("outcome") for key in practice[-ENOUGH:]]
     ended = bool(data.participants.get(who, {}).get("practice_ended"))
-    return ended or row == [True] * ENOUGH or minutes >= data.plan["design"]["practice_minutes"]
+    return ended or last == ["inserted"] * ENOUGH
 
 
-def progress(data: StudyData) -> list[dict[str, Any]]:
+def list_progress(data: StudyData) -> list[dict[str, Any]]:
     """Return how far each participant is, for who chooses one."""
     found = []
     for who in data.plan["participants"]:
-        done = sum(name == who and period > 0 for name, period, _ in data.trials)
-        of = 0
-        for trial in data.plan["trials"]:
-            if trial["participant"] == who and trial["period"] > 0:
-                of += 1
-        step = find_next_step(data, who).kind
-        state = (
-            "erased"
-            if who in data.plan.get("erased", {})
-            else step
-            if step in ("done", "stopped")
-            else ""
-        )
-        begun = who in data.participants
-        found.append(
-            {"name": who, "done": done, "of": of, "state": state or ("begun" if begun else "new")}
-        )
+        counted = [one for one in data.planned if one.participant == who and one.period]
+        done = sum((who, one.period, one.number) in data.trials for one in counted)
+        state = "begun" if who in data.participants else "new"
+        kind = find_next_step(data, who).kind
+        if who in data.erased:
+            state = "erased"
+        elif kind in ("done", "stopped"):
+            state = kind
+        found.append({"name": who, "done": done, "of": len(counted), "state": state})
     return found

@@ -23,17 +23,15 @@ from pathlib import Path
 from typing import Any
 
 from brokk_rl.errors import ConfigError, StorageError, list_choices
+from brokk_rl.machine import Machine
 from brokk_rl.session import write_json
-from study.design import CONDITIONS, PERIODS
+from study.design import CONDITIONS, PERIODS, Design, Trial
 
 PLAN, REPORTS = "plan.json", "reports.json"
-TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS = (
-    "trials",
-    "recordings",
-    "questionnaires",
-    "participants",
-)
-CAPTURES = "captures"
+TRIALS, RECORDINGS, CAPTURES = "trials", "recordings", "captures"
+QUESTIONNAIRES, PARTICIPANTS = "questionnaires", "participants"
+NOTICE = "simulated operators: no person took part, and nothing here is evidence about people"
+"""What stands on all that simulated operators have done."""
 TRIAL_FIELDS = {
     "participant": str,
     "period": int,
@@ -65,6 +63,8 @@ class StudyData:
     Attributes:
         folder: The folder.
         plan: `plan.json`.
+        design: The design of the plan.
+        planned: The trials of the plan.
         trials: Trials that count, by participant, period and number.
         questionnaires: By participant and period.
         participants: Records of participants, by pseudonym.
@@ -75,6 +75,8 @@ class StudyData:
 
     folder: Path
     plan: dict[str, Any]
+    design: Design
+    planned: list[Trial]
     trials: dict[tuple[str, int, int], dict[str, Any]] = field(default_factory=dict)
     questionnaires: dict[tuple[str, int], dict[str, Any]] = field(default_factory=dict)
     participants: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -88,30 +90,51 @@ class StudyData:
         entries = [*self.trials.values(), *self.spare, *self.questionnaires.values()]
         return any(entry.get("simulated") for entry in entries)
 
+    @property
+    def erased(self) -> dict[str, str]:
+        """Erased participants, with the time."""
+        return self.plan.get("erased", {})
 
-def read_plan(folder: Path) -> dict[str, Any]:
-    """Return the plan of a study.
+    def require_participant(self, who: str) -> None:
+        """Raise a `ConfigError` for a name that is not in the plan, or that was erased."""
+        there = [name for name in self.plan["participants"] if name not in self.erased]
+        if who not in there:
+            raise ConfigError(
+                f"study.participant={who}: no participant of the plan; {list_choices(who, there)}"
+            )
+
+    def note(self, where: str, text: str) -> None:
+        """Add a remark."""
+        self.remarks.append(Remark(where, text))
+
+
+def read_study(folder: Path, machine: Machine | None = None) -> StudyData:
+    """Read a study with all that is wrong with it; problems of the data are collected, not raised.
+
+    Args:
+        folder: The study's.
+        machine: The machine that it has to be of; `None` for any.
 
     Raises:
-        ConfigError: there is none, or it cannot be read.
+        ConfigError: there is no plan, it cannot be read, or is of another machine.
     """
     if not (folder / PLAN).is_file():
         raise ConfigError(
             f"{folder} holds no study ({PLAN} is missing); give study.folder=<folder>, or plan one with study.do=plan"
         )
     plan = _read(folder / PLAN)
-    if not isinstance(plan, dict) or plan.get("schema") != 1 or "participants" not in plan:
+    try:
+        if plan["schema"] != 2:
+            raise ValueError(f"schema {plan['schema']}")
+        planned = [Trial(**trial) for trial in plan["trials"]]
+        data = StudyData(folder, plan, Design(**plan["design"]), planned)
+    except (KeyError, TypeError, ValueError, ConfigError) as error:
         raise ConfigError(
-            f"{folder / PLAN}: expected a plan of schema 1 as study.do=plan writes it"
-        )
-    return plan
-
-
-def read_study(folder: Path) -> StudyData:
-    """Read a study with all that is wrong with it."""
-    # Problems are collected, not raised: a study in the field cannot be repeated.
-    data = StudyData(folder, read_plan(folder))
-    for name, entry in _iterate_entries(folder / PARTICIPANTS, data):
+            f"{folder / PLAN}: expected a plan of schema 2 as study.do=plan writes it, got {error!r}; plan the study again"
+        ) from error
+    if machine is not None:
+        machine.check_fingerprint(plan["fingerprint"], f"the study in {folder}")
+    for name, entry in _iterate_entries(data, PARTICIPANTS):
         data.participants[str(entry.get("participant", name))] = entry
     _read_trials(data)
     _read_questionnaires(data)
@@ -121,18 +144,16 @@ def read_study(folder: Path) -> StudyData:
 
 def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
     """Write the record of a trial; one that is there already stays, and this becomes a second one beside it."""
-    path = folder / TRIALS / f"{name}.json"
-    # A hundred repetitions of one trial are an error elsewhere.
-    for again in range(2, 100):
-        if not path.exists():
-            break
+    path, again = folder / TRIALS / f"{name}.json", 2
+    while path.exists():
         path = folder / TRIALS / f"{name}_again{again}.json"
-    return _write(path, {"schema": 1, "created": datetime.now().astimezone().isoformat(), **trial})
+        again += 1
+    return _write(path, trial)
 
 
 def rewrite(path: Path, changes: dict[str, Any]) -> None:
-    """Change the record of a trial, participant or questionnaire that is still going on."""
-    _write(path, _read(path) | changes)
+    """Change the record of a trial or questionnaire that is still going on."""
+    write_json(path, _read(path) | changes)
 
 
 def write_questionnaire(
@@ -140,29 +161,29 @@ def write_questionnaire(
 ) -> Path:
     """Write a questionnaire; answers given again take the place of those before, which are kept within the file."""
     path = folder / QUESTIONNAIRES / f"{participant}_{period}.json"
-    entry: dict[str, Any] = {"schema": 1, "participant": participant, "period": period}
-    entry |= {"created": datetime.now().astimezone().isoformat(), **answers}
-    if path.exists():
-        # The earlier answers stay inside, since nothing that a participant said is thrown away.
-        entry["before"] = _read(path)
-    return _write(path, entry)
+    # Nothing that a participant said is thrown away.
+    before = {"before": _read(path)} if path.exists() else {}
+    return _write(path, {"participant": participant, "period": period, **answers, **before})
 
 
 def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> Path:
-    """Write the record of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
-    return _write(
-        folder / PARTICIPANTS / f"{participant}.json",
-        {"schema": 1, "participant": participant, **facts},
-    )
+    """Add to the record of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
+    path = folder / PARTICIPANTS / f"{participant}.json"
+    known = _read(path) if path.exists() else {}
+    return _write(path, {**known, "participant": participant, **facts})
 
 
 def note_report(folder: Path, report: Path) -> None:
-    """Remember where a report of this study was written."""
+    """Remember where a report of this study was written; reports may be written anywhere."""
     path = folder / REPORTS
     known = _read(path) if path.exists() else []
-    # Absolute paths: reports may be written anywhere.
     if str(report.resolve()) not in known:
-        _write(path, [*known, str(report.resolve())])
+        write_json(path, [*known, str(report.resolve())])
+
+
+def format_now() -> str:
+    """Return the present time as it stands in files."""
+    return datetime.now().astimezone().isoformat(timespec="microseconds")
 
 
 def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
@@ -175,169 +196,133 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     Raises:
         ConfigError: the study has no such participant.
     """
-    plan = read_plan(folder)
-    if participant not in plan["participants"]:
-        raise ConfigError(
-            f"study.participant={participant}: the study has no such participant; {list_choices(participant, plan['participants'])}"
-        )
+    data = read_study(folder)
+    data.require_participant(participant)
     gone = []
     for part in (TRIALS, RECORDINGS, CAPTURES, QUESTIONNAIRES, PARTICIPANTS):
         for path in sorted((folder / part).glob("*")):
             # Also files that were renamed by hand: their content tells whose they are.
-            if (
-                path.stem == participant
-                or path.stem.startswith(f"{participant}_")
-                or _is_of_participant(path, participant)
-            ):
-                try:
-                    if path.is_dir():
-                        shutil.rmtree(path)
-                    else:
-                        path.unlink()
-                except OSError as error:
-                    raise StorageError(
-                        f"cannot delete {path}: {error.strerror}; {len(gone)} files are gone, run it again"
-                    ) from error
-                gone.append(path)
+            is_named = path.stem == participant or path.stem.startswith(f"{participant}_")
+            if not is_named and not _is_of_participant(path, participant):
+                continue
+            try:
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+            except OSError as error:
+                raise StorageError(
+                    f"cannot delete {path}: {error.strerror}; {len(gone)} files are gone, run it again"
+                ) from error
+            gone.append(path)
     # The plan keeps the place, so that the sequences of the others still make sense.
-    plan.setdefault("erased", {})[participant] = (
-        datetime.now().astimezone().isoformat(timespec="seconds")
+    write_json(folder / PLAN, data.plan | {"erased": data.erased | {participant: format_now()}})
+    reports = (
+        [Path(name) for name in _read(folder / REPORTS)] if (folder / REPORTS).exists() else []
     )
-    _write(folder / PLAN, plan)
-    reports = []
-    for name in _read(folder / REPORTS) if (folder / REPORTS).exists() else []:
-        if Path(name).exists():
-            reports.append(Path(name))
-    return gone, reports
+    return gone, [path for path in reports if path.exists()]
 
 
 def _is_of_participant(path: Path, participant: str) -> bool:
     """Return whether a file with another name is about the participant."""
-    if path.suffix != ".json":
-        return False
     try:
-        entry = json.loads(path.read_text())
-    except (OSError, ValueError):
+        return path.suffix == ".json" and _read(path).get("participant") == participant
+    except (ConfigError, AttributeError):
         return False
-    return isinstance(entry, dict) and entry.get("participant") == participant
 
 
 def _read_trials(data: StudyData) -> None:
     # In the order of their making, so that the first of two counts.
-    found = sorted(
-        _iterate_entries(data.folder / TRIALS, data),
-        key=lambda item: str(item[1].get("created", "")),
-    )
+    found = sorted(_iterate_entries(data, TRIALS), key=lambda item: str(item[1].get("created", "")))
     for name, trial in found:
-        lacking = []
-        for key, kind in TRIAL_FIELDS.items():
-            if not isinstance(trial.get(key), kind):
-                lacking.append(key)
-        if lacking:
-            data.remarks.append(
-                Remark(name, f"the trial lacks {', '.join(lacking)}; it does not count")
-            )
+        if problem := _find_problem(data, trial):
+            data.note(name, problem)
             data.spare.append(trial)
-            continue
-        # Checks from the gravest to the mildest: one problem is reported for a trial.
-        who, period, condition = trial["participant"], trial["period"], trial["condition"]
-        key = (who, period, trial["number"])
-        if who not in data.plan["participants"]:
-            problem = f"'{who}' is no participant of the plan; kept, but it does not count"
-        elif period not in (0, *PERIODS) or condition not in CONDITIONS:
-            problem = (
-                f"period {period}, condition '{condition}': expected 0, 1 or 2 and"
-                f" {' or '.join(CONDITIONS)}; it does not count"
-            )
-        elif period and data.plan["participants"][who][period - 1] != condition:
-            problem = f"done {condition}, but planned {data.plan['participants'][who][period - 1]}; kept, but it does not count"
-        elif key in data.trials:
-            problem = "done twice: the first counts, since the second had more practice; the other is kept"
-        elif trial.get("outcome") == "aborted":
-            problem = (
-                f"aborted ({trial.get('reason', 'no reason given')}); kept, but it does not count"
-            )
         else:
-            data.trials[key] = trial
-            continue
-        data.remarks.append(Remark(name, problem))
-        data.spare.append(trial)
+            data.trials[trial["participant"], trial["period"], trial["number"]] = trial
+
+
+def _find_problem(data: StudyData, trial: dict[str, Any]) -> str:
+    """Return why a trial does not count, from the gravest reason to the mildest; empty if it does."""
+    lacking = [key for key, kind in TRIAL_FIELDS.items() if not isinstance(trial.get(key), kind)]
+    if lacking:
+        return f"the trial lacks {', '.join(lacking)}; it does not count"
+    who, period, condition = trial["participant"], trial["period"], trial["condition"]
+    if who not in data.plan["participants"]:
+        return f"'{who}' is no participant of the plan; kept, but it does not count"
+    if period not in (0, *PERIODS) or condition not in CONDITIONS:
+        return (
+            f"period {period}, condition '{condition}': expected 0, 1 or 2 and"
+            f" {' or '.join(CONDITIONS)}; it does not count"
+        )
+    planned = data.plan["participants"][who][period - 1]
+    if period and planned != condition:
+        return f"done {condition}, but planned {planned}; kept, but it does not count"
+    if (who, period, trial["number"]) in data.trials:
+        return "done twice: the first counts, since the second had more practice; the other is kept"
+    if trial.get("outcome") == "aborted":
+        reason = trial.get("reason", "no reason given")
+        return f"aborted ({reason}); kept, but it does not count"
+    return ""
 
 
 def _read_questionnaires(data: StudyData) -> None:
-    for name, entry in _iterate_entries(data.folder / QUESTIONNAIRES, data):
+    for name, entry in _iterate_entries(data, QUESTIONNAIRES):
         who, period = str(entry.get("participant")), entry.get("period")
         if who not in data.plan["participants"] or period not in PERIODS:
-            data.remarks.append(
-                Remark(
-                    name,
-                    f"a questionnaire of '{who}', period {period}, whom the plan does not know; not counted",
-                )
+            data.note(
+                name, f"of '{who}', period {period}, whom the plan does not know; not counted"
             )
         elif (who, period) in data.questionnaires:
-            data.remarks.append(
-                Remark(
-                    name,
-                    "a second questionnaire for the same period: the one that is named as it should be counts",
-                )
-            )
+            data.note(name, "a second questionnaire for the same period; the first one counts")
         else:
             data.questionnaires[who, period] = entry
             if "before" in entry:
-                data.remarks.append(
-                    Remark(
-                        name,
-                        "was filled in twice: the later answers count, the earlier are kept in the file",
-                    )
+                data.note(
+                    name, "was filled in twice: the later answers count, the earlier are kept"
                 )
 
 
 def _note_missing(data: StudyData) -> None:
-    # Practice has period 0 and need not be complete.
-    planned: dict[str, set[tuple[int, int]]] = {}
-    for trial in data.plan["trials"]:
-        if trial["period"]:
-            planned.setdefault(trial["participant"], set()).add((trial["period"], trial["number"]))
     for who in data.plan["participants"]:
-        done = {(period, number) for name, period, number in data.trials if name == who and period}
-        known = data.participants.get(who, {})
-        if when := data.plan.get("erased", {}).get(who):
-            data.remarks.append(Remark(who, f"erased on request, {when}"))
+        if who in data.erased:
+            data.note(who, f"erased on request, {data.erased[who]}")
             continue
+        # Practice has period 0 and need not be complete.
+        planned = [one for one in data.planned if one.participant == who and one.period]
+        lost = []
+        for trial in planned:
+            if (who, trial.period, trial.number) not in data.trials:
+                lost.append(f"{trial.period}.{trial.number}")
+        num_done = len(planned) - len(lost)
+        known = data.participants.get(who, {})
         if known.get("stopped"):
-            data.remarks.append(
-                Remark(
-                    who,
-                    f"stopped after {len(done)} trials ({known.get('reason', 'no reason given')}); what was done is kept",
-                )
-            )
-        lost = sorted(planned.get(who, set()) - done)
-        if not done:
-            data.remarks.append(Remark(who, "has no trials"))
+            reason = known.get("reason", "no reason given")
+            data.note(who, f"stopped after {num_done} trials ({reason}); what was done is kept")
+        if not num_done:
+            data.note(who, "has no trials and is in no comparison")
         elif lost:
-            names = ", ".join(f"{period}.{number}" for period, number in lost)
-            data.remarks.append(
-                Remark(
-                    who,
-                    f"{len(lost)} of {len(planned[who])} trials are missing (period.trial {names}); means are over the others",
-                )
+            data.note(
+                who,
+                f"{len(lost)} of {len(planned)} trials are missing (period.trial {', '.join(lost)});"
+                " means are over the others",
             )
         for period in PERIODS:
-            if done and (who, period) not in data.questionnaires:
-                data.remarks.append(Remark(who, f"no questionnaire for period {period}"))
+            if num_done and (who, period) not in data.questionnaires:
+                data.note(who, f"no questionnaire for period {period}")
 
 
-def _iterate_entries(folder: Path, data: StudyData) -> Iterator[tuple[str, dict[str, Any]]]:
-    for path in sorted(folder.glob("*.json")):
+def _iterate_entries(data: StudyData, part: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    for path in sorted((data.folder / part).glob("*.json")):
         try:
-            entry = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            data.remarks.append(Remark(path.name, f"cannot be read ({error}); left out"))
+            entry = _read(path)
+        except ConfigError as error:
+            data.note(path.name, f"{error}; left out")
             continue
         if isinstance(entry, dict):
             yield path.name, entry
         else:
-            data.remarks.append(Remark(path.name, "expected a JSON object; left out"))
+            data.note(path.name, "expected a JSON object; left out")
 
 
 def _read(path: Path) -> Any:
@@ -347,6 +332,7 @@ def _read(path: Path) -> Any:
         raise ConfigError(f"{path} cannot be read: {error}") from error
 
 
-def _write(path: Path, value: Any) -> Path:
-    write_json(path, value)
+def _write(path: Path, entry: dict[str, Any]) -> Path:
+    """Write an entry with its schema, and the time of its making where it has none."""
+    write_json(path, {"schema": 1, "created": format_now(), **entry})
     return path

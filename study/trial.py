@@ -12,14 +12,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from brokk_rl import record
 from brokk_rl.errors import BrokkError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.record import Recording, write_recording
 from brokk_rl.spec import spec
 from study import study_folder as folders
-from study.design import Hole, Success, Trial
+from study.design import Trial
 from study.measures import find_insertion
+from study.study_folder import StudyData
 from study.twin_control import FILLED, Stage
 
 log = logging.getLogger(__name__)
@@ -51,11 +52,8 @@ class Attempt:
     """The trial that runs now; see the module.
 
     Args:
-        folder: The study's.
-        design: The plan's design, as plain data.
+        data: The study.
         trial: The planned trial.
-        hole: Its hole, as plain data.
-        start: Joint positions to begin from, `(J,)`.
         machine: The machine.
         stage: Where it takes place.
         times: Countdown and the like.
@@ -65,11 +63,8 @@ class Attempt:
 
     def __init__(
         self,
-        folder: Path,
-        design: dict[str, Any],
+        data: StudyData,
         trial: Trial,
-        hole: dict[str, Any],
-        start: np.ndarray,
         machine: Machine,
         stage: Stage,
         times: Times,
@@ -77,27 +72,19 @@ class Attempt:
         clock: Callable[[], float],
     ) -> None:
         self.trial = trial
-        self._folder, self._start, self._machine, self._stage, self._times = (
-            folder,
-            start,
-            machine,
-            stage,
-            times,
-        )
-        self._hole = Hole(
-            center_in_base_m=tuple(hole["center_in_base_m"]), radius_m=float(hole["radius_m"])
-        )
-        self._success, self._limit_s = Success(**design["success"]), float(design["limit_s"])
-        self._facts, self._clock = facts, clock
+        self._folder, self._design, self._machine = data.folder, data.design, machine
+        self._stage, self._times, self._facts, self._clock = stage, times, facts, clock
+        self._hole = data.design.holes[trial.hole]
+        self._start = np.array(data.design.starts[trial.start])
         self._phase: Phase = "ready"
         # All clocks begin now, so that nothing has timed out before the first tick.
         self._since_s = self._began_s = self._seen_s = clock()
-        self._path: Path | None = None
+        self._path = Path()
         self._outcome, self._reason, self._seconds = "", "", 0.0
         self._saving: Future[None] | None = None
         # One worker: recordings are converted beside the page, one after the other.
         self._worker = ThreadPoolExecutor(1)
-        stage.prepare(self._hole, start)
+        stage.prepare(self._hole, self._start)
 
     @property
     def running(self) -> bool:
@@ -115,31 +102,26 @@ class Attempt:
             return "not now"
         if self._stage.sight().q is None:
             return "no positions"
-        hole = {"name": self.trial.hole, **asdict(self._hole)}
-        facts: dict[str, Any] = {
+        entry = {
             **asdict(self.trial),
-            "hole": hole,
-            "limit_s": self._limit_s,
             **self._facts,
-        }
-        # Until the trial is over, its file describes it as interrupted.
-        unfinished = {
+            "hole": {"name": self.trial.hole, **asdict(self._hole)},
+            "limit_s": self._design.limit_s,
+            # Until the trial is over, its file describes it as interrupted.
             "outcome": "aborted",
             "reason": "interrupted: the sitting ended during the trial",
         }
         # On the disk before the recording begins: no capture is without a trial.
-        self._path = folders.write_trial(self._folder, self.trial.name, facts | unfinished)
-        self._stage.record(self._captured)
+        self._path = folders.write_trial(self._folder, self.trial.name, entry)
+        self._stage.record(self._folder.resolve() / folders.CAPTURES / self._path.stem)
         self._enter("starting")
         return ""
 
     def stop(self) -> str:
         """End the trial at the participant's wish; a trial that has not begun stays as it is."""
-        return (
-            self._end("stopped", "")
-            if self._phase == "running"
-            else self.abort("stopped before it began")
-        )
+        if self._phase == "running":
+            return self._end("stopped", "")
+        return self.abort("stopped before it began")
 
     def abort(self, reason: str) -> str:
         """End the trial for a fault: it is kept, does not count, and is repeated."""
@@ -161,24 +143,18 @@ class Attempt:
             self.abort("the recording did not begin")
         elif self._phase == "countdown" and in_phase_s >= self._times.countdown_s:
             self._began_s = now_s
-            if self._path is not None and sight.q is not None:
+            if sight.q is not None:
                 # The start error tells later how well the start was met.
-                folders.rewrite(
-                    self._path, {"start_error": np.round(sight.q - self._start, 4).tolist()}
-                )
+                error = np.round(sight.q - self._start, 4).tolist()
+                folders.rewrite(self._path, {"start_error": error})
             self._enter("running")
         elif self._phase == "running" and sight.q is not None:
-            inside = (
-                find_insertion(
-                    compute_tool_kinematics(self._machine, sight.q).tip_in_base_m[None],
-                    self._hole,
-                    self._success,
-                )
-                is not None
-            )
+            tip_m = compute_tool_kinematics(self._machine, sight.q).tip_in_base_m
             # Inserted wins where both happen in one tick.
-            if inside or in_phase_s >= self._limit_s:
-                self._end("inserted" if inside else "time limit", "")
+            if find_insertion(tip_m[None], self._hole, self._design.success) is not None:
+                self._end("inserted", "")
+            elif in_phase_s >= self._design.limit_s:
+                self._end("time limit", "")
         elif self._phase == "settling" and in_phase_s >= self._times.settle_s:
             self._save()
         elif self._phase == "saving" and self._saving is not None and self._saving.done():
@@ -186,21 +162,25 @@ class Attempt:
 
     def view(self) -> dict[str, Any]:
         """Return the trial as plain data for the pages."""
-        now_s, sight = self._clock(), self._stage.sight()
-        away = None if sight.q is None else sight.q - self._start
-        joints = []
-        if away is not None:
-            for name, value in zip(self._machine.joint_names, away, strict=True):
-                is_there = bool(abs(value) <= self._times.start_tolerance)
-                joints.append({"joint": name, "away": round(float(value), 3), "there": is_there})
-        left_s = {"countdown": self._times.countdown_s, "running": self._limit_s}.get(
-            self._phase, 0.0
-        ) - (now_s - self._since_s)
+        sight, joints = self._stage.sight(), []
+        if sight.q is not None:
+            for name, away in zip(self._machine.joint_names, sight.q - self._start, strict=True):
+                is_there = bool(abs(away) <= self._times.start_tolerance)
+                joints.append({"joint": name, "away": round(float(away), 3), "there": is_there})
+        lasts_s = {"countdown": self._times.countdown_s, "running": self._design.limit_s}
+        left_s = lasts_s.get(self._phase, 0.0) - (self._clock() - self._since_s)
         return {
-            "phase": self._phase, "number": self.trial.number, "hole": self.trial.hole, "start": self.trial.start, "joints": joints,
-            "advised": sight.advised, "left_s": round(max(0.0, left_s), 1), "outcome": self._outcome, "reason": self._reason,
+            "phase": self._phase,
+            "number": self.trial.number,
+            "hole": self.trial.hole,
+            "start": self.trial.start,
+            "joints": joints,
+            "advised": sight.advised,
+            "left_s": round(max(0.0, left_s), 1),
+            "outcome": self._outcome,
+            "reason": self._reason,
             "seconds": round(self._seconds, 1),
-        }  # fmt: skip
+        }
 
     def close(self) -> None:
         """Wait until everything is on the disk."""
@@ -213,52 +193,38 @@ class Attempt:
         self.abort("the program ended")
         self._worker.shutdown(wait=False, cancel_futures=True)
 
-    @property
-    def _captured(self) -> Path:
-        assert self._path is not None
-        return self._folder.resolve() / folders.CAPTURES / self._path.stem
-
     def _enter(self, phase: Phase) -> None:
         self._phase, self._since_s = phase, self._clock()
 
     def _end(self, outcome: str, reason: str) -> str:
-        ran = self._phase == "running"
+        has_run = self._phase == "running"
         # A trial that never ran took no time.
-        self._seconds = self._clock() - self._began_s if ran else 0.0
+        self._seconds = self._clock() - self._began_s if has_run else 0.0
         self._outcome, self._reason = outcome, reason
-        assert self._path is not None
-        folders.rewrite(
-            self._path, {"outcome": outcome, "reason": reason, "seconds": round(self._seconds, 2)}
-        )
+        seconds = round(self._seconds, 2)
+        folders.rewrite(self._path, {"outcome": outcome, "reason": reason, "seconds": seconds})
         self._enter("settling")
         # Nothing to settle where nothing moved.
-        if not ran:
+        if not has_run:
             self._save()
         return ""
 
     def _save(self) -> None:
         end_s = self._clock()
         self._stage.record(None)
-        assert self._path is not None
         # Without a window there is nothing to keep: the trial never ran.
         if self._seconds:
+            capture = f"{folders.CAPTURES}/{self._path.stem}"
             window_s = [self._began_s, end_s]
-            folders.rewrite(
-                self._path,
-                {"capture": f"{folders.CAPTURES}/{self._path.stem}", "window_s": window_s},
-            )
+            folders.rewrite(self._path, {"capture": capture, "window_s": window_s})
+        # The conversion takes seconds; the page must go on.
         self._saving = self._worker.submit(
-            # The conversion takes seconds; the page must go on.
-            keep,
-            self._folder,
-            self._path,
-            self._machine,
-            self._stage,
+            keep_recording, self._folder, self._path, self._machine, self._stage
         )
         self._enter("saving")
 
 
-def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
+def keep_recording(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
     """Write the captured trial as a recording to the file `path`; faults are reported in that file.
 
     A trial that began has a `window_s`, so that this can be done again where it was interrupted:
@@ -272,7 +238,7 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
     try:
         found = stage.keep(folder.resolve() / trial["capture"], *trial["window_s"])
         name = f"{folders.RECORDINGS}/{path.stem}.parquet"
-        record.write_recording(_describe_target(found, trial), folder / name)
+        write_recording(_describe_target(found, trial), folder / name)
         changes["recording"] = name
         if FILLED in found.metadata:
             changes["recording_problem"] = found.metadata[FILLED]
@@ -282,14 +248,13 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
     folders.rewrite(path, changes)
 
 
-def _describe_target(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
+def _describe_target(found: Recording, trial: dict[str, Any]) -> Recording:
     """Return the recording with the hole, and without advice that was not shown."""
-    guided = trial["condition"] == "guided"
     extra = {}
     for name, values in found.extra.items():
-        if guided or not name.startswith("advice_"):
+        if trial["condition"] == "guided" or not name.startswith("advice_"):
             extra[name] = values
     # The hole stands in the recording as constant columns, as in recordings of other tools.
-    at = zip("xyz", trial["hole"]["center_in_base_m"], strict=True)
-    extra |= {f"target_{axis}_m": np.full(len(found.t_s), value, np.float32) for axis, value in at}
+    for axis, value in zip("xyz", trial["hole"]["center_in_base_m"], strict=True):
+        extra[f"target_{axis}_m"] = np.full(len(found.t_s), value, np.float32)
     return replace(found, extra=extra)

@@ -92,60 +92,47 @@ class LoopStage:
 
     def sight(self) -> MachineView:
         """See `Stage`."""
-        state, advice, controls = (
-            self._memory.state.read(),
-            self._memory.advice.read(),
-            self._memory.controls.read(),
-        )
-        now_s = time.monotonic()
-        fresh = state is not None and now_s - state.q_t_s < FRESH_S and state.q_plausible
-        advised = AdviceStatus.NO_STATE
+        memory, now_s = self._memory, time.monotonic()
+        state, advice, controls = memory.state.read(), memory.advice.read(), memory.controls.read()
+        q, advised = None, AdviceStatus.NO_STATE
+        if state is not None and now_s - state.q_t_s < FRESH_S and state.q_plausible:
+            q = np.array(state.q)
         if advice is not None and now_s - advice.t_s < FRESH_S:
             advised = advice.reason
-        recording = controls is not None and controls.recording
-        q = np.array(state.q) if fresh and state is not None else None
-        return MachineView(q, advised.value, recording)
+        return MachineView(q, advised.value, controls is not None and controls.recording)
 
     def prepare(self, hole: Hole, start: np.ndarray) -> None:
         """See `Stage`."""
-        write_json(self._target, {"center_in_base_m": list(hole.center_in_base_m)})
-        if self._port is not None:
-            place = {"q": start.tolist(), "hole_in_base_m": list(hole.center_in_base_m)}
-            try:
-                request_fault(self._port, {"place": place}, timeout_s=2.0)
-            except OSError as error:
-                raise RecordingError(
-                    f"the twin does not answer on port {self._port} ({error}); is it running?"
-                ) from error
+        center = list(hole.center_in_base_m)
+        write_json(self._target, {"center_in_base_m": center})
+        if self._port is None:
+            return
+        try:
+            place = {"q": start.tolist(), "hole_in_base_m": center}
+            request_fault(self._port, {"place": place}, timeout_s=2.0)
+        except OSError as error:
+            raise RecordingError(
+                f"the twin does not answer on port {self._port} ({error}); is it running?"
+            ) from error
 
     def record(self, folder: Path | None) -> None:
         """See `Stage`."""
-        request = (
-            {"kind": "record", "value": "off"}
-            if folder is None
-            else {"kind": "record", "value": "on", "into": str(folder)}
-        )
+        request = {"kind": "record", "value": "off"}
+        if folder is not None:
+            request = {"kind": "record", "value": "on", "into": str(folder)}
         self._memory.requests.put(json.dumps(request).encode())
 
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
         """See `Stage`."""
         path, patience_s = folder / MCAP, time.monotonic() + CLOSING_S
-        while (
-            not (path.exists() and capture_reader.is_whole(path)) and time.monotonic() < patience_s
-        ):
+        while time.monotonic() < patience_s:
+            if path.exists() and capture_reader.is_whole(path):
+                break
             time.sleep(0.2)
+        window = path, self._machine, begin_s, end_s
         try:
-            return CaptureLogReader(longest_gap_s=GAP_S, shortest_s=0.0).between(
-                path, self._machine, begin_s, end_s
-            )
+            return CaptureLogReader(longest_gap_s=GAP_S, shortest_s=0.0).between(*window)
         except RecordingError:
-            found = CaptureLogReader(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(
-                path, self._machine, begin_s, end_s
-            )
-        return replace(
-            found,
-            metadata={
-                **found.metadata,
-                FILLED: f"silences of up to {LONGEST_GAP_S:g} s are filled in",
-            },
-        )
+            found = CaptureLogReader(longest_gap_s=LONGEST_GAP_S, shortest_s=0.0).between(*window)
+        text = f"silences of up to {LONGEST_GAP_S:g} s are filled in"
+        return replace(found, metadata={**found.metadata, FILLED: text})

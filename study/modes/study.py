@@ -2,11 +2,57 @@
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
+from typing import Literal
+
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.session import Session
+from brokk_rl.progress import track_items
+from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from study.study_steps import Steps
-from study.trial_contract import Operator, TrialGround
+from study import study_folder as folders
+from study.design import Design, Trial, format_plan, plan_trials
+from study.measures import COMPARED
+from study.plan_page import build_plan_page
+from study.sitting import Sitting, reserve_study
+from study.twins import TwinGround
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class StudySteps:
+    """A study of guidance against no guidance.
+
+    Attributes:
+        do: `plan`, `run`, `simulate`, `report` or `erase`.
+        folder: The study's folder; `null`: the run folder, where `plan` and `simulate` begin one.
+        participant: Whom to erase, or whose sitting to begin with.
+        design: The design of the plan.
+        sitting: How participants are led through it.
+    """
+
+    do: Literal["plan", "run", "simulate", "report", "erase"]
+    folder: str | None
+    participant: str | None
+    design: Design
+    sitting: Sitting
+
+    def check(self) -> None:
+        if self.design.primary not in COMPARED:
+            raise ConfigError(
+                f"design.primary: expected a measure, got '{self.design.primary}'; "
+                + list_choices(self.design.primary, COMPARED)
+            )
+        if self.do == "run" and self.folder is None:
+            raise ConfigError(
+                "folder: study.do=run needs study.folder=<folder>, the study that study.do=plan has planned"
+            )
+        if self.do == "erase" and self.participant is None:
+            raise ConfigError(
+                "participant: study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>"
+            )
 
 
 @spec
@@ -16,22 +62,75 @@ class StudyMode:
     Attributes:
         session: Folder, seed, device.
         machine: The machine.
-        study: Plan, measures, statistics.
-        ground: Where simulated operators work.
-        guided: Simulated operators with advice.
-        unguided: Simulated operators without; the same persons.
+        study: Plan, sittings, and which step to do.
+        ground: Where simulated operators work; `null` where people do.
     """
 
     session: Session
     machine: Machine
-    study: Steps
-    ground: TrialGround
-    guided: Operator
-    unguided: Operator
+    study: StudySteps
+    ground: TwinGround | None
+
+    def check(self) -> None:
+        if self.study.do == "simulate" and self.ground is None:
+            raise ConfigError("ground: study.do=simulate needs simulated operators; ground=twin")
 
     def run(self) -> None:
         """Leave `plan.{json,html}`, or `report.html` with pictures and tables, in the run folder.
 
         Sittings go into `study.folder`.
         """
-        self.study.run(self.machine, self.session, self.ground, self.guided, self.unguided)
+        study, session, machine = self.study, self.session, self.machine
+        folder = Path(study.folder) if study.folder else session.folder
+        if study.do == "plan":
+            self._plan(folder, "")
+        elif study.do == "run":
+            study.sitting.run(machine, session, folder, study.participant)
+        elif study.do == "simulate":
+            assert self.ground is not None
+            planned = self._plan(folder, f"The trials of this study are done by {folders.NOTICE}.")
+            self.ground.conduct(folder, study.design, planned, machine, session)
+            self._report(folder)
+        elif study.do == "report":
+            self._report(folder)
+        else:
+            self._erase(folder)
+
+    def _plan(self, folder: Path, notice: str) -> list[Trial]:
+        design, machine, seed = self.study.design, self.machine, self.session.seed
+        design.check_machine(machine)
+        if (folder / folders.PLAN).exists():
+            raise ConfigError(
+                f"{folder} already holds a study; plan another one with study.folder=<folder>"
+            )
+        planned = plan_trials(design, self.session.generator("study plan"))
+        write_json(folder / folders.PLAN, format_plan(design, machine, seed, planned))
+        page = build_plan_page(design, machine.name, seed, planned, notice)
+        page.write(folder / "plan.html")
+        log.info("planned: %s", folder / "plan.html")
+        return planned
+
+    def _report(self, folder: Path) -> None:
+        from study.analysis import analyse
+        from study.report import state_verdict, write_report
+
+        data = folders.read_study(folder, self.machine)
+        found = analyse(data, self.machine, lambda trials: track_items(trials, "measuring trials"))
+        path = write_report(self.session.folder, found)
+        folders.note_report(folder, self.session.folder)
+        for remark in data.remarks:
+            log.warning("%s: %s", remark.where, remark.text)
+        log.info("%s", state_verdict(found)[0])
+        log.info("report: %s", path)
+
+    def _erase(self, folder: Path) -> None:
+        assert self.study.participant is not None
+        folders.read_study(folder)
+        with reserve_study(folder):
+            gone, reports = folders.erase(folder, self.study.participant)
+        log.info("%s erased: %d files deleted", self.study.participant, len(gone))
+        for place in reports:
+            log.warning(
+                "%s was made with this participant's data: delete it, and make it again with study.do=report",
+                place,
+            )

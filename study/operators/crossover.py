@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from actuators.person import HumanFollower
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from study.operators.hands import Hands
+from study.operators.person import Hands, Person, Range
 from study.operators.sight import Sight
-from study.operators.traits import Range, Traits
-from study.trial_contract import OperatorModel, OperatorView
 
 
 @spec
@@ -30,7 +29,7 @@ class Crossover:
         good_rad: Error with which a joint is left alone, rad or m.
     """
 
-    hands: Hands
+    hands: HumanFollower
     sight: Sight
     crossover_rad_s: Range
     anticipation: Range
@@ -38,51 +37,46 @@ class Crossover:
     creep: float
     good_rad: float
 
-    def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
-        """See `study.trial_contract.Operator`."""
-        return CrossoverModel(self, machine, persons, seed)
+    def build(self, machine: Machine, person: Person) -> CrossoverModel:
+        """See `study.operators.person.Operator`."""
+        return CrossoverModel(self, machine, person)
+
+
+@spec
+class Expert(Crossover):
+    """Simulated, unguided: reckons with all that is on its way, and so works faster than the delay lets others.
+
+    Law and fields are those of `Crossover`.
+    """
 
 
 class CrossoverModel:
-    """Such operators at work."""
+    """Such an operator at work."""
 
-    def __init__(
-        self, operator: Crossover, machine: Machine, persons: np.ndarray, seed: int
-    ) -> None:
-        traits = Traits(persons, seed)
+    def __init__(self, operator: Crossover, machine: Machine, person: Person) -> None:
         self._config, self._speed = operator, machine.max_speed
-        self._hands, self._sight = (
-            operator.hands.build(machine, persons, seed),
-            operator.sight.build(machine, persons, seed),
-        )
-        self._crossover = traits.draw("crossover_rad_s", operator.crossover_rad_s)
-        self._anticipation = traits.draw("anticipation", operator.anticipation)
+        self._hands = Hands(operator.hands, machine, person)
+        self._sight = operator.sight.build(machine, person)
+        self._crossover = person.draw("crossover_rad_s", operator.crossover_rad_s)
+        self._anticipation = person.draw("anticipation", operator.anticipation)
         self._period_s = machine.period_s
-        self._sent = np.zeros(
-            (len(persons), round(machine.dead_time_s / machine.period_s), machine.num_joints)
-        )
-        self._since = np.zeros((len(persons), machine.num_joints))
+        num_sent = round(machine.dead_time_s / machine.period_s)
+        self._sent = np.zeros((num_sent, machine.num_joints))
+        self._since = np.zeros(machine.num_joints)
 
-    def step(self, view: OperatorView) -> np.ndarray:
-        """See `study.trial_contract.OperatorModel`."""
-        coming = self._sent.sum(1) * self._period_s * self._speed
-        ahead = view.q + self._anticipation * coming
-        if self._sight.look(view, ahead):
-            self._since = ahead.copy()
-        # between two pictures the hands' own motion is felt
+    def step(self, q: np.ndarray, rim_in_base_m: np.ndarray, advice: np.ndarray) -> np.ndarray:
+        """See `study.operators.person.OperatorModel`."""
+        config = self._config
+        coming = self._sent.sum(0) * self._period_s * self._speed
+        ahead = q + self._anticipation * coming
+        if self._sight.look(ahead, rim_in_base_m):
+            self._since = ahead
+        # Between two pictures the hands' own motion is felt.
         away = self._sight.way - (ahead - self._since)
         share = np.clip(self._crossover * away / self._speed, -1.0, 1.0)
-        size = np.where(
-            np.abs(away) > self._config.good_rad, np.maximum(np.abs(share), self._config.creep), 0.0
-        )
-        given = self._hands.step(
-            np.sign(share)
-            * np.where(size > 0, self._config.band + (1.0 - self._config.band) * size, 0.0)
-        )
-        opened = (
-            np.sign(given)
-            * np.maximum(np.abs(given) - self._config.band, 0.0)
-            / (1.0 - self._config.band)
-        )
-        self._sent = np.concatenate((self._sent[:, 1:], opened[:, None]), 1)
+        size = np.maximum(np.abs(share), config.creep)
+        wanted = np.sign(share) * (config.band + (1.0 - config.band) * size)
+        given = self._hands.step(np.where(np.abs(away) > config.good_rad, wanted, 0.0))
+        opening = np.maximum(np.abs(given) - config.band, 0.0) / (1.0 - config.band)
+        self._sent = np.concatenate((self._sent[1:], (np.sign(given) * opening)[None]))
         return given

@@ -6,10 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from actuators.person import HumanFollower
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from study.operators.hands import Hands, HandsModel
-from study.trial_contract import OperatorModel, OperatorView
+from study.operators.person import Hands, Person
 
 
 @spec
@@ -20,22 +20,21 @@ class AdviceFollower:
         hands: How the levers are moved.
     """
 
-    hands: Hands
+    hands: HumanFollower
 
-    # Recordings and reports of earlier versions hold this name.
     label: ClassVar[str] = "follower"
 
-    def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
-        """See `study.trial_contract.Operator`."""
-        return AdviceFollowerModel(self.hands.build(machine, persons, seed))
+    def build(self, machine: Machine, person: Person) -> AdviceFollowerModel:
+        """See `study.operators.person.Operator`."""
+        return AdviceFollowerModel(Hands(self.hands, machine, person))
 
 
 class AdviceFollowerModel:
-    """Followers at work."""
+    """A follower at work."""
 
-    def __init__(self, hands: HandsModel) -> None:
+    def __init__(self, hands: Hands) -> None:
         self._hands = hands
 
-    def step(self, view: OperatorView) -> np.ndarray:
-        """See `study.trial_contract.OperatorModel`."""
-        return self._hands.step(np.nan_to_num(view.advice))
+    def step(self, q: np.ndarray, rim_in_base_m: np.ndarray, advice: np.ndarray) -> np.ndarray:
+        """See `study.operators.person.OperatorModel`."""
+        return self._hands.step(np.nan_to_num(advice))

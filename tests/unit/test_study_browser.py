@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import TOKEN, chromium, served
-from sitting import Arm, conductor, feed, in_trial, machine, plan
+from browser import SHOWN, TOKEN, Scripted, chromium, served
+from sitting import MACHINE, Arm, agreed, conductor, done, plan
 
 from study import tlx
 from study.conductor import Conductor
-from study.study_server import StudyFeed, StudyPages
+from study.sitting import StudyFeed, StudyPages
 
-MACHINE = machine()
 SIZE = {"width": 1280, "height": 800}
 
 
@@ -28,24 +27,26 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def lead(tmp_path: Path) -> Conductor:
-    plan(tmp_path, MACHINE)
-    return conductor(tmp_path, Arm(MACHINE))
+    plan(tmp_path)
+    return conductor(tmp_path, Arm())
 
 
 @pytest.fixture
 def asked(lead: Conductor) -> Conductor:
     """Everything before the first questionnaire is done, before a server also lets time go by."""
-    lead.choose("P01")
-    lead.take({"do": "consent", "agreed": True})
+    agreed(lead)
     for _ in range(2):
-        in_trial(lead, lead._stage)  # type: ignore[arg-type]
-        lead.take({"do": "next"})
+        done(lead, lead._stage)  # type: ignore[arg-type]
     return lead
+
+
+def open_study(lead: Conductor, port: int = 0) -> Any:
+    return served(StudyFeed(Scripted(SHOWN), lead), port=port, extensions=(StudyPages(lead),))
 
 
 @pytest.fixture
 def port(lead: Conductor) -> Iterator[int]:
-    with served(StudyFeed(feed(), lead), extensions=(StudyPages(lead),)) as found:
+    with open_study(lead) as found:
         yield found
 
 
@@ -162,7 +163,7 @@ def test_the_whole_questionnaire_by_key_in_german(
     found = answers(tmp_path)
     assert (
         list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70]
-        and tlx.compute_raw_tlx(found) == 57.5
+        and tlx.compute_scores(found)[0]["raw"] == 57.5
     )
     assert [answer["chosen"] for answer in found["pairs"]] == [
         pair[0] for pair in found["shown_pairs"]
@@ -172,7 +173,7 @@ def test_the_whole_questionnaire_by_key_in_german(
 def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
     tmp_path: Path, asked: Conductor, opened: Callable[..., Any]
 ) -> None:
-    with served(StudyFeed(feed(), asked), extensions=(StudyPages(asked),)) as port:
+    with open_study(asked) as port:
         page = opened(port)
         at(page, 0)
         page.keyboard.press("End")
@@ -184,9 +185,9 @@ def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
         at(page, 1)
         page.keyboard.press("Home")
         until(page, "() => window.sitting().ratings.physical === 0")
-    again = conductor(tmp_path, Arm(MACHINE))  # another process would know no more than this
+    again = conductor(tmp_path, Arm())  # another process would know no more than this
     again.choose("P01")
-    with served(StudyFeed(feed(), again), port=port, extensions=(StudyPages(again),)):
+    with open_study(again, port):
         until(page, "() => window.sitting().at === 2")  # the page comes back by itself
         page.locator("#study .language").click()
         until(

@@ -7,32 +7,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from browser import SHOWN, Scripted
-from sitting import FACTS, Arm, conductor, in_trial, machine, plan, saved
+from sitting import MACHINE, Arm, agreed, begun, conductor, done, plan, saved
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, StorageError
 from deploy.page.protocol import OperatorRequest
 from study import analysis, study_folder, tlx
 from study.conductor import Conductor
-from study.sitting import reserve_study
+from study.sitting import StudyFeed, reserve_study
 from study.steps import find_next_step
-from study.study_server import StudyFeed
-
-MACHINE = machine()
 
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Arm:
-    plan(tmp_path, MACHINE)
-    return Arm(MACHINE)
+    plan(tmp_path)
+    return Arm()
 
 
-def agreed(lead: Conductor, who: str = "P01") -> None:
-    lead.choose(who)
-    assert lead.take({"do": "consent", "agreed": True, "language": "de"}) == ""
+@pytest.fixture
+def lead(tmp_path: Path, arm: Arm) -> Conductor:
+    """Who leads the first participant, who has agreed."""
+    made = conductor(tmp_path, arm)
+    agreed(made)
+    return made
 
 
 def answer(lead: Conductor, value: int = 40) -> None:
@@ -47,37 +46,38 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
+def remarks(place: Path) -> str:
+    found = analysis.analyse(study_folder.read_study(place), MACHINE)
+    return "\n".join(f"{remark.where}: {remark.text}" for remark in found.data.remarks)
+
+
 def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(
-    tmp_path: Path, arm: Arm
+    tmp_path: Path, arm: Arm, lead: Conductor
 ) -> None:
-    lead, seen = conductor(tmp_path, arm), []
-    agreed(lead)
+    seen = []
     while (kind := lead.view()["kind"]) != "done":
         seen.append((kind, lead.view()["period"], lead.view()["condition"]))
         if kind == "trial":
-            in_trial(lead, arm)
-            assert lead.take({"do": "next"}) == ""
+            done(lead, arm)
         else:
             answer(lead)
-    conditions = study_folder.read_plan(tmp_path)["participants"]["P01"]
-    assert seen == [
-        (kind, period, conditions[period - 1]) for period in (1, 2) for kind in ("trial", "trial", "questionnaire")
-    ]  # fmt: skip
-    found = analysis.analyse(study_folder.read_study(tmp_path), MACHINE)
-    mine = [trial for trial in found.trials if trial.facts["participant"] == "P01"]
-    assert len(mine) == 4 and all(trial.values["success"] == 1 for trial in mine)
-    assert all(
-        trial.facts["outcome"] == "inserted" and trial.facts["twin"] is True for trial in mine
-    )
-    assert found.loads["weighted"]["guided"][0] == found.loads["raw"]["unguided"][0] == 40.0
-    # Nothing to say against it.
-    assert "P01" not in "".join(f"{remark.where}{remark.text}" for remark in found.remarks)
+    data = study_folder.read_study(tmp_path)
+    expected = []
+    for period, condition in enumerate(data.plan["participants"]["P01"], 1):
+        for kind in ("trial", "trial", "questionnaire"):
+            expected.append((kind, period, condition))
+    assert seen == expected
+    found = analysis.analyse(data, MACHINE)
+    assert found.trials.success.tolist() == [1.0] * 4
+    assert found.trials.outcome.tolist() == ["inserted"] * 4
+    assert found.means.tlx_weighted[:2].tolist() == found.means.tlx_raw[:2].tolist() == [40.0] * 2
+    assert "P01" not in remarks(tmp_path)  # nothing to say against it
     consent = read(tmp_path / "participants" / "P01.json")["consent"]
     assert consent["agreed"] and consent["language"] == "de" and consent["version"] == "v1"
-    for trial in mine:
-        columns = record.read_recording(tmp_path / trial.facts["recording"], MACHINE).extra
-        assert ("advice_q1" in columns) == (trial.facts["condition"] == "guided")
-        assert trial.facts["start_error"] == [0.0] * 5
+    for trial in data.trials.values():
+        columns = record.read_recording(tmp_path / trial["recording"], MACHINE).extra
+        assert ("advice_q1" in columns) == (trial["condition"] == "guided")
+        assert trial["start_error"] == [0.0] * 5 and trial["twin"] is True
 
 
 def test_who_does_not_agree_takes_no_part(tmp_path: Path, arm: Arm) -> None:
@@ -86,44 +86,34 @@ def test_who_does_not_agree_takes_no_part(tmp_path: Path, arm: Arm) -> None:
     assert lead.take({"do": "begin"}) != ""
     lead.take({"do": "consent", "agreed": False})
     assert lead.view()["kind"] == "stopped" and not (tmp_path / "trials").exists()
-    assert "no consent" in "".join(
-        remark.text for remark in study_folder.read_study(tmp_path).remarks
-    )
+    assert "no consent" in remarks(tmp_path)
 
 
 def test_a_trial_that_the_program_did_not_survive_is_kept_and_done_again(
-    tmp_path: Path, arm: Arm
+    tmp_path: Path, arm: Arm, lead: Conductor
 ) -> None:
-    lead = conductor(tmp_path, arm)
-    agreed(lead)
-    in_trial(lead, arm)
-    lead.take({"do": "next"})
-    lead.take({"do": "begin"})
-    arm.later(lead, 3.0)
-    assert lead.running
-    del lead  # killed: nobody says goodbye
-    again = conductor(tmp_path, Arm(MACHINE))
+    done(lead, arm)
+    begun(lead, arm)
+    # Killed: nobody says goodbye.
+    arm = Arm()
+    again = conductor(tmp_path, arm)
     again.choose("P01")
     view = again.view()
     assert (view["kind"], view["number"], view["phase"], view["done"]) == ("trial", 2, "ready", 1)
     lost = read(tmp_path / "trials" / "P01_1_02.json")
     assert lost["outcome"] == "aborted" and "interrupted" in lost["reason"]
-    in_trial(again, again._stage)  # type: ignore[arg-type]
-    again.take({"do": "next"})
+    done(again, arm)
     data = study_folder.read_study(tmp_path)
-    assert (
-        data.trials["P01", 1, 2]["outcome"] == "inserted"
-        and find_next_step(data, "P01").kind == "questionnaire"
-    )
-    assert any("aborted (interrupted" in remark.text for remark in data.remarks)
+    assert data.trials["P01", 1, 2]["outcome"] == "inserted"
+    assert find_next_step(data, "P01").kind == "questionnaire"
+    assert "aborted (interrupted" in remarks(tmp_path)
 
 
-def test_half_a_questionnaire_is_kept_said_and_gone_on_with(tmp_path: Path, arm: Arm) -> None:
-    lead = conductor(tmp_path, arm)
-    agreed(lead)
+def test_half_a_questionnaire_is_kept_said_and_gone_on_with(
+    tmp_path: Path, arm: Arm, lead: Conductor
+) -> None:
     for _ in range(2):
-        in_trial(lead, arm)
-        lead.take({"do": "next"})
+        done(lead, arm)
     lead.take({"do": "rate", "scale": "mental", "value": 35})
     lead.take({"do": "to", "to": 6})
     first = lead.view()["pairs"]
@@ -131,38 +121,26 @@ def test_half_a_questionnaire_is_kept_said_and_gone_on_with(tmp_path: Path, arm:
     again = conductor(tmp_path, arm)
     again.choose("P01")
     view = again.view()
-    assert (
-        view["ratings"] == {"mental": 35}
-        and view["pairs"] == first
-        and view["chosen"][0] == first[0][1]
-    )
+    assert view["ratings"] == {"mental": 35} and view["pairs"] == first
+    assert view["chosen"][0] == first[0][1]
     assert view["at"] == 1, "the first screen without an answer"
     for wrong in ({"value": 101}, {"value": 33}, {"value": True}, {"scale": "joy", "value": 5}, {}):
         assert again.take({"do": "rate", "scale": "effort", **wrong}) == "malformed"
     again.take({"do": "to", "to": 21})
     assert again.take({"do": "finish"}) == "" and again.view()["kind"] == "trial"
-    said = [
-        remark.text
-        for remark in analysis.analyse(study_folder.read_study(tmp_path), MACHINE).remarks
-    ]
-    assert any(
-        "physical, temporal, performance, effort, frustration not answered" in text for text in said
-    )
-    assert any("1 of 15 pairs" in text for text in said)
+    said = remarks(tmp_path)
+    assert "physical, temporal, performance, effort, frustration not answered" in said
+    assert "1 of 15 pairs" in said
 
 
-def test_who_stops_in_a_trial_is_believed_and_may_come_back(tmp_path: Path, arm: Arm) -> None:
-    lead = conductor(tmp_path, arm)
-    agreed(lead)
-    lead.take({"do": "begin"})
-    arm.later(lead, 3.0)
+def test_who_stops_in_a_trial_is_believed_and_may_come_back(
+    tmp_path: Path, arm: Arm, lead: Conductor
+) -> None:
+    begun(lead, arm)
     assert lead.take({"do": "stop_sitting", "reason": "felt unwell"}) == ""
     assert lead.view()["kind"] == "stopped" and arm.recorded is None
     assert read(tmp_path / "trials" / "P01_1_01.json")["outcome"] == "stopped"
-    assert any(
-        "stopped after 1 trials (felt unwell)" in remark.text
-        for remark in study_folder.read_study(tmp_path).remarks
-    )
+    assert "stopped after 1 trials (felt unwell)" in remarks(tmp_path)
     lead.take({"do": "go_on"})
     assert (lead.view()["kind"], lead.view()["number"]) == ("trial", 2)
 
@@ -171,26 +149,22 @@ def test_who_stops_in_a_trial_is_believed_and_may_come_back(tmp_path: Path, arm:
     ("happens", "outcome", "reason"),
     [
         ("late", "time limit", ""),
-        ("button", "stopped", ""),
-        ("fault", "aborted", "experimenter"),
+        ("stop_trial", "stopped", ""),
+        ("abort", "aborted", "experimenter"),
         ("silence", "aborted", "positions"),
     ],
 )
 def test_how_a_trial_can_end(
-    tmp_path: Path, arm: Arm, happens: str, outcome: str, reason: str
+    tmp_path: Path, arm: Arm, lead: Conductor, happens: str, outcome: str, reason: str
 ) -> None:
-    lead = conductor(tmp_path, arm)
-    agreed(lead)
-    lead.take({"do": "begin"})
-    arm.later(lead, 2.0)
+    begun(lead, arm)
     if happens == "late":
         arm.later(lead, 20.0)
     elif happens == "silence":
         arm.q = None
         arm.later(lead, 1.5)
     else:
-        assert lead.take({"do": {"button": "stop_trial", "fault": "abort"}[happens]}) == ""
-    arm.later(lead, 1.0)
+        assert lead.take({"do": happens}) == ""
     saved(lead, arm)
     told = read(tmp_path / "trials" / "P01_1_01.json")
     assert told["outcome"] == outcome and reason in told["reason"]
@@ -199,70 +173,55 @@ def test_how_a_trial_can_end(
 
 
 def test_a_recording_that_cannot_be_used_is_said_and_the_outcome_kept(
-    tmp_path: Path, arm: Arm
+    tmp_path: Path, arm: Arm, lead: Conductor
 ) -> None:
-    lead, arm.fails = conductor(tmp_path, arm), "a gap of 3 s"
-    agreed(lead)
-    in_trial(lead, arm)
+    arm.fails = "a gap of 3 s"
+    done(lead, arm)
     told = read(tmp_path / "trials" / "P01_1_01.json")
-    assert (
-        told["outcome"] == "inserted"
-        and told["recording_problem"] == "a gap of 3 s"
-        and "recording" not in told
-    )
+    assert told["outcome"] == "inserted" and "recording" not in told
+    assert "its recording cannot be used (a gap of 3 s)" in remarks(tmp_path)
 
 
 def test_practice_ends_with_two_successes_in_a_row_or_when_it_is_said(tmp_path: Path) -> None:
-    plan(tmp_path, MACHINE, practice=4)
-    arm = Arm(MACHINE)
+    plan(tmp_path, practice=4)
+    arm = Arm()
     lead = conductor(tmp_path, arm)
     agreed(lead)
     for _ in range(2):
         assert lead.view()["period"] == 0
-        in_trial(lead, arm)
-        lead.take({"do": "next"})
+        done(lead, arm)
     assert lead.view()["period"] == 1
     agreed(lead, "P02")
     assert lead.view()["period"] == 0
     lead.take({"do": "end_practice"})
-    assert (
-        lead.view()["period"] == 1
-        and read(tmp_path / "participants" / "P02.json")["consent"]["agreed"]
-    )
+    assert lead.view()["period"] == 1
+    assert read(tmp_path / "participants" / "P02.json")["consent"]["agreed"]
 
 
-def test_advice_leaves_the_loop_in_guided_trials_alone(tmp_path: Path, arm: Arm) -> None:
-    lead, inner = conductor(tmp_path, arm), Scripted(replace(SHOWN, guiding=False))
-    feed = StudyFeed(inner, lead)
-    agreed(lead)
-    while lead.view()["kind"] == "trial":
-        condition = lead.view()["condition"]
+def test_advice_leaves_the_loop_in_guided_trials_alone(arm: Arm, lead: Conductor) -> None:
+    inner = Scripted(replace(SHOWN, guiding=False))
+    feed, conditions = StudyFeed(inner, lead), set()
+    while lead.view()["kind"] != "done":
+        if lead.view()["kind"] == "questionnaire":
+            answer(lead)
+            continue
+        is_guided = lead.view()["condition"] == "guided"
+        conditions.add(is_guided)
         assert feed.read_state().advice is None and feed.read_state().path_in_base_m == ()
-        lead.take({"do": "begin"})
-        arm.later(lead, 2.0)
-        assert (
-            (feed.read_state().advice is not None)
-            == feed.read_state().guiding
-            == (condition == "guided")
-        )
-        assert (
-            not feed.submit(OperatorRequest("record", "off"))
-            and not feed.submit(OperatorRequest("start", ""))
-            and inner.requests == []
-        )
+        begun(lead, arm)
+        assert (feed.read_state().advice is not None) == feed.read_state().guiding == is_guided
+        assert not feed.submit(OperatorRequest("record", "off"))
+        assert not feed.submit(OperatorRequest("start", "")) and inner.requests == []
         assert feed.submit(OperatorRequest("stop", "")) and not lead.running
-        arm.later(lead, 1.0)
         saved(lead, arm)
         lead.take({"do": "next"})
+    assert conditions == {True, False}
 
 
 def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(
-    tmp_path: Path, arm: Arm, monkeypatch: pytest.MonkeyPatch
+    arm: Arm, lead: Conductor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lead = conductor(tmp_path, arm)
-    agreed(lead)
-    lead.take({"do": "begin"})
-    arm.later(lead, 2.0)
+    begun(lead, arm)
 
     def full(*_: Any) -> None:
         raise StorageError("cannot write: No space left on device")
@@ -271,26 +230,18 @@ def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(
         patch.setattr(study_folder, "write_json", full)
         arm.q = MACHINE.home
         arm.later(lead, 0.2)
-        assert (
-            lead.view()["kind"] == "choose"
-            and "No space left" in lead.view()["problem"]
-            and arm.recorded is None
-        )
+        assert lead.view()["kind"] == "choose" and arm.recorded is None
+        assert "No space left" in lead.view()["problem"]
     lead.take({"do": "choose", "who": "P01"})
-    assert (lead.view()["kind"], lead.view()["number"], lead.view()["problem"]) == (
-        "trial",
-        1,
-        "",
-    ), "it is done again"
+    assert (lead.view()["kind"], lead.view()["number"], lead.view()["problem"]) == ("trial", 1, "")
 
 
 def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     lead = conductor(tmp_path, arm)
     with pytest.raises(ConfigError, match="no participant of the plan"):
         lead.choose("Jane")
-    assert (
-        lead.take({"do": "choose", "who": "Jane"}) == "failed" and "Jane" in lead.view()["problem"]
-    )
+    assert lead.take({"do": "choose", "who": "Jane"}) == "failed"
+    assert "Jane" in lead.view()["problem"]
     assert lead.take({"do": "begin"}) == "nobody" and lead.take({}) == "nobody"
     agreed(lead)
     (tmp_path / "captures" / "P01_1_01").mkdir(parents=True)
@@ -298,23 +249,20 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     study_folder.erase(tmp_path, "P01")
     assert not list(tmp_path.rglob("P01*"))
     assert conductor(tmp_path, arm).view()["participants"][0]["state"] == "erased"
-    assert np.all([FACTS["twin"], not FACTS["simulated"]])
 
 
 def test_a_recording_that_an_interruption_left_unsaved_is_made_the_next_time(
-    tmp_path: Path, arm: Arm
+    tmp_path: Path, arm: Arm, lead: Conductor
 ) -> None:
-    lead = conductor(tmp_path, arm)
-    agreed(lead)
-    in_trial(lead, arm)
+    done(lead, arm)
     path = tmp_path / "trials" / "P01_1_01.json"
     told = read(path)
     path.write_text(json.dumps({key: value for key, value in told.items() if key != "recording"}))
     (tmp_path / told["recording"]).unlink()
-    conductor(tmp_path, Arm(MACHINE))
+    conductor(tmp_path, Arm())
     assert read(path) == told and (tmp_path / told["recording"]).exists()
     (path.parent / "P02_1_01.json").write_text("{half")
-    assert conductor(tmp_path, Arm(MACHINE)).view()["kind"] == "choose"
+    assert conductor(tmp_path, Arm()).view()["kind"] == "choose"
 
 
 def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None:

@@ -1,0 +1,126 @@
+"""The pictures of a study: the paper's two (tool paths, radar), and each person.
+
+Guided is always blue and solid, unguided orange and dotted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, make_figure, remove_frame
+from brokk_rl.statistics import compute_student_interval
+from study import tlx
+from study.analysis import TITLES, Analysis
+from study.design import CONDITIONS
+
+LOOK = {"guided": (BLUE, "-"), "unguided": (ORANGE, ":")}
+COLUMNS = 3
+"""Panels beside each other."""
+
+
+def draw_paths(found: Analysis) -> Figure:
+    """Draw the tool's paths from above and from the side, a column a hole; a star is where a trial begins, a dot the hole."""
+    holes = found.data.design.holes
+    drawn = found.trials[found.trials.counts.astype(bool) & found.trials.hole.isin(list(holes))]
+    figure = make_figure(3.6 * len(holes), 6.8)
+    panels = figure.subplots(2, len(holes), squeeze=False)
+    for column, (name, hole) in enumerate(holes.items()):
+        paths = drawn[drawn.hole == name]
+        above, beside = panels[:, column]
+        for axis, project in ((above, _project_above), (beside, _project_beside)):
+            for _, trial in paths.iterrows():
+                colour, line = LOOK[trial.condition]
+                path = project(trial.tip_in_base_m)
+                axis.plot(*path.T, line, color=colour, linewidth=0.9, alpha=0.75)
+                axis.plot(*path[:1].T, "*", color=colour, markersize=8)
+            center = project(np.array([hole.center_in_base_m]))
+            axis.plot(*center.T, "o", color="black", markersize=9)
+            axis.set_aspect("equal", adjustable="datalim")
+            remove_frame(axis)
+        above.set(title=f"hole {name}, from above", xlabel="x, m")
+        beside.set(title=f"hole {name}, from the side", xlabel="distance from the slew axis, m")
+    panels[0, 0].set_ylabel("y, m")
+    panels[1, 0].set_ylabel("height, m")
+    for condition, (colour, line) in LOOK.items():
+        # An empty line gives the legend its entry, however many trials there are.
+        panels[0, 0].plot([], [], line, color=colour, label=condition)
+    add_legend(figure, panels[0, 0])
+    return figure
+
+
+def _project_above(tip_in_base_m: np.ndarray) -> np.ndarray:
+    return tip_in_base_m[:, :2]
+
+
+def _project_beside(tip_in_base_m: np.ndarray) -> np.ndarray:
+    distance_m = np.hypot(tip_in_base_m[:, 0], tip_in_base_m[:, 1])
+    return np.stack((distance_m, tip_in_base_m[:, 2]), 1)
+
+
+def draw_radar(found: Analysis) -> Figure:
+    """Draw the mean of each NASA-TLX scale, with and without guidance, with Student's intervals."""
+    figure = make_figure(6.2, 5.6)
+    axis = figure.add_subplot(projection="polar")
+    angles = np.linspace(0, 2 * math.pi, len(tlx.SCALES), endpoint=False)
+    # The two conditions are drawn slightly apart, so that their intervals do not hide each other.
+    for shift, condition in zip((-0.02, 0.02), CONDITIONS, strict=True):
+        mine = found.means[found.means.condition == condition]
+        colour, line = LOOK[condition]
+        means = [mine[f"tlx_{scale}"].mean() for scale in tlx.SCALES]
+        # Closed by repeating the first point.
+        axis.plot(
+            np.append(angles, angles[0]) + shift, [*means, means[0]], line, color=colour,
+            label=condition, linewidth=2,
+        )  # fmt: skip
+        for angle, scale in zip(angles, tlx.SCALES, strict=True):
+            _draw_mean(axis, angle + shift, mine[f"tlx_{scale}"], colour)
+    titles = [title.replace(" (", "\n(") for title in tlx.SCALES.values()]
+    axis.set_xticks(angles, titles, fontsize=9)
+    axis.tick_params(axis="x", pad=16)
+    # The full scale, so that small differences look small.
+    axis.set_ylim(0, 100)
+    axis.set_yticks([20, 40, 60, 80], ["20", "40", "60", "80"], fontsize=7, color=GREY)
+    add_legend(figure, axis)
+    return figure
+
+
+def draw_pairs(found: Analysis, names: Sequence[str]) -> Figure:
+    """Draw one line a participant from unguided to guided, a panel a measure; means with intervals beside."""
+    rows = -(-len(names) // COLUMNS)
+    figure = make_figure(3.6 * COLUMNS, 2.9 * rows + 0.5)
+    is_guided_first = (found.means.condition == "guided") == (found.means.period == 1)
+    for number, name in enumerate(names, 1):
+        axis = figure.add_subplot(rows, COLUMNS, number)
+        for first, colour, label in ((True, GREEN, "guided first"), (False, RED, "unguided first")):
+            wide = found.means[is_guided_first == first].pivot(
+                index="condition", columns="participant", values=name
+            )
+            lines = wide.reindex(["unguided", "guided"]).to_numpy(float)
+            axis.plot([0, 1], lines, "-o", color=colour, markersize=3, linewidth=0.9, alpha=0.7)
+            axis.plot([], [], "-o", color=colour, markersize=3, label=label)
+        for place, condition in ((-0.15, "unguided"), (1.15, "guided")):
+            _draw_mean(axis, place, found.means[name][found.means.condition == condition], "black")
+        axis.set_xticks([0, 1], ["unguided", "guided"])
+        axis.set_xlim(-0.35, 1.35)
+        p = found.effects[name].p
+        axis.set_title(TITLES[name] + ("" if p is None else f"\np = {p:.2g}"), fontsize=9)
+        remove_frame(axis)
+    add_legend(figure, figure.axes[0])
+    return figure
+
+
+def _draw_mean(axis: Axes, place: float, values: pd.Series, colour: str) -> None:
+    """Draw a mean with Student's interval; nothing for no values, no interval for one."""
+    known = values.dropna().tolist()
+    if known:
+        low, high = compute_student_interval(known) or (known[0], known[0])
+        half = (high - low) / 2
+        axis.errorbar(
+            [place], [np.mean(known)], half, fmt="s", color=colour, markersize=4, capsize=3
+        )
