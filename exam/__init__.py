@@ -3,7 +3,6 @@
 case_distribution  kinds, effects, joints, sizes of cases; the protocol of a plant family
 generate           plans and recordings of reference and field
 dataset            cases on disk, labels, seal
-held_out           a make of plants for sealed exams only
 run_cases          one process a case
 examiner           the repair of an answer, simulated on withheld recordings
 score              one answer against one label

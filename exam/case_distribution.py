@@ -59,11 +59,6 @@ class PlantFamily(Protocol):
     """A spec in `conf/exam_plants`: machines of many makes, written apart from the library."""
 
     @property
-    def is_held_out(self) -> bool:
-        """True if only sealed exams may draw from it."""
-        ...
-
-    @property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects that its plants can have."""
         ...

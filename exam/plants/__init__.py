@@ -1,17 +1,24 @@
 """Plants of an exam, written apart from the library's models; some share the textbook equation.
 
-plant_parameters         parameters of one machine, drawn from a seed, nuisances included
-electronics              command frames on the bus; encoders and tracker
-valve                    pilot, spool, metering land
-power_stages             from opening to speed, three makes
-linkage                  elastic boom, play, weight, tool
-changes                  table of effects as changes of numbers
-family                   bases of a link to runs, and of a family of plants
-faults                   effects of the library as changes of the parameters
-out_of_library_faults    faults that the library has no name for
-plant                    all parts at work in N runs side by side
+changes            table of effects as changes of numbers
+family             bases of a link to runs, and of a family of plants
+electronics        command frames on the bus, losses in bursts, encoders
+linkage            weight of an arm, tool point
+valve_parameters   one machine with valves, drawn from a seed; effects as changes of its parameters
+hydraulics         pilot pressure, spool, notches, compensators, load-sensing pump, cylinders on a linkage
+valve_causes       causes outside the library
+valve_arm          all parts at work in N runs side by side; the plant family
+servo_…            the same for tabletop arms of position servos in MuJoCo C
 
-Numpy only. The plants share no code with `actuators.effects`, `actuators.models.hydraulic` or any
-fitted model, so that a right answer does not rest on an identical implementation. Axes: `N` runs,
-`J` joints.
+The plants share no code with `actuators.effects`, `actuators.models.hydraulic` or any fitted model, so
+that a right answer does not rest on an identical implementation. Axes: `N` runs, `J` joints.
+
+Sources of the hydraulics:
+Merritt, Hydraulic Control Systems (1967): orifices and leakage (ch. 3), flow forces and spools
+(ch. 5), chambers and valve-controlled actuators (ch. 6).
+Jelali and Kroll, Hydraulic Servo-systems (2003): cylinders, friction, load-sensing supply (ch. 2
+to 4).
+Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994) 1083: static friction.
+Gilbert, Bell System Technical Journal 39 (1960) 1253: losses in bursts.
+Figures of the ranges are chosen by hand for arms of about a tonne.
 """

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from brokk_rl.errors import ConfigError, list_choices
-from exam.plants.plant_parameters import PlantParameters
 
+PlantParameters = dict[str, np.ndarray]
+"""Numbers of a machine by name, `(J,)` each, or `(N, J)` of several side by side."""
 FaultSizes = Mapping[str, np.ndarray]
 """Numbers of an effect by name, `(J,)`, at the value that changes nothing where a joint lacks it."""
 Row = tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray], str]

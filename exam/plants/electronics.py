@@ -1,13 +1,19 @@
-"""Electronics of the plants: command frames on the bus, encoders, and the tracker of the tool."""
+"""Electronics of the plants: command frames on the bus, losses in bursts, encoders."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from exam.plants.plant_parameters import PlantParameters
+from exam.plants.changes import PlantParameters
 
 NUM_FRAMES = 64
 """Frames on their way: 3.2 s at 20 Hz, more than any delay."""
+BURST_FRAMES = 1.8
+"""Mean length of a burst of lost frames; chosen by hand, as of a fading radio link."""
+NUM_MOTIONS = 4096
+"""Motions of a run for which the rest of a compensator is drawn; then they repeat."""
+QUANTISER_BAND = 0.6
+"""Steps that a position must leave its reading by before that changes: 0.5 without hysteresis."""
 
 
 class CommandBus:
@@ -53,29 +59,68 @@ class CommandBus:
         return np.take_along_axis(self._u, (self._seen % NUM_FRAMES)[None], 0)[0]
 
 
-class Encoders:
+class RunChance:
+    """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours.
+
+    Attributes:
+        lost: Whether the frame of each period is lost, `(T,)`.
+        queue: Delay of each frame over the mean delay of the queue, `(T,)`.
+        noise: Noise of the encoders over its standard deviation, `(T, J)`.
+        luck: Uniform numbers, `(T,)`.
+        tool: Normal numbers of the tracker, `(T, 4)`.
+        settling: Where compensators come to rest, normal, `(M, J)`.
+        phase: Uniform.
+    """
+
+    def __init__(self, seed: int, one: PlantParameters, steps: int) -> None:
+        generator = np.random.default_rng([seed, 7])
+        count = len(one["loss"])
+        self.lost = draw_bursts(generator.random(steps + 1), float(one["loss"].max()))
+        # waiting times of a queue are exponential; a frame older than three means is dropped
+        self.queue = np.minimum(generator.exponential(1.0, steps + 1), 3.0)
+        shape = (steps + 1, count)
+        # of a Laplace distribution the variance is twice the squared scale
+        self.noise = generator.laplace(0.0, np.sqrt(0.5), shape).astype(np.float32)
+        self.luck = generator.random(steps + 1)
+        self.tool = generator.standard_normal((steps + 1, 4)).astype(np.float32)
+        self.settling = generator.standard_normal((NUM_MOTIONS, count)).astype(np.float32)
+        self.phase = float(generator.random())
+
+
+def draw_bursts(luck: np.ndarray, share: float) -> np.ndarray:
+    """Return which frames a two-state channel loses, `(T,)` bool: `share` of them in the long run.
+
+    A burst ends with the chance `1 / BURST_FRAMES` a frame (Gilbert 1960).
+    """
+    ends = 1.0 / BURST_FRAMES
+    begins = min(ends * share / max(1.0 - share, 1e-9), 1.0)
+    lost, is_bad = np.zeros(len(luck), dtype=bool), False
+    for k, chance in enumerate(luck.tolist()):
+        is_bad = chance >= ends if is_bad else chance < begins
+        lost[k] = is_bad
+    return lost
+
+
+class SteppedEncoders:
     """Positions as they are logged.
 
     Args:
         numbers: The machine's, `(N, J)`.
-        period_s: Control period.
     """
 
-    def __init__(self, numbers: PlantParameters, period_s: float) -> None:
+    def __init__(self, numbers: PlantParameters) -> None:
         self._n = numbers
-        self._part = numbers["stamp_s"] / period_s
         self._sigma = np.hypot(numbers["noise_rad"], numbers["extra_noise_rad"])
         self._step = np.maximum(numbers["step_rad"], 1e-9)
+        self._count: np.ndarray | None = None
 
-    def read(self, now: np.ndarray, before: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the readings with the present time stamp.
-
-        Args:
-            now: Positions that the encoders are at, `(N, J)`.
-            before: Those one period ago: a late stamp shows some of them.
-            noise: Normal random numbers, `(N, J)`.
-        """
+    def read(self, q: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the readings at positions `q` with unit noise, both `(N, J)`."""
         n = self._n
-        late = now + self._part * (before - now)
-        shown = n["scale"] * late + n["bias_rad"] + self._sigma * noise
-        return np.where(n["step_rad"] > 0, (np.floor(shown / self._step) + 0.5) * self._step, shown)
+        shown = n["scale"] * q + n["bias_rad"] + self._sigma * noise
+        nearest = np.round(shown / self._step)
+        if self._count is None:
+            self._count = nearest
+        keeps = np.abs(shown / self._step - self._count) < QUANTISER_BAND
+        self._count = np.where(keeps, self._count, nearest)
+        return np.where(n["step_rad"] > 0, self._count * self._step, shown)

@@ -11,9 +11,8 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import JointState
 from exam.case_distribution import PlantRun
-from exam.plants.changes import Change
+from exam.plants.changes import Change, PlantParameters
 from exam.plants.linkage import Arm
-from exam.plants.plant_parameters import PlantParameters
 
 TRACKER_SPREAD = (0.0015, 0.0015, 0.0015, 0.001)
 """Standard deviation of the measured tool point, m, and of its pitch, rad; chosen by hand."""
@@ -86,7 +85,6 @@ class DrawnPlants:
     """Base of plant families: each machine is drawn from its seed; see `PlantFamily`."""
 
     roughness: dict[str, float]
-    is_held_out: ClassVar[bool] = False
     outside_not_on: dict[str, tuple[str, ...]]
     table: ClassVar[Mapping[str, Change]]
     causes: ClassVar[tuple[str, ...]]

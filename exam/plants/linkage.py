@@ -1,4 +1,4 @@
-"""The linkage of the plants: elastic boom, play in the pins, weight of the arm, tool point.
+"""Geometry of the plants: weight of the arm, and its tool point.
 
 All arrays begin with `N` runs. Each run has a base that may stand tilted and links that may differ
 from the drawing.
@@ -9,45 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Body, Machine
-from exam.plants.plant_parameters import RAD_PER_CYCLE, PlantParameters
+from exam.plants.changes import PlantParameters
 
 GRAVITY_M_S2 = 9.81
 """Gravity, m/s²: standard gravity (9.80665), rounded."""
-RIGID_S = 0.05
-"""Period of oscillation up to which a boom counts as rigid, s: a control period of 20 Hz."""
-HARDENS_AT = 0.05
-"""Deflection in rad (m) at which the spring of the boom is twice as stiff as at rest; chosen by
-hand."""
-
-
-class Boom:
-    """The joint behind the actuator: a hardening spring where it is soft, then play.
-
-    Args:
-        numbers: `soft_s`, `soft_damping`, `gap_rad`, `(N, J)`.
-        q: Where the joints are, `(N, J)`.
-        elastic: Whether a soft joint bends here, `(N, 1)`; a make with chambers is soft in its oil.
-    """
-
-    def __init__(self, numbers: PlantParameters, q: np.ndarray, elastic: np.ndarray) -> None:
-        soft_s = np.where(elastic, numbers["soft_s"], 0.0)
-        self._soft, self._omega = soft_s > RIGID_S, RAD_PER_CYCLE / np.maximum(soft_s, 1e-6)
-        self._fade = 2.0 * numbers["soft_damping"] * self._omega
-        self._half = 0.5 * numbers["gap_rad"]
-        self._bent, self._rate, self._q = q.copy(), np.zeros_like(q), q.copy()
-
-    def step(self, q: np.ndarray, speed: np.ndarray, dt_s: float) -> np.ndarray:
-        """Return the positions of the links, `(N, J)`, for actuators at `q` with `speed`."""
-        if self._soft.any():
-            bend = q - self._bent
-            pull = self._omega**2 * bend * (1.0 + (bend / HARDENS_AT) ** 2) + self._fade * (
-                speed - self._rate
-            )
-            self._rate = np.where(self._soft, self._rate + dt_s * pull, 0.0)
-            self._bent = np.where(self._soft, self._bent + dt_s * self._rate, q)
-            q = self._bent
-        self._q = np.clip(self._q, q - self._half, q + self._half)
-        return self._q
 
 
 class Arm:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.plant_parameters import PlantParameters
+from exam.plants.changes import PlantParameters
 
 STEP_S = 0.002
 """Time step, s; that of `so101_arm.xml`."""

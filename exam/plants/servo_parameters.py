@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.changes import Change, FaultSizes, apply_changes
-from exam.plants.faults import FAULTS as VALVE_FAULTS
-from exam.plants.plant_parameters import PlantParameters
+from exam.plants.changes import Change, FaultSizes, PlantParameters, apply_changes
+from exam.plants.valve_parameters import CHANGES as VALVE_CHANGES
 
 MAKES = ("bristle", "dry")
 """Friction of a make: bristles that bend before they slip (LuGre), or dry friction of MuJoCo with a
@@ -100,7 +99,7 @@ LIKE_VALVES = ("dead_time", "delay_jitter", "frame_loss", "rate_limit", "sensor_
 """Effects that change the same parameters as on a valve: of the bus, of the slope of targets, of
 readings."""
 FAULTS: dict[str, Change] = {
-    **{name: VALVE_FAULTS[name] for name in LIKE_VALVES},
+    **{name: VALVE_CHANGES[name] for name in LIKE_VALVES},
     "lag": _add_lag,
     "backlash": _add_backlash,
     "sag": _add_sag,

@@ -21,9 +21,9 @@ from brokk_rl.spec import spec
 from diagnosis.mjcf.plant import MjcfPlant
 from exam.case_distribution import PlantRun
 from exam.plants import servo_parameters
+from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus
 from exam.plants.family import DrawnPlants, PlantLink
-from exam.plants.plant_parameters import PlantParameters
 from exam.plants.servo_causes import CAUSES, ServoCauses
 from exam.plants.servo_drive import FRICTIONS, STEP_S, Friction, PositionLoop, TargetFilter
 

@@ -1,234 +1,231 @@
-"""Plants of an exam: each fault does what its numbers say, by other means than the library's."""
+"""Plants of an exam with valves: physics worked by hand, effects as their numbers say, causes that show."""
 
 from __future__ import annotations
-
-from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 import torch
 from composed import option
 
+from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from exam.case_distribution import PlantRun, UnknownFault
-from exam.plants import out_of_library_faults
-from exam.plants.electronics import CommandBus
-from exam.plants.faults import FAULTS, apply_faults
+from exam.plants import valve_causes, valve_parameters
+from exam.plants.changes import PlantParameters
+from exam.plants.electronics import CommandBus, SteppedEncoders, draw_bursts
 from exam.plants.linkage import Arm
-from exam.plants.plant import ExamPlant
-from exam.plants.plant_parameters import MAKES, PlantParameters, draw_plant
-from exam.plants.valve import SpoolValve
+from exam.plants.valve_arm import SensingArm
+from exam.plants.valve_parameters import change_machine, draw_machine
 
-Q3 = 2
+Q1, Q3, Q4 = 0, 2, 3
 
 
-def clean(machine: Machine, make: str) -> PlantParameters:
-    """A machine of this make without nuisances, noise or lever arms, so that numbers can be worked by hand."""
-    numbers = next(
-        found for seed in range(100) if (found := draw_plant(machine, seed, 0.0))[0] == make
-    )[1]
+def clean(machine: Machine) -> PlantParameters:
+    """A machine without nuisances, noise or change of lever, so that numbers can be worked by hand."""
+    numbers = draw_machine(machine, 5, 0.0)
     for name, value in {
-        "noise_rad": 0.0,
-        "lever": 0.0,
-        "notch": 0.0,
-        "speed_scale": 1.0,
-        "retract_ratio": 1.0,
-    }.items():
-        numbers[name] = np.full(machine.num_joints, value)
-    for name, value in {
-        "overlap_extend": 0.1,
-        "overlap_retract": 0.1,
-        "demand": 0.2,
-        "sensitivity": 0.0,
-        "transport_s": 0.4,
-    }.items():
+        "noise_rad": 0.0, "overlap_extend": 0.1, "overlap_retract": 0.1, "notch": 0.2, "flow_force": 0.0,
+        "extend": 1.0, "retract": 1.0, "linkage_rad": 1.57, "demand": 0.2, "transport_s": 0.4,
+        "coulomb": 0.02, "pin": 0.0,
+    }.items():  # fmt: skip
         numbers[name] = np.full(machine.num_joints, value)
     return numbers
 
 
-def size(machine: Machine, none: float, value: float) -> np.ndarray:
-    return np.where(np.arange(machine.num_joints) == Q3, value, none)
-
-
 def played(
     machine: Machine,
-    make: str,
     runs: list[tuple[PlantParameters, np.ndarray]],
-    outside_faults: Sequence[str | None] | None = None,
+    kinds: list[str | None] | None = None,
+    elapsed_s: float = 900.0,
 ) -> np.ndarray:
-    """Returns the positions of several machines of one make side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
-    numbers, commands = [numbers for numbers, _ in runs], np.stack([u for _, u in runs], 1)
-    count = len(runs)
-    made = []
-    for kind in outside_faults or [None] * count:
-        fault = None if kind is None else UnknownFault(kind, np.ones(machine.num_joints))
-        made.append(PlantRun(0, "mild", 0, 900.0, outside_fault=fault))
-    plant = ExamPlant(machine, make, numbers, made, len(commands))
+    """Positions of machines side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
+    steps, made = len(runs[0][1]), []
+    for kind in kinds or [None] * len(runs):
+        cause = None if kind is None else UnknownFault(kind, np.ones(machine.num_joints))
+        made.append(PlantRun(0, "mild", 0, elapsed_s, outside_fault=cause))
+    plant = SensingArm(machine, "sensing", [numbers for numbers, _ in runs], made, steps)
     path = [plant.read().q]
-    for u in commands:
-        plant.send(Command(u))
+    for k in range(steps):
+        plant.send(Command(np.stack([u[k] for _, u in runs])))
         path.append(plant.read().q)
     return np.array(path)
 
 
-def step(machine: Machine, level: float, steps: int = 50, joint: int = Q3) -> np.ndarray:
+def push(machine: Machine, level: float, steps: int = 50, joint: int = Q3) -> np.ndarray:
     u = np.zeros((steps, machine.num_joints))
     u[:, joint] = level
     return u
 
 
-def speeds(
-    machine: Machine, make: str, runs: list[tuple[PlantParameters, float]], joint: int = Q3
-) -> np.ndarray:
-    """Steady speeds at commands, of `max_speed`."""
-    q = played(
-        machine, make, [(numbers, step(machine, level, joint=joint)) for numbers, level in runs]
-    )[:, :, joint]
-    return (q[50] - q[40]) / (10 * machine.period_s) / machine.max_speed[joint]
+def on_q3(machine: Machine, none: float, value: float) -> np.ndarray:
+    return np.where(np.arange(machine.num_joints) == Q3, value, none)
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_a_clean_machine_goes_at_full_speed_and_in_proportion_beyond_its_overlap(
-    machine: Machine, make: str
-) -> None:
-    numbers = clean(machine, make)
-    found = speeds(machine, make, [(numbers, level) for level in (1.0, -1.0, 0.55, 0.08)])
-    assert found == pytest.approx([1.0, -1.0, 0.5, 0.0], abs=0.05)
-    assert abs(found[3]) < 0.01
+def find_speeds(machine: Machine, runs: list[tuple[PlantParameters, float]]) -> np.ndarray:
+    """Steady speeds of q3, of full speed."""
+    q = played(machine, [(numbers, push(machine, level)) for numbers, level in runs])[:, :, Q3]
+    return (q[50] - q[40]) / (10 * machine.period_s) / machine.max_speed[Q3]
 
 
-ONE_SIDED = {"extend_gain": (1.0, 0.7), "retract_gain": (1.0, 1.0)}
-STEADY = (
-    # opens at 0.1 + 0.9 * 0.2 = 0.28
-    ("dead_band", {"extend": (0.0, 0.2), "retract": (0.0, 0.0)}, 0.64, 0.5),
-    ("flow_gain", {"gain": (1.0, 0.8)}, 1.0, 0.8),
-    ("asymmetry", ONE_SIDED, 1.0, 0.7),
-    ("asymmetry", ONE_SIDED, -1.0, -1.0),
-    # (0.55 - 0.1) / 0.9
-    ("saturation", {"level": (1.0, 0.55)}, 1.0, 0.5),
-    ("thermal_drift", {"change": (0.0, 0.3), "time_s": (1.0, 1.0)}, 1.0, 1.3),
-    ("encoder_scale", {"scale": (1.0, 1.1)}, 1.0, 1.1),
-)
-"""Effects, their sizes, the command, and the steady speed with them, of full speed."""
+def test_a_clean_machine_goes_at_full_speed_and_by_its_notches_below(machine: Machine) -> None:
+    found = find_speeds(machine, [(clean(machine), u) for u in (1.0, -1.0, 0.55, 0.19, 0.08)])
+    # opening 0.5 of 0.9: (2 * 0.5 - 0.2) / 1.8; opening 0.1, in the notches: 0.01 / (0.2 * 1.8)
+    assert found == pytest.approx([1.0, -1.0, 0.444, 0.028, 0.0], abs=0.035)
+    assert abs(found[4]) < 0.002
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_a_fault_changes_the_steady_speed_of_its_joint_as_it_says(
-    machine: Machine, make: str
-) -> None:
-    well = clean(machine, make)
-    ill = []
-    for effect, sizes, level, _ in STEADY:
-        fault = {name: size(machine, *pair) for name, pair in sizes.items()}
-        ill.append((apply_faults(well, {effect: fault}), level))
-    found, full, others = (
-        speeds(machine, make, *runs) for runs in ((ill,), ([(well, 1.0)],), (ill, 3))
-    )
-    assert found / full == pytest.approx([steady for *_, steady in STEADY], abs=0.05)
-    there = speeds(machine, make, [(well, level) for _, level in ill], 3)
-    assert others == pytest.approx(there, abs=0.01)
+STEADY = {
+    "dead_band": ({"extend": (0.0, 0.2), "retract": (0.0, 0.0)}, 0.64, 0.5),  # (0.64 - 0.28) / 0.72 = 0.5 open
+    "flow_gain": ({"gain": (1.0, 0.8)}, 1.0, 0.8),
+    "asymmetry": ({"extend_gain": (1.0, 0.7), "retract_gain": (1.0, 1.0)}, 1.0, 0.7),
+    "saturation": ({"level": (1.0, 0.55)}, 1.0, 0.5),  # 0.5 open
+    "thermal_drift": ({"change": (0.0, 0.3), "time_s": (1.0, 1.0)}, 1.0, 1.3),
+    "encoder_scale": ({"scale": (1.0, 1.1)}, 1.0, 1.1),
+}  # fmt: skip
+"""Sizes, the command, and the opening or the factor on the speed that they leave."""
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine, make: str) -> None:
-    well = clean(machine, make)
-    # a filter of time constant T keeps the overlap (0.1) closed for T ln(1 / 0.9) and then costs T;
-    # a ramp of 0.5 s costs 0.05 s before the land opens and half of 0.45 s after it, of which the
-    # spool's own 0.04 to 0.08 s are
-    # not lost twice
-    late = {
-        "dead_time": ("dead_time_s", 0.08, 0.08),
-        "lag": ("time_constant_s", 0.1, 0.11),
-        "rate_limit": ("stroke_s", 0.5, 0.215),
-    }
-    runs = [well] + [
-        apply_faults(well, {effect: {name: size(machine, 0.0, value)}})
-        for effect, (name, value, _) in late.items()
-    ]
-    q = played(machine, make, [(numbers, step(machine, 1.0)) for numbers in runs])[:, :, Q3]
+def test_an_effect_changes_the_steady_speed_as_its_number_says(machine: Machine) -> None:
+    well, runs, expected = clean(machine), [], []
+    for effect, (sizes, level, value) in STEADY.items():
+        numbers = {name: on_q3(machine, *pair) for name, pair in sizes.items()}
+        runs.append((change_machine(well, {effect: numbers}), level))
+        by_area = effect in ("dead_band", "saturation")
+        expected.append(
+            float(valve_parameters.compute_notch_area(np.array(value), np.array(0.2)))
+            if by_area
+            else value
+        )
+    found = find_speeds(machine, [*runs, (well, 1.0)])
+    assert found[:-1] / found[-1] == pytest.approx(expected, abs=0.04)
+
+
+def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine) -> None:
+    late = {"dead_time": ("dead_time_s", 0.08, 0.08), "lag": ("time_constant_s", 0.1, 0.10)}
+    late["rate_limit"] = ("stroke_s", 0.5, 0.25)
+    well = clean(machine)
+    runs = [(well, push(machine, 1.0))]
+    for effect, (name, value, _) in late.items():
+        runs.append(
+            (change_machine(well, {effect: {name: on_q3(machine, 0.0, value)}}), push(machine, 1.0))
+        )
+    q = played(machine, runs)[:, :, Q3]
     lost_s = (q[-1, 0] - q[-1, 1:]) / ((q[50, 0] - q[40, 0]) / (10 * machine.period_s))
-    assert lost_s == pytest.approx([expected for _, _, expected in late.values()], abs=0.03)
+    # a ramp of 0.5 s costs half of it and a little for the overlap and the notches
+    assert lost_s == pytest.approx([expected for _, _, expected in late.values()], abs=0.04)
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_backlash_takes_its_gap_at_each_reversal(machine: Machine, make: str) -> None:
-    u = np.concatenate([step(machine, 0.6, 30), step(machine, -0.6, 30), step(machine, 0.0, 20)])
-    faults = {"backlash": {"gap_rad": size(machine, 0.0, 0.02)}}
-    before, after = played(
-        machine, make, [(apply_faults(clean(machine, make), found), u) for found in ({}, faults)]
-    )[:, :, Q3].T
-    assert before.max() - after.max() == pytest.approx(
-        0.01, abs=0.001
-    )  # half of it from the middle
-    assert after[-1] - before[-1] == pytest.approx(
-        0.01, abs=0.002
-    )  # then the other half, less what the oil springs back
+def test_a_leak_lets_a_heavy_joint_sink_and_the_slew_not(machine: Machine) -> None:
+    size = np.full(machine.num_joints, 0.05)
+    numbers = change_machine(clean(machine), {"creep": {"sink_rad_s": size}})
+    weight = Arm(machine, {name: value[None] for name, value in numbers.items()})
+    load = weight.load(machine.home[None])[0]
+    q = played(machine, [(numbers, push(machine, 0.0, 200))])[:, 0]
+    found = (q[200] - q[100]) / 5.0
+    # turbulent: nominal at two fifths of the yield force, with the root of the load elsewhere
+    expected = 0.4 * 0.05 * np.sign(load) * np.sqrt(np.abs(load) / 0.4)
+    assert abs(load[Q3]) > 0.1 and found[Q3] == pytest.approx(expected[Q3], rel=0.25)
+    assert abs(found[Q1]) < 1e-4
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_a_leak_lets_a_heavy_joint_sink_in_proportion_to_its_load(
-    machine: Machine, make: str
-) -> None:
-    numbers = apply_faults(
-        clean(machine, make), {"creep": {"sink_rad_s": size(machine, 0.0, 0.05)}}
-    )
-    arm = Arm(machine, {name: value[None] for name, value in numbers.items()})
-    load = arm.load(machine.home[None])[0, Q3]
-    q = played(machine, make, [(numbers, step(machine, 0.0, 200))])[:, 0, Q3]
-    assert abs(load) > 0.1
-    assert (q[200] - q[100]) / 5.0 == pytest.approx(0.05 * load, rel=0.15)
-
-
-@pytest.mark.parametrize("make", MAKES)
-def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine, make: str) -> None:
-    demand = np.array([0.5, 0.0, 0.5, 0.5, 0.5])
-    numbers = apply_faults(clean(machine, make), {"flow_sharing": {"demand": demand}})
+def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine) -> None:
+    numbers = change_machine(clean(machine), {"flow_sharing": {"demand": np.full(5, 0.5)}})
     together = np.ones((50, 5)) * [1.0, 0.0, 1.0, 1.0, 1.0]
-    q = played(machine, make, [(numbers, together), (numbers, step(machine, 1.0))])
+    q = played(machine, [(numbers, together), (numbers, push(machine, 1.0))])
     flow, alone = (q[50] - q[40]) / 0.5 / machine.max_speed
     assert alone[Q3] == pytest.approx(1.0, abs=0.05)
-    assert flow.sum() == pytest.approx(2.0, abs=0.15)  # the pump's flow at half each
+    assert flow.sum() == pytest.approx(2.0, rel=0.15)  # the pump's flow at half each
+    assert np.ptp(flow[[0, 2, 3, 4]]) > 0.1  # no proportional split: the heaviest is starved
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_stiction_asks_for_more_command_to_start_than_to_go_on(machine: Machine, make: str) -> None:
-    numbers = apply_faults(clean(machine, make), {"stiction": {"start": size(machine, 0.0, 0.2)}})
-    pushed = np.concatenate([step(machine, 0.25, 30), step(machine, 0.15, 50)])
-    below, after = played(machine, make, [(numbers, step(machine, 0.15, 80)), (numbers, pushed)])[
-        :, :, Q3
-    ].T
-    assert abs(below[80] - below[0]) < 0.002
-    assert after[75] - after[50] > 0.01  # the same command keeps it moving
+def test_frames_are_lost_in_bursts_at_the_stated_share() -> None:
+    lost = draw_bursts(np.random.default_rng(0).random(200_000), 0.15)
+    assert lost.mean() == pytest.approx(0.15, rel=0.05)
+    starts = int((lost[1:] & ~lost[:-1]).sum())
+    assert lost.sum() / starts == pytest.approx(1.8, rel=0.05)
+    assert not draw_bursts(np.random.default_rng(0).random(1000), 0.0).any()
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_what_is_soft_rings_at_its_period_and_what_is_not_does_not(
-    machine: Machine, make: str
+def test_a_coarse_encoder_keeps_its_reading_within_its_band(machine: Machine) -> None:
+    numbers = {name: np.zeros((1, 1)) for name in ("noise_rad", "extra_noise_rad", "bias_rad")}
+    numbers |= {"scale": np.ones((1, 1)), "step_rad": np.full((1, 1), 0.01)}
+    encoder = SteppedEncoders(numbers)
+    shown = [
+        float(encoder.read(np.full((1, 1), q), np.zeros((1, 1)))[0, 0])
+        for q in (0.0, 0.0055, 0.0061, 0.0045)
+    ]
+    # steps of 10 mrad: at 5.5 it stays, beyond 6 it goes, back at 4.5 it stays
+    assert shown == pytest.approx([0.0, 0.0, 0.01, 0.01])
+
+
+def test_each_cause_shows_on_its_joint_and_a_machine_of_severity_zero_is_well(
+    machine: Machine,
 ) -> None:
-    u = np.concatenate([step(machine, 0.8, 30), step(machine, 0.0, 50)])
-    faults = {
-        "compliance": {"ringing_s": size(machine, 0.0, 0.5), "damping": size(machine, 0.1, 0.1)}
-    }
+    well = draw_machine(machine, 3, 0.0)
+    ill = change_machine(well, {})
+    ill["outside_severity"] = on_q3(machine, 0.0, 1.0)
+    levels = (0.8, 0.8, 0.0, -0.8, 0.0, 0.25, -0.9, -0.9, -0.9, 0.7, 0.7, 0.7)
+    u = np.concatenate([push(machine, level, 50) for level in levels])
+    u[:, Q4] = np.where(np.arange(len(u)) % 150 > 109, 0.4, 0.0)  # q3 lifts alone at first
+    u[-150:] = push(machine, 1.0, 150)  # to the end of the travel
+    kinds: list[str | None] = list(valve_causes.CAUSES)
+    runs = [(ill, u)] * len(kinds) + [(well, u)] * (len(kinds) + 1)
+    q = played(machine, runs, [*kinds, *kinds, None])[:, :, Q3]
+    apart = np.abs(q - q[:, -1:]).max(0)
+    assert dict(zip(kinds, apart[: len(kinds)] > 0.01, strict=True)) == dict.fromkeys(kinds, True)
+    assert not apart[len(kinds) :].any()
 
-    q = played(
-        machine, make, [(apply_faults(clean(machine, make), found), u) for found in ({}, faults)]
-    )[42:, :, Q3]
-    stiff, soft = np.abs(np.diff(q, axis=0)).sum(0) - np.abs(q[-1] - q[0])
-    assert soft > 5.0 * stiff and soft > 0.004
+
+def test_a_moved_stop_ends_the_travel_and_home_can_be_reached(machine: Machine) -> None:
+    ill = change_machine(draw_machine(machine, 3, 0.0), {})
+    ill["outside_severity"] = np.ones(machine.num_joints)
+    q = played(machine, [(ill, push(machine, 1.0, 200))], ["moved_stop"])[:, 0, Q3]
+    # 0.4 of 2.7 rad are cut off the side that is farther from home
+    assert q.max() == pytest.approx(machine.upper[Q3] - 0.4 * 2.7, abs=0.003)
+    assert (machine.home <= machine.upper).all()
 
 
-@pytest.mark.parametrize("make", MAKES)
-def test_a_loose_compensator_lifts_slower_than_it_lowers(machine: Machine, make: str) -> None:
-    numbers = apply_faults(
-        clean(machine, make), {"load_dependence": {"sensitivity": size(machine, 0.0, 0.6)}}
-    )
-    well = clean(machine, make)
-    down, up, *even = np.abs(
-        speeds(machine, make, [(n, level) for n in (numbers, well) for level in (1.0, -1.0)])
-    )
-    assert down / up > 1.05 * even[0] / even[1]  # positive lowers
+def test_a_run_is_the_same_whatever_runs_beside_it(machine: Machine) -> None:
+    drawn = [draw_machine(machine, seed, 1.0) for seed in range(3)]
+    u = push(machine, 0.7, 40)
+    alone, together = played(machine, [(drawn[0], u)]), played(machine, [(one, u) for one in drawn])
+    assert np.array_equal(alone[:, 0], together[:, 0])
+    assert np.abs(together[-1, 0] - together[-1, 1]).max() > 0.005
+
+
+def test_every_effect_of_the_mix_is_neutral_where_a_joint_lacks_it(machine: Machine) -> None:
+    mix, numbers = option("exam_mix", "main"), draw_machine(machine, 3, 1.0)
+    assert set(mix.troubles) <= set(valve_parameters.CHANGES)
+    for effect, trouble in mix.troubles.items():
+        if trouble.joints == "all":
+            continue
+        sizes = {name: np.full(5, value) for name, value in trouble.shape.items()}
+        for name, (none, typical) in trouble.numbers.items():
+            sizes[name] = on_q3(machine, none if none in (0.0, 1.0) else 0.0, typical)
+        found = change_machine(numbers, {effect: sizes})
+        differing = {
+            name for name in numbers if not np.array_equal(found[name][:2], numbers[name][:2])
+        }
+        # the damping of a soft hose counts only where there is one
+        assert not differing - {"soft_damping"}, effect
+        assert any(not np.array_equal(found[name], numbers[name]) for name in numbers), effect
+
+
+def test_thermal_drift_rises_earlier_than_the_library(machine: Machine) -> None:
+    well = clean(machine)
+    well["warm_change"] = np.zeros(5)
+    size = {"change": np.full(5, 0.3), "time_s": np.full(5, 600.0)}
+    ill = change_machine(well, {"thermal_drift": size})
+    u, ratio = push(machine, 1.0, 50), []
+    for elapsed_s in (150.0, 6000.0):
+        q = played(machine, [(ill, u), (well, u)], elapsed_s=elapsed_s)[:, :, Q3]
+        ratio.append((q[50, 0] - q[40, 0]) / (q[50, 1] - q[40, 1]))
+    # after a quarter of the time constant: exponential in the logarithm of the viscosity
+    part = (6.0 - 6.0 ** np.exp(-0.25)) / 5.0
+    assert ratio == pytest.approx([1.0 + 0.3 * part, 1.3], abs=0.015)
+    assert part > 1.0 - np.exp(-0.25) + 0.1, "the library's rises later"
 
 
 def test_lost_frames_hold_the_command_before_and_late_ones_keep_their_order() -> None:
@@ -262,20 +259,7 @@ def test_lost_frames_hold_the_command_before_and_late_ones_keep_their_order() ->
     assert float(line.at(0.302)[0, 0]) == 4.0
 
 
-def test_a_spool_with_bounded_slope_takes_its_time() -> None:
-    machine_numbers = {name: np.full((1, 1), value) for name, value in {
-        "hysteresis": 0.0, "stroke_s": 0.5, "breakaway": 0.0, "pilot_s": 0.0, "spool_hz": 8.0, "spool_damping": 0.9, "stop": 1.0,
-        "overlap_extend": 0.0, "overlap_retract": 0.0, "notch": 0.0, "wave": 0.0, "wave_number": 2.0, "wave_phase": 0.0,
-        "extend": 1.0, "retract": 1.0, "retract_ratio": 1.0, "speed_scale": 1.0}.items()}  # fmt: skip
-    valve, one, none = SpoolValve(machine_numbers), np.ones((1, 1)), np.zeros((1, 1))
-    path = [float(valve.step(one, 0.005, none, none > 0, none)[0, 0]) for _ in range(200)]
-    assert path[60] - path[40] == pytest.approx(20 * 0.005 / 0.5, rel=0.01)
-    assert path[-1] == pytest.approx(1.0, abs=0.01)
-
-
 def test_weight_and_tool_are_those_of_the_machine(machine: Machine) -> None:
-    from brokk_rl.gravity import Gravity
-
     q = np.random.default_rng(0).uniform(machine.lower, machine.upper, (6, machine.num_joints))
     arm = Arm(
         machine,
@@ -311,98 +295,34 @@ def test_a_longer_link_and_a_tilted_base_move_the_tool_as_geometry_says(machine:
     )  # the front goes down
 
 
-def test_a_run_is_the_same_whatever_runs_beside_it_and_machines_differ(machine: Machine) -> None:
-    found = [draw_plant(machine, seed, 1.0) for seed in range(40)]
-    mine = [numbers for make, numbers in found if make == "throttled"][:3]
-    u = step(machine, 0.7, 40)
-
-    def paths(numbers: list[PlantParameters], seeds: list[int]) -> np.ndarray:
-        runs = [PlantRun(0, "mild", seed, 0.0) for seed in seeds]
-        plant = ExamPlant(machine, "throttled", numbers, runs, 40)
-        for command in u:
-            plant.send(Command(np.repeat(command[None], len(numbers), 0)))
-        return plant.read().q
-
-    alone, together = paths(mine[1:2], [5]), paths(mine, [4, 5, 6])
-    assert np.array_equal(alone[0], together[1])
-    assert np.abs(together[0] - together[1]).max() > 0.005
+def test_backlash_takes_its_gap_at_each_reversal(machine: Machine) -> None:
+    u, well = np.concatenate([push(machine, 0.6, 30), push(machine, -0.6, 30)]), clean(machine)
+    worn = change_machine(well, {"backlash": {"gap_rad": on_q3(machine, 0.0, 0.02)}})
+    before, after = played(machine, [(well, u), (worn, u)])[:, :, Q3].T
+    assert before.max() - after.max() == pytest.approx(0.01, abs=0.001)  # half, from the middle
+    assert after[-1] - before[-1] == pytest.approx(0.01, abs=0.001)  # the other half
 
 
-@pytest.mark.parametrize(
-    ("roughness", "low_rad", "high_rad"), [("mild", 0.005, 0.011), ("strong", 0.011, 0.025)]
-)
-def test_chance_alone_leaves_most_of_the_stated_floor(
-    machine: Machine, roughness: str, low_rad: float, high_rad: float
-) -> None:
-    # the same machines twice under the same commands: what differs over 5 s no model can know
-    rough = option("exam_plants", "valves").roughness[roughness]
-    numbers = [
-        found
-        for seed in range(24)
-        for make, found in [draw_plant(machine, seed, rough)]
-        if make == "throttled"
-    ]
-    count, steps = len(numbers), 1200
-    runs = [PlantRun(0, roughness, chance, 0.0) for chance in range(2 * count)]
-    twice = ExamPlant(machine, "throttled", numbers * 2, runs, steps)
-    generator, shape = np.random.default_rng(0), (steps // 30, count, machine.num_joints)
-    levels = generator.uniform(-1.0, 1.0, shape) * (
-        generator.random(shape) > 0.3
-    )  # as excitation=levels: 0.3 of them rest
-    levels *= mask_exclusive_joints(machine.is_exclusive, generator.random(shape[:2]) < 0.3)
-    path = []
-    for u in np.repeat(levels, 30, 0):
-        path.append(twice.read().q)
-        twice.send(Command(np.concatenate([u, u])))
-    apart = np.diff(np.array(path).reshape(steps, 2, count, -1), axis=1)[:, 0]
-    growth = np.stack([apart[k : k + 100] - apart[k] for k in range(0, steps - 100, 100)])
-    assert low_rad < np.sqrt(np.square(growth).mean() / 2.0) < high_rad
+def test_stiction_asks_for_more_command_to_start(machine: Machine) -> None:
+    well = clean(machine)
+    stuck = change_machine(well, {"stiction": {"start": on_q3(machine, 0.0, 0.25)}})
+    runs = [(stuck, push(machine, 0.18)), (well, push(machine, 0.18)), (stuck, push(machine, 0.6))]
+    moved = np.ptp(played(machine, runs)[:, :, Q3], axis=0)
+    assert moved[0] < 0.002 and moved[1] > 0.005 and moved[2] > 0.1
 
 
-def test_each_fault_outside_the_library_shows_and_a_machine_of_severity_zero_is_well(
-    machine: Machine,
-) -> None:
-    well = clean(machine, "throttled")
-    u = np.concatenate([step(machine, level, 60) for level in (0.8, 0.8, 0.8, -0.8, 0.3, -0.3)])
-    u[:, 3] = np.where(u[:, Q3] > 0, 0.5, 0.0)
-    ill, kinds = (
-        well | {"outside_severity": size(machine, 0.0, 1.0)},
-        list(out_of_library_faults.KINDS),
-    )
-    q = played(
-        machine,
-        "throttled",
-        [(ill, u)] * len(kinds) + [(well, u)] * (len(kinds) + 1),
-        [*kinds, *kinds, None],
-    )[:, :, Q3]
-    apart = np.abs(q - q[:, -1:]).max(0)
-    assert dict(zip(kinds, apart[: len(kinds)] > 0.01, strict=True)) == dict.fromkeys(kinds, True)
-    assert not apart[len(kinds) :].any()
+def test_what_is_soft_rings_and_what_is_not_does_not(machine: Machine) -> None:
+    u = np.concatenate([push(machine, 0.8, 30), push(machine, 0.0, 50)])
+    size = {"ringing_s": on_q3(machine, 0.0, 0.5), "damping": on_q3(machine, 0.1, 0.1)}
+    soft = change_machine(clean(machine), {"compliance": size})
+    q = played(machine, [(clean(machine), u), (soft, u)])[42:, :, Q3]
+    stiff, ringing = np.abs(np.diff(q, axis=0)).sum(0) - np.abs(q[-1] - q[0])
+    assert ringing > 5.0 * stiff and ringing > 0.004
 
 
-def test_every_fault_is_neutral_where_a_joint_has_not_got_it(
-    machine: Machine, mix_sizes: Callable[[str], dict[str, np.ndarray]]
-) -> None:
-    numbers = clean(machine, "compensated")
-    for effect in FAULTS:
-        found = apply_faults(numbers, {effect: mix_sizes(effect)})
-        differing = [
-            name for name in numbers if not np.array_equal(found[name][:2], numbers[name][:2])
-        ]
-        assert not set(differing) - {"drift_s", "soft_damping"}, (
-            effect
-        )  # these count where their size is above 0 only
-
-
-@pytest.fixture
-def mix_sizes(machine: Machine) -> Callable[[str], dict[str, np.ndarray]]:
-    mix = option("exam_mix", "main")
-
-    def sizes(effect: str) -> dict[str, np.ndarray]:
-        trouble = mix.troubles[effect]
-        found = {name: np.full(machine.num_joints, value) for name, value in trouble.shape.items()}
-        for name, (none, typical) in trouble.numbers.items():
-            found[name] = size(machine, none if none in (0.0, 1.0) else 0.0, typical)
-        return found
-
-    return sizes
+def test_a_loose_compensator_lifts_slower_than_it_lowers(machine: Machine) -> None:
+    well = clean(machine)
+    loose = change_machine(well, {"load_dependence": {"sensitivity": on_q3(machine, 0.0, 0.6)}})
+    runs = [(numbers, level) for numbers in (loose, well) for level in (1.0, -1.0)]
+    down, up, *even = np.abs(find_speeds(machine, runs))
+    assert down / up > 1.05 * even[0] / even[1]  # positive lowers

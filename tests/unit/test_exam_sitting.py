@@ -36,7 +36,7 @@ def test_a_sealed_exam_knows_its_engine_before_its_labels_are_opened(
     made = brokk(*SMALL, *sealed, f"session.out={exam}")
     assert made.code == 0, made.err
     facts = json.loads((exam / "exam.json").read_text())
-    assert facts["sealed"] and facts["held_out"] and facts["num_cases"] == 2
+    assert facts["sealed"] and facts["num_cases"] == 2
     withheld = sorted((exam / dataset.WITHHELD_FOLDER).rglob("*.parquet"))
     assert {path.parent.name for path in withheld} == {"0000", "0001", UNCHANGED_FOLDER}
     about = ("mode=exam", f"exam.folder={exam}", "exam_candidate=always_none")
@@ -117,7 +117,7 @@ def test_an_exam_of_arms_known_by_their_joints_asks_nothing_that_needs_masses(
 
 @pytest.fixture(scope="module")
 def slow_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An exam of one case: all joints at 0.6 of their speed, withheld recordings of 40 s."""
+    """An exam of one case: all joints at 0.6 of their speed, withheld recordings of 30 s."""
     out = tmp_path_factory.mktemp("examined") / "exam"
     gain = (
         "{flow_gain: {_target_: exam.case_distribution.EffectDistribution, numbers: {gain: [1.0, 0.6]}, "
@@ -127,8 +127,8 @@ def slow_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "mode=exam", "exam.mix.num_cases=1", "exam.mix.shares={none: 0, faint: 0, one: 1, several: 0, outside: 0}",
         "exam.mix.sizes=[1.0,1.0]", "~exam.mix.troubles", f"+exam.mix.troubles={gain}",
         "exam.reference.programs=[[levels],[levels]]",
-        "exam.reference.file_s=60", "exam.field.programs=[[levels]]", "exam.field.file_s=20", "exam.withheld.programs=[[levels]]",
-        "exam.withheld.file_s=40", f"session.out={out}",
+        "exam.reference.file_s=40", "exam.field.programs=[[levels]]", "exam.field.file_s=8", "exam.withheld.programs=[[levels]]",
+        "exam.withheld.file_s=30", f"session.out={out}",
     ]  # fmt: skip
     mode = load_mode(*words)
     out.mkdir()

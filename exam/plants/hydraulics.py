@@ -1,4 +1,4 @@
-"""Hydraulics of the held-out make, from commands at the valve block to joint speeds.
+"""Hydraulics of a machine with valves, from commands at the valve block to joint speeds.
 
 Per joint, with a step of `STEP_S`:
 
@@ -22,8 +22,8 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.held_out.parameters import compute_notch_area
-from exam.plants.plant_parameters import PlantParameters
+from exam.plants.changes import PlantParameters
+from exam.plants.valve_parameters import compute_notch_area
 
 STEP_S = 0.0025
 """Time step, s: a twentieth of a control period; the first mode of a joint lasts 50 of them."""

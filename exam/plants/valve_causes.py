@@ -1,4 +1,4 @@
-"""Causes outside the library that only the held-out make has.
+"""Causes outside the library that machines with valves have.
 
 No effect of the library describes them: they depend on time at rest, on the sign of the command
 before, on other joints' motion, or on the pose without the weight. Each has a severity by joint: 1
@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.held_out.hydraulics import STEP_S
+from exam.plants.hydraulics import STEP_S
 
 CAUSES = (
     "silted_spool", "ajar_check", "supply_voltage", "moved_stop", "back_flow", "stale_readings", "coarse_driver",

