@@ -9,6 +9,6 @@ score              one answer against one label
 answer_scoring     answers of a candidate, their scores, published answers
 ledger             who answered with which engine, and when labels were opened
 metrics            rates with intervals, calibration, confusion
-report             table, figures
+report             one page with the table
 constant_answer    a candidate to compare with
 """

@@ -16,14 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_text
 from exam.case_distribution import CaseDesign, CaseFault
-from exam.generate import CaseRecorder, Half, HalfPlan, RecordedHalf
+from exam.generate import CaseRecorder, Half, HalfPlan
 
 LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
 OPENED_FILE = "labels.json"
@@ -85,8 +83,6 @@ PARTIAL_FILE = "labels.partial.jsonl"
 BLOCK_CASES = 12
 """Cases recorded side by side: 48 runs of a step in one array. More are hardly faster a case, and
 an interruption loses more."""
-HORIZON_S = 5.0
-"""Window of `moved_rad`, s. Chosen by hand; not searched."""
 
 
 @dataclass(frozen=True)
@@ -115,15 +111,13 @@ class CaseSet:
         jobs = {}
         for half, plan in self.halves.items():
             jobs[half] = self.recorder.planned(questions, plan, half)
-        made: dict[Half, list[RecordedHalf]] = {}
         for half, of_half in jobs.items():
             parent = WITHHELD_FOLDER if half == "withheld" else CASES_FOLDER
-            folders = [self.folder / parent / name for name in names]
-            made[half] = self.recorder.record(of_half, folders)
+            self.recorder.record(of_half, [self.folder / parent / name for name in names])
         labels = []
-        for name, question, half in zip(names, questions, made["field"], strict=True):
+        for name, question in zip(names, questions, strict=True):
             other_hand = self.halves["field"].has_other_hand(question)
-            labels.append(make_label(name, question, half, self.machine, other_hand))
+            labels.append(make_label(name, question, self.machine, other_hand))
         return labels
 
 
@@ -207,13 +201,9 @@ def _append_private(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
 
 
 def make_label(
-    name: str, question: CaseDesign, field: RecordedHalf, machine: Machine, other_hand: bool
+    name: str, question: CaseDesign, machine: Machine, other_hand: bool
 ) -> dict[str, Any]:
-    """Return the label of a case; `other_hand`: another hand drives the field than the reference.
-
-    `moved_rad`: root mean square change of the measured motion by its cause, over 5 s from equal
-    starts, by joint.
-    """
+    """Return the label of a case; `other_hand`: another hand drives the field than the reference."""
     return {
         "case": name,
         "kind": question.kind,
@@ -227,9 +217,6 @@ def make_label(
             "joints": list(question.joints),
             "size": question.size,
         },
-        "moved_rad": dict(
-            zip(machine.joint_names, measure_motion_change(field, machine).tolist(), strict=True)
-        ),
         "machine_seed": question.machine_seed,
         "chance": question.chance,
     }
@@ -248,14 +235,3 @@ def _label_fault(fault: CaseFault, machine: Machine) -> dict[str, Any]:
         "parameters": parameters,
         "nothing": fault.drawn,
     }
-
-
-def measure_motion_change(field: RecordedHalf, machine: Machine) -> np.ndarray:
-    """Return the change of motion by the cause in windows of 5 s, root mean square, `(J,)`."""
-    steps, total, count = round(HORIZON_S / machine.period_s), 0.0, 0
-    for q, without in zip(field.q, field.without_q, strict=True):
-        apart = (q - without).astype(float)
-        for begin in range(0, len(apart) - steps, steps // 2):
-            growth = apart[begin + 1 : begin + 1 + steps] - apart[begin]
-            total, count = total + (growth**2).sum(0), count + steps
-    return np.sqrt(total / max(count, 1))

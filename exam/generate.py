@@ -7,7 +7,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -74,22 +74,6 @@ class HalfPlan:
     def has_other_hand(self, question: CaseDesign) -> bool:
         """Return whether another hand drives this half of a case: by its chance, in half of the cases."""
         return bool(self.other_hand) and question.chance % 2 == 1
-
-
-@dataclass(frozen=True)
-class RecordedHalf:
-    """Recordings of one half of all cases.
-
-    Attributes:
-        u: Commands, `(T, J)` a file.
-        q: Measured positions.
-        without_q: Where the same machine would have gone, by the same commands and chance, without
-            what the case is about.
-    """
-
-    u: list[np.ndarray]
-    q: list[np.ndarray]
-    without_q: list[np.ndarray]
 
 
 @contextmanager
@@ -206,8 +190,8 @@ class CaseRecorder:
                 jobs.append(job)
         return jobs
 
-    def record(self, jobs: Sequence[RecordingJob], folders: Sequence[Path]) -> list[RecordedHalf]:
-        """Write the files of one half of each case into its folder; return their content by case.
+    def record(self, jobs: Sequence[RecordingJob], folders: Sequence[Path]) -> None:
+        """Write the files of one half of each case into its folder.
 
         Args:
             jobs: The files. They are the same whatever is recorded beside them.
@@ -215,15 +199,8 @@ class CaseRecorder:
         """
         specimens = list(map(self._specimen, jobs))
         makes = self._plants.makes(self._machine, specimens)
-        done = [RecordedHalf([], [], []) for _ in folders]
-        found: dict[int, RecordedHalf] = {}
         for batch in _split_by_make(makes, SIDE_BY_SIDE):
-            made = self._batch(_take(jobs, batch), _take(specimens, batch), folders)
-            found |= dict(zip(batch, made, strict=True))
-        for i, job in enumerate(jobs):  # a case's files are in order
-            for name in ("u", "q", "without_q"):
-                getattr(done[job.case], name).extend(getattr(found[i], name))
-        return done
+            self._batch(_take(jobs, batch), _take(specimens, batch), folders)
 
     def _specimen(self, job: RecordingJob) -> PlantRun:
         question = job.question
@@ -261,8 +238,8 @@ class CaseRecorder:
 
     def _batch(
         self, jobs: Sequence[RecordingJob], specimens: Sequence[PlantRun], folders: Sequence[Path]
-    ) -> list[RecordedHalf]:
-        """Record files of one half, of machines of one make; return the content of each."""
+    ) -> None:
+        """Record files of one half, of machines of one make."""
         half = jobs[0].half
         machine = self._machine
         plan = ExcitationPlan(
@@ -279,20 +256,20 @@ class CaseRecorder:
         for name in samples[0].extra:
             extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)
-        without = self._without(specimens, u, half) if jobs[0].is_field else q
         t_s = track.t_s - track.t_s[0]
-        recorded = []
+        is_withheld = jobs[0].name == "withheld"
+        if is_withheld:
+            unchanged = self._without(specimens, u, half)
+            for n, job in enumerate(jobs):
+                place = folders[job.case] / UNCHANGED_FOLDER
+                self._write(job, t_s, u[:, n], unchanged[:, n], {}, place)
         for n, job in enumerate(jobs):
             columns = {}
             if job.question.tracked:
                 columns = {name: values[n] for name, values in extra.items()}
-            place = folders[job.case] / job.name
-            if job.name == "withheld":  # it has a folder of its own, beside those of the cases
-                place = folders[job.case]
-                self._write(job, t_s, u[:, n], without[:, n], {}, place / UNCHANGED_FOLDER)
+            # the withheld part has a folder of its own, beside those of the cases
+            place = folders[job.case] if is_withheld else folders[job.case] / job.name
             self._write(job, t_s, u[:, n], q[:, n], columns, place)
-            recorded.append(RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]))
-        return recorded
 
     def _write(
         self,

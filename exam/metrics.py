@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
-from operator import attrgetter
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,17 +13,12 @@ from scipy import stats
 
 from brokk_rl.statistics import CONFIDENCE, compute_wilson_interval
 from exam.case_distribution import KINDS
-from exam.score import CaseScore, Claim
+from exam.score import CaseScore
 
 NUM_DRAWS = 1000
 """Bootstrap draws; the usual number for 95 % intervals."""
 NUM_BINS = 10
-"""Bins of the reliability diagram and of the expected calibration error; the usual number."""
-SIZES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.01)
-"""Edges of the detection curve over the size of an effect, of typical; chosen by hand: about 30
-cases a bin in an exam of 220."""
-MOVED_RAD = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 1.0)
-"""Edges of the same curve over the change of the motion, rad: each bin doubles."""
+"""Bins of the expected calibration error; the usual number."""
 
 Metric = dict[str, Any]
 """`value`, `of` and `ci95`; `None` where there is nothing to count."""
@@ -38,7 +32,6 @@ class MetricDefinition:
         title: Its label.
         kinds: Kinds of cases that count.
         collect: Numbers of a case; a case may have none or several.
-        more_is_better: Whether more of it is better; `None`: neither.
         compute: The metric of the numbers of all cases, with an interval by bootstrap over cases;
             `None`: the rate of true ones, with Wilson's.
     """
@@ -46,7 +39,6 @@ class MetricDefinition:
     title: str
     kinds: tuple[str, ...]
     collect: Callable[[CaseScore], Sequence[Any]]
-    more_is_better: bool | None
     compute: Callable[[np.ndarray], float | None] | None = None
 
 
@@ -88,30 +80,30 @@ def compute_median(rows: np.ndarray) -> float:
 
 ONE, SEVERAL, KNOWN = ("one",), ("several",), ("one", "several")
 ROWS: dict[str, tuple[Any, ...]] = {
-    "top1": ("one effect: named first", ONE, lambda s: [s.first], True),
-    "top1_equivalent": ("  or a listed equivalent", ONE, lambda s: [s.first_equivalent], True),
-    "top1_other_hand": ("  field by another hand", ONE, lambda s: [s.first] if s.other_hand else [], True),
-    "exactly_one": ("one effect: it and no other", ONE, lambda s: [s.exact], True),
-    "exactly_one_equivalent": ("  or an equivalent only", ONE, lambda s: [s.exact_equivalent], True),
-    "exact_set": ("two or three effects: exact set", SEVERAL, lambda s: [s.exact], True),
-    "exact_set_equivalent": ("  or equivalents", SEVERAL, lambda s: [s.exact_equivalent], True),
-    "set_f1": ("two or three effects: F1", SEVERAL, lambda s: [s.count_names(s.named)], True, compute_ratio),
-    "set_f1_equivalent": ("  with equivalents", SEVERAL, lambda s: [s.count_names(s.stands_for)], True, compute_ratio),
-    "joints": ("joints right, when the effect or an equivalent is", KNOWN, lambda s: s.joints_right, True),
-    "false_alarms_none": ("unchanged: an effect or unknown", ("none",), lambda s: [s.alarm], False),
-    "false_alarms_other_hand": ("  field by another hand", ("none",), lambda s: [s.alarm] if s.other_hand else [], False),
-    "false_alarms_faint": ("below noise: a false effect or unknown", ("faint",), lambda s: [s.alarm], False),
-    "unknown_recall": ("outside the library: said unknown", ("outside",), lambda s: [s.verdict == "unknown"], True),
-    "unknown_wrongly": ("a known effect called unknown", KNOWN, lambda s: [s.verdict == "unknown"], False),
-    "missed": ("a known effect called none", KNOWN, lambda s: [s.verdict == "none"], False),
-    "unknown_auroc": ("AUROC of unknown", KINDS, lambda s: [(s.unknown, s.kind == "outside")], True, compute_auroc),
-    "ece": ("calibration error (ECE), with equivalents", KINDS, lambda s: s.claims, False, compute_ece),
-    "parameter_error": ("parameter error, median", KINDS, lambda s: [one.error for one in s.numbers], False, compute_median),
-    "cover_90": ("90 % intervals cover", KINDS, lambda s: [one.in_90 for one in s.numbers], None),
-    "cover_95": ("95 % intervals cover", KINDS, lambda s: [one.in_95 for one in s.numbers], None),
-    "closed_examined": ("gap closed by the examiner, median", KNOWN, lambda s: drop_none(s.examined), True, compute_median),
-    "closed_differs": ("stated closing disagrees with the examiner's", KNOWN, lambda s: drop_none(s.differs), False),
-    "closed_missing": ("effects named without a share", KINDS, lambda s: [s.closed is None] if s.named else [], False),
+    "top1": ("one effect: named first", ONE, lambda s: [s.first]),
+    "top1_equivalent": ("  or a listed equivalent", ONE, lambda s: [s.first_equivalent]),
+    "top1_other_hand": ("  field by another hand", ONE, lambda s: [s.first] if s.other_hand else []),
+    "exactly_one": ("one effect: it and no other", ONE, lambda s: [s.exact]),
+    "exactly_one_equivalent": ("  or an equivalent only", ONE, lambda s: [s.exact_equivalent]),
+    "exact_set": ("two or three effects: exact set", SEVERAL, lambda s: [s.exact]),
+    "exact_set_equivalent": ("  or equivalents", SEVERAL, lambda s: [s.exact_equivalent]),
+    "set_f1": ("two or three effects: F1", SEVERAL, lambda s: [s.count_names(s.named)], compute_ratio),
+    "set_f1_equivalent": ("  with equivalents", SEVERAL, lambda s: [s.count_names(s.stands_for)], compute_ratio),
+    "joints": ("joints right, when the effect or an equivalent is", KNOWN, lambda s: s.joints_right),
+    "false_alarms_none": ("unchanged: an effect or unknown", ("none",), lambda s: [s.alarm]),
+    "false_alarms_other_hand": ("  field by another hand", ("none",), lambda s: [s.alarm] if s.other_hand else []),
+    "false_alarms_faint": ("below noise: a false effect or unknown", ("faint",), lambda s: [s.alarm]),
+    "unknown_recall": ("outside the library: said unknown", ("outside",), lambda s: [s.verdict == "unknown"]),
+    "unknown_wrongly": ("a known effect called unknown", KNOWN, lambda s: [s.verdict == "unknown"]),
+    "missed": ("a known effect called none", KNOWN, lambda s: [s.verdict == "none"]),
+    "unknown_auroc": ("AUROC of unknown", KINDS, lambda s: [(s.unknown, s.kind == "outside")], compute_auroc),
+    "ece": ("calibration error (ECE), with equivalents", KINDS, lambda s: s.claims, compute_ece),
+    "parameter_error": ("parameter error, median", KINDS, lambda s: [one.error for one in s.numbers], compute_median),
+    "cover_90": ("90 % intervals cover", KINDS, lambda s: [one.in_90 for one in s.numbers]),
+    "cover_95": ("95 % intervals cover", KINDS, lambda s: [one.in_95 for one in s.numbers]),
+    "closed_examined": ("gap closed by the examiner, median", KNOWN, lambda s: drop_none(s.examined), compute_median),
+    "closed_differs": ("stated closing disagrees with the examiner's", KNOWN, lambda s: drop_none(s.differs)),
+    "closed_missing": ("effects named without a share", KINDS, lambda s: [s.closed is None] if s.named else []),
 }  # fmt: skip
 METRICS = {key: MetricDefinition(*row) for key, row in ROWS.items()}
 """All metrics of the report's table, in its order."""
@@ -143,12 +135,9 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
     median = float(np.median(seconds)) if seconds else None
     return found | {
         "seconds": {"median": median, "most": max(seconds, default=None)},
-        "reliability": compute_reliability(scores),
         "by_effect": summarize_effects(scores),
         "confusion": _count_answers((s.truth[0], (*s.named, s.verdict)[0]) for s in one),
         "outside": _count_answers((s.outside, "+".join(s.named) or s.verdict) for s in outside),
-        "by_size": compute_detection_curve(one, attrgetter("size"), SIZES),
-        "by_motion": compute_detection_curve(one, attrgetter("moved_rad"), MOVED_RAD),
     }
 
 
@@ -180,20 +169,6 @@ def bootstrap_cases(
     return {"value": value, "of": len(parts), "ci95": interval}
 
 
-def compute_reliability(scores: Sequence[CaseScore]) -> list[Metric]:
-    """Return, by bins of the stated probability, its mean and the rate of true statements."""
-    bins: dict[int, list[Claim]] = {}
-    for claim in chain.from_iterable(score.claims for score in scores):
-        # A certain statement (1.0) belongs to the last bin.
-        place = min(int(claim.probability * NUM_BINS), NUM_BINS - 1)
-        bins.setdefault(place, []).append(claim)
-    found = []
-    for _, inside in sorted(bins.items()):
-        stated, is_true = zip(*inside, strict=True)
-        found.append({"stated": float(np.mean(stated)), **compute_rate(is_true)})
-    return found
-
-
 def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, dict[str, float | None]]:
     """Return precision, recall and F1 of each effect, strictly, over all cases but those below the noise."""
     counts: dict[str, dict[str, int]] = {}
@@ -222,20 +197,6 @@ def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, dict[str, float 
             "f1": 2.0 * right / (named + there) if there else None,
             "parameter_error": float(np.median(errors[effect])) if effect in errors else None,
         }
-    return found
-
-
-def compute_detection_curve(
-    one: Sequence[CaseScore], measure: Callable[[CaseScore], float], edges: Sequence[float]
-) -> list[dict[str, Any]]:
-    """Return, by bins of a size, the rate of right names and of the verdict `none`; empty bins are left out."""
-    found = []
-    for low, high in pairwise(edges):
-        inside = [score for score in one if low <= measure(score) < high]
-        if inside:
-            right = compute_rate([score.first for score in inside])
-            none = compute_rate([score.verdict == "none" for score in inside])
-            found.append({"from": low, "to": high, "right": right, "none": none})
     return found
 
 

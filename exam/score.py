@@ -58,8 +58,6 @@ class CaseScore:
         unknown: Probability that the cause lies outside the library.
         claims: Statements whose truth the label knows.
         numbers: Parameters of strictly right names.
-        size: Largest size of an effect or outside fault, of typical.
-        moved_rad: Change of the motion by the cause over 5 s, on the joint with the largest.
         closed: Share of the gap closed, by the answer's own account.
         examined: Share of the gap closed on withheld recordings, by the examiner's simulation of
             `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
@@ -79,8 +77,6 @@ class CaseScore:
     unknown: float
     claims: tuple[Claim, ...]
     numbers: tuple[ParameterScore, ...]
-    size: float
-    moved_rad: float
     closed: float | None
     examined: float | None
     differs: bool | None
@@ -156,7 +152,6 @@ def score_answer(
         claims.append(Claim(read_probability(answer, verdict), kind in ("none", "faint")))
     if verdict == "unknown":
         claims.append(Claim(read_probability(answer, verdict), kind == "outside"))
-    sizes = [one["size"] for one in (*label["effects"], *filter(None, (outside,)))]
     gap = answer.gap if answer else None
     closed = gap.closed.mean if gap and gap.closed else None
     examined, differs = None, None
@@ -175,8 +170,6 @@ def score_answer(
         unknown=read_probability(answer, "unknown"),
         claims=tuple(claims),
         numbers=tuple(numbers),
-        size=max(sizes, default=0.0),
-        moved_rad=max(label["moved_rad"].values()),
         closed=closed,
         examined=examined,
         differs=differs,

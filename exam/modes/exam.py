@@ -264,8 +264,7 @@ class Exam:
         write_text(out / dataset.OPENED_FILE, text)
         write_json(out / "marks.json", {"exam": facts, "candidates": tables})
         report.write_report(out, facts, tables)
-        rows = [list(map(report.format_cell, row)) for row in report.build_rows(tables)]
-        print_table(["", *tables], rows)
+        print_table(["", *tables], report.build_rows(tables))
         for sentence in facts["ledger"]:
             print_text(sentence)
         log.info("report: %s", out / report.REPORT_FILE)
