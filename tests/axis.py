@@ -14,12 +14,7 @@ from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
 PLANT = FirstOrderLag(
-    dead_time_s=0.31,
-    dead_band_extend=0.07,
-    dead_band_retract=0.1,
-    gain=0.9,
-    time_constant_s=0.08,
-    spread={},
+    dead_time_s=0.31, dead_band_extend=0.07, dead_band_retract=0.1, gain=0.9, time_constant_s=0.08
 )
 
 

@@ -32,19 +32,16 @@ PLACED_M = 0.2
 
 def check_excitation(excitation: Excitation, machine: Machine) -> None:
     """Check the segments of an excitation: limits, time, exclusive joints, repeatability."""
-    still = np.zeros((20, machine.num_joints))
-    start = Segment(name="before_00", start=machine.home, u=still, stops="inward", stop_margin=0.1)
     global_state = str(np.random.get_state(legacy=False))
     first, again = (
-        excitation.segments(machine, DURATION_S, np.random.default_rng(1), [start])
-        for _ in range(2)
+        excitation.segments(machine, DURATION_S, np.random.default_rng(1)) for _ in range(2)
     )
     untouched = str(np.random.get_state(legacy=False)) == global_state
     assert untouched, "segments: drew from numpy's global generator"
-    assert excitation.weight(1.0) > 0, "weight: expected more than 0"
+    assert excitation.share > 0, "share: expected more than 0"
     text = f"segments: none in {DURATION_S:g} s; raise a ConfigError where there is no room"
     assert first, text
-    names = [segment.name for segment in (start, *first)]
+    names = [segment.name for segment in first]
     assert len(set(names)) == len(names), f"segments: names repeat: {', '.join(names)}"
     num_steps = sum(len(segment.u) for segment in first)
     is_short = num_steps * machine.period_s <= DURATION_S + machine.period_s
@@ -52,8 +49,6 @@ def check_excitation(excitation: Excitation, machine: Machine) -> None:
     assert len(first) == len(again), "segments: the same seed gives others"
     for segment, same in zip(first, again, strict=True):
         _check_segment(segment, machine)
-        text = f"{segment.name}: repeats '{segment.repeat_of}', which there is not"
-        assert segment.repeat_of in (None, *names), text
         for one, other in ((segment.u, same.u), (segment.start, same.start)):
             assert np.array_equal(one, other), "segments: the same seed gives others"
 

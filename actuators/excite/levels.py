@@ -1,7 +1,5 @@
 """Random levels on several joints at once: the only excitation that shows a shared pump."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from actuators.excite.poses import fill_from_poses
@@ -53,16 +51,8 @@ class Levels:
         if self.turn_s > self.pose_s:
             raise ConfigError(f"pose_s: expected turn_s={self.turn_s} or more, got {self.pose_s}")
 
-    def weight(self, before: float) -> float:
-        """Return `share`."""
-        return self.share
-
     def segments(
-        self,
-        machine: Machine,
-        duration_s: float,
-        generator: np.random.Generator,
-        before: Sequence[Segment],
+        self, machine: Machine, duration_s: float, generator: np.random.Generator
     ) -> list[Segment]:
         """Return segments of about `pose_s` each, which fill the time."""
         return fill_from_poses(

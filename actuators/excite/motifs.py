@@ -1,6 +1,6 @@
 """Motifs: short single-joint programs that separate effects which look alike otherwise."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from itertools import count, product
 from typing import Annotated
 
@@ -21,10 +21,6 @@ class Motif:
     share: float
     stop_margin: float
 
-    def weight(self, before: float) -> float:
-        """Return `share`."""
-        return self.share
-
     def programs(
         self, machine: Machine, generator: np.random.Generator
     ) -> list[tuple[str, np.ndarray]]:
@@ -32,11 +28,7 @@ class Motif:
         raise NotImplementedError
 
     def segments(
-        self,
-        machine: Machine,
-        duration_s: float,
-        generator: np.random.Generator,
-        before: Sequence[Segment],
+        self, machine: Machine, duration_s: float, generator: np.random.Generator
     ) -> list[Segment]:
         """Return as many segments as fit into `duration_s`."""
         candidates = self._candidates(machine, generator)
@@ -191,45 +183,3 @@ class Reversals(Motif):
             parts += [np.tile(cycle, self.num_cycles), pause]
         commands = np.concatenate(parts)
         return build_joint_programs("reversals", machine, lambda joint: commands)
-
-
-@spec
-class Staircase(Motif):
-    """Held levels of one joint, up and down, both ways: flow curve, dead band, saturation.
-
-    Attributes:
-        share: Part of the time, relative to the others of the plan.
-        levels: Rising commands; each is held forward, then backward, so that the joint stays where
-            it is in the long run.
-        hold_s: Time for which a level is held.
-        reach: Largest way of one level, as a part of the joint's travel, at the machine's nominal
-            speed; shortens the holds.
-        stop_margin: As in `levels`.
-    """
-
-    share: float
-    levels: tuple[float, ...]
-    hold_s: float
-    reach: float
-    stop_margin: float
-
-    def check(self) -> None:
-        levels = list(self.levels)
-        if not levels or levels != sorted(levels) or not 0 < levels[0] <= levels[-1] <= 1:
-            raise ConfigError(
-                f"excitation: levels: expected rising commands in (0, 1], got {levels}"
-            )
-
-    def programs(
-        self, machine: Machine, generator: np.random.Generator
-    ) -> list[tuple[str, np.ndarray]]:
-        """Return the staircase of each joint."""
-        stairs = np.array([*self.levels, *self.levels[::-1]])
-
-        def program(joint: int) -> np.ndarray:
-            travel_s = (machine.upper[joint] - machine.lower[joint]) / machine.max_speed[joint]
-            holds_s = np.minimum(self.hold_s, self.reach * travel_s / stairs)
-            levels = np.stack([stairs, -stairs], 1).ravel()
-            return hold_levels(levels, np.repeat(holds_s, 2), machine.period_s)
-
-        return build_joint_programs("staircase", machine, program)

@@ -1,4 +1,4 @@
-"""Report of a plan: `plan.json`, `plan.png`, and the notes that recordings carry."""
+"""Report of a plan: `plan.json` and `plan.png`."""
 
 from collections.abc import Iterable, Sequence
 from itertools import cycle, pairwise
@@ -34,7 +34,6 @@ class PlanTrack:
         u: Commands, `(T, N, J)`.
         stage: `BEFORE`, `PLAYING`, `AWAY` or `AFTER`, `(T, N)`.
         segment: Number of the segment, `(T, N)`.
-        played: Control periods since its program began, `(T, N)`.
     """
 
     def __init__(self, samples: Iterable[Sample]) -> None:
@@ -44,7 +43,6 @@ class PlanTrack:
         self.u = np.stack([sample.u for sample in kept])
         self.stage = STAGE[np.stack([sample.phase for sample in kept])]
         self.segment = np.stack([sample.segment for sample in kept])
-        self.played = np.stack([sample.played for sample in kept])
 
     def list_actions(self, run: int) -> list[tuple[int, int]]:
         """Return first sample and end of each way and each program of a run, in order."""
@@ -55,42 +53,6 @@ class PlanTrack:
             if self.stage[begin, run] != AFTER:
                 found.append((begin, end))
         return found
-
-
-def describe_run(
-    track: PlanTrack, run: int, segments: tuple[Segment, ...], period_s: float
-) -> list[dict[str, Any]]:
-    """Return the actions of one run on this track, in order, as plain JSON data.
-
-    Times count from the first sample.
-
-    Each entry: `name` of the segment; `part`: `approach` (with the rest after it) or `program`;
-    `start_s` and `end_s`; for programs `offset_s`, how far the program was at `start_s` (0 unless a
-    file begins in the middle), `away_s`, pairs of times between which the machine was brought home
-    instead, and `repeat_of` where it repeats another segment.
-    """
-    t_s, stage = track.t_s - track.t_s[0], track.stage[:, run]
-    ends_s = np.append(t_s[1:], t_s[-1] + period_s)
-    found = []
-    for begin, end in track.list_actions(run):
-        segment, is_way = segments[track.segment[begin, run]], stage[begin] == BEFORE
-        entry: dict[str, Any] = {
-            "name": segment.name,
-            "part": "approach" if is_way else "program",
-            "start_s": _round_ms(t_s[begin]),
-            "end_s": _round_ms(ends_s[end - 1]),
-        }
-        if not is_way:
-            entry["offset_s"] = _round_ms(track.played[begin, run] * period_s)
-            entry["away_s"] = []
-            for first, last in split_stretches(stage[begin:end] == AWAY):
-                if stage[begin + first] == AWAY:
-                    span_s = _round_ms(t_s[begin + first]), _round_ms(ends_s[begin + last - 1])
-                    entry["away_s"].append(list(span_s))
-            if segment.repeat_of:
-                entry["repeat_of"] = segment.repeat_of
-        found.append(entry)
-    return found
 
 
 def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> dict[str, Any]:
@@ -127,7 +89,6 @@ def _summarise_run(
             }
         entry = {
             "name": segment.name,
-            "repeat_of": segment.repeat_of,
             "program_s": _round_ms(len(segment.u) * period_s),
             "approach_s": _round_ms((mine & (stage == BEFORE)).sum() * period_s),
             "start_s": _round_ms(track.t_s[rows[0]]) if len(rows) else None,
@@ -199,7 +160,7 @@ def _draw_segments(
     colors = dict(zip(plan.names, cycle((BLUE, ORANGE, *OTHERS))))
     for begin, end in track.list_actions(0):
         segment = plan.runs[0][track.segment[begin, 0]]
-        name = segment.repeat_of or segment.name
+        name = segment.name
         color = colors.get(name.split("_")[0], GREY)
         if track.stage[begin, 0] == BEFORE:
             name, color = "", "white"
@@ -210,8 +171,7 @@ def _draw_segments(
             )
         if stop - start > LETTER * minutes[-1] * len(name):
             place = 0.5 * (start + stop), 0.5
-            text = name.replace("_", " ") + (" again" if segment.repeat_of else "")
-            axes[0].annotate(text, place, ha="center", va="center", fontsize=8)
+            axes[0].annotate(name.replace("_", " "), place, ha="center", va="center", fontsize=8)
     axes[0].set_yticks([])
     axes[0].set_ylim(0.0, 1.0)
     axes[0].spines[:].set_visible(False)

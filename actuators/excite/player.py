@@ -7,7 +7,6 @@
 
 Approaches run in closed loop, programs in open loop, both within the guards. The clock of a
 program keeps running while its joint is brought home, so a segment lasts as long as its program.
-A repeat plays the commands that were really sent in the original: only then are both comparable.
 """
 
 import logging
@@ -92,9 +91,6 @@ def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
 
 log = logging.getLogger(__name__)
 
-REPEAT_MARGIN = 0.25
-"""Stop margin of a repeat, of that of the original: the small difference of their starts must not
-turn it back earlier."""
 SPEED_WINDOW = 4
 """Control periods over which the measured speed is taken; one period alone would be mostly
 noise."""
@@ -169,7 +165,6 @@ class PlanPlayer:
         """Take the commands that were really sent, `(N, J)`, and advance by one control period."""
         self._in_flight = np.concatenate([self._in_flight[:, 1:], u[:, None]], 1)
         inside = INSIDE[self.phase]
-        self._sent[self._rows[inside], self._index[inside]] = u[inside]
         self._index += inside
         self._left -= 1
         over = inside & (self._index >= self._end[self._rows, self.segment])
@@ -180,25 +175,11 @@ class PlanPlayer:
         if following.any():
             assert self._seen is not None
             self._left[following] = self._patience(self._seen[-1])[following]
-            for n in np.flatnonzero(following).tolist():
-                self._take_up_repeat(n, self.segment[n])
-
-    @property
-    def played(self) -> np.ndarray:
-        """Control periods since the program of the present segment began, `(N,)`."""
-        return self._index - self._begin[self._rows, self.segment]
 
     @property
     def done(self) -> bool:
         """True when every run has played all its segments."""
         return bool((self.phase == DONE).all())
-
-    def _take_up_repeat(self, n: int, segment: int) -> None:
-        """Copy the commands sent in the original into a repeat; leave other segments."""
-        original = self._original[n, segment]
-        if original >= 0:
-            there, here = (slice(self._begin[n, i], self._end[n, i]) for i in (original, segment))
-            self._program[n, here] = self._sent[n, there]
 
     def _advance(self, q: np.ndarray, far: np.ndarray) -> None:
         """Go on from approach to rest to play, and from return to wait to play."""
@@ -266,27 +247,22 @@ class PlanPlayer:
             raise ConfigError("plan: a run has no segments")
         length = max(sum(len(segment.u) for segment in run) for run in runs)
         self._program = np.zeros((count, length, machine.num_joints))
-        self._sent = np.zeros_like(self._program)
         self._at_zero = np.zeros((count, length), dtype=bool)
         self._start = np.tile(machine.home, (count, most, 1))
         self._low, self._high = np.zeros_like(self._start), np.zeros_like(self._start)
-        self._begin, self._end = np.zeros((2, count, most), dtype=int)
+        self._end = np.zeros((count, most), dtype=int)
         self._goes_home = np.zeros((count, most), dtype=bool)
-        self._original = np.full((count, most), -1)
         for n, run in enumerate(runs):
-            end, names = 0, [segment.name for segment in run]
+            end = 0
             for i, segment in enumerate(run):
                 begin, end = end, end + len(segment.u)
                 self._program[n, begin:end] = segment.u
                 passes = np.zeros(segment.u.shape, dtype=bool)
                 passes[1:] = (segment.u[1:] * segment.u[:-1] <= 0) & (segment.u[:-1] != 0)
                 self._at_zero[n, begin:end] = passes.any(1)
-                self._start[n, i], self._begin[n, i], self._end[n, i] = segment.start, begin, end
+                self._start[n, i], self._end[n, i] = segment.start, end
                 self._goes_home[n, i] = segment.stops == "home"
                 margin = segment.stop_margin * self._travel
-                if segment.repeat_of in names[:i]:
-                    self._original[n, i] = names.index(segment.repeat_of)
-                    margin = margin * REPEAT_MARGIN
                 self._low[n, i], self._high[n, i] = machine.lower + margin, machine.upper - margin
 
 
@@ -307,7 +283,6 @@ class Sample:
         u: Commands really sent, in force from `t_s` on, `(N, J)`.
         phase: Phase of each run, `(N,)`: `APPROACH`, `REST`, …
         segment: Number of its segment, `(N,)`.
-        played: Control periods since the program of that segment began, `(N,)`.
         extra: Further measurements of the link, each `(N,)`.
     """
 
@@ -316,7 +291,6 @@ class Sample:
     u: np.ndarray
     phase: np.ndarray
     segment: np.ndarray
-    played: np.ndarray
     extra: Mapping[str, np.ndarray]
 
 
@@ -351,13 +325,13 @@ def drive(
             )
         q = q.reshape(shape)
         u, speeds = program.command(runner.command(q), q)
-        phase, segment, played = runner.phase.copy(), runner.segment.copy(), runner.played
+        phase, segment = runner.phase.copy(), runner.segment.copy()
         sent = np.array(link.send(Command(u.reshape(form))).u, dtype=np.float64).reshape(shape)
         runner.took(speeds if machine.interface == "position" else sent)
         columns = {}
         for name, value in extra().items():
             columns[name] = np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64)
-        yield Sample(state.t_s, q.copy(), sent, phase, segment, played, columns)
+        yield Sample(state.t_s, q.copy(), sent, phase, segment, columns)
 
 
 def _wait_for_state(link: Link, due_s: float) -> JointState:

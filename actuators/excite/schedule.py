@@ -85,16 +85,15 @@ def plan_runs(
     """
     if not excitations:
         raise ConfigError(
-            "excitation: none chosen; for example excitation=sine or excitation=[levels,ramps,holds,repeat]"
+            "excitation: none chosen; for example excitation=sine or excitation=[levels,ramps,holds]"
         )
-    weights: dict[str, float] = {}
-    for name, excitation in excitations.items():
-        weights[name] = excitation.weight(sum(weights.values()))
-        if weights[name] <= 0:
+    shares = {name: excitation.share for name, excitation in excitations.items()}
+    for name, share in shares.items():
+        if share <= 0:
             raise ConfigError(
-                f"excitation.{name}: its share is {weights[name]:g}; expected more than 0, or leave it out"
+                f"excitation.{name}: its share is {share:g}; expected more than 0, or leave it out"
             )
-    parts = {name: weight / sum(weights.values()) for name, weight in weights.items()}
+    parts = {name: share / sum(shares.values()) for name, share in shares.items()}
     runs = []
     for seed in generator.integers(2**63, size=num_runs):
         programs_s, tries = run_s, []
@@ -118,7 +117,7 @@ def _collect_segments(
     """Return the segments of one run; the same seed draws the same."""
     generator, found = np.random.default_rng(seed), []
     for name, excitation in excitations.items():
-        found += excitation.segments(machine, parts[name] * programs_s, generator, tuple(found))
+        found += excitation.segments(machine, parts[name] * programs_s, generator)
     return found
 
 

@@ -1,6 +1,5 @@
 """The paper's excitation: one joint at a time, sines of random frequency and amplitude."""
 
-from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -43,16 +42,8 @@ class Sine:
                 f"smallest: expected largest={self.largest} or less, got {self.smallest}"
             )
 
-    def weight(self, before: float) -> float:
-        """Return `share`."""
-        return self.share
-
     def segments(
-        self,
-        machine: Machine,
-        duration_s: float,
-        generator: np.random.Generator,
-        before: Sequence[Segment],
+        self, machine: Machine, duration_s: float, generator: np.random.Generator
     ) -> list[Segment]:
         """Return one segment per joint, from home, of equal length, in random order."""
         steps = int(duration_s / machine.num_joints / machine.period_s)

@@ -1,6 +1,5 @@
 """A person at work: strokes towards places, and short corrections there. It moves otherwise than a test programme."""
 
-from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -51,16 +50,8 @@ class Work:
                     f"{name}: expected [low, high] with low <= high, got [{low}, {high}]"
                 )
 
-    def weight(self, before: float) -> float:
-        """Return `share`."""
-        return self.share
-
     def segments(
-        self,
-        machine: Machine,
-        duration_s: float,
-        generator: np.random.Generator,
-        before: Sequence[Segment],
+        self, machine: Machine, duration_s: float, generator: np.random.Generator
     ) -> list[Segment]:
         """Return segments of about `pose_s` each, which fill the time."""
         return fill_from_poses(

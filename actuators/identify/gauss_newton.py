@@ -14,7 +14,6 @@ Axes: `C` candidates, `P` parameters, `J` joints, `W` windows, `K` steps, `D` co
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import torch
@@ -82,7 +81,6 @@ class CandidateRuns:
     Args:
         actuator: Gives all numbers that are not free.
         free: Lower and upper bound by name.
-        coupled: Whether a joint's numbers change how the others move.
         machine: The machine.
         cut: Windows.
         active: Which joints each window says something about, `(W, J)`; the others neither count
@@ -94,14 +92,13 @@ class CandidateRuns:
         self,
         actuator: Actuator,
         free: Mapping[str, tuple[float, float]],
-        coupled: bool,
         machine: Machine,
         cut: open_loop.FreeRunWindows,
         active: np.ndarray,
         device: torch.device,
     ) -> None:
         self._actuator, self._machine, self._device = actuator, machine, device
-        self.names, self.coupled, self.cut, self.active = tuple(free), coupled, cut, active
+        self.names, self.cut, self.active = tuple(free), cut, active
         self._low, self._high = np.array([free[name] for name in self.names]).T[:, :, None]
         self._ahead = np.arange(1, cut.measured.shape[1] + 1)[:, None] * machine.period_s
 
@@ -162,34 +159,24 @@ class CandidateRuns:
     def jacobian(self, x: np.ndarray, size: float = STEP) -> tuple[np.ndarray, np.ndarray]:
         """Return errors `(W, K, J)` at `x` `(P, J)` and derivatives `(W, K, J, D)`.
 
-        The derivatives are finite differences of `size`.
-
-        One free run of a window serves a number of all joints at once where joints do not influence
-        each other; only joints that are active there are varied.
+        The derivatives are finite differences of `size`. Joints do not influence each other, so one
+        free run of a window serves a number of all joints at once.
         """
         num, joints = x.shape
-        varied_joints = range(joints) if self.coupled else [slice(None)]
-        columns = list(product(range(num), varied_joints))
-        pairs = []
-        for column, (_, j) in enumerate(columns):
-            active = self.active[:, j] if self.coupled else self.active.any(1)
-            pairs += [(w, column) for w in np.flatnonzero(active)]
         step = np.where(x + size <= 1.0, size, -size)
-        varied = np.repeat(x[None], len(columns), 0)
-        for column, place in enumerate(columns):
-            varied[(column, *place)] += step[place]
-        rows = np.array(pairs)
-        base = np.arange(len(self.active))
-        candidates = np.concatenate([np.repeat(x[None], len(base), 0), varied[rows[:, 1]]])
-        error = self.errors(candidates, np.concatenate([base, rows[:, 0]]))
+        varied = np.repeat(x[None], num, 0)
+        numbers = np.arange(num)
+        varied[numbers, numbers] += step
+        base, told = np.arange(len(self.active)), np.flatnonzero(self.active.any(1))
+        candidates = np.concatenate(
+            [np.repeat(x[None], len(base), 0), np.repeat(varied, len(told), 0)]
+        )
+        error = self.errors(candidates, np.concatenate([base, np.tile(told, num)]))
         error, moved = error[: len(base)], error[len(base) :]
         slopes = np.zeros((*error.shape, num, joints), dtype=np.float32)
         each = np.arange(joints)
-        for (w, column), path in zip(pairs, moved, strict=True):
-            p, j = columns[column]
-            if self.coupled:
-                slopes[w, :, :, p, j] = (path - error[w]) / step[p, j]
-            else:
+        for p, paths in enumerate(moved.reshape(num, len(told), *error.shape[1:])):
+            for w, path in zip(told, paths, strict=True):
                 slopes[w][:, each, p, each] = (path - error[w]) / step[p]
         return error, slopes.reshape(*error.shape, num * joints)
 
@@ -229,7 +216,7 @@ def take_step(runs: CandidateRuns, x: np.ndarray, robust: float) -> tuple[np.nda
 
     Also returns the relative fall of the loss.
 
-    Each joint takes its own best step where joints do not influence each other.
+    Each joint takes its own best step.
     """
     error, slopes = runs.jacobian(x)
     squares = np.square(error, dtype=np.float64).sum(1)
@@ -246,8 +233,6 @@ def take_step(runs: CandidateRuns, x: np.ndarray, robust: float) -> tuple[np.nda
         step[inward] = -np.linalg.solve(damped, gradient[inward])
         trials.append(np.clip(x + step.reshape(x.shape), 0.0, 1.0))
     totals = loss.total(runs.squares(np.stack(trials)))  # (C, J)
-    if runs.coupled:
-        totals = np.repeat(totals.sum(1, keepdims=True), x.shape[1], 1)
     best = totals.argmin(0)
     gain = (totals[0] - totals.min(0)) / np.maximum(totals[0], 1e-12)
     return np.stack([trials[c][:, j] for j, c in enumerate(best)], 1), float(gain.max())

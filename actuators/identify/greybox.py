@@ -117,8 +117,6 @@ def log_undetermined(facts: dict[str, Any]) -> None:
         log.warning(text, *pair["pair"], pair["correlation"])
 
 
-REFIT_STEPS = 6
-"""Gauss-Newton steps of a refit at most: it begins near its end."""
 ACTIVE_SHARE = 0.1
 """A window says something about a joint that is commanded for so much of it."""
 
@@ -132,8 +130,6 @@ class GreyBoxFit:
             `actuator=@…`, and `<name>.json`.
         actuator: The model; numbers that are not free keep the values they have here.
         free: Lower and upper bound of each number that is fitted, joint by joint, by name.
-        coupled: Whether a joint's numbers change how the others move (a shared pump); costs a free
-            run a joint and number.
         horizon_s: Length of the free runs.
         windows: Free runs a joint, taken evenly from the runs of the machine, where the joint is
             commanded.
@@ -150,7 +146,6 @@ class GreyBoxFit:
     name: str
     actuator: Actuator
     free: dict[str, tuple[float, float]]
-    coupled: bool
     horizon_s: Positive
     windows: Count
     validation_windows: Count
@@ -171,10 +166,6 @@ class GreyBoxFit:
         if self.starts > self.candidates + 1:
             raise ConfigError(
                 f"starts: {self.starts} of {self.candidates} candidates; raise candidates"
-            )
-        if getattr(self.actuator, "spread", None):
-            raise ConfigError(
-                "actuator.spread: expected {}; a number that is drawn anew at each reset cannot be fitted"
             )
 
     def fit(
@@ -229,22 +220,6 @@ class GreyBoxFit:
         log_undetermined(facts)
         return fitted
 
-    def refit(
-        self, fitted: Actuator, machine: Machine, recordings: Sequence[Recording]
-    ) -> Actuator:
-        """Return `fitted` with its free numbers fitted to other recordings, from where they are."""
-        device = torch.device("cpu")
-        beside = dataclasses.replace(self, actuator=fitted)
-        # It draws which windows count, where there are more than `windows`.
-        random = np.random.default_rng(0)
-        runs = beside._free_runs(machine, recordings, self.windows, random, device)
-        x = beside._nominal(machine, device)
-        for _ in range(REFIT_STEPS):
-            x, gain = take_step(runs, x, self.robust)
-            if gain < self.tolerance:
-                break
-        return dataclasses.replace(fitted, **self._rounded(machine, runs, x))  # pyright: ignore[reportArgumentType, reportCallIssue]
-
     def _nominal(self, machine: Machine, device: torch.device) -> np.ndarray:
         """Return the actuator's own parameters in units of their ranges, `(P, J)`.
 
@@ -276,9 +251,7 @@ class GreyBoxFit:
         active = (np.abs(cut.u) > COMMANDED).mean(1) >= ACTIVE_SHARE
         rows = _select_windows(active, cut.run, num_windows, random)
         cut = dataclasses.replace(cut, u=cut.u[rows], q=cut.q[rows], run=cut.run[rows])
-        return CandidateRuns(
-            self.actuator, self.free, self.coupled, machine, cut, active[rows], device
-        )
+        return CandidateRuns(self.actuator, self.free, machine, cut, active[rows], device)
 
     def _rounded(
         self, machine: Machine, runs: CandidateRuns, x: np.ndarray
@@ -310,14 +283,12 @@ class _Search:
         return np.stack(found)
 
     def choose(self, stacked: np.ndarray, held: CandidateRuns) -> np.ndarray:
-        """Return the parameters `(P, J)` with the best validation runs, per joint if uncoupled."""
+        """Return the parameters `(P, J)` with the best validation runs, joint by joint."""
         score, fallback = (
             _average_rmse(runs.squares(stacked), runs.active) for runs in (held, self.runs)
         )
         # The fallback is for a joint that the validation never moves.
         score = np.where(np.isfinite(score), score, fallback)
-        if self.config.coupled:
-            score = np.repeat((score / score.min(0)).sum(1, keepdims=True), score.shape[1], 1)
         return np.stack([stacked[best][:, j] for j, best in enumerate(score.argmin(0))], 1)
 
     def _starts(self, nominal: np.ndarray, seed: int) -> np.ndarray:

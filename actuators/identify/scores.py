@@ -82,22 +82,16 @@ class FreeRunScores:
     def at(self, name: str, horizon_s: float) -> list[dict[str, Any]]:
         """Return the error of a model at a horizon, joint by joint.
 
-        `rmse` of the position at the end, rad or m, with `ci95`; `percent` of the joint's travel;
-        over the same windows `path_rmse` and `path_mean` (absolute) along the path and `end_mean`
-        at its end.
+        `rmse` of the position at the end, rad or m, with `ci95`; `percent` of the joint's travel.
         """
         step = self.step(horizon_s)
-        error = self.error[name][np.isfinite(self.cut.measured[:, step, 0])]
-        path, (rmse, resampled) = error[:, : step + 1], self.rmse(name)
+        rmse, resampled = self.rmse(name)
         rows = []
         for j in range(len(self.travel)):
             row = {
                 "rmse": float(rmse[step, j]),
                 "ci95": bound_interval(resampled[:, step, j]),
                 "percent": float(100.0 * rmse[step, j] / self.travel[j]),
-                "path_rmse": float(np.sqrt(np.mean(path[..., j] ** 2))),
-                "path_mean": float(np.abs(path[..., j]).mean()),
-                "end_mean": float(np.abs(error[:, step, j]).mean()),
             }
             rows.append(row)
         return rows
@@ -134,7 +128,7 @@ def average_joints(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict
     """Return means over joints; those in rad or m only where all joints have the same unit."""
     keys = ["percent"]
     if len(set(units)) == 1:
-        keys = ["rmse", "percent", "path_rmse", "path_mean", "end_mean"]
+        keys = ["rmse", "percent"]
     return {key: float(np.mean([row[key] for row in rows])) for key in keys}
 
 

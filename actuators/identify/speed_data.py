@@ -9,7 +9,6 @@ Axes: `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments,
 play.
 """
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -95,7 +94,6 @@ class SpeedData:
     Attributes:
         way: Increments, `(J, I)`.
         num_increments: Number of increments of each used recording.
-        known: Increments that count, `(I,)` bool.
         scale: Mean square of the increments, `(J,)`.
     """
 
@@ -121,58 +119,17 @@ class SpeedData:
         way = [self._increments(np.diff(part, axis=0, append=part[-1:])) for part in q]
         self.way = np.concatenate(way).T  # (J, I)
         self._free = np.concatenate([self._at_stop(part) for part in q]).T
-        self.known = np.ones(self.way.shape[1], dtype=bool)
         self._bend = _build_bend_penalty(knots)
-        self._measure_scale()
-
-    def _measure_scale(self) -> None:
         self.scale = np.maximum(np.mean(self.way**2, 1), 1e-12)
         self._noise = 1e-3 * self.scale  # a first guess of the squared error, for the priors
 
-    @property
-    def moves(self) -> np.ndarray:
-        """Joints that move at all, `(J,)` bool."""
-        return self.scale >= STILL
-
-    @property
-    def weights(self) -> np.ndarray:
-        """1 for increments away from both stops, else 0, `(J, I)`."""
-        return self._free
-
-    def strokes(self, j: int, dynamics: np.ndarray) -> np.ndarray:
-        """Return the mean stroke of the valve of joint `j` over each increment, `(I,)`."""
-        parts = [self._increments(one.spool(j, dynamics)) for one in self._used]
-        return np.concatenate(parts) / WIDTH
-
-    def pull(self, noise: float, size: int) -> np.ndarray:
-        """Return the prior of the curve as a normal matrix, `(size, size)`, zero beyond the curve."""
-        found = np.zeros((size, size))
-        count = len(self._bend)
-        found[:count, :count] = noise / STIFFNESS**2 * self._bend
-        return found
-
     def check_motion(self) -> None:
         """Raise `RecordingError` where a joint never moves: nothing can be fitted to it."""
-        if (still := np.flatnonzero(~self.moves)).size:
+        if (still := np.flatnonzero(self.scale < STILL)).size:
             names = ", ".join(self.machine.joint_names[j] for j in still)
             raise RecordingError(
                 f"too little data: {names} never moves in the {len(self._used)} recordings to fit to"
             )
-
-    def replace_motion(self, steps: Sequence[np.ndarray]) -> "SpeedData":
-        """Return the same commands and poses with another motion.
-
-        Args:
-            steps: Motion from each sample to the next of each recording, `(T, J)`; increments with
-                NaN count nothing.
-        """
-        other = copy.copy(self)
-        used = [steps[n] for n in self._places]
-        way = np.concatenate([self._increments(part) for part in used]).T
-        other.known = np.isfinite(way).all(0)
-        other.way, other._free = np.where(other.known, way, 0.0), self._free * other.known
-        other._measure_scale()
-        return other
 
     def features(
         self, j: int, dynamics: np.ndarray, known: Sequence[np.ndarray] | None = None
@@ -223,20 +180,15 @@ class SpeedData:
         normal += 1e-9 * np.trace(normal) * np.eye(len(normal))
         return np.linalg.solve(normal, weighted.T @ way)
 
-    def statics(
-        self, dynamics: np.ndarray, sweeps: int, demand: np.ndarray | None = None
-    ) -> StaticFit:
-        """Return curves, pose and demands for given dynamics `(J, 4)`.
-
-        `demand`: where to begin, if known.
-        """
+    def statics(self, dynamics: np.ndarray, sweeps: int) -> StaticFit:
+        """Return curves, pose and demands for given dynamics `(J, 4)`."""
         joints, half = range(self.machine.num_joints), len(self._knots) - 1
         spools = [one.spools(dynamics) for one in self._used]
         bases = [[self._basis(spool[:, j], j) for spool in spools] for j in joints]
         found = StaticFit(
             np.zeros((len(joints), 2 * half)),
             np.zeros((len(joints), 2, self.num_pose)),
-            np.full(len(joints), FIRST_DEMAND) if demand is None else demand,
+            np.full(len(joints), FIRST_DEMAND),
         )
         opening = [np.abs(spool) for spool in spools]
         noise, free = self._noise.copy(), self._free.copy()

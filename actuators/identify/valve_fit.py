@@ -80,27 +80,8 @@ class ValveFit:
         write_option(folder, self.name, fitted, comment)
         return fitted
 
-    def refit(
-        self, fitted: ValveActuator, machine: Machine, recordings: Sequence[Recording]
-    ) -> ValveActuator:
-        """Return `fitted` with curves, pose and pump refitted; the dynamics stay."""
-        columns = [getattr(fitted, name) for name in ("dead_time_s", "play", "spool_s", "speed_s")]
-        by_joint = []
-        for name in machine.joint_names:
-            by_joint.append([column[name] for column in columns])
-        dynamics = np.array(by_joint)
-        assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
-        demand = np.array([fitted.demand[name] for name in machine.joint_names])
-        data = SpeedData(recordings, machine, np.array(self.actuator.knots))
-        data.check_motion()
-        return self._spec(data, dynamics, demand)
-
-    def _spec(
-        self, data: SpeedData, dynamics: np.ndarray, demand: np.ndarray | None = None
-    ) -> ValveActuator:
-        found = data.statics(
-            dynamics, self.sweeps if demand is None else max(1, self.sweeps // 2), demand
-        )
+    def _spec(self, data: SpeedData, dynamics: np.ndarray) -> ValveActuator:
+        found = data.statics(dynamics, self.sweeps)
         machine, half = data.machine, len(self.actuator.knots) - 1
         curve = np.insert(np.maximum(found.curve, 0.0), [0, half], 0.0, axis=1)
         columns = {
@@ -124,19 +105,14 @@ def fit_all_dynamics(
     start: np.ndarray | None,
     longest_lag_s: float,
     iterations: int,
-    joints: Sequence[int] | None = None,
 ) -> np.ndarray:
-    """Return the dynamics of all `joints`, 0 for others, `(J, 4)`; arguments as in `fit_dynamics`."""
-    joints = range(data.machine.num_joints) if joints is None else joints
-    found = np.zeros((data.machine.num_joints, NUM_DYNAMICS))
+    """Return the dynamics of all joints, `(J, 4)`; arguments as in `fit_dynamics`."""
 
     def fit(j: int) -> np.ndarray:
         factors, begin = known[j] if known else None, None if start is None else start[j]
         return fit_dynamics(data, j, factors, begin, longest_lag_s, iterations)
 
-    for j, row in zip(joints, map_parallel(fit, joints), strict=True):
-        found[j] = row
-    return found
+    return np.stack(list(map_parallel(fit, range(data.machine.num_joints))))
 
 
 def fit_dynamics(
@@ -163,7 +139,7 @@ def fit_dynamics(
     most = np.array([longest_s, PLAYS[-1], longest_lag_s, longest_lag_s])
 
     def left(x: np.ndarray) -> np.ndarray:
-        features, way = data.features(j, x, known)[data.known], data.way[j][data.known]
+        features, way = data.features(j, x, known), data.way[j]
         return (way - features @ data.curve(features, way)) / np.sqrt(data.scale[j])
 
     if start is None:

@@ -104,7 +104,6 @@ class HydraulicCircuit:
         bypass_stroke: Stroke at which an open centre is closed, of full stroke.
         outrigger_nm_rad: Stiffness of the stand on its outriggers; 0: rigid.
         substep_s: Own time step.
-        spread: Relative half width, by field name, of draws per environment and joint at reset.
     """
 
     compensation: Literal["pre", "post", "none"]
@@ -141,7 +140,6 @@ class HydraulicCircuit:
     bypass_stroke: Positive
     outrigger_nm_rad: Annotated[float, Ge(0)]
     substep_s: Annotated[float, Interval(gt=0, le=0.005)]
-    spread: dict[str, float]
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> CircuitModel:
         """Return a model for `num_envs` environments on `device`.

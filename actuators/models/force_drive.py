@@ -60,7 +60,6 @@ class ForceDrive:
         outside_load_at_rest: The same of the weight.
         motor_load_square: Friction at rest over the square of the motor's force over `max_force`.
         outside_load_square: The same of the weight.
-        spread: Relative half width, by field name, of draws per environment and joint at reset.
     """
 
     label: ClassVar = "force"
@@ -71,7 +70,6 @@ class ForceDrive:
     viscous_n_s_m: PerJoint
     coulomb_n: PerJoint
     offset_n: PerJoint
-    spread: dict[str, float]
     # Files from before these numbers lack them; neutral.
     pose_sin_n: PerJoint = 0.0
     pose_cos_n: PerJoint = 0.0
@@ -135,7 +133,7 @@ class ForceDriveModel(ParametricModel):
             not_negative=("viscous_n_s_m", "coulomb_n", "stribeck_n", *LOADS),
             absent={"stribeck_m_s": STRIBECK_SPEED * machine.max_speed},
         )
-        super().__init__(config, nominal, machine, num_envs, device)
+        super().__init__(nominal, machine, num_envs, device)
         self.drive_changes: dict[str, torch.Tensor] = {}
         self.motor: Motor | None = None
         self._max_force = torch.as_tensor(machine.max_force, dtype=torch.float32, device=device)

@@ -80,8 +80,6 @@ class Hydraulic:
         thermal_gain: Relative change of speed and spool frequency per kelvin.
         substep_s: Own time step; the control period is divided into the nearest whole number of
             them.
-        spread: Relative half width, by field name, of draws per environment and joint at
-            reset.
     """
 
     transport_s: PerJoint
@@ -109,7 +107,6 @@ class Hydraulic:
     oil_reference_c: float
     thermal_gain: float
     substep_s: Annotated[float, Interval(gt=0, le=0.01)]
-    spread: dict[str, float]
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HydraulicModel":
         """Return a model for `num_envs` environments on `device`.
@@ -124,7 +121,7 @@ class OilModel(ParametricModel):
     """Base of hydraulic plants: numbers within bounds, weight, stiffness, substeps.
 
     Args:
-        config: The spec, with `substep_s` and `spread`.
+        config: The spec, with `substep_s`.
         machine: A machine with known masses.
         num_envs: Number of environments, `N`.
         device: Where the tensors live.
@@ -156,9 +153,8 @@ class OilModel(ParametricModel):
             raise ConfigError(
                 "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)"
             )
-        longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
-        check_dead_time(float(longest_s), machine, "actuator.transport_s")
-        super().__init__(config, nominal, machine, num_envs, device)
+        check_dead_time(float(nominal["transport_s"].max()), machine, "actuator.transport_s")
+        super().__init__(nominal, machine, num_envs, device)
         self._config = config
         self._num_substeps = max(1, round(machine.period_s / config.substep_s))
         self._dt_s = machine.period_s / self._num_substeps

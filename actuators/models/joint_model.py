@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import SpreadParameters, split_run_commands
+from actuators.models.parameters import split_run_commands
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
@@ -37,8 +37,7 @@ class ParametricModel:
     """Base of models with numbers and a state by joint.
 
     Args:
-        config: The spec, with `spread`.
-        nominal: Its numbers by name, `(J,)`.
+        nominal: Numbers by name, `(J,)`.
         machine: The machine.
         num_envs: Number of environments, `N`.
         device: Where the tensors live.
@@ -57,16 +56,15 @@ class ParametricModel:
 
     def __init__(
         self,
-        config: Any,
         nominal: Mapping[str, np.ndarray],
         machine: Machine,
         num_envs: int,
         device: torch.device,
     ) -> None:
-        self._parameters = SpreadParameters(
-            nominal, config.spread, num_envs, device, "actuator.spread"
-        )
-        self.parameters = self._parameters.value
+        self.parameters: dict[str, torch.Tensor] = {}
+        for name, value in nominal.items():
+            row = torch.as_tensor(value, dtype=torch.float32, device=device)
+            self.parameters[name] = row.expand(num_envs, -1).clone()
         self.plant = MachineTensors(machine, device)
         shape = (num_envs, machine.num_joints)
         self._state = {name: torch.zeros(shape, device=device) for name in self.STATES}
@@ -74,8 +72,8 @@ class ParametricModel:
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """State of the joints, `fresh` `(N,)` where it is not begun yet, and the drawn parameters."""
-        return {**self._state, "fresh": self._fresh, **self._parameters.state}
+        """State of the joints, and `fresh` `(N,)` where it is not begun yet."""
+        return {**self._state, "fresh": self._fresh}
 
     @property
     def delay_s(self) -> torch.Tensor:
@@ -83,17 +81,13 @@ class ParametricModel:
         return self.parameters[self.DELAY]
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Let the environments of `mask`, `(N,)` bool, start from their history; redraw.
-
-        Cuts gradients.
-        """
+        """Let the environments of `mask`, `(N,)` bool, start from their history; cuts gradients."""
         for name in self.STATES:
             value = self._state[name]
             if value.requires_grad:
                 value.detach_()
             value.masked_fill_(mask[:, None], 0.0)
         self._fresh.logical_or_(mask)
-        self._parameters.redraw(mask)
 
     def recall(self, begun: JointMemory) -> JointMemory:
         """Return the state of the joints, `begun` in environments that start from their history."""

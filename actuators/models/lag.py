@@ -57,8 +57,6 @@ class FirstOrderLag:
         dead_band_retract: The same for the negative direction.
         gain: Speed at full command over the machine's `max_speed`.
         time_constant_s: Time constant with which the speed follows the command; 0 for none.
-        spread: Relative half width, by field name, of draws per environment and joint at
-            reset.
     """
 
     label: ClassVar = "lag"
@@ -68,7 +66,6 @@ class FirstOrderLag:
     dead_band_retract: PerJoint
     gain: PerJoint
     time_constant_s: PerJoint
-    spread: dict[str, float]
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "FirstOrderLagModel":
         """Return a model for `num_envs` environments on `device`.
@@ -117,7 +114,7 @@ class FirstOrderLagModel(PlannableModel):
                 raise ConfigError(
                     f"actuator.{name}: expected dead bands in [0, 1), got {nominal[name].tolist()}"
                 )
-        super().__init__(config, nominal, machine, num_envs, device)
+        super().__init__(nominal, machine, num_envs, device)
         self.reset(self._fresh.clone())
 
     def ask(self, commands: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Parameters of an actuator: one value or one per joint, drawn per episode, dead time and dead band.
+"""Parameters of an actuator: one value or one per joint, random draws, dead time and dead band.
 
 Random numbers come from a counter in the state instead of a generator. No host is involved, a CUDA
 graph may hold the draws, and a run that is restored from its state goes on exactly; a generator would
@@ -89,7 +89,7 @@ def read_parameters(
     """Return the numbers of an actuator's spec for every joint, `(J,)` each, checked.
 
     Args:
-        config: The spec, with `spread`. A `dead_time_s` of `None` takes the machine's.
+        config: The spec. A `dead_time_s` of `None` takes the machine's.
         names: Fields to read, `dead_time_s` among them.
         machine: The machine.
         positive: Fields that must be above 0.
@@ -113,71 +113,8 @@ def read_parameters(
             raise ConfigError(f"actuator.{name}: expected > 0, got {found[name].tolist()}")
         if name in not_negative and (found[name] < 0).any():
             raise ConfigError(f"actuator.{name}: expected 0 or more, got {found[name].tolist()}")
-    longest_s = found["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
-    check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
+    check_dead_time(float(found["dead_time_s"].max()), machine, "actuator.dead_time_s")
     return found
-
-
-class SpreadParameters:
-    """Parameters for all environments: tensors `(N, J)` at fixed addresses, in `value` by name.
-
-    With a `spread` a number is `nominal * (1 + spread * U(-1, 1))`, drawn per environment and joint
-    at each reset. The draws come from a counter in `state` and not from a generator: no host is
-    involved, a CUDA graph may hold them, and a resumed run goes on exactly.
-
-    Args:
-        nominal: Nominal values by name, each `(J,)`.
-        spread: Relative half width by name; names that are not listed stay at their nominal value.
-        num_envs: Number of environments, `N`.
-        device: Where the tensors live.
-        where: Spec field named in error messages.
-
-    Raises:
-        ConfigError: `spread` names something that is no parameter, or is outside [0, 1).
-    """
-
-    def __init__(
-        self,
-        nominal: Mapping[str, np.ndarray],
-        spread: Mapping[str, float],
-        num_envs: int,
-        device: torch.device,
-        where: str,
-    ) -> None:
-        for name, width in spread.items():
-            if name not in nominal:
-                raise ConfigError(
-                    f"{where}: '{name}' is no parameter; {list_choices(name, nominal)}"
-                )
-            if not 0 <= width < 1:
-                raise ConfigError(
-                    f"{where}.{name}: expected a relative half width in [0, 1), got {width}"
-                )
-
-        def fill(value: np.ndarray) -> torch.Tensor:
-            found = torch.as_tensor(value, dtype=torch.float32, device=device)
-            return found.expand(num_envs, -1).clone()
-
-        self.value = {name: fill(value) for name, value in nominal.items()}
-        self._width = dict(spread)
-        self._nominal = {name: fill(nominal[name]) for name in spread}
-        self.state: dict[str, torch.Tensor] = {}
-        if spread:
-            num_joints = len(next(iter(nominal.values())))
-            self._joint = torch.arange(num_joints, dtype=torch.int64, device=device) * 40_503
-            self._draw = start_counter(num_envs, 0, device)
-            drawn = {f"drawn_{name}": self.value[name] for name in spread}
-            self.state = {"draw": self._draw, **drawn}
-
-    def redraw(self, mask: torch.Tensor) -> None:
-        """Draw new values in the environments of `mask`, shape `(N,)` bool."""
-        if not self._width:
-            return
-        self._draw.add_(mask.to(torch.int64))
-        for column, (name, width) in enumerate(self._width.items()):
-            uniform = hash_uniform(self._draw[:, None] * 7_919 + self._joint + column * 104_729)
-            drawn = self._nominal[name] * (1.0 + width * (2.0 * uniform - 1.0))
-            self.value[name].copy_(torch.where(mask[:, None], drawn, self.value[name]))
 
 
 # random numbers
@@ -229,7 +166,7 @@ def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
     reach_s = (machine.num_history - 1) * machine.period_s
     if not 0.0 <= longest_s <= reach_s + 1e-6:
         raise ConfigError(
-            f"{where}: a dead time of {longest_s:.3f} s (spread included) does not fit the {reach_s:.3f} s that the history of "
+            f"{where}: a dead time of {longest_s:.3f} s does not fit the {reach_s:.3f} s that the history of "
             f"machine '{machine.name}' reaches back; shorten it or raise machine.num_history"
         )
 

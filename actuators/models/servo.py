@@ -66,7 +66,6 @@ class Servo:
         sag_rad: How far the joint stays below its target in the middle of its travel, in the
             negative direction (m for a sliding joint).
         sag_slope: Change of the sag over the change of the target.
-        spread: Relative half width, by field name, of draws per environment and joint at reset.
         limit_rad: Error of the held target from which on the motor pulls no harder: its largest torque
             over the stiffness of the loop (m for a sliding joint); `null` for no limit.
         firmware_damping: Part of the damping that the loop itself commands, so that it lies within the
@@ -83,7 +82,6 @@ class Servo:
     play_rad: PerJoint
     sag_rad: PerJoint
     sag_slope: PerJoint
-    spread: dict[str, float]
     # Files from before there was a limit lack it; neutral.
     limit_rad: PerJoint | None = None
     firmware_damping: PerJoint = 0.5
@@ -119,7 +117,7 @@ class ServoModel(PlannableModel):
             positive=("damping", "top_speed", "limit_rad"),
             not_negative=("response_s", "play_rad", "firmware_damping"),
         )
-        super().__init__(config, nominal, machine, num_envs, device)
+        super().__init__(nominal, machine, num_envs, device)
         self.drive_changes: dict[str, torch.Tensor] = {}
         self.reset(self._fresh.clone())
 

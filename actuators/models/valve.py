@@ -66,8 +66,6 @@ class ValveActuator:
         pose_extend: Relative change of the speed per feature of the pose, positive direction, by
             joint; empty for none.
         pose_retract: The same for the negative direction.
-        spread: Relative half width, by field name, of draws per environment and joint at
-            reset.
     """
 
     label: ClassVar = "valve"
@@ -82,7 +80,6 @@ class ValveActuator:
     curve_retract: tuple[float, ...] | dict[str, tuple[float, ...]]
     pose_extend: dict[str, tuple[float, ...]]
     pose_retract: dict[str, tuple[float, ...]]
-    spread: dict[str, float]
 
     def check(self) -> None:
         ends = self.knots[:1] + self.knots[-1:]
@@ -174,7 +171,7 @@ class ValveModel(PlannableModel):
     ) -> None:
         check_interface(machine, "speed", "a valve sets speeds")
         nominal = read_parameters(config, NUMBERS, machine, not_negative=NUMBERS)
-        super().__init__(config, nominal, machine, num_envs, device)
+        super().__init__(nominal, machine, num_envs, device)
 
         def tensor(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)

@@ -1,6 +1,5 @@
 """`brokk mode=collect`: plans an excitation, drives a machine through it, writes recordings."""
 
-import json
 import logging
 import time
 from dataclasses import replace
@@ -178,7 +177,7 @@ class Writer:
         settings: Collection,
         metadata: dict[str, str],
     ) -> None:
-        self._plan, self._folder = plan, folder
+        self._folder = folder
         self._period_s, self._flush_s = machine.period_s, settings.flush_s
         self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
         self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
@@ -232,12 +231,10 @@ class Writer:
         for name in samples[0].extra:
             extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
         for n, name in enumerate(self._names):
-            notes = plan_report.describe_run(track, n, self._plan.runs[n], self._period_s)
             metadata = {
                 **self._template.metadata,
                 "created": record.add_seconds(self._created, begin_s - self._begin_s),
                 "run": f"{name} {self._created}",
-                "excitation": json.dumps(notes),
             }
             columns = {key: values[n] for key, values in extra.items()}
             motion = {"t_s": track.t_s - begin_s, "u": track.u[:, n], "q": track.q[:, n]}

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import numpy as np
     import torch
 
@@ -92,8 +90,6 @@ class Segment:
                 zero. `inward`: this joint is
             driven the other way until its program next passes zero.
         stop_margin: Distance from the stops, as a part of the joint's travel.
-        repeat_of: Name of an earlier segment of the same length, of which this one repeats the
-            commands that were really sent.
     """
 
     name: str
@@ -101,7 +97,6 @@ class Segment:
     u: np.ndarray
     stops: Literal["home", "inward"]
     stop_margin: float
-    repeat_of: str | None = None
 
 
 class Excitation(Protocol):
@@ -110,16 +105,13 @@ class Excitation(Protocol):
     Numpy only: it also runs on the machine's computer.
     """
 
-    def weight(self, before: float) -> float:
-        """Return its share of the time; the excitations before it have `before` in all."""
+    @property
+    def share(self) -> float:
+        """Part of the time, relative to the others of a plan; above 0."""
         ...
 
     def segments(
-        self,
-        machine: Machine,
-        duration_s: float,
-        generator: np.random.Generator,
-        before: Sequence[Segment],
+        self, machine: Machine, duration_s: float, generator: np.random.Generator
     ) -> list[Segment]:
         """Return segments of `duration_s` in all, or as much as whole segments fill.
 
@@ -128,7 +120,6 @@ class Excitation(Protocol):
                 others.
             duration_s: Time for the programs, without the ways to their start poses.
             generator: The only source of chance.
-            before: Segments that are already planned.
 
         Raises:
             ConfigError: not a single segment fits into `duration_s`.

@@ -19,7 +19,6 @@ dead_band_extend: 0.1
 dead_band_retract: 0.1
 gain: 1.0
 time_constant_s: 0.02
-spread: {}
 """
 EFFECTS = """stiction: {_target_: actuators.effects.command.Stiction, joints: [q3], start: 0.14, stop: 0.1}
 backlash: {_target_: actuators.effects.speed.Backlash, joints: [q3], gap_rad: 0.031}

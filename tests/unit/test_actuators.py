@@ -61,7 +61,6 @@ def lag(**changes: Any) -> FirstOrderLag:
         "dead_band_retract": 0.0,
         "gain": 1.0,
         "time_constant_s": 0.0,
-        "spread": {},
     }
     return FirstOrderLag(**(plain | changes))
 
@@ -294,22 +293,6 @@ def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine)
         torch.testing.assert_close(value[1], fresh[key][1])
         torch.testing.assert_close(value[[0, 2]], used[key][[0, 2]])
         assert value.data_ptr() == addresses[key]
-
-
-def test_spread_draws_within_its_width_anew_at_each_reset(machine: Machine) -> None:
-    model = lag(dead_time_s=0.5, spread={"dead_time_s": 0.1, "gain": 0.2}).build(machine, 4000, CPU)
-    drawn = model.state["drawn_gain"].clone()
-    assert 0.8 <= drawn.min() < 0.81
-    assert 1.19 < drawn.max() <= 1.2
-    assert drawn.mean() == pytest.approx(1.0, abs=0.01)
-    assert drawn.std() == pytest.approx(0.2 / math.sqrt(3.0), rel=0.03)  # uniform
-    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 1])[0, 1]) < 0.05
-    assert abs(np.corrcoef(drawn[:, 0], model.state["drawn_dead_time_s"][:, 0])[0, 1]) < 0.05
-    mask = torch.arange(4000) < 2000
-    model.reset(mask)
-    again = model.state["drawn_gain"]
-    assert (again[2000:] == drawn[2000:]).all()
-    assert (again[:2000] != drawn[:2000]).float().mean() > 0.99
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ def segments(
     name: str, machine: Machine, duration_s: float, seed: int = 0, **fields: object
 ) -> list[Segment]:
     excitation = replace(option("excitation", name), **fields)
-    return excitation.segments(machine, duration_s, np.random.default_rng(seed), [])
+    return excitation.segments(machine, duration_s, np.random.default_rng(seed))
 
 
 def moved(segment: Segment) -> set[int]:
@@ -120,15 +120,6 @@ def test_ramps_cross_zero_at_each_slope_in_both_directions(machine: Machine) -> 
     )
 
 
-def test_a_staircase_goes_up_and_down_each_step_to_and_fro(machine: Machine) -> None:
-    (segment,) = segments("staircase", machine, 13.0, levels=(0.2, 1.0), hold_s=1.5, reach=1.0)
-    (joint,) = moved(segment)
-    u = segment.u[:, joint]
-    edges = np.flatnonzero(np.diff(u)) + 1
-    assert [u[0], *u[edges]] == [0.2, -0.2, 1.0, -1.0, 1.0, -1.0, 0.2, -0.2]
-    assert set(np.diff(edges)) == {30}  # 1.5 s at 20 Hz
-
-
 def test_holds_are_still_in_poses_of_different_load(machine: Machine) -> None:
     found = segments("holds", machine, 100.0)
     assert [len(segment.u) for segment in found] == [500] * 4 and not any(
@@ -144,27 +135,13 @@ def test_reversals_come_back(machine: Machine) -> None:
         assert (np.diff(np.sign(segment.u[:, joint])) == -2).sum() >= 12
 
 
-def test_a_repeat_is_the_same_again_under_another_name(machine: Machine) -> None:
-    before = segments("levels", machine, 120.0)
-    repeat = option("excitation", "repeat")
-    again = repeat.segments(machine, 0.0, np.random.default_rng(3), before)
-    assert [segment.repeat_of for segment in again] == [segment.name for segment in before]
-    for one, other in zip(before, again, strict=True):
-        assert (
-            one.name != other.name and (one.u == other.u).all() and (one.start == other.start).all()
-        )
-    assert repeat.weight(2.5) == 2.5
-    with pytest.raises(ConfigError, match="nothing before it"):
-        repeat.weight(0.0)
-
-
 def test_an_excitation_that_finds_no_room_says_so(machine: Machine) -> None:
-    for name in ("holds", "ramps", "staircase", "reversals", "sine"):
+    for name in ("holds", "ramps", "reversals", "sine"):
         with pytest.raises(ConfigError, match=f"excitation={name}.*raise collect.run_minutes"):
             segments(name, machine, 5.0)
 
 
-@pytest.mark.parametrize("name", ["sine", "levels", "ramps", "staircase", "reversals", "work"])
+@pytest.mark.parametrize("name", ["sine", "levels", "ramps", "reversals", "work"])
 def test_another_seed_draws_others(name: str, machine: Machine) -> None:
     one, other = (segments(name, machine, 300.0, seed) for seed in (1, 2))
     assert any(

@@ -31,7 +31,6 @@ TRUTH = FirstOrderLag(
     dead_band_retract={"q2": 0.12, "other": 0.07},
     gain={"q1": 0.8, "q5": 1.2, "other": 0.95},
     time_constant_s={"q2": 0.2, "other": 0.12},
-    spread={},
 )
 
 
@@ -129,32 +128,6 @@ def test_what_a_fit_leaves_is_an_option(
     assert FirstOrderLag(**node) == fitted
 
 
-def test_known_numbers_of_the_plant_are_found(machine: Machine, tmp_path: Path) -> None:
-    shipped = option("actuator", "hydraulic")
-    changed = {
-        "transport_s": 0.44,
-        "overlap_extend": 0.13,
-        "speed_scale": {"q3": 0.8, "other": 0.9},
-    }
-    data = recordings(dataclasses.replace(shipped, **changed), machine, 4, 12.0)
-    free = {"transport_s": (0.2, 0.6), "overlap_extend": (0.0, 0.3), "speed_scale": (0.5, 1.5)}
-    fit = quick(
-        "hydraulic",
-        free=free,
-        windows=6,
-        validation_windows=2,
-        candidates=16,
-        starts=1,
-        iterations=5,
-    )
-    fitted = fit.fit(machine, data[:3], data[3:], tmp_path, 0, CPU)
-    for joint in machine.joint_names:
-        assert fitted.transport_s[joint] == pytest.approx(0.44, abs=0.01)
-        assert fitted.overlap_extend[joint] == pytest.approx(0.13, abs=0.01)
-        assert fitted.speed_scale[joint] == pytest.approx(0.8 if joint == "q3" else 0.9, abs=0.02)
-    assert fitted.notch == shipped.notch
-
-
 def test_what_the_recordings_do_not_show_is_said(
     machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -180,20 +153,6 @@ def test_a_machine_that_was_blocked_for_a_while_hardly_moves_the_numbers(
         assert fitted.gain[joint] == pytest.approx(TRUTH.gain.get(joint, 0.95), abs=0.03)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_independent_joints_may_be_varied_together(machine: Machine, runs: list[Recording]) -> None:
-    cut = open_loop.cut_windows(runs[:1], machine, 3.0, 8.0)
-    active = np.ones((len(cut.q), 5), dtype=bool)
-    free = {"gain": (0.2, 2.0), "dead_time_s": (0.0, 0.6)}
-    x = np.full((2, 5), 0.45)
-    together, apart = (
-        CandidateRuns(TRUTH, free, coupled, machine, cut, active, CPU).jacobian(x)
-        for coupled in (False, True)
-    )
-    np.testing.assert_allclose(together[0], apart[0], atol=1e-6)
-    np.testing.assert_allclose(together[1], apart[1], atol=1e-3)
-    assert np.abs(together[1]).max() > 0.05
-
-
 def test_the_interval_covers_as_often_as_it_says(machine: Machine) -> None:
     """A model with a wrong time constant has errors that are no white noise; the runs' own spread must carry the interval."""
     free, hits = {"gain": (0.5, 1.5)}, []
@@ -202,9 +161,7 @@ def test_the_interval_covers_as_often_as_it_says(machine: Machine) -> None:
 
     def fitted(part: list[Recording]) -> tuple[np.ndarray, np.ndarray]:
         cut = open_loop.cut_windows(part, machine, 3.0, 3.0)
-        runs = CandidateRuns(
-            wrong, free, False, machine, cut, np.ones((len(cut.q), 5), dtype=bool), CPU
-        )
+        runs = CandidateRuns(wrong, free, machine, cut, np.ones((len(cut.q), 5), dtype=bool), CPU)
         x = np.full((1, 5), 0.5)
         for _ in range(4):
             x, _ = greybox.take_step(runs, x, 3.0)
@@ -271,10 +228,6 @@ def test_a_free_run_that_begins_in_motion_goes_on_with_it(name: str, machine: Ma
             r"upper bound: actuator\.dead_time_s.*does not fit",
         ),
         ({"actuator": option("actuator", "ideal")}, "IdealModel has no numbers to fit"),
-        (
-            {"actuator": dataclasses.replace(TRUTH, spread={"gain": 0.1})},
-            r"actuator\.spread: expected \{\}",
-        ),
         ({"starts": 60}, "starts: 60 of"),
     ],
 )

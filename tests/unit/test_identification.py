@@ -27,12 +27,7 @@ from brokk_rl.session import Session
 
 CPU = torch.device("cpu")
 PLANT = FirstOrderLag(
-    dead_time_s=0.55,
-    dead_band_extend=0.1,
-    dead_band_retract=0.1,
-    gain=0.6,
-    time_constant_s=0.0,
-    spread={},
+    dead_time_s=0.55, dead_band_extend=0.1, dead_band_retract=0.1, gain=0.6, time_constant_s=0.0
 )
 
 

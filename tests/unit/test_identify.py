@@ -22,12 +22,7 @@ from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
 PLANT = FirstOrderLag(
-    dead_time_s=0.43,
-    dead_band_extend=0.06,
-    dead_band_retract=0.09,
-    gain=0.9,
-    time_constant_s=0.0,
-    spread={},
+    dead_time_s=0.43, dead_band_extend=0.06, dead_band_retract=0.09, gain=0.9, time_constant_s=0.0
 )
 
 
@@ -39,7 +34,7 @@ def drive(
     for n in range(num_runs):
         spec = option("excitation", excitation)
         found = spec.segments(
-            machine, seconds * (machine.num_joints if excitation == "sine" else 1), generator, []
+            machine, seconds * (machine.num_joints if excitation == "sine" else 1), generator
         )
         played.append(
             sorted(found, key=lambda segment: segment.name)[

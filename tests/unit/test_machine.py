@@ -29,12 +29,7 @@ def unseen(machine: Machine) -> Machine:
 
 def test_its_actuators_can_be_modelled(unseen: Machine) -> None:
     lag = FirstOrderLag(
-        dead_time_s=None,
-        dead_band_extend=0.1,
-        dead_band_retract=0.1,
-        gain=1.0,
-        time_constant_s=0.1,
-        spread={},
+        dead_time_s=None, dead_band_extend=0.1, dead_band_retract=0.1, gain=1.0, time_constant_s=0.1
     )
     check_actuator(lag, unseen)
     assert not unseen.has_bodies

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,6 @@ from hydra.utils import instantiate
 from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
 from actuators.excite.player import (
-    DONE,
-    PLAY,
     CommandGuards,
     NominalLink,
     PlanPlayer,
@@ -186,38 +183,6 @@ def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(
     assert (stage != plan_report.BEFORE).sum() == 2000, "a segment lasts as long as its program"
 
 
-class Noisy(NominalLink):
-    """Measures with noise."""
-
-    def read(self) -> JointState:
-        state = super().read()
-        return JointState(
-            state.t_s,
-            state.q
-            + 0.0003 * np.random.default_rng(round(state.t_s * 20)).standard_normal(state.q.shape),
-        )
-
-
-def test_a_repeat_plays_what_was_sent_although_the_stops_came_in_between(
-    machine: Machine, approach: Approach
-) -> None:
-    levels = option("excitation", "levels").segments(machine, 240.0, np.random.default_rng(0), [])
-    run = [
-        *levels,
-        *option("excitation", "repeat").segments(machine, 240.0, np.random.default_rng(0), levels),
-    ]
-    track = played([run], machine, approach, link=Noisy(machine, 1), run_s=900.0)
-    turned = 0
-    for i, segment in enumerate(levels):
-        first, again = (
-            track.u[(track.segment[:, 0] == k) & (track.stage[:, 0] != plan_report.BEFORE), 0]
-            for k in (i, i + len(levels))
-        )
-        assert (first == again).all()
-        turned += (first != segment.u).any()
-    assert turned, "or this shows nothing"
-
-
 def test_commands_keep_to_the_largest(machine: Machine, approach: Approach) -> None:
     guards = CommandGuards(max_command=0.3, max_tool_speed_m_s=None)
     track = played(
@@ -310,7 +275,7 @@ def test_a_link_that_fails_is_an_error(
 def test_a_plan_fills_its_time_and_repeats_with_its_seed(
     machine: Machine, approach: Approach
 ) -> None:
-    chosen = {name: option("excitation", name) for name in ("levels", "ramps", "holds", "repeat")}
+    chosen = {name: option("excitation", name) for name in ("levels", "ramps", "holds")}
     plan, again, other = (
         plan_runs(chosen, machine, approach, 2, 600.0, np.random.default_rng(seed))
         for seed in (1, 1, 2)
@@ -325,39 +290,7 @@ def test_a_plan_fills_its_time_and_repeats_with_its_seed(
             (a.u == b.u).all() and (a.start == b.start).all()
             for a, b in zip(run, same, strict=True)
         )
-        half = len(run) // 2
-        assert [segment.repeat_of for segment in run[half:]] == [
-            segment.name for segment in run[:half]
-        ]
         assert {segment.name.split("_")[0] for segment in run} == {"levels", "ramps", "holds"}
     assert (plan.runs[0][0].start != plan.runs[1][0].start).any() and (
         plan.runs[0][0].start != other.runs[0][0].start
     ).any()
-
-
-def test_the_notes_say_what_was_played_when(machine: Machine, approach: Approach) -> None:
-    u = np.zeros((600, 5))
-    u[:, 2] = np.where(np.arange(600) < 500, 0.9, -0.2)
-    first = constant({}, 0.0, machine.home, u=u, stops="home")
-    second = constant({}, 2.0, anywhere(machine, 3), name="a_01", repeat_of="elsewhere")
-    plan = ExcitationPlan(runs=((first, second),), run_s=120.0, names=("a",))
-    samples = list(
-        drive(NominalLink(machine, 1), PlanPlayer(plan, machine, approach, OPEN), machine, 1, 120.0)
-    )
-    notes = plan_report.describe_run(PlanTrack(samples), 0, plan.runs[0], 0.05)
-    assert [(note["name"], note["part"]) for note in notes] == [
-        ("a_00", "approach"), ("a_00", "program"), ("a_01", "approach"), ("a_01", "program"),
-    ]  # fmt: skip
-    assert notes[0]["start_s"] == 0.0 and notes[1]["end_s"] - notes[1]["start_s"] == pytest.approx(
-        30.0
-    )
-    assert all(one["end_s"] == next_["start_s"] for one, next_ in pairwise(notes))
-    ((away, back),) = notes[1]["away_s"]
-    assert away < back == pytest.approx(notes[1]["start_s"] + 25.0)
-    assert notes[3]["repeat_of"] == "elsewhere"
-    playing = [
-        k for k, sample in enumerate(samples) if sample.phase[0] == PLAY and sample.segment[0] == 0
-    ]
-    later = plan_report.describe_run(PlanTrack(samples[playing[0] + 100 :]), 0, plan.runs[0], 0.05)
-    assert later[0]["offset_s"] == 5.0 and later[0]["start_s"] == 0.0
-    assert not any(sample.phase[0] == DONE for sample in samples)

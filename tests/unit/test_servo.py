@@ -13,7 +13,6 @@ from composed import option
 from scipy.integrate import solve_ivp
 
 from actuators.excite.player import NominalLink
-from brokk_rl import record
 from brokk_rl.checks.actuator import check_actuator_model
 from brokk_rl.commands import (
     SpeedProgram,
@@ -202,17 +201,3 @@ def test_play_holds_a_joint_about_its_target_less_the_sag(arm: Machine) -> None:
     np.testing.assert_allclose(
         run_servo(model, arm, u)[20:], run_servo(whole, arm, u)[20:], atol=1e-5
     )
-
-
-def test_a_servo_is_fitted_again_to_other_recordings(arm: Machine) -> None:
-    servo = replace(option("actuator", "servo"), play_rad=0.03, sag_rad=0.02)
-    generator = np.random.default_rng(1)
-    u = 0.5 * np.sin(np.cumsum(generator.uniform(0.02, 0.25, (500, arm.num_joints)), 0))
-    q = run_servo(servo.build(arm, 1, CPU), arm, u)
-    # A command acts on the position of the row after it.
-    log = record.make_motion(arm, "log", arm.period_s * np.arange(499), u[1:], q[:-1])
-    fit = option("fit", "servo")
-    fit = replace(fit, free={name: fit.free[name] for name in ("play_rad", "sag_rad")})
-    found = fit.refit(replace(servo, play_rad=0.05, sag_rad=0.0), arm, [log])
-    assert list(found.play_rad.values()) == pytest.approx([0.03] * arm.num_joints, abs=0.001)
-    assert list(found.sag_rad.values()) == pytest.approx([0.02] * arm.num_joints, abs=0.001)

@@ -32,12 +32,7 @@ from diagnosis.tellable import ExpectedError, MotionView, TellableEffects
 
 torch.set_num_threads(1)
 PLANT = FirstOrderLag(
-    dead_time_s=0.2,
-    dead_band_extend=0.0,
-    dead_band_retract=0.0,
-    gain=1.0,
-    time_constant_s=0.0,
-    spread={},
+    dead_time_s=0.2, dead_band_extend=0.0, dead_band_retract=0.0, gain=1.0, time_constant_s=0.0
 )
 NOISY = ExpectedError(sensor=0.03, change=0.0, wander=0.02, reading=0.0)
 """Noise that keeps every smallest size above the least size that is ever named."""
@@ -69,7 +64,7 @@ def motions(machine: Machine, seconds: float, seed: int, name: str = "levels") -
     late = round(machine.dead_time_s / machine.period_s) + 1
     full = machine.max_speed * machine.period_s
     found = []
-    for number, segment in enumerate(excitation.segments(machine, seconds, generator, [])):
+    for number, segment in enumerate(excitation.segments(machine, seconds, generator)):
         u = np.pad(segment.u, ((before, 0), (0, 0)))
         margin = max(segment.stop_margin, 0.05) * (machine.upper - machine.lower)
         heading = segment.start.astype(float)

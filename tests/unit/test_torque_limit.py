@@ -294,13 +294,15 @@ def test_a_withheld_limit_is_named(arm: Machine, tmp_path: Any, limit_n_m: float
     assert shortage.mean == pytest.approx(4.5 / limit_n_m, rel=0.2)
 
 
-def test_a_limit_is_fitted_where_it_is_asked_for(arm: Machine) -> None:
+def test_a_limit_is_fitted_where_it_is_asked_for(arm: Machine, tmp_path: Any) -> None:
     servo = make_servo(response_s=0.04, damping=0.8, limit_rad=0.05)
     u = np.concatenate([draw_levels(arm, seed, 20, 25) for seed in range(2)])
     q = run_servo(servo.build(arm, 1, CPU), arm, u)
     # A command acts on the position of the row after it.
     log = make_motion(arm, "log", arm.period_s * np.arange(len(u) - 1), u[1:], q[:-1])
     fit = option("fit", "servo")
-    fit = replace(fit, free={"limit_rad": (0.01, 0.5)})
-    found = fit.refit(replace(servo, limit_rad=0.2), arm, [log])
+    begun = replace(servo, limit_rad=0.2)
+    few = {"windows": 12, "validation_windows": 4, "candidates": 8, "starts": 1}
+    fit = replace(fit, free={"limit_rad": (0.01, 0.5)}, actuator=begun, **few)
+    found = fit.fit(arm, [log], [], tmp_path, 0, CPU)
     assert list(found.limit_rad.values()) == pytest.approx([0.05] * 2, rel=0.03)
