@@ -10,7 +10,7 @@ friction of any size is stable and dry friction brings a joint exactly to rest.
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 
@@ -92,31 +92,12 @@ class ForceDrive:
         return ForceDriveModel(self, machine, num_envs, device)
 
 
-class Motor(Protocol):
-    """Circuit of motors that are commanded by their duty."""
-
-    @property
-    def limit(self) -> torch.Tensor:
-        """Largest force, `(J,)`."""
-        ...
-
-    @property
-    def back_emf(self) -> torch.Tensor:
-        """Loss of force over speed, `(J,)`."""
-        ...
-
-    def compute_stall(self, duty: torch.Tensor, speed: torch.Tensor) -> torch.Tensor:
-        """Return the force at standstill, `(N, J)`, N or Nm."""
-        ...
-
-
 class ForceDriveModel(ParametricModel):
     """Implicit solution over a control period.
 
     Attributes:
         drive_changes: Changes of the numbers by effects, `(N, J)` by name: a factor on the mass, force
             added to the others.
-        motor: Circuit of motors that are commanded by their duty; `None`: a command is a force.
     """
 
     STATES = ("speed",)
@@ -135,7 +116,6 @@ class ForceDriveModel(ParametricModel):
         )
         super().__init__(nominal, machine, num_envs, device)
         self.drive_changes: dict[str, torch.Tensor] = {}
-        self.motor: Motor | None = None
         self._max_force = torch.as_tensor(machine.max_force, dtype=torch.float32, device=device)
         count = min(SPEED_SAMPLES, machine.num_history)
         times_s = machine.period_s * torch.arange(1 - count, 1, dtype=torch.float64)
@@ -155,7 +135,8 @@ class ForceDriveModel(ParametricModel):
         begun = torch.einsum("h,nhj->nj", self._slope, recent)
         before = self.recall({"speed": begun})["speed"]
         mass = value["mass_kg"]
-        motor, speed = self._solve(value, command, weight, before)
+        step, motor = period_s / mass, command * self._max_force
+        speed = (before + step * (motor - weight)) / (1.0 + step * value["viscous_n_s_m"])
         states = (before, motor, weight, self._max_force)
         friction = period_s * compute_dry_friction(value, *states) / mass
         speed = speed.sign() * (speed.abs() - friction).clamp(min=0.0)
@@ -163,25 +144,6 @@ class ForceDriveModel(ParametricModel):
         held = self.plant.hold_from(q, moved)
         self.keep({"speed": speed.masked_fill(held != moved, 0.0)})
         return held
-
-    def _solve(
-        self,
-        value: dict[str, torch.Tensor],
-        command: torch.Tensor,
-        weight: torch.Tensor,
-        before: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the force of the motor and the speed at the end of the period, without dry friction."""
-        step, viscous = self.plant.period_s / value["mass_kg"], value["viscous_n_s_m"]
-        if self.motor is None:
-            force = command * self._max_force
-            return force, (before + step * (force - weight)) / (1.0 + step * viscous)
-        stall, back_emf = self.motor.compute_stall(command, before), self.motor.back_emf
-        speed = (before + step * (stall - weight)) / (1.0 + step * (viscous + back_emf))
-        # The force falls with the speed: beyond the limit at this one, it is at the limit.
-        limit = self.motor.limit
-        force = (stall - back_emf * speed).clamp(-limit, limit)
-        return force, (before + step * (force - weight)) / (1.0 + step * viscous)
 
     def _weigh(self, value: dict[str, torch.Tensor], q: torch.Tensor) -> torch.Tensor:
         """Return the force from outside against the positive direction, `(N, J)`."""

@@ -22,7 +22,7 @@ OTHER = "other"
 SUITABLE = {
     "speed": "actuator=lag or another model of a speed",
     "position": "actuator=servo fit=servo",
-    "torque": "actuator=force (or dc_motor) fit=force",
+    "torque": "actuator=force fit=force",
 }
 """Actuators and fits for each interface, as an error names them."""
 COMMANDS = {"speed": "valve or velocity", "position": "position", "torque": "torque with max_force"}

@@ -92,7 +92,7 @@ def test_the_plan_says_beforehand_what_the_run_will_do(collected: Path, machine:
     for entry in plan["runs"][0]:
         joint = machine.joint_names.index(entry["name"].removeprefix("sine_"))
         moving = np.flatnonzero(commanded[:, joint])
-        assert machine.period_s * moving[-1] == pytest.approx(entry["end_s"], abs=1.5)
+        assert machine.period_s * moving[0] == pytest.approx(entry["start_s"], abs=1.5)
 
 
 def test_only_the_plan(tmp_path: Path) -> None:
