@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from textwrap import fill
 from typing import Annotated, Any
 
@@ -31,7 +30,6 @@ from brokk_rl.comparison import (
 )
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.task import Figure
-from brokk_rl.errors import ConfigError
 from brokk_rl.plot import (
     BLUE,
     GREY,
@@ -47,13 +45,6 @@ from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
-SUCCESS = "episode/success_strict"
-PROGRESS_COLUMNS = ["seconds", "env_steps", SUCCESS]
-REACHED = 0.95
-"""Success rate whose first crossing is reported and drawn, the goal of one insertion in 20
-failing."""
-MOST_ROWS = 250
-"""Rows of a learning curve in `learning.csv`: about the horizontal pixels of one axis at 50 dpi."""
 MOST_COLUMNS = 4
 """Largest number of columns of differences; above it one column has the values that most rows lack.
 Chosen by hand."""
@@ -77,13 +68,13 @@ class RunSelection:
 
 @spec
 class Compare:
-    """Compare runs: success with 95 % intervals and learning curves, as tables and pictures."""
+    """Compare runs: success with 95 % intervals, as tables and a picture."""
 
     session: Session
     compare: RunSelection
 
     def run(self) -> None:
-        """Print the table; write `comparison.*`, and of trainings `learning.*`."""
+        """Print the table; write `comparison.*`."""
         patterns = (self.compare.runs,) if isinstance(self.compare.runs, str) else self.compare.runs
         runs = [load_run(folder) for folder in find_runs(patterns)]
         columns = find_differences(runs)
@@ -100,7 +91,6 @@ class Compare:
         words = collect_words(runs, list_figures(table))
         picture = draw_comparison(groups, columns, words, list_rates(table))
         save_figure(picture, folder / "comparison.png")
-        _write_learning(runs, columns, folder)
         _print_groups(groups, columns, words, list_rates(table))
         log.info("%d runs compared in %s", len(runs), folder)
 
@@ -202,70 +192,3 @@ def _name_rows(axis: Axes, labels: Sequence[str]) -> None:
     """Write labels beside rows, the first row at the top."""
     axis.set_yticks(range(len(labels)), [fill(label, LABEL_WIDTH) for label in labels])
     axis.set_ylim(len(labels) - 0.4, -0.6)
-
-
-def _write_learning(runs: Sequence[EvaluatedRun], columns: Sequence[str], folder: Path) -> None:
-    """Write and draw the learning curves of those runs that trained; say when they succeeded."""
-    curves: list[pd.DataFrame] = []
-    settings = []
-    for run in runs:
-        curve = _read_progress(run)
-        if curve is None:
-            continue
-        curves.append(curve)
-        settings.append({column: run.describe_setting(column) for column in columns})
-        reached_s: Any = curve["seconds"][curve[SUCCESS] >= REACHED]
-        when = f"not in {curve['seconds'].iloc[-1]:.0f} s"
-        if not reached_s.empty:
-            when = f"after {reached_s.iloc[0]:.1f} s"
-        log.info("%s: success of %.2f while learning %s", run.folder.name, REACHED, when)
-    if not curves:
-        return
-    thinned = pd.concat([curve.iloc[:: -(-len(curve) // MOST_ROWS)] for curve in curves])
-    write_text(folder / "learning.csv", thinned.to_csv(index=False, lineterminator="\n"))
-    labels = describe_differences(pd.DataFrame(settings, index=range(len(curves))))
-    save_figure(draw_learning(labels, curves), folder / "learning.png")
-
-
-def _read_progress(run: EvaluatedRun) -> pd.DataFrame | None:
-    """Return the learning curve of a run; `None` where nothing was trained."""
-    path = run.folder / "progress.csv"
-    if not path.is_file():
-        return None
-    try:
-        curve: Any = pd.read_csv(path, usecols=PROGRESS_COLUMNS, dtype=float)[PROGRESS_COLUMNS]
-    except ValueError as error:
-        raise ConfigError(
-            f"{path} cannot be read ({error}); leave the run out of compare.runs"
-        ) from error
-    curve = curve.dropna(subset=[SUCCESS])
-    curve.insert(0, "folder", str(run.folder))
-    curve.insert(1, "seed", run.seed)
-    return None if curve.empty else curve
-
-
-def draw_learning(labels: Sequence[str], curves: Sequence[pd.DataFrame]) -> Picture:
-    """Draw strict success of training episodes over time and over control steps.
-
-    Args:
-        labels: Settings of each run; runs of the same settings share a colour.
-        curves: Seconds, control steps and success of each run.
-    """
-    picture = make_figure(11.0, 4.2)
-    left, right = picture.subplots(1, 2, sharey=True)
-    names = list(dict.fromkeys(labels))
-    for index, (label, curve) in enumerate(zip(labels, curves, strict=True)):
-        style = {"color": f"C{names.index(label) % 10}", "linewidth": 1.0}
-        if label in labels[:index]:
-            label = ""  # one entry of the legend for all runs of the same settings
-        left.plot(curve["seconds"], curve[SUCCESS], label=label, **style)
-        right.plot(1e-6 * curve["env_steps"], curve[SUCCESS], **style)
-    left.set(xlabel="wall clock of training, s", ylabel="success while learning")
-    right.set(xlabel="control steps, millions", ylim=(0.0, 1.0))
-    for axis in (left, right):
-        axis.axhline(REACHED, color=GREY, linewidth=0.8, linestyle="--")
-        axis.set_xlim(left=0.0)
-        draw_grid(axis)
-    if len(names) > 1:
-        left.legend(loc="lower right", frameon=False, fontsize=8)
-    return picture

@@ -1,4 +1,7 @@
-"""Properties of the machine that differ from world to world: nominal numbers times factors."""
+"""What the worlds of both simulators share: a stored state, words for faults, machines that differ.
+
+Properties of a machine are nominal numbers times factors, which events draw.
+"""
 
 from __future__ import annotations
 

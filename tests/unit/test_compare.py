@@ -160,20 +160,6 @@ def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path)
     assert (ideal["success_strict"], mlp["success_strict"]) == (0.5, 0.7)
 
 
-def test_learning_curves_are_thinned_and_say_when_success_was_reached(
-    sweep: Path, brokk: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    lines = ["seconds,env_steps,episode/success_strict", "0.5,0,"]  # no episode had ended yet
-    lines += [f"{second},{10 * second},{min(second, 600) / 600}" for second in range(1, 1001)]
-    (sweep / "2_mlp" / "progress.csv").write_text("\n".join(lines))
-    with caplog.at_level("INFO"):
-        brokk("mode=compare", f"compare.runs={sweep}", "session.out=compared")
-    assert "2_mlp: success of 0.95 while learning after 570.0 s" in caplog.messages
-    rows = list(csv.DictReader((tmp_path / "compared" / "learning.csv").read_text().splitlines()))
-    assert [float(row["seconds"]) for row in rows[:3]] == [1.0, 5.0, 9.0]
-    assert (tmp_path / "compared" / "learning.png").read_bytes()[:4] == b"\x89PNG"
-
-
 def test_differences_are_those_of_the_same_seed_and_condition() -> None:
     columns, rows = ["actuator", "evaluated on"], []
     scores = {
