@@ -408,9 +408,9 @@ class DriveReferences:
         torch.addcmul(reference, self._lead, ctrl, out=act)
         reference.add_(increment)
 
-    def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
-        """Return diverged worlds, `(N,)` bool: absurd or NaN joint speeds, infinite references."""
-        return (self.measure_speeds(qvel).amax(1) <= self._max_speed).logical_not_()
+    def diverged(self, speeds: torch.Tensor) -> torch.Tensor:
+        """Return diverged worlds, `(N,)` bool, whose `measure_speeds`, `(N, J)`, are absurd or NaN."""
+        return (speeds.amax(1) <= self._max_speed).logical_not_()
 
     def measure_speeds(self, qvel: torch.Tensor) -> torch.Tensor:
         """Return sizes of joint speeds `(N, J)`, NaN also where a reference is not finite.

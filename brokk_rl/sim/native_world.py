@@ -109,12 +109,13 @@ class NativeWorld(StoredWorld):
             self.faults[torch.from_numpy(error.ids)] = True
         self.contact_force_n.copy_((self._sensors @ self._is_normal).amax(1))
         self.q.copy_(self._qpos)
-        self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(
+        speeds = self._drive.measure_speeds(self._qvel)
+        self.faults.logical_or_(self._drive.diverged(speeds)).logical_or_(
             self._warning.flatten(1).any(1)
         )
         if self.faults.any():
             bits = torch.tensor(list(self.alarm_names))
-            self._note_faults(self._qvel, (self._warning[:, :, 1] > 0).long() @ bits)
+            self._note_faults(speeds, (self._warning[:, :, 1] > 0).long() @ bits)
 
     def bare_step(self) -> None:
         """Run the substeps of `mujoco.batch` alone, without drive and read-out.

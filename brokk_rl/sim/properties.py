@@ -157,7 +157,6 @@ class StoredWorld:
     """Meaning of each bit of an alarm of the simulator."""
     faults: torch.Tensor
     _machine: Machine
-    _drive: DriveReferences
     _alarms: torch.Tensor
     """Alarms of worlds at fault since they were last explained, `(N,)`."""
     _fastest: torch.Tensor
@@ -196,11 +195,12 @@ class StoredWorld:
             return "; ".join([*said, f"the motion of {joint.name} was not finite"])
         return "; ".join([*said, f"the speed of {joint.name} came to {speed:,.3g} {joint.unit}/s"])
 
-    def _note_faults(self, speed: torch.Tensor, alarms: torch.Tensor) -> None:
-        """Note alarms, `(N,)`, and joint speeds, `(N, J)`, of the worlds at fault."""
-        speed = self._drive.measure_speeds(speed).nan_to_num(nan=torch.inf)
-        fastest = speed.masked_fill_(~self.faults[:, None], 0.0).amax(0)
-        torch.maximum(self._fastest, fastest, out=self._fastest)
+    def _note_faults(self, speeds: torch.Tensor, alarms: torch.Tensor) -> None:
+        """Note alarms, `(N,)`, and sizes of joint speeds, `(N, J)`, of the worlds at fault."""
+        of_faults = speeds.nan_to_num(nan=torch.inf, posinf=torch.inf).masked_fill_(
+            ~self.faults[:, None], 0.0
+        )
+        torch.maximum(self._fastest, of_faults.amax(0), out=self._fastest)
         self._alarms.bitwise_or_(alarms.masked_fill(~self.faults, 0))
 
     def _stored(self) -> dict[str, torch.Tensor]:

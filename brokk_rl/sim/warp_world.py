@@ -161,10 +161,9 @@ class WarpWorld(StoredWorld):
             for _ in range(self.substeps):
                 self._substep()
         self.q.copy_(view["qpos"])
-        self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_(
-            (view["overflow"] & _LOST) != 0
-        )
-        self._note_faults(view["qvel"], view["overflow"] & _LOST)
+        speeds, alarms = self._drive.measure_speeds(view["qvel"]), view["overflow"] & _LOST
+        self.faults.logical_or_(self._drive.diverged(speeds)).logical_or_(alarms != 0)
+        self._note_faults(speeds, alarms)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
