@@ -25,13 +25,11 @@ log = logging.getLogger(__name__)
 CALLS = 10
 """Of one thing before it is the turn of the next."""
 RATES = {
-    "batch_env_steps_per_s": "mujoco.batch alone /s",
     "physics_env_steps_per_s": "physics /s",
     "env_steps_per_s": "control step /s",
     "train_env_steps_per_s": "training /s",
 }
-"""Headings in the order of what each has to do: MuJoCo's own batch (CPU only), with drive and
-contacts, the control step, training."""
+"""Headings in the order of what each has to do: physics, the control step, training."""
 
 
 @spec
@@ -72,7 +70,7 @@ class Benchmark(SimulatedPlant):
                 starts = self.session.stream("starts")
                 loop = self.build(device, num_envs, self.rl.num_starts, starts)
                 rows.append(_sum_over_ranks(group.gather(self._measure(loop, device, group))))
-                rates = [f"{name} {rows[-1][name]:,.0f}" for name in RATES if name in rows[-1]]
+                rates = [f"{name} {rows[-1][name]:,.0f}" for name in RATES]
                 log.info("%d environments: %s", num_envs, ", ".join(rates))
         if group.rank.first:
             facts = {"device": _name_device(device), "ranks": group.rank.count}
@@ -96,15 +94,12 @@ class Benchmark(SimulatedPlant):
         loop.capture(self.rl.fuse)
         action = torch.zeros(num, loop.num_actions, device=device)
         steps = {"physics_env_steps_per_s": physics, "env_steps_per_s": lambda: loop.step(action)}
-        if bare := getattr(loop.world, "bare_step", None):
-            steps["batch_env_steps_per_s"] = bare
         # processes of one computer share its cores and power: measure at the same time
         group.wait()
         seconds = self._in_turn(steps, loop, device)
         rates = {name: num / time_s for name, time_s in seconds.items()}
         rates["train_env_steps_per_s"] = num / self._time_training(loop, device, group)
-        ordered = {name: rates[name] for name in RATES if name in rates}
-        return {"num_envs": num, **ordered, "graph": loop.graph_active}
+        return {"num_envs": num, **rates, "graph": loop.graph_active}
 
     def _time_training(
         self, loop: ControlLoop, device: torch.device, group: TrainingGroup
@@ -159,10 +154,8 @@ def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the row of all processes: rates add up; `per_rank` holds the rates of each."""
     if len(rows) == 1:
         return rows[0]
-    per_rank = []
-    for row in rows:
-        per_rank.append({name: row[name] for name in RATES if name in row})
-    total = {name: sum(rates[name] for rates in per_rank) for name in per_rank[0]}
+    per_rank = [{name: row[name] for name in RATES} for row in rows]
+    total = {name: sum(rates[name] for rates in per_rank) for name in RATES}
     return rows[0] | total | {"ranks": len(rows), "per_rank": per_rank}
 
 
@@ -172,9 +165,8 @@ def _wait(device: torch.device) -> None:
 
 
 def _print_rows(rows: list[dict[str, Any]]) -> None:
-    names = [name for name in RATES if name in rows[0]]
     cells = []
     for row in rows:
-        rates = [f"{row[name]:,.0f}" for name in names]
+        rates = [f"{row[name]:,.0f}" for name in RATES]
         cells.append([f"{row['num_envs']:,}", *rates, "yes" if row["graph"] else "no"])
-    print_table(["environments", *(RATES[name] for name in names), "CUDA graph"], cells)
+    print_table(["environments", *RATES.values(), "CUDA graph"], cells)

@@ -117,13 +117,6 @@ class NativeWorld(StoredWorld):
             bits = torch.tensor(list(self.alarm_names))
             self._note_faults(speeds, (self._warning[:, :, 1] > 0).long() @ bits)
 
-    def bare_step(self) -> None:
-        """Run the substeps of `mujoco.batch` alone, without drive and read-out.
-
-        Benchmarks compare `step` with it.
-        """
-        self._batch.step(nstep=self.substeps)
-
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
         rows = mask.nonzero()[:, 0]
