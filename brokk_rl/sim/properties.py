@@ -1,4 +1,4 @@
-"""What the worlds of both simulators share: a stored state, words for faults, machines that differ.
+"""State, faults and properties that the worlds of both simulators share.
 
 Properties of a machine are nominal numbers times factors, which events draw.
 """
