@@ -44,13 +44,22 @@ def read_json(path: Path, most_bytes: int) -> dict[str, Any]:
         OSError: see `check_plain_file`.
         ValueError: it holds no JSON object, or one that is nested beyond reason.
     """
-    try:
-        content = json.loads(read_plain_file(path, most_bytes))
-    except RecursionError as error:
-        raise ValueError("nested too deeply") from error
+    content = parse_json(read_plain_file(path, most_bytes))
     if not isinstance(content, dict):
         raise ValueError(f"expected a JSON object, got {type(content).__name__}")
     return content
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value that a JSON text holds.
+
+    Raises:
+        ValueError: it holds none, or one that is nested beyond reason.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
 
 
 def check_yaml_size(text: str) -> None:

@@ -20,6 +20,7 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
 from deploy.bus.can_bus import CanBus
+from deploy.bus.description import BusDescription
 from deploy.guard_setup import check_command_rate
 from deploy.kernel.bus_process import BusProcessConfig
 from deploy.kernel.guard import GuardState
@@ -68,12 +69,13 @@ class CanConnection:
         """Return the link, not yet opened.
 
         Raises:
-            ConfigError: more than one machine is asked for, or commands would be too old for the
-                guard.
+            ConfigError: more than one machine is asked for, commands would be too old for the guard,
+                or messages are not protected.
         """
         if num_runs != 1:
             raise ConfigError(f"link=can reaches one machine, not {num_runs}: collect.num_runs=1")
         check_command_rate(self.limits, machine)
+        BusDescription(self.dbc, machine).check_protection()
         return CanLink(self, machine)
 
 

@@ -68,7 +68,7 @@ SHOWN = PageState(
         BoreholeChoice("A", (2.6, 0.0, 0.75), (0.0, 0.0, 1.0), 0.05, 0.002, 0.97, True),
         BoreholeChoice("B", (2.2, 0.4, 0.75), (0.0, 0.0, 1.0), 0.05, None, None, False),
     ),
-    path_in_base_m=((2.6, 0.3, 1.2), (2.6, 0.0, 1.05), (2.6, 0.0, 0.65)), block_in_base_m=None,
+    path_in_base_m=((2.6, 0.3, 1.2), (2.6, 0.0, 1.05), (2.6, 0.0, 0.65)),
 )  # fmt: skip
 """All is well, all levers in neutral."""
 READING = InsertionReading(

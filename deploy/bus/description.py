@@ -37,6 +37,11 @@ ROUNDING = 1e-6
 CRC_BITS = 8
 MOST_BYTES = 1 << 24
 """Size beyond which a file is no DBC; those of cars have a MB."""
+KNOWN = (
+    "Command", "Position_", "Valid_", "Flow", "Lever_", "ButtonRight", "DeadMan", "RemoteOn", "EStop",
+    "ExclusiveSelected", "RoundTrip", "DescriptionHash", "MachineHash",
+)  # fmt: skip
+"""Beginnings of the signals that decide about motion; each stands in one message."""
 HASH_BYTES = 3
 """Of the hash of description and machine; both fit into one message with counter and CRC."""
 PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
@@ -107,7 +112,12 @@ class BusDescription:
             self.layouts[message.name] = layout
             self.by_id[layout.frame_id] = layout
             for signal in message.signals:
-                self._home[signal.name] = message.name
+                first = self._home.setdefault(signal.name, message.name)
+                if first != message.name and signal.name.startswith(KNOWN):
+                    raise ConfigError(
+                        f"bus: {name}: expected '{signal.name}' in one message, got it in {first} and "
+                        f"{message.name}; rename one of them"
+                    )
                 if not signal.scale:
                     raise ConfigError(
                         f"bus: {name}: expected a factor other than 0 for '{signal.name}', got 0; mend the DBC"
@@ -148,6 +158,25 @@ class BusDescription:
                 f"bus: {self.name}: expected 0 within the range of '{name}', got "
                 f"[{signal.minimum}, {signal.maximum}]; mend the DBC"
             )
+
+    def list_needed(self) -> set[str]:
+        """Return the messages without which nothing may be commanded."""
+        signals = ["DeadMan", "EStop", "ExclusiveSelected"]
+        signals += [one for one in self._home if one.startswith(("Position_", "Flow_"))]
+        return {self._home[signal] for signal in signals}
+
+    def check_protection(self) -> None:
+        """Check that commands, and what they depend on, are protected end to end.
+
+        Raises:
+            ConfigError: a message is not.
+        """
+        for name in sorted({self.command.name, *self.list_needed()}):
+            if self.layouts[name].data_id is None:
+                raise ConfigError(
+                    f"bus: {self.name}: expected E2EDataId for message {name}, since commands are sent, "
+                    "got none; protect it, or only listen (deploy=listen)"
+                )
 
     def has_signal(self, signal: str) -> bool:
         """Return whether any message has `signal`."""

@@ -68,11 +68,7 @@ class BusReceiver:
         self._clock, self._longest_wrap_s = GatewayClock(), max(own, default=0.0)
         # A gateway that does not measure it reports none.
         self.round_trip_s = math.inf if described.has_signal("RoundTrip") else 0.0
-        first_flow = f"Flow_{machine.joint_names[0]}"
-        signals = ["DeadMan", "EStop", "ExclusiveSelected", first_flow]
-        signals += [f"Position_{joint}" for joint in machine.joint_names]
-        # channels without which nothing may be commanded
-        self._needed = {described.message_of(name) for name in signals} & set(self.channels)
+        self._needed = described.list_needed() & set(self.channels)
         self.bounds = build_joint_bounds(
             machine.lower.tolist(),
             machine.upper.tolist(),

@@ -187,7 +187,6 @@ class LoopFeed:
             targets=targets,
             insertion=insertion,
             path_in_base_m=path,
-            block_in_base_m=None,
             view=self._read_view(),
         )
 

@@ -192,8 +192,6 @@ class PageState:
         targets: Boreholes to choose from.
         insertion: Tool and chosen borehole; `None` while either is not known.
         path_in_base_m: Way of the tool from its tip; empty where nothing is planned.
-        block_in_base_m: Two opposite corners of a block to draw; `None` where only the point cloud
-            is known.
         view: Where a moving camera looks, and why; `None` without one.
         replay: Place in the recording that is played; `None`: this is live.
     """
@@ -210,7 +208,6 @@ class PageState:
     targets: tuple[BoreholeChoice, ...]
     insertion: InsertionReading | None
     path_in_base_m: tuple[Vector, ...]
-    block_in_base_m: tuple[Vector, Vector] | None
     view: CameraView | None = None
     replay: ReplayTimeline | None = None
 
@@ -265,7 +262,6 @@ class PageState:
             "targets": [asdict(one) for one in self.targets],
             "insertion": self.insertion and asdict(self.insertion),
             "path_in_base_m": self.path_in_base_m,
-            "block_in_base_m": self.block_in_base_m,
             "view": self.view and asdict(self.view),
             "replay": self.replay and asdict(self.replay),
         }

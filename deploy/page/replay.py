@@ -7,7 +7,6 @@ perception and page.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.errors import CheckpointError, RecordingError
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
@@ -84,10 +83,7 @@ class CaptureReplay:
         path = Path(self.capture)
         path = path / "capture.mcap" if path.is_dir() else path
         contents = read_capture(path, VIEWS)
-        try:
-            machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
-        except (CheckpointError, KeyError, ValueError) as error:
-            raise RecordingError(f"{path}: {error}") from error
+        contents.check_machine(machine, path)
         if not contents.messages:
             raise RecordingError(f"{path}: expected messages to replay, found none")
         return ReplayFeed(self, machine, contents, time.monotonic)
@@ -180,7 +176,6 @@ class ReplayFeed:
             targets=targets,
             insertion=insertion,
             path_in_base_m=path,
-            block_in_base_m=None,
             view=None if view is None else read_view(view[2]),
             replay=ReplayTimeline(position_s, self._duration_s, self._speed, self._marks),
         )
@@ -289,13 +284,11 @@ class ReplayFeed:
             chosen = goal_m is not None and float(np.linalg.norm(center_m - goal_m)) < NEAR_M
             chosen = chosen and not is_chosen
             is_chosen |= chosen
-            # Recordings of before hold neither axis nor radius.
-            axis, radius_m = hole.get("axis_in_base", UP), hole.get("radius_m", RADIUS_M)
             choice = BoreholeChoice(
                 str(hole["name"]),
                 to_vector(center_m),
-                to_vector(np.array(axis)),
-                radius_m,
+                to_vector(np.array(hole["axis_in_base"])),
+                hole["radius_m"],
                 hole["std_m"],
                 hole["score"],
                 chosen,

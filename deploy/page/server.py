@@ -29,7 +29,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from brokk_rl.errors import LinkError
+from brokk_rl.errors import LinkError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.page import access, frame_codec
@@ -142,12 +142,19 @@ def build_link(page: PageSettings, port: int, token: str) -> str:
 
 
 def write_link(session: Session, address: str) -> None:
-    """Write the link into the run folder, readable for its owner alone."""
+    """Write the link into the run folder, readable for its owner alone.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
     path = session.folder / LINK
-    # Another's file, or a link to one, goes; a new file has the mode from its creation on.
-    path.unlink(missing_ok=True)
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-        file.write(address + "\n")
+    try:
+        # Another's file, or a link to one, goes; a new file has the mode from its creation on.
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(address + "\n")
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror}); remove it") from error
 
 
 class PageServer:

@@ -8,7 +8,6 @@ here.
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import onnxruntime
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, restore_encoder
-from brokk_rl.plain_files import check_plain_file, read_json
+from brokk_rl.plain_files import check_plain_file, parse_json, read_json
 from brokk_rl.policy_folder import TaskDescription
 from brokk_rl.registry import resolve_package_path
 
@@ -245,8 +244,10 @@ def _open_session(
     metadata = session.get_modelmeta().custom_metadata_map
     said = {}
     for key in ("fingerprint", "task"):
-        text = metadata.get(f"brokk.{key}")
-        said[key] = None if text is None else json.loads(text)
+        try:
+            said[key] = parse_json(metadata.get(f"brokk.{key}", "null"))
+        except ValueError as error:
+            raise CheckpointError(f"policy {folder}: {ONNX} is damaged ({error})") from error
     if said != {"fingerprint": contract["fingerprint"], "task": contract.get("task")}:
         raise CheckpointError(
             f"policy {folder}: {CONTRACT} and {ONNX} do not belong together; export it again (mode=export)"

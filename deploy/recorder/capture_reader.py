@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import logging
 import mmap
 import os
@@ -21,7 +20,9 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, MessageIndex, Metadata, Schema, Statistics
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import CheckpointError, RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.plain_files import parse_json
 from deploy.recorder.capture import FACTS
 from deploy.recorder.topics import PACKAGE, TIME, decode_message, load_message_class
 
@@ -114,6 +115,17 @@ class CaptureContents:
     num_lost: int = 0
     num_damaged: int = 0
 
+    def check_machine(self, machine: Machine, path: Path) -> None:
+        """Check that a machine made the capture at `path`.
+
+        Raises:
+            RecordingError: another one did.
+        """
+        try:
+            machine.check_fingerprint(parse_json(self.facts["fingerprint"]), str(path))
+        except (AttributeError, CheckpointError, KeyError, TypeError, ValueError) as error:
+            raise RecordingError(f"{path}: {error}") from error
+
 
 def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
     """Read the capture at `path` as far as it goes.
@@ -161,7 +173,7 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
 
 
 class _Decoder:
-    """Decodes messages of this framework: protobuf, and JSON of captures of before."""
+    """Decodes messages of this framework."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -170,10 +182,7 @@ class _Decoder:
 
     def decode(self, message: Message) -> dict[str, Any] | None:
         """Return its values; `None` for a message that is meant for viewers."""
-        channel = self.channels[message.channel_id]
-        if channel.message_encoding == "json":
-            return json.loads(message.data)
-        schema = self.schemas[channel.schema_id]
+        schema = self.schemas[self.channels[message.channel_id].schema_id]
         if not schema.name.startswith(f"{PACKAGE}."):
             return None
         if schema.id not in self._classes:

@@ -8,14 +8,13 @@ metadata `run`.
 
 from __future__ import annotations
 
-import json
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from brokk_rl import record
-from brokk_rl.errors import CheckpointError, RecordingError
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import DAMAGE, Recording
 from brokk_rl.spec import spec
@@ -87,10 +86,7 @@ class CaptureLogReader:
     ) -> tuple[CaptureContents, dict[str, Series], dict[str, Series]]:
         """Return the capture, and positions and valve feedback by joint."""
         contents = capture_reader.read_capture(path)
-        try:
-            machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
-        except (CheckpointError, KeyError, ValueError) as error:
-            raise RecordingError(f"{path}: {error}") from error
+        contents.check_machine(machine, path)
         names = machine.joint_names
         q = {name: _find_series(contents, f"Position_{name}", path) for name in names}
         return contents, q, {name: _find_series(contents, f"Flow_{name}", path) for name in names}

@@ -4,7 +4,7 @@ Foxglove and Rerun draw these without further work: frames of the links, shapes 
 boreholes and tool path, pictures, point clouds, and events in words. Everything here follows from
 other topics of the same capture and from the camera; nothing else reads it but the page's replay.
 
-Rerun knows no scenes, so shapes and path stand as point clouds beside them.
+Shapes and path are point clouds, since Rerun knows no scenes of Foxglove's.
 
 Source: the message schemas of https://docs.foxglove.dev/docs/sdk/schemas.
 """
@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf import (
     CameraCalibration_pb2,
-    Color_pb2,
     CompressedImage_pb2,
     FrameTransform_pb2,
     FrameTransforms_pb2,
@@ -27,8 +26,6 @@ from foxglove_schemas_protobuf import (
     PointCloud_pb2,
     Pose_pb2,
     Quaternion_pb2,
-    SceneEntityDeletion_pb2,
-    SceneUpdate_pb2,
     Vector3_pb2,
 )
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -37,7 +34,7 @@ from google.protobuf.message import Message
 from brokk_rl.kinematics import compute_tool_kinematics, rotate_about_axis
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from deploy.checks.shapes import BASE, MachineShapes
+from deploy.checks.shapes import MachineShapes
 from deploy.kernel.guard import GuardState
 from deploy.page.scene import plan_approach
 from deploy.picture import decode_jpeg, encode_jpeg
@@ -45,8 +42,7 @@ from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import AdviceStatus
 from deploy.runtime.target import NEAR_M
 
-SHAPES, SHAPE_POINTS = "scene/machine", "scene/machine_points"
-TASK, TASK_POINTS = "scene/task", "scene/task_points"
+SHAPES, TASK = "scene/machine", "scene/task"
 LINKS, LOG = "tf", "log"
 """Topics."""
 BASE_FRAME, TIP_FRAME, CAMERA_FRAME = "base", "tip", "camera"
@@ -56,8 +52,8 @@ JPEG_QUALITY = 80
 """Chosen by hand: no loss that a person sees."""
 MOST_POINTS = 6000
 """Points of a cloud at most: 96 kB a picture before compression. Chosen by hand."""
-RING_POINTS, LINE_POINTS, LINE_M = 48, 40, 0.004
-"""Points of a rim, of a line, and width of a line."""
+RING_POINTS, LINE_POINTS = 48, 40
+"""Points of a rim, and of a line."""
 AXIS_M = 0.3
 """Length at which the axis of a borehole is drawn."""
 STEEL, PAINT = (0.25, 0.25, 0.27, 1.0), (0.93, 0.62, 0.05, 1.0)
@@ -72,8 +68,8 @@ SEED, SURFACE_POINTS = 7, 150
 """Seed and number of the points on a shape's surface: dense enough to see it, chosen by hand."""
 WriteMessage = Callable[[str, float, str, bytes, bytes], None]
 Color = tuple[float, float, float, float]
-Line = tuple[str, np.ndarray, Color]
-"""Name, points `(K, 3)` in the base frame, and colour."""
+Line = tuple[np.ndarray, Color]
+"""Points `(K, 3)` in the base frame, and colour."""
 
 
 class SceneTopics:
@@ -172,60 +168,36 @@ class SceneTopics:
         self._write(LINKS, t_s, message)
 
     def _write_shapes(self, t_s: float, shapes: MachineShapes) -> None:
-        """Write the machine's shapes, each in the frame of its link: once."""
-        update = SceneUpdate_pb2.SceneUpdate()
+        """Write points on the machine's shapes, in the frame of their link: once."""
         clouds: dict[str, list[np.ndarray]] = {}
         names = [*self._machine.joint_names, BASE_FRAME]
-        for number, box in enumerate(shapes.body):
-            frame = names[box.link]
+        for box in shapes.body:
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = box.rotation, box.center_m
             size = 2.0 * (box.half_m + box.radius_m)
-            entity = update.entities.add(frame_id=frame, id=f"body_{number}", frame_locked=True)
-            color = _build_color(STEEL if box.link == BASE else PAINT)
-            entity.cubes.add(pose=_build_pose(pose), size=_build_vector(size), color=color)
-            clouds.setdefault(frame, []).append(_sample_box(pose, size))
-        for number, capsule in enumerate(shapes.arm):
-            frame, along = names[capsule.link], capsule.end_m - capsule.begin_m
-            pose, length_m = _turn_z_to(along), float(np.linalg.norm(along))
+            clouds.setdefault(names[box.link], []).append(_sample_box(pose, size))
+        for capsule in shapes.arm:
+            along = capsule.end_m - capsule.begin_m
+            pose, width_m = _turn_z_to(along), 2.0 * capsule.radius_m
             pose[:3, 3] = (capsule.begin_m + capsule.end_m) / 2
-            width_m = 2.0 * capsule.radius_m
-            size = np.array([width_m, width_m, length_m + width_m])
-            is_tool = capsule.link == self._machine.num_joints - 1
-            entity = update.entities.add(frame_id=frame, id=f"arm_{number}", frame_locked=True)
-            color = _build_color(STEEL if is_tool else PAINT)
-            placed, extent = _build_pose(pose), _build_vector(size)
-            entity.cylinders.add(
-                pose=placed, size=extent, bottom_scale=1.0, top_scale=1.0, color=color
-            )
-            clouds.setdefault(frame, []).append(_sample_cylinder(pose, size))
-        self._write(SHAPES, t_s, update)
+            size = np.array([width_m, width_m, float(np.linalg.norm(along)) + width_m])
+            clouds.setdefault(names[capsule.link], []).append(_sample_cylinder(pose, size))
         for frame, parts in clouds.items():
             paint = STEEL if frame in (BASE_FRAME, names[-2]) else PAINT
             cloud = _build_cloud(frame, np.concatenate(parts), np.array(paint))
-            self._write(f"{SHAPE_POINTS}/{frame}", t_s, cloud)
+            self._write(f"{SHAPES}/{frame}", t_s, cloud)
 
     def _write_task(self, t_s: float) -> None:
         """Write boreholes and tool path, all anew: a viewer that jumps shows the last message."""
         if t_s - self._task_s < TASK_PERIOD_S:
             return
         self._task_s = t_s
-        update, lines = SceneUpdate_pb2.SceneUpdate(), list(self._list_lines())
-        # Whatever is no longer there must go.
-        update.deletions.add(type=SceneEntityDeletion_pb2.SceneEntityDeletion.ALL)
         points, colors = [np.empty((0, 3))], [np.empty((0, 4))]
-        for name, points_m, color in lines:
-            entity = update.entities.add(frame_id=BASE_FRAME, id=name)
-            line = entity.lines.add(thickness=LINE_M, color=_build_color(color))
-            line.pose.CopyFrom(_build_pose(np.eye(4)))
-            for point_m in points_m:
-                line.points.add(x=point_m[0], y=point_m[1], z=point_m[2])
-            dense = _fill_line(points_m)
-            points.append(dense)
-            colors.append(np.tile(color, (len(dense), 1)))
-        self._write(TASK, t_s, update)
+        for points_m, color in self._list_lines():
+            points.append(_fill_line(points_m))
+            colors.append(np.tile(color, (LINE_POINTS, 1)))
         cloud = _build_cloud(BASE_FRAME, np.concatenate(points), np.concatenate(colors))
-        self._write(TASK_POINTS, t_s, cloud)
+        self._write(TASK, t_s, cloud)
 
     def _list_lines(self) -> Iterator[Line]:
         """Yield rims and axes of the boreholes, and the way of the tool into the chosen one."""
@@ -239,12 +211,11 @@ class SceneTopics:
             angle = np.linspace(0.0, 2.0 * np.pi, RING_POINTS + 1)[:, None]
             turn = _turn_z_to(axis)[:3, :3]
             ring_m = np.cos(angle) * turn[:, 0] + np.sin(angle) * turn[:, 1]
-            yield f"rim {hole['name']}", center_m + hole["radius_m"] * ring_m, color
-            ends_m = np.stack([center_m, center_m + AXIS_M * axis])
-            yield f"axis {hole['name']}", ends_m, color
+            yield center_m + hole["radius_m"] * ring_m, color
+            yield np.stack([center_m, center_m + AXIS_M * axis]), color
         if goal is not None and self._machine.has_bodies and not np.isnan(self._q).any():
             tip_m = compute_tool_kinematics(self._machine, self._q).tip_in_base_m
-            yield "tool path", np.array(plan_approach(tip_m, goal, up)), PINK
+            yield np.array(plan_approach(tip_m, goal, up)), PINK
 
 
 def describe_event(
@@ -313,12 +284,8 @@ def decode_frame(
 
 
 def _stamp(message: Any, wall_ns: int) -> bytes:
-    """Return a message with its time: its own field, or one in each of its parts."""
-    fields = message.DESCRIPTOR.fields_by_name
-    parts = [message] if "timestamp" in fields else []
-    for name in ("transforms", "entities", "deletions"):
-        parts += getattr(message, name) if name in fields else []
-    for part in parts:
+    """Return a message with its time: its own field, or one in each of its transforms."""
+    for part in getattr(message, "transforms", [message]):
         part.timestamp.FromNanoseconds(wall_ns)
     return message.SerializeToString()
 
@@ -382,11 +349,6 @@ def _build_pose(pose: np.ndarray) -> Pose_pb2.Pose:
 def _build_vector(values: Sequence[float] | np.ndarray) -> Vector3_pb2.Vector3:
     x, y, z = map(float, values)
     return Vector3_pb2.Vector3(x=x, y=y, z=z)
-
-
-def _build_color(color: Color) -> Color_pb2.Color:
-    r, g, b, a = color
-    return Color_pb2.Color(r=r, g=g, b=b, a=a)
 
 
 def _to_quaternion(rotation: np.ndarray) -> np.ndarray:

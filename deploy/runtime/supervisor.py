@@ -19,6 +19,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
+from deploy.bus.description import BusDescription
 from deploy.guard_setup import build_envelope, read_observer_content
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
@@ -103,6 +104,7 @@ class DeploymentLoop(BusAndPolicySettings):
         """
         self.check_machine(machine)
         if self.commands:
+            BusDescription(self.dbc, machine).check_protection()
             read_observer_content(self.limits, machine, self.wire.interface, commands=True)
             build_envelope(self.limits, machine, commands=True)
         if self.video is not None:

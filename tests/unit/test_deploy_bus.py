@@ -145,9 +145,10 @@ def test_a_replay_of_nothing_is_refused(tmp_path: Path) -> None:
         ("Position_q3", "Pos3", "no signal 'Position_q3'"),
         (" SG_ Crc : 56|8@1+ (1,0) [0|255] \"\" GATEWAY\n\nBO_ 2566918439", "\nBO_ 2566918439", "needs Counter, and Crc"),
         ("(0.001,0) [0|65.535]", "(0,0) [0|65.535]", "factor other than 0"),
+        ("SG_ Position_q5", "SG_ Position_q1", "'Position_q1' in one message, got it in JointPos1 and JointPos3"),
         ("BO_ 2365592067 JointPos1: 8", "BO_ JointPos1: 8", "no valid DBC"),
     ],
-    ids=["signal", "crc", "factor", "syntax"],
+    ids=["signal", "crc", "factor", "twice", "syntax"],
 )  # fmt: skip
 def test_a_description_that_does_not_do_is_refused(
     machine: Machine, tmp_path: Path, old: str, new: str, message: str
@@ -158,6 +159,21 @@ def test_a_description_that_does_not_do_is_refused(
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(ConfigError, match=message):
         BusDescription(str(path), machine)
+
+
+@pytest.mark.parametrize(
+    "message", ["ValveCmd", "JointPos2", "LeverState", "ValveFeedback", "MachineStatus"]
+)
+def test_where_commands_are_sent_all_that_they_depend_on_is_protected(
+    bus: BusDescription, machine: Machine, tmp_path: Path, message: str
+) -> None:
+    bus.check_protection()
+    mark = f'BA_ "E2EDataId" BO_ {1 << 31 | bus.layouts[message].frame_id}'
+    lines = described.resolve_package_path(DBC).read_text().splitlines()
+    path = tmp_path / "other.dbc"
+    path.write_text("\n".join(line for line in lines if not line.startswith(mark)))
+    with pytest.raises(ConfigError, match=f"E2EDataId for message {message}"):
+        BusDescription(str(path), machine).check_protection()
 
 
 def test_another_layout_with_the_same_names_is_as_good(machine: Machine, tmp_path: Path) -> None:

@@ -316,6 +316,8 @@ def write_network(folder: Path, kind: str) -> None:
         network.ir_version = 99
     elif kind == "newer operators":
         network.opset_import[0].version = 99
+    elif kind == "nested metadata":
+        next(one for one in network.metadata_props if one.key == "brokk.task").value = "[" * 100_000
     if not kind.startswith("weights"):
         onnx.save(network, folder / "policy.onnx")
         return
@@ -332,6 +334,7 @@ def write_network(folder: Path, kind: str) -> None:
     [
         ("newer format", "update onnxruntime"),
         ("newer operators", "update onnxruntime"),
+        ("nested metadata", "damaged"),
         ("weights left behind", r"copy it, mostly policy\.onnx\.data"),
         ("weights cut off", r"missing or cut off"),
         ("weights beside it", None),

@@ -293,6 +293,11 @@ def test_a_capture_of_another_machine_or_of_nothing_is_refused(
         READER.read(tmp_path / MCAP, replace(machine, name="other"))
     with pytest.raises(RecordingError, match="no piece"):
         replace(READER, shortest_s=10.0).read(tmp_path / MCAP, machine)
+    facts = {"fingerprint": "[" * 100_000}
+    with CaptureWriter(CaptureConfig(tmp_path / "nested", DBC, machine, facts, 0.0)):
+        pass
+    with pytest.raises(RecordingError, match="nested too deeply"):
+        READER.read(tmp_path / "nested" / MCAP, machine)
     (tmp_path / "empty.mcap").write_bytes(b"")
     with pytest.raises(RecordingError, match="cut off"):
         READER.read(tmp_path / "empty.mcap", machine)

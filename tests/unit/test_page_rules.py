@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import ConfigError, FrameError, StorageError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import JointPart
 from brokk_rl.session import Session
@@ -373,6 +373,9 @@ def test_the_link_with_the_token_is_its_owners_alone(
     tmp_path: Path, before: str, record_property: Callable[[str, object], None]
 ) -> None:
     path, other = tmp_path / "page.url", tmp_path / "other"
+    (tmp_path / "run/page.url").mkdir(parents=True)
+    with pytest.raises(StorageError, match="remove it"):
+        write_link(Session(out=str(tmp_path / "run"), seed=0, device="cpu"), "http://x")
     other.write_text("another's")
     if before == "link":
         path.symlink_to(other)

@@ -1,7 +1,7 @@
-// The 3D scene, in a worker with a canvas and a WebSocket of its own: machine, block, boreholes, path, and the point cloud.
+// The 3D scene, in a worker with a canvas and a WebSocket of its own: machine, boreholes, path, and the point cloud.
 import { add, lookAlong, lookAt, multiply, perspective } from "./matrices.js";
 import { Painter } from "./painter.js";
-import { Shapes, block, boreholes, camera, ground, machine, path, tip } from "./shapes.js";
+import { Shapes, boreholes, camera, ground, machine, path, tip } from "./shapes.js";
 import { Socket } from "./socket.js";
 
 const FOV = 0.7, NEAR = 0.1, FAR = 40, REPORT_MS = 1000;
@@ -59,7 +59,6 @@ function tick() {
   if (state) {
     if (tool) tip(shapes, tool);
     else if (setup.geometry && state.q) machine(shapes, setup.geometry, state.q);
-    if (state.block_in_base_m) block(shapes, state.block_in_base_m);
     boreholes(shapes, state.targets);
     path(shapes, state.path_in_base_m);
     if (state.view && painter.header?.placed && !tool) camera(shapes, painter.header);

@@ -91,7 +91,3 @@ export function path(shapes, points) {
   }
 }
 
-export function block(shapes, corners) {
-  const [low, high] = corners, corner = bits => [0, 1, 2].map(i => (bits >> i) & 1 ? high[i] : low[i]);
-  for (let from = 0; from < 8; from++) for (let i = 0; i < 3; i++) if (!((from >> i) & 1)) shapes.rod(corner(from), corner(from | 1 << i), 0.008, EDGE);
-}
