@@ -19,8 +19,8 @@ from deploy.kernel.limits import GuardLimits
 
 log = logging.getLogger(__name__)
 
-DESKS = ("udp_multicast", "virtual", "replay")
-"""Interfaces of buses without a machine: twins and recorded frames."""
+DESKS = ("udp_multicast", "virtual")
+"""Interfaces of buses without a machine: twins."""
 MACHINES = ("machine: ", "capture: ", "log: ")
 """Beginnings of the sources of recordings that may be of a machine."""
 

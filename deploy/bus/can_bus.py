@@ -1,4 +1,4 @@
-"""CAN buses through python-can, and the replay of recorded frames.
+"""CAN buses through python-can.
 
 Only `recv` and `send` of python-can are used. Its `Notifier` dies silently of the first exception.
 Its cyclic senders die too or, in the kernel, go on repeating the last command while the program
@@ -8,19 +8,14 @@ hangs. Nothing here uses them.
 from __future__ import annotations
 
 import logging
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 import can
-from can.io.blf import BLFParseError, BLFReader
 
 from brokk_rl.errors import LinkError
-from brokk_rl.plain_files import check_plain_file
-from brokk_rl.spec import Positive, spec
+from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
@@ -161,86 +156,3 @@ class OpenCanBus:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
-
-
-@spec
-class BusReplay:
-    """Recorded frames, received again at the times of the recording; nothing is sent.
-
-    Attributes:
-        path: BLF file; frames that the loop itself sent are left out.
-        speed: Times real time.
-    """
-
-    path: str
-    speed: Positive
-
-    interface: ClassVar[str] = "replay"
-
-    @property
-    def channel(self) -> str:
-        """The file."""
-        return self.path
-
-    def open(self, frame_ids: Sequence[int] | None = None) -> OpenBusReplay:
-        """Begin the replay; see `CanBus.open`.
-
-        Raises:
-            LinkError: the file cannot be read.
-        """
-        wanted = None if frame_ids is None else frozenset(frame_ids)
-        try:
-            check_plain_file(Path(self.path), sys.maxsize)
-            return OpenBusReplay(BLFReader(self.path), self.speed, wanted)
-        except (OSError, ValueError, BLFParseError) as error:
-            raise LinkError(f"bus.path={self.path}: nothing can be replayed ({error})") from error
-
-
-class OpenBusReplay:
-    """A running replay; used as `OpenCanBus`."""
-
-    def __init__(self, reader: BLFReader, speed: float, frame_ids: frozenset[int] | None) -> None:
-        self._reader, self._speed, self._frame_ids = reader, speed, frame_ids
-        self._messages, self._next = iter(reader), None
-        self._offset_s: float | None = None
-
-    def recv(self, timeout_s: float) -> CanFrame | None:
-        """Return the next frame when its time has come; see `OpenCanBus.recv`.
-
-        Raises:
-            LinkError: the replay is over.
-        """
-        end_s = time.monotonic() + max(0.0, timeout_s)
-        if self._next is None:
-            self._next = self._read_next()
-        # The first frame is due at once; the others keep their distance from it.
-        if self._offset_s is None:
-            self._offset_s = time.monotonic() - self._next.timestamp / self._speed
-        due_s = self._next.timestamp / self._speed + self._offset_s
-        time.sleep(max(0.0, min(due_s, end_s) - time.monotonic()))
-        # The frame stays, for the next call.
-        if due_s > end_s:
-            return None
-        message, self._next = self._next, None
-        return CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id)
-
-    def send(self, frame: CanFrame) -> None:
-        """Send nothing."""
-
-    def close(self) -> None:
-        """Close the file."""
-        self._reader.stop()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
-    def _read_next(self) -> can.Message:
-        for message in self._messages:
-            wanted = self._frame_ids is None or message.arbitration_id in self._frame_ids
-            has_data = not message.is_error_frame and not message.is_remote_frame
-            if wanted and has_data and message.is_rx:
-                return message
-        raise LinkError("bus: the replay is over")

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
-from deploy.bus.can_bus import BusReplay, CanBus, CanFrame, OpenBusReplay, OpenCanBus
+from deploy.bus.can_bus import CanBus, CanFrame, OpenCanBus
 from deploy.bus.description import BusDescription
 from deploy.guard_setup import build_envelope, build_observer
 from deploy.kernel.bus_logic import CYCLE_S, BusInputs, BusLogic
@@ -54,7 +54,7 @@ class BusProcessConfig:
         needs_page: Whether commands are sent only while the operator's page lives.
     """
 
-    wire: CanBus | BusReplay
+    wire: CanBus
     dbc: str
     machine: Machine
     limits: GuardLimits
@@ -81,7 +81,7 @@ class BusProcess:
         self._seen_s = limits.target.seen_s
         self._joint_names = machine.joint_names
         self._gap_s = config.limits.gap_s
-        self._bus: OpenCanBus | OpenBusReplay | None = None
+        self._bus: OpenCanBus | None = None
         self._was_down, self._reopen_s = False, -math.inf
         self._log: list[bytes] = []
         self._timer = CycleTimer(CYCLE_S)

@@ -9,7 +9,7 @@ from typing import Any
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from deploy.bus.can_bus import BusReplay, CanBus
+from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
 from deploy.guard_setup import check_command_rate
 from deploy.guidance import LeverGuidance, LeverMap
@@ -103,7 +103,7 @@ class BusAndPolicySettings:
         realtime: Whether to ask for real-time priority.
     """
 
-    wire: CanBus | BusReplay
+    wire: CanBus
     dbc: str
     limits: GuardLimits
     guidance: LeverGuidance

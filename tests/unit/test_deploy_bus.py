@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import can
 import pytest
-from can.io.blf import BLFWriter
 from desk import DBC
 from desk import wire as udp
 from hypothesis import given, settings
@@ -22,7 +20,7 @@ from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from deploy.bus import description as described
 from deploy.bus.c_header import generate_c_header
-from deploy.bus.can_bus import BusReplay, CanBus, CanFrame
+from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
 
@@ -112,31 +110,6 @@ def test_a_closed_wire_is_an_error_and_may_be_closed_again(
 def test_a_wire_that_is_not_there_is_an_error_that_says_what_to_change() -> None:
     with pytest.raises(LinkError, match=r"bus\.channel=nowhere"):
         CanBus(interface="socketcan", channel="nowhere", bitrate=None, port=None, hops=None).open()
-
-
-def test_a_replay_says_what_was_recorded_in_its_own_time_and_sends_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "frames.blf"
-    with BLFWriter(path) as writer:
-        for number in range(5):
-            message = can.Message(
-                timestamp=1000.0 + 0.02 * number,
-                arbitration_id=0x100 + number,
-                data=[number],
-                is_rx=number != 3,
-            )
-            writer.on_message_received(message)
-    with BusReplay(path=str(path), speed=2.0).open() as one:
-        one.send(CanFrame(0x200, b""))
-        found = [one.recv(0.5) for _ in range(4)]
-        # What was sent from here is left out.
-        assert [frame.frame_id for frame in found if frame] == [0x100, 0x101, 0x102, 0x104]
-        with pytest.raises(LinkError, match="over"):
-            one.recv(0.5)
-
-
-def test_a_replay_of_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(LinkError, match="nothing"):
-        BusReplay(path=str(tmp_path / "nothing.blf"), speed=1.0).open()
 
 
 @pytest.mark.parametrize(

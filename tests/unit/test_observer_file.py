@@ -143,7 +143,6 @@ def test_the_guard_says_whose_thresholds_it_has(
         ("machine: socketcan can0", "socketcan"),
         ("machine: socketcan can0", "udp_multicast"),
         ("simulator: Hydraulic", "virtual"),
-        ("simulator: Hydraulic", "replay"),
     ):
         limits = write_file(tmp_path / "observer.json", MACHINE, source)
         caplog.clear()

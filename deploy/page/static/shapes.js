@@ -2,7 +2,7 @@
 import { add, chain, cross, frame, norm, rim, scaled, sub, unit } from "./matrices.js";
 
 const PAINT = [0.96, 0.65, 0.05], DARK = [0.16, 0.17, 0.18], STEEL = [0.42, 0.43, 0.45], LINE = [0.55, 0.6, 0.66];
-const CHOSEN = [0, 0.55, 0.2], OTHER = [0.05, 0.3, 0.85], PATH = [0.82, 0, 0.45], EDGE = [0.1, 0.1, 0.12];
+const CHOSEN = [0, 0.55, 0.2], OTHER = [0.05, 0.3, 0.85], PATH = [0.82, 0, 0.45];
 const THICK_M = [0.20, 0.13, 0.11, 0.095, 0.12];
 const VIEW = [0.1, 0.6, 0.75], VIEW_M = 0.7;  // how far the edges of a camera's view are drawn
 const DASH_M = 0.09, CHISEL_M = 0.034, CHISEL_PART = 0.4;
