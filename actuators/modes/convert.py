@@ -1,7 +1,7 @@
 """`brokk mode=convert`: makes recordings of the logs of other machines and programs."""
 
 from actuators.recordings import conversion
-from actuators.recordings.log_reader import LogReader
+from actuators.recordings.conversion import LogReader
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec

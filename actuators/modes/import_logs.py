@@ -8,11 +8,11 @@ from pathlib import Path
 
 from actuators.recordings import conversion, log_draft
 from actuators.recordings.column_names import UNITS, read_unit
+from actuators.recordings.conversion import LogReader
 from actuators.recordings.guess import CommandKind, GivenColumns, Guess
 from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.log_draft import Draft
 from actuators.recordings.log_files import Damaged
-from actuators.recordings.log_reader import LogReader
 from actuators.recordings.recording_checks import examine_recordings
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices

@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from scipy import io as matlab
 
-from actuators.recordings.log_tables import LogFile, LogRun, Table
+from actuators.recordings.log_tables import LogFile, LogRun, Table, Wanted
 from brokk_rl.errors import RecordingError
 
 EPISODE = "episode_index"
@@ -54,12 +54,9 @@ class TableLog(LogFile):
         """Return the columns of numbers, and those of fixed lists item by item."""
         return {"": [*self._list_places()]}
 
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield the file as one run."""
-        columns = self.read_columns(wanted.get("", ()), max_rows)
-        yield LogRun(self.path.stem, str(self.path), {"": Table(columns)})
+    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+        """Return the table of the file."""
+        return {"": Table(self.read_columns(wanted.get("", ()), max_rows))}
 
     def read_columns(self, names: Collection[str], max_rows: int | None) -> dict[str, np.ndarray]:
         """Return the named columns, each `(T,)`; NaN for an empty cell, s since 1970 for a time."""
@@ -138,9 +135,7 @@ class LeRobotLog(LogFile):
         """Return the columns of numbers, items of lists by the names that the dataset gives them."""
         return self._files[0].list_tables()
 
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
+    def read_runs(self, wanted: Wanted, max_rows: int | None) -> Iterator[LogRun]:
         """Yield each episode as a run."""
         for file in self._files if max_rows is None else self._files[:1]:
             columns = file.read_columns({*wanted.get("", ()), EPISODE}, max_rows)
@@ -180,14 +175,12 @@ class ArrayLog(LogFile):
         """Return the real vectors of the most frequent length, and columns of such matrices."""
         return {table: [*columns] for table, columns in self._tables.items()}
 
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield the file as one run."""
+    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+        """Return the tables of the file."""
         tables = {}
         for table, names in wanted.items():
             tables[table] = Table({name: self._tables[table][name][:max_rows] for name in names})
-        yield LogRun(self.path.stem, str(self.path), tables)
+        return tables
 
 
 def _read_npz(path: Path) -> dict[str, dict[str, np.ndarray]]:

@@ -8,7 +8,7 @@ missing in the rows of the others. Frames are read and decoded by blocks.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from datetime import datetime
 from io import StringIO
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 from actuators.recordings.advice import advise
-from actuators.recordings.log_tables import LogFile, LogRun, Table
+from actuators.recordings.log_tables import LogFile, Table, Wanted
 from brokk_rl import registry
 from brokk_rl.errors import ConfigError, RecordingError
 
@@ -72,10 +72,8 @@ class CanLog(LogFile):
             )
         return tables
 
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield the log as one run."""
+    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+        """Return the signals of each message."""
         chosen = {at: one for at, one in self._messages.items() if one.name in wanted}
         names, parts = {}, {}
         for at, message in chosen.items():
@@ -96,7 +94,7 @@ class CanLog(LogFile):
             columns = dict(zip([TIME, *names[at]], values.T, strict=True))
             units = {signal.name: signal.unit for signal in message.signals if signal.unit}
             tables[message.name] = Table(columns, units, TIME, message.is_multiplexed())
-        yield LogRun(self.path.stem, str(self.path), tables)
+        return tables
 
     def _refuse_channels(self, name: str, frames: pd.DataFrame) -> None:
         channels = sorted(frames["channel"].unique())

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 from actuators.recordings.log_files import expand_logs
-from actuators.recordings.log_reader import LogReader
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
@@ -17,6 +17,18 @@ log = logging.getLogger(__name__)
 
 FOLDER = "recordings"
 """Folder of the recordings in a run folder."""
+
+
+class LogReader(Protocol):
+    """A spec in `conf/import`: reads one kind of log of another machine or program."""
+
+    def read(self, path: Path, machine: Machine) -> list[Recording]:
+        """Return the gapless pieces of the log at `path`, in order; they share metadata `run`.
+
+        Raises:
+            RecordingError: the log cannot be used; names file, row and column.
+        """
+        ...
 
 
 def find_logs(patterns: str | Sequence[str]) -> list[Path]:

@@ -16,19 +16,8 @@ CommandKind = Literal["velocity", "position", "torque"]
 """Quantity that commands set."""
 SURE, LIKELY = 0.97, 0.8
 """Least probabilities of a sure and of a likely guess."""
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """An observation that speaks for a meaning, or against it.
-
-    Attributes:
-        text: Observation.
-        weight: Logarithm of the odds that it adds.
-    """
-
-    text: str
-    weight: float
+Evidence = tuple[str, float]
+"""An observation as text, and the logarithm of the odds that it adds."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +34,14 @@ class Guess:
 
     subject: str
     value: str
-    evidence: tuple[Evidence, ...]
+    evidence: Sequence[Evidence]
     others: tuple[str, ...] = ()
     is_given: bool = False
 
     @property
     def probability(self) -> float:
         """Probability that the value is right."""
-        return 1.0 / (1.0 + math.exp(-sum(one.weight for one in self.evidence)))
+        return 1.0 / (1.0 + math.exp(-sum(weight for _, weight in self.evidence)))
 
     @property
     def sureness(self) -> Sureness:
@@ -64,7 +53,7 @@ class Guess:
     @property
     def reason(self) -> str:
         """Evidence as text."""
-        return "; ".join(one.text for one in self.evidence if one.text)
+        return "; ".join(text for text, _ in self.evidence if text)
 
     @property
     def is_open(self) -> bool:
@@ -73,8 +62,7 @@ class Guess:
 
     def advise(self, text: str) -> Guess:
         """Return it with a remedy beside the evidence, where a person has to fill in the value."""
-        remedy = Evidence(text, 0.0)
-        return replace(self, evidence=(*self.evidence, remedy)) if self.is_open else self
+        return replace(self, evidence=[*self.evidence, (text, 0.0)]) if self.is_open else self
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain JSON data."""
@@ -109,3 +97,12 @@ class GivenColumns:
     time: Sequence[str] | None = None
     rate_hz: float | None = None
     wraps: float | Mapping[str, float] | None = None
+
+    def find_unit(self, joint: str) -> str | None:
+        """Return the unit of a joint's positions, where it is given."""
+        given = self.position_unit
+        return given.get(joint) if isinstance(given, Mapping) else given
+
+    def find_wraps(self, joint: str) -> float | None:
+        """Return the value at which a joint's positions begin again, where it is given."""
+        return self.wraps.get(joint) if isinstance(self.wraps, Mapping) else self.wraps

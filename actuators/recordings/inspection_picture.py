@@ -2,26 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from actuators.recordings.finding_kinds import FINDINGS
 from actuators.recordings.inspection import Inspection
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure, save_figure
 from brokk_rl.record import Breach, Recording
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# Okabe and Ito's, which those tell apart who see no red or green, and Tol's
-HUES = (
-    "#e69f00", "#f0e442", "#000000", "#cc79a7", "#882255", "#56b4e9", "#0072b2", "#d55e00", "#009e73",
-    "#999999", "#bbbbbb", "#dddddd", "#332288",
-)  # fmt: skip
-COLOURS = dict(zip(FINDINGS, HUES, strict=True))
-BREACH = "#b00020"
+FINDING, BREACH = "#e69f00", "#b00020"
 THINNEST = 0.002
 """A finding is drawn at least this wide, as a part of the picture, so that a single row can be
 seen."""
@@ -58,11 +47,7 @@ def draw_recording(
             if finding.joint in (joint.name, None):
                 width_s = max(finding.duration_s, THINNEST * span_s)
                 commands.axvspan(
-                    finding.t_s,
-                    finding.t_s + width_s,
-                    color=COLOURS[finding.kind],
-                    alpha=0.35,
-                    linewidth=0,
+                    finding.t_s, finding.t_s + width_s, color=FINDING, alpha=0.35, linewidth=0
                 )
         own = {f"u_{joint.name}", f"q_{joint.name}_{joint.unit}", "t_s"}
         for breach in breaches:
@@ -71,30 +56,8 @@ def draw_recording(
     axes[-1].set_xlabel("time [s]")
     axes[-1].set_xlim(begin_s, begin_s + span_s)
     name = recording.path.name if recording.path else "recording"
-    figure.suptitle(f"{name}: measured position (black), command in [-1, 1] (grey)", fontsize=11)
-    _add_legend(
-        figure,
-        {finding.kind for finding in inspection.findings},
-        any(breach.row is not None for breach in breaches),
+    title = (
+        "measured position (black), command in [-1, 1] (grey), findings (shaded), breaches (red)"
     )
+    figure.suptitle(f"{name}: {title}", fontsize=11)
     save_figure(figure, path)
-
-
-def _add_legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:
-    """Explain the colours that occur."""
-    from matplotlib.patches import Patch
-
-    patches = []
-    for kind, colour in COLOURS.items():
-        if kind in kinds:
-            patches.append(Patch(color=colour, alpha=0.6, label=kind))
-    if has_breaches:
-        patches.append(Patch(color=BREACH, label="breaks the format"))
-    if patches:
-        figure.legend(
-            handles=patches,
-            loc="outside lower center",
-            ncols=len(patches),
-            fontsize=9,
-            frameon=False,
-        )

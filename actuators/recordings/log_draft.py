@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from actuators.recordings.column_table import ColumnTable, JointGuess, read_columns
-from actuators.recordings.guess import Evidence, GivenColumns, Guess
+from actuators.recordings.column_pairs import JointGuess
+from actuators.recordings.column_table import read_columns
+from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.log_files import Damaged, open_log
+from actuators.recordings.log_signals import RunSignals
 from actuators.recordings.log_survey import JointSurvey, LogSurvey, measure_logs
-from actuators.recordings.log_tables import index_columns
 from actuators.recordings.text_log import TextLog
 from actuators.recordings.time_guess import TimeGuess
 from brokk_rl.errors import RecordingError
@@ -73,8 +74,7 @@ class Draft:
         times: Clock of each table that is used.
         joints: Joints whose command changes.
         survey: Their numbers over all logs.
-        samples: What the columns of the first logs are.
-        best: Number of the sample that each joint was judged by.
+        signals: Signals of the run that each joint was judged by.
         signs: Delimiter and decimal sign of text files.
         dbc: DBC file of logs of a CAN bus.
         channel: Channel of the recorder.
@@ -86,8 +86,7 @@ class Draft:
     times: Mapping[str, TimeGuess]
     joints: Sequence[JointGuess]
     survey: LogSurvey
-    samples: Sequence[ColumnTable]
-    best: Mapping[str, int]
+    signals: Mapping[str, RunSignals]
     signs: tuple[str, str]
     dbc: str | None
     channel: int | str | None
@@ -189,8 +188,8 @@ def make_draft(
     Raises:
         RecordingError: A log cannot be read, nothing can be proposed, or no joint is ever commanded.
     """
-    samples: list[ColumnTable] = []
-    best: dict[str, int] = {}
+    clocks: Mapping[str, TimeGuess] = {}
+    best: dict[str, tuple[JointGuess, RunSignals]] = {}
     remarks: dict[str, None] = {}
     signs = (",", ".")
     for path in paths[:SAMPLED_LOGS]:
@@ -200,16 +199,15 @@ def make_draft(
         run = next(opened.read_runs(opened.list_tables(), SAMPLED_ROWS), None)
         if run is None:
             raise RecordingError(f"{path}: no row")
-        samples.append(read_columns(run, given, damaged == "skip"))
-        remarks |= dict.fromkeys(samples[-1].remarks)
-        for joint in samples[-1].joints:
-            number = best.get(joint.name)
-            if number is None or _rank(joint) > _rank(find_joint(samples[number], joint.name)):
-                best[joint.name] = len(samples) - 1
-    joints = [find_joint(samples[number], joint) for joint, number in best.items()]
-    places = index_columns({table: [*columns] for table, columns in _list_places(samples)})
-    used = {places[column][0] for joint in joints for column in (joint.command, joint.position)}
-    times = {table: time for table, time in samples[0].times.items() if table in used}
+        sample = read_columns(run, given, damaged == "skip")
+        clocks = clocks or sample.times
+        remarks |= dict.fromkeys(sample.remarks)
+        for joint in sample.joints:
+            if joint.name not in best or _rank(joint) > _rank(best[joint.name][0]):
+                best[joint.name] = joint, sample.signals
+    joints = [joint for joint, _ in best.values()]
+    used = {column.name.table for joint in joints for column in (joint.u, joint.q)}
+    times = {table: time for table, time in clocks.items() if table in used}
     survey = measure_logs(paths, times, joints, signs, dbc, damaged, channel)
     moving = []
     for joint in joints:
@@ -221,22 +219,8 @@ def make_draft(
     if not moving:
         raise RecordingError(f"{paths[0]}: no command of any joint changes in {len(paths)} logs")
     all_remarks = [*remarks, *survey.gaps]
-    return Draft(
-        name, times, moving, survey, samples, best, signs, dbc, channel, damaged, all_remarks
-    )
-
-
-def find_joint(table: ColumnTable, name: str) -> JointGuess:
-    """Return a joint of a sample by its name."""
-    return next(joint for joint in table.joints if joint.name == name)
-
-
-def _list_places(samples: Sequence[ColumnTable]) -> list[tuple[str, list[str]]]:
-    return [
-        (name, [*table.columns])
-        for sample in samples
-        for name, table in sample.signals.run.tables.items()
-    ]
+    signals = {name: one for name, (_, one) in best.items()}
+    return Draft(name, times, moving, survey, signals, signs, dbc, channel, damaged, all_remarks)
 
 
 def _rank(joint: JointGuess) -> tuple[float, float]:
@@ -245,46 +229,40 @@ def _rank(joint: JointGuess) -> tuple[float, float]:
 
 def scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
     """Return neutral and full commands of a joint whose command sets its speed, or a force."""
-    low, high = survey.lowest_command, survey.highest_command
-    subject = f"{joint.name}: full command"
+    low, high, neutral = survey.lowest_command, survey.highest_command, 0.0
+    is_at_rest = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
+    largest = max(abs(low), abs(high))
+    value = None
     if joint.kind == "torque":  # a joint at rest may be held by a force, so 0 is neutral
-        full = max(abs(low), abs(high))
-        guess = Guess(
-            subject,
-            f"-{full:.6g} to {full:.6g}",
-            (Evidence("the largest command of the logs, both ways", 2.0),),
+        low, high, value = -largest, largest, f"{-largest:.6g} to {largest:.6g}"
+        evidence = [("the largest command of the logs, both ways", 2.0)]
+    elif -1.001 <= low < -0.5 and 0.5 < high <= 1.001:
+        low, high, value = -1.0, 1.0, "-1 to 1"
+        evidence = [(f"commands lie within -1 and 1, at rest {survey.rest:g}", 4.0)]
+    elif is_at_rest:
+        neutral = survey.rest
+        text = f"neutral {neutral:.6g} is the command of {survey.rest_share:.0%} of the rows, all at rest"
+        evidence = [(f"{text}; full commands are the largest of the logs", 2.0)]
+    elif low <= 0.0 <= high:
+        text = (
+            "neutral 0: no command is frequent at rest; full commands are the largest of the logs"
         )
-        return CommandDraft(0.0, full, -full, guess)
-    if -1.001 <= low < -0.5 and 0.5 < high <= 1.001:
-        neutral, low, high = 0.0, -1.0, 1.0
-        text = f"commands lie within -1 and 1, at rest {survey.rest:g}"
-        guess = Guess(subject, "-1 to 1", (Evidence(text, 4.0),))
+        evidence = [(text, 2.0)]
     else:
-        is_known = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
-        neutral = survey.rest if is_known else 0.0
-        reason = (
-            f"neutral {neutral:.6g} is the command of {survey.rest_share:.0%} of the rows, all at rest; full commands are the "
-            "largest of the logs"
-        )
-        weight = 2.0
-        if not is_known and not low <= 0.0 <= high:
-            weight, reason = -1.0, "no command is frequent at rest, and none is 0"
-        elif not is_known:
-            reason = "neutral 0: no command is frequent at rest; full commands are the largest of the logs"
-        if neutral == 0.0 and joint.speed_scale is not None:  # a speed counts alike both ways
-            largest = max(-low, high)
-            low = -largest if low < 0.0 else low
-            high = largest if high > 0.0 else high
-        value = f"{low:.6g} to {high:.6g}, neutral {neutral:.6g}"
-        guess = Guess(subject, value, (Evidence(reason, weight),))
-    above = high if high > neutral + 1e-9 * max(1.0, abs(neutral)) else None
-    below = low if low < neutral - 1e-9 * max(1.0, abs(neutral)) else None
+        evidence = [("no command is frequent at rest, and none is 0", -1.0)]
+    if value is None and neutral == 0.0 and joint.speed_scale is not None:
+        # a speed counts alike both ways
+        low = -largest if low < 0.0 else low
+        high = largest if high > 0.0 else high
+    value = value or f"{low:.6g} to {high:.6g}, neutral {neutral:.6g}"
+    least = 1e-9 * max(1.0, abs(neutral))
+    above = high if high > neutral + least else None
+    below = low if low < neutral - least else None
     if above is None or below is None:
-        guess = Guess(
-            subject, guess.value, (*guess.evidence, Evidence("commands go one way only", 0.0))
-        )
+        evidence.append(("commands go one way only", 0.0))
     if joint.sign < 0:
         above, below = below, above
+    guess = Guess(f"{joint.name}: full command", value, evidence)
     return CommandDraft(neutral, above, below, guess)
 
 
@@ -314,7 +292,7 @@ def draw_draft(draft: Draft) -> Figure:
     figure = make_figure(12.0, 0.6 + 1.6 * len(draft.joints))
     axes = figure.subplots(len(draft.joints), 1, squeeze=False)[:, 0]
     for joint, axis in zip(draft.joints, axes, strict=True):
-        signals = draft.samples[draft.best[joint.name]].signals
+        signals = draft.signals[joint.name]
         command, position = signals.read(joint.command), signals.read(joint.position)
         begin_s = min(command.t_s[0], position.t_s[0])
         axis.plot(position.t_s - begin_s, position.values, color=BLUE, lw=1.2)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
 from actuators.recordings.advice import advise
 from actuators.recordings.array_log import FORMATS, ArrayLog, LeRobotLog, TableLog
-from actuators.recordings.log_tables import LogFile, LogRun
+from actuators.recordings.log_tables import LogFile, Table, Wanted
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import ConfigError, RecordingError
 
@@ -65,16 +64,13 @@ class CsvFolderLog(LogFile):
         """Return the columns of both files, items of lists by the joints where they are listed."""
         return {table: log.list_tables()[""] for table, log in self._logs.items()}
 
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield the motion as one run."""
+    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+        """Return the rows of each file."""
         tables = {}
         for table, log in self._logs.items():
             if names := wanted.get(table):
-                (run,) = log.read_runs({"": names}, max_rows)
-                tables[table] = run.tables[""]
-        yield LogRun(self.path.resolve().name, str(self.path), tables)
+                tables[table] = log.read_tables({"": names}, max_rows)[""]
+        return tables
 
 
 def open_log(

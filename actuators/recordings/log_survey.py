@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from actuators.recordings.column_map import Column, ColumnMap, JointColumns, TargetColumn
-from actuators.recordings.column_table import JointGuess
+from actuators.recordings.column_pairs import JointGuess
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_signals import Signal
 from actuators.recordings.time_guess import TimeGuess

@@ -68,6 +68,10 @@ class LogRun:
     tables: Mapping[str, Table]
 
 
+Wanted = Mapping[str, Collection[str]]
+"""Columns to read by table; other tables are left out."""
+
+
 @functools.cache
 def warn_once(text: str) -> None:
     """Warn of a damage; a log is read several times, and each time it is met again."""
@@ -102,11 +106,8 @@ class LogFile(ABC):
             RecordingError: The log cannot be read.
         """
 
-    @abstractmethod
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield each run with the wanted columns.
+    def read_runs(self, wanted: Wanted, max_rows: int | None) -> Iterator[LogRun]:
+        """Yield each run with the wanted columns; a log is one run unless its reader says otherwise.
 
         Args:
             wanted: Columns to read by table; other tables are left out.
@@ -115,6 +116,12 @@ class LogFile(ABC):
         Raises:
             RecordingError: The log is damaged; names the place.
         """
+        name = self.path.resolve().name if self.path.is_dir() else self.path.stem
+        yield LogRun(name, str(self.path), self.read_tables(wanted, max_rows))
+
+    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+        """Return the wanted columns of a log that is one run; see `read_runs`."""
+        raise NotImplementedError
 
 
 def join_names(table: str, column: str) -> str:

@@ -14,12 +14,11 @@ import struct
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from actuators.recordings.log_tables import LogFile, LogRun, Table
+from actuators.recordings.log_tables import LogFile, Table, Wanted
 from actuators.recordings.message_numbers import NumberReader, find_leaves
 from brokk_rl.errors import RecordingError
 
@@ -28,8 +27,6 @@ HEAD_MESSAGES = 200
 """Messages of a topic from which its columns are listed: two sources may alternate on it."""
 HEAD_S = 5.0
 """Time from the first message within which all sources of a topic send one."""
-MAGIC = b"\x89MCAP0\r\n"
-"""Begin of an MCAP file."""
 
 
 class LoggedMessage(NamedTuple):
@@ -84,10 +81,8 @@ class MessageLog(LogFile):
             if found[table]
         }
 
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield the log as one run; messages without any wanted number are left out."""
+    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+        """Return the numbers of each topic; messages without any wanted number are left out."""
         readers = {
             table: NumberReader(sorted(set(names) - {LOG_TIME}, key=_pad_numbers))
             for table, names in wanted.items()
@@ -125,7 +120,7 @@ class MessageLog(LogFile):
             for at, name in enumerate(reader.names):
                 columns[name] = numbers[order, at]
             tables[table] = Table(columns, {}, LOG_TIME, is_sparse=True)
-        yield LogRun(self.path.resolve().stem, str(self.path), tables)
+        return tables
 
     def _decode(self, message: LoggedMessage, number: int, begin_ns: int) -> Any:
         """Return the content of a message, `None` for a damaged one that is left out."""
@@ -154,10 +149,7 @@ class MessageLog(LogFile):
         except Exception as error:  # the libraries raise what they stumble over
             elapsed_s = (last_ns - (begin_ns or 0)) * 1e-9
             where = f"after {count} messages, {elapsed_s:.3f} s from the first one"
-            self.report_damage(f"damaged {where} ({self._explain(error)})", error)
-
-    def _explain(self, error: Exception) -> str:
-        return describe(error)
+            self.report_damage(f"damaged {where} ({describe(error)})", error)
 
 
 class BagLog(MessageLog):
@@ -241,9 +233,6 @@ class McapLog(MessageLog):
                 yield "", record
             byte = file.tell()
 
-    def _explain(self, error: Exception) -> str:
-        return f"{describe(error)}; {_find_damage(self.path)}"
-
 
 def name_tables(topics: Mapping[int, str]) -> dict[int, str]:
     """Return the name of each channel's table: its topic, with the channel where several have it."""
@@ -300,23 +289,3 @@ def _find_decoder(encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
         read = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
         return lambda data: read(data, name)
     return None
-
-
-def _find_damage(path: Path) -> str:
-    """Return the place to which an MCAP file can be read."""
-    from mcap.stream_reader import StreamReader
-
-    with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            return "it does not begin as an MCAP file does"
-        file.seek(0)
-        at = 0
-        try:
-            for _ in StreamReader(file, emit_chunks=True, validate_crcs=False).records:
-                at = file.tell()
-        except Exception:
-            pass
-        size = file.seek(0, 2)
-    if at >= size > 0:
-        return "all its records are there, so a chunk is damaged inside"
-    return f"whole up to byte {at} of {size}; `mcap recover` saves that part"

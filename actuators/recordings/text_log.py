@@ -14,7 +14,7 @@ import itertools
 import logging
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ import pandas as pd
 
 from actuators.recordings.advice import advise
 from actuators.recordings.column_names import is_unit
-from actuators.recordings.log_tables import LogFile, LogRun, Table
+from actuators.recordings.log_tables import LogFile, Table, Wanted
 from brokk_rl.errors import RecordingError
 
 log = logging.getLogger(__name__)
@@ -114,10 +114,8 @@ class TextLog(LogFile):
         """Return the columns whose cells are numbers, times, flags or lists."""
         return {"": [*self._places]}
 
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield the file as one run; a last line that a crash cut off is left out with a warning.
+    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+        """Return the rows of the file; a last line that a crash cut off is left out with a warning.
 
         Raises:
             RecordingError: A cell cannot be read, or the file is damaged; names line and column.
@@ -126,7 +124,7 @@ class TextLog(LogFile):
         frame = self._read_cells(sorted({at for at, _ in places.values()}), max_rows)
         numbers = {at: self._convert(cells, at) for at, cells in frame.items()}
         columns = {name: numbers[at][:, item] for name, (at, item) in places.items()}
-        yield LogRun(self.path.stem, str(self.path), {"": Table(columns, find_line=self.find_line)})
+        return {"": Table(columns, find_line=self.find_line)}
 
     def find_line(self, row: int) -> tuple[int, dict[str, str]]:
         """Return number, from 1, and cells by column of the line of a row of data."""

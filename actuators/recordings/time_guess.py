@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +33,8 @@ RATES_HZ = (0.1, 5000.0)
 USUAL_RATES_HZ = (10.0, 1000.0)
 EPOCH_S = (1e9, 4e9)
 """Seconds since 1970 from 2001 to 2096."""
+SECOND_WORDS = {"sec", "secs", "seconds", "s"}
+NANO_WORDS = {"nanosec", "nsec", "nsecs", "nanosecs", "ns", "nanoseconds", "nanos"}
 TIME_MODULI = (2.0**16, 2.0**24, 2.0**32, 1e3, 1e4, 1e5, 1e6, 1e9, 3600.0, 86400.0)
 """Values at which counters of time begin again, in their own unit."""
 
@@ -66,11 +68,7 @@ def guess_time(name: str, table: Table, given: GivenColumns, skip: bool) -> Time
     subject = f"time of '{name}'" if name else "time"
     if given.rate_hz is not None:
         guess = Guess(
-            subject,
-            f"row / {given.rate_hz:g} Hz",
-            (Evidence("as given by log.rate_hz", 5.0),),
-            (),
-            True,
+            subject, f"row / {given.rate_hz:g} Hz", (("as given by log.rate_hz", 5.0),), (), True
         )
         return TimeGuess(RowTime(rate_hz=given.rate_hz), guess)
     if table.clock is not None and given.time is None:
@@ -106,9 +104,9 @@ def _guess_own_clock(subject: str, table: Table) -> TimeGuess:
             )
             anchor = Column(column=clock, scale=1.0, offset=0.0)
             time = AlignedTime(column=stamp, scale=1.0, anchor=anchor)
-            return TimeGuess(time, Guess(subject, stamp, (Evidence(reason, 5.0),), (clock,)))
+            return TimeGuess(time, Guess(subject, stamp, ((reason, 5.0),), (clock,)))
     time = Column(column=clock, scale=1.0, offset=0.0)
-    guess = Guess(subject, clock, (Evidence("the recorder's own clock, in s", 5.0),))
+    guess = Guess(subject, clock, (("the recorder's own clock, in s", 5.0),))
     return TimeGuess(time, guess, num_doubled)
 
 
@@ -117,22 +115,23 @@ def _list_clocks(table: Table, given: Sequence[str] | None) -> Iterable[tuple[st
     columns = table.columns
     if given is not None:
         if all(name in columns for name in given):
-            text = given[0] if len(given) == 1 else f"{quote(given[0])} + 1e-9 * {quote(given[1])}"
-            values = columns[given[0]] + (1e-9 * columns[given[1]] if len(given) > 1 else 0.0)
-            yield text, values
+            is_pair = len(given) > 1
+            yield _pair_columns(columns, *given[:2]) if is_pair else (given[0], columns[given[0]])
         return
-    for name, values in columns.items():
-        words = split_words(name)
-        if not any(word in ("sec", "secs", "seconds", "s") for word in words):
-            continue
+    for name in columns:
         for other, parts in columns.items():
-            has_unit = any(
-                word in ("nanosec", "nsec", "nsecs", "nanosecs", "ns", "nanoseconds", "nanos")
-                for word in split_words(other)
-            )
-            if has_unit and other != name and np.nanmin(parts) >= 0 and np.nanmax(parts) < 1e9:
-                yield f"{quote(name)} + 1e-9 * {quote(other)}", values + 1e-9 * parts
+            is_pair = SECOND_WORDS & {*split_words(name)} and NANO_WORDS & {*split_words(other)}
+            if is_pair and other != name and np.nanmin(parts) >= 0 and np.nanmax(parts) < 1e9:
+                yield _pair_columns(columns, name, other)
     yield from columns.items()
+
+
+def _pair_columns(
+    columns: Mapping[str, np.ndarray], second: str, nano: str
+) -> tuple[str, np.ndarray]:
+    """Return the time of a column of seconds and one of nanoseconds, as arithmetic and as numbers."""
+    text = f"{quote(second)} + 1e-9 * {quote(nano)}"
+    return text, columns[second] + 1e-9 * columns[nano]
 
 
 def quote(name: str) -> str:
@@ -144,15 +143,12 @@ def _judge_clock(
     subject: str, text: str, values: np.ndarray, table: Table, skip: bool, is_given: bool
 ) -> TimeGuess | str | None:
     """Return a clock made of a column, a sentence about one that is broken, or `None` for no clock."""
-    if len(values) < 2 or not np.isfinite(values).any():
-        return None
-    is_pair = text not in table.columns
     plain, stated = split_unit(text)
-    words = split_words(plain)
-    is_named = (
-        is_pair or is_given or any(word in TIME_WORDS or word in TIME_UNITS for word in words)
-    )
-    if not is_pair and not is_given and any(word in COUNT_WORDS for word in words):
+    words = {*split_words(plain)}
+    is_chosen = is_given or text not in table.columns  # a pair is chosen by its two units
+    is_named = is_chosen or not words.isdisjoint(TIME_WORDS | {*TIME_UNITS})
+    is_count = not is_chosen and not words.isdisjoint(COUNT_WORDS)
+    if is_count or len(values) < 2 or not np.isfinite(values).any():
         return None
     wraps = _find_time_wrap(values) if is_named else None
     values = unwrap(values, wraps)
@@ -164,67 +160,63 @@ def _judge_clock(
             return None
         fault = find_fault(values, table, text)
         assert fault is not None
-        if any(word in ("dt", "delta", "diff", "period") for word in words):
+        if not words.isdisjoint(("dt", "delta", "diff", "period")):
             rate_hz = 1.0 / max(float(np.mean(values)), 1e-9)
             return f"'{text}' holds the time since the row before; {advise('rate', rate_hz=float(f'{rate_hz:.3g}'))}"
         if not skip or fault.kind == "coarse":
             place = table.locate(int(fault.rows[0]))
             return f"'{text}': {fault.text}, first in {place}; {fault.advice}"
+    unit = 1.0 if text not in table.columns else TIME_UNITS.get(stated or "")
+    if unit is None:
+        named = [TIME_UNITS[word] for word in split_words(plain) if word in TIME_UNITS]
+        unit = named[-1] if named else None
+    judged = _judge_unit(values[later], unit if is_named else None, is_named)
+    if judged is None:
+        return None
+    scale, reason = judged
     steps = np.diff(values[later])
-    period = float(np.median(steps)) if len(steps) else 0.0
+    period = float(np.median(steps))
+    is_regular = float(np.quantile(np.abs(steps / period - 1.0), 0.9)) < 0.2
+    bad = f"increases but for {int((~later).sum())} of {len(later)} rows"
+    evidence = [("only increases" if later.all() else bad, 0.0), reason]
+    evidence.append((f"{1.0 / (period * scale):.4g} Hz", 0.5 if is_regular else -0.5))
+    evidence.append(("", 1.5) if is_named else ("its name does not say it", 0.0))
+    if wraps is not None:
+        evidence.append((f"it begins again at {wraps:g}", 0.0))
+    if is_given:
+        evidence.append(("as given by log.time", 2.0))
+    time = Column(column=text, scale=scale, offset=0.0, wraps=wraps)
+    return TimeGuess(time, Guess(subject, text, evidence, (), is_given))
+
+
+def _judge_unit(
+    times: np.ndarray, unit: float | None, is_named: bool
+) -> tuple[float, Evidence] | None:
+    """Return seconds for one of a clock and why, `None` where no unit gives the rate of a log of joints.
+
+    Args:
+        times: Increasing times.
+        unit: Seconds for one, where a name says it.
+        is_named: The name says that it is a time.
+    """
+    period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     if period <= 0.0:
         return None
-    evidence = [
-        Evidence(
-            "only increases"
-            if later.all()
-            else f"increases but for {int((~later).sum())} of {len(later)} rows",
-            0.0,
-        )
-    ]
-    unit = 1.0 if is_pair else TIME_UNITS.get(stated or "")
-    if unit is None:
-        unit = next((TIME_UNITS[word] for word in reversed(words) if word in TIME_UNITS), None)
-    scales = [
-        s for s in (1.0, 1e-3, 1e-6, 1e-9) if RATES_HZ[0] <= 1.0 / (period * s) <= RATES_HZ[1]
-    ]
-    epochs = [s for s in scales if EPOCH_S[0] <= abs(values[later][0]) * s <= EPOCH_S[1]]
-    if unit is not None and is_named:
-        scale = unit
-        evidence.append(
-            Evidence(f"1 = {scale:g} s (unit in its name)", 5.0 if unit in scales else -3.0)
-        )
-    elif not scales:
-        return None
-    elif epochs:
-        scale = epochs[0]
-        evidence.append(
-            Evidence(f"1 = {scale:g} s (it counts from 1970)", 4.0 if is_named else 2.0)
-        )
-    else:
-        usual = [s for s in scales if USUAL_RATES_HZ[0] <= 1.0 / (period * s) <= USUAL_RATES_HZ[1]]
-        is_whole = bool((values[later] == np.round(values[later])).all())
-        scale = (usual or scales)[0] if is_whole else scales[0]
-        is_only = len(scales) == 1 or (not is_whole and len(usual) == 1 and usual[0] == scale)
-        text_of_unit = (
-            "the only unit that gives a usual rate"
-            if is_only
-            else "a unit 1000 times longer or shorter would do too"
-        )
-        evidence.append(Evidence(f"1 = {scale:g} s ({text_of_unit})", 1.0 if is_only else 0.0))
-        if period == 1.0 and is_whole and not is_named:
-            return None  # whole numbers that count rows are no clock
-    is_regular = float(np.quantile(np.abs(steps / period - 1.0), 0.9)) < 0.2
-    evidence.append(Evidence(f"{1.0 / (period * scale):.4g} Hz", 0.5 if is_regular else -0.5))
-    evidence.append(
-        Evidence("" if is_named else "its name does not say it", 1.5 if is_named else 0.0)
-    )
-    if wraps is not None:
-        evidence.append(Evidence(f"it begins again at {wraps:g}", 0.0))
-    if is_given:
-        evidence.append(Evidence("as given by log.time", 2.0))
-    guess = Guess(subject, text, tuple(evidence), (), is_given)
-    return TimeGuess(Column(column=text, scale=scale, offset=0.0, wraps=wraps), guess)
+    rates_hz = {scale: 1.0 / (period * scale) for scale in (1.0, 1e-3, 1e-6, 1e-9)}
+    scales = [one for one, rate in rates_hz.items() if RATES_HZ[0] <= rate <= RATES_HZ[1]]
+    if unit is not None:
+        return unit, (f"1 = {unit:g} s (unit in its name)", 5.0 if unit in scales else -3.0)
+    for scale in scales:
+        if EPOCH_S[0] <= abs(times[0]) * scale <= EPOCH_S[1]:
+            return scale, (f"1 = {scale:g} s (it counts from 1970)", 4.0 if is_named else 2.0)
+    is_whole = bool((times == np.round(times)).all())
+    if not scales or (period == 1.0 and is_whole and not is_named):
+        return None  # whole numbers that count rows are no clock
+    usual = [one for one in scales if USUAL_RATES_HZ[0] <= rates_hz[one] <= USUAL_RATES_HZ[1]]
+    scale = (usual or scales)[0] if is_whole else scales[0]
+    if len(scales) == 1 or (not is_whole and usual == [scale]):
+        return scale, (f"1 = {scale:g} s (the only unit that gives a usual rate)", 1.0)
+    return scale, (f"1 = {scale:g} s (a unit 1000 times longer or shorter would do too)", 0.0)
 
 
 def _find_time_wrap(values: np.ndarray) -> float | None:

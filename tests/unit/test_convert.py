@@ -149,20 +149,6 @@ def test_a_bad_log_is_refused_by_name(
         reader.read(logged(tmp_path, rows), excavator)
 
 
-def test_a_log_with_decimal_commas_and_windows_line_ends_is_read(
-    tmp_path: Path, excavator: Machine, reader: ColumnMap
-) -> None:
-    (expected,) = reader.read(logged(tmp_path, lines()), excavator)
-    text = (
-        "\n".join([HEADER, *lines()]).replace(",", ";").replace(".", ",").replace("\n", "\r\n")
-        + "\r\n"
-    )
-    (tmp_path / "dig.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())  # as a spreadsheet saves it
-    (recording,) = replace(reader, delimiter=";", decimal=",").read(tmp_path / "dig.csv", excavator)
-    np.testing.assert_array_equal(recording.q, expected.q)
-    np.testing.assert_array_equal(recording.u, expected.u)
-
-
 def test_a_map_of_another_machine_is_refused(
     tmp_path: Path, machine: Machine, reader: ColumnMap
 ) -> None:

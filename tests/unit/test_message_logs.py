@@ -198,15 +198,23 @@ def test_the_sensor_clock_of_a_topic_replaces_a_late_recorder(
     assert errors[1] < 0.1 * errors[0]
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3, 0.7, 0.98])
-def test_a_cut_off_mcap_is_refused_by_its_place(
-    tmp_path: Path, carriage: Machine, share: float
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: data[: len(data) // 10],
+        lambda data: data[: int(0.98 * len(data))],
+        lambda data: data[: len(data) // 3] + b"\xff\xff" + data[len(data) // 3 + 2 :],
+    ],
+)
+def test_a_damaged_mcap_is_refused_by_its_place(
+    tmp_path: Path, carriage: Machine, damage: Callable[[bytes], bytes]
 ) -> None:
     path = tmp_path / "a.mcap"
     reader = write_json(path)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(RecordingError, match=r"a\.mcap: .*whole up to byte \d+ of \d+"):
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(
+        RecordingError, match=r"a\.mcap: (damaged after \d+ messages|chunk at byte)"
+    ):
         reader.read(path, carriage)
 
 
@@ -219,16 +227,6 @@ def test_a_damaged_sqlite_bag_is_refused_by_its_name(tmp_path: Path, carriage: M
     file.write_bytes(data)
     with pytest.raises(RecordingError, match=r"bag: .*malformed"):
         reader.read(tmp_path / "bag", carriage)
-
-
-def test_a_flipped_byte_of_an_mcap_is_refused(tmp_path: Path, carriage: Machine) -> None:
-    path = tmp_path / "a.mcap"
-    reader = write_json(path)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 3] ^= 0xFF
-    path.write_bytes(data)
-    with pytest.raises(RecordingError, match=r"a\.mcap: "):
-        reader.read(path, carriage)
 
 
 def test_a_message_that_cannot_be_decoded_is_told_by_its_number(
@@ -285,12 +283,12 @@ def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(
     np.testing.assert_array_equal(first.u, whole.u[: first.num_samples])
     np.testing.assert_array_equal(second.u, whole.u[-second.num_samples :])
     assert first.num_samples + second.num_samples < whole.num_samples
-    with pytest.raises(RecordingError, match=r"cut\.mcap: .*whole up to byte \d+ of \d+"):
+    with pytest.raises(RecordingError, match=r"cut\.mcap: .*damaged after \d+ messages"):
         reader.read(cut, carriage)
     (begin,) = skipping.read(cut, carriage)
     np.testing.assert_array_equal(begin.u, whole.u[: begin.num_samples])
     path.write_text("no log")
-    with pytest.raises(RecordingError, match="does not begin as an MCAP file does"):
+    with pytest.raises(RecordingError, match="damaged after 0 messages"):
         reader.read(path, carriage)
 
 
