@@ -15,9 +15,6 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception.robust_fit import fit_linear, guess_plane
 
-FACES = ((2, 1), (2, -1), (0, 1), (0, -1), (1, 1), (1, -1))
-"""Axis and side of each face; the first is the drilled one, at z = 0, whose normal is +z."""
-
 
 @dataclass(frozen=True)
 class Mouth:
@@ -65,23 +62,28 @@ class Cuboid:
         """Return points of the world, `(…, 3)`, in its own coordinates."""
         return (points_m - self.origin_m) @ self.rotation
 
+    def locate(self, mouth: int) -> np.ndarray:
+        """Return the centre of a mouth in its own coordinates, `(3,)`."""
+        return np.array([self.mouths[mouth].x_m, self.mouths[mouth].y_m, 0.0])
+
     def moved(self, change: np.ndarray) -> Cuboid:
         """Return the block turned about its face's middle, shifted, and with another face.
 
         Args:
-            change: Rotation vector (3, rad), shift (3, m), growth of the face (2, m).
+            change: Rotation vector (3, rad), shift (3, m), growth of the face (2, m), and shift of
+                each mouth on it (2, m).
         """
         middle = self.world(self.high_m * [0.5, 0.5, 0.0])
         turn = Rotation.from_rotvec(change[:3]).as_matrix()
         size_m = self.size_m + np.array([change[6], change[7], 0.0])
         rotation = turn @ self.rotation
-        # the face grows on both sides of its middle, and the mouths stay where they are on it
+        # The face grows on both sides of its middle.
         origin_m = middle + change[3:6] - rotation @ (size_m * [0.5, 0.5, 0.0])
-        mouths = tuple(
-            replace(one, x_m=one.x_m + change[6] / 2, y_m=one.y_m + change[7] / 2)
-            for one in self.mouths
-        )
-        return Cuboid(rotation, origin_m, size_m, mouths)
+        mouths = []
+        for number, one in enumerate(self.mouths):
+            shift_m = change[6:8] / 2 + change[8 + 2 * number : 10 + 2 * number]
+            mouths.append(Mouth(one.x_m + shift_m[0], one.y_m + shift_m[1], one.radius_m))
+        return Cuboid(rotation, origin_m, size_m, tuple(mouths))
 
     def edges(self, eye_m: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the edges of the faces that are seen, as end points in its own coordinates.
@@ -90,25 +92,21 @@ class Cuboid:
             eye_m: Where from, world, `(3,)`.
         """
         eye = self.own(eye_m)
-        low, high = self.low_m, self.high_m
-        visible = set()
-        for axis, side in FACES:
-            is_visible = eye[axis] > high[axis] if side > 0 else eye[axis] < low[axis]
-            if is_visible:
-                visible.add((axis, side))
+        bounds = self.low_m, self.high_m
         edges = []
         for axis in range(3):
             one, two = (axis + 1) % 3, (axis + 2) % 3
-            for first, second in itertools.product((-1, 1), (-1, 1)):
-                if (one, first) not in visible and (two, second) not in visible:
-                    continue
-                begin = np.empty(3)
-                begin[axis] = low[axis]
-                begin[one] = high[one] if first > 0 else low[one]
-                begin[two] = high[two] if second > 0 else low[two]
+            for first, second in itertools.product((0, 1), (0, 1)):
+                begin = self.low_m.copy()
+                begin[one], begin[two] = bounds[first][one], bounds[second][two]
                 end = begin.copy()
-                end[axis] = high[axis]
-                edges.append((begin, end))
+                end[axis] = self.high_m[axis]
+                is_seen = False
+                for across, side in ((one, first), (two, second)):
+                    beyond = eye[across] - bounds[side][across]
+                    is_seen |= bool(beyond > 0 if side else beyond < 0)
+                if is_seen:
+                    edges.append((begin, end))
         return edges
 
 
@@ -118,12 +116,10 @@ class CuboidView:
 
     Attributes:
         depth_m: Depth along z of its visible part, infinite beside it.
-        face: Number of the face that is seen (`FACES`), -1 beside it.
-        mouth: Where a mouth is seen, bool.
+        mouth: Number of the mouth that is seen, -1 beside them.
     """
 
     depth_m: np.ndarray
-    face: np.ndarray
     mouth: np.ndarray
 
 
@@ -140,29 +136,22 @@ def trace_rays(cuboid: Cuboid, rays: np.ndarray, world_from_camera: np.ndarray) 
     along = np.where(np.abs(along) < 1e-9, 1e-9, along)
     low, high = (cuboid.low_m - eye) / along, (cuboid.high_m - eye) / along
     first = np.minimum(low, high)
-    axis = first.argmax(-1)
     enters, leaves = first.max(-1), np.maximum(low, high).min(-1)
     hit = (enters > 0) & (enters < leaves)
-    # a ray against an axis enters through the face on its positive side
-    positive = np.take_along_axis(along, axis[..., None], -1)[..., 0] < 0
-    face = np.full(axis.shape, -1)
-    for number, (of, side) in enumerate(FACES):
-        face[hit & (axis == of) & (positive == (side > 0))] = number
+    # A ray against z enters through the drilled face, at z = 0.
+    on_face = hit & (first.argmax(-1) == 2) & (along[..., 2] < 0)
     point = eye + along * np.where(hit, enters, 0.0)[..., None]
-    mouth = np.zeros(hit.shape, bool)
-    for one in cuboid.mouths:
-        mouth |= (face == 0) & (
-            np.hypot(point[..., 0] - one.x_m, point[..., 1] - one.y_m) < one.radius_m
-        )
-    return CuboidView(np.where(hit, enters, np.inf), face, mouth)
+    mouth = np.full(hit.shape, -1)
+    for number, one in enumerate(cuboid.mouths):
+        away_m = np.hypot(point[..., 0] - one.x_m, point[..., 1] - one.y_m)
+        mouth[on_face & (away_m < one.radius_m)] = number
+    return CuboidView(np.where(hit, enters, np.inf), mouth)
 
 
-def compute_pixel_rays(frame: Frame, step: int = 1) -> np.ndarray:
-    """Return the undistorted rays of every `step`-th pixel at depth 1, `(h, w, 3)`."""
+def compute_pixel_rays(frame: Frame) -> np.ndarray:
+    """Return the undistorted rays of all pixels at depth 1, `(h, w, 3)`."""
     height, width = frame.color.shape[:2]
-    columns, rows = np.meshgrid(
-        np.arange(0, width, step, dtype=float), np.arange(0, height, step, dtype=float)
-    )
+    columns, rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     return compute_rays(frame, np.stack([columns, rows], axis=-1))
 
 

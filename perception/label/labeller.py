@@ -1,7 +1,8 @@
-"""Masks for real footage: a block, placed once and refined over all frames, is projected into each.
+"""Masks for real footage: a block, placed once by clicks, is projected into each frame.
 
 LabelFusion (Marion et al., 2018) does the same with reconstructed and aligned meshes; a cuboid
-needs neither.
+needs neither. Depth cuts away what stands before the block, and what lies behind it where the
+clicks were a few pixels off.
 """
 
 from __future__ import annotations
@@ -28,19 +29,14 @@ from perception.label.cuboid import (
     compute_pixel_rays,
     place_cuboid,
     place_mouths,
-    project_points,
     read_placing,
     trace_rays,
 )
-from perception.label.outline_match import LEAST_SIGMAS, OutlineMatch, match_outline
 from perception.label.refinement import (
-    POINTS_PER_MOUTH,
+    RefinementView,
+    measure_misfit_px,
     prepare_view,
     refine_cuboid,
-    refine_mouths,
-    sample_block_outline,
-    sample_mouth_outline,
-    smooth_gray,
 )
 
 FRAMES, OVERLAYS = "frames", "overlays"
@@ -71,6 +67,21 @@ class _Footage:
     clicked_pose: np.ndarray
 
 
+@dataclass(frozen=True)
+class _LabelledView:
+    """Masks of a frame, and what they rest on.
+
+    Attributes:
+        label: The masks.
+        depth_share: Part of the block's known depth that agrees with it; `None` for no depth.
+        hidden: Part of each mouth that is not seen.
+    """
+
+    label: FrameLabel
+    depth_share: float | None
+    hidden: tuple[float, ...]
+
+
 @spec
 class BlockLabelling:
     """Label a folder of frames of one block that does not move.
@@ -83,10 +94,9 @@ class BlockLabelling:
         noise_per_m: Standard deviation of inverse depth, 1/m.
         num_sigma: Depth this many standard deviations off says that something else is there.
         num_refined: Frames, evenly spread, by which the block is refined; 0 takes it as placed.
-        reach_px: How far from the placed outline the picture's edges are looked for, and how far
-            copies of the outline are shifted to judge its place.
-        max_outline_px: Largest distance of the copy of the outline that fits the picture best; a
-            frame with more is left out.
+        reach_px: How far from the placed outline the picture's edges are looked for.
+        max_outline_px: Largest distance of three quarters of the outline from edges of the picture;
+            a frame with more is left out.
         min_depth_share: Least part of the block's known depth that must agree with it.
     """
 
@@ -99,14 +109,6 @@ class BlockLabelling:
     reach_px: Positive
     max_outline_px: Positive
     min_depth_share: float
-
-    def check(self) -> None:
-        if self.max_outline_px >= self.reach_px / 2:
-            raise ConfigError(
-                f"max_outline_px: the outline is compared with copies up to reach_px="
-                f"{self.reach_px:g} px away; expected less than half of that, got "
-                f"{self.max_outline_px:g}"
-            )
 
     def label(self, folder: Path) -> dict[str, Any]:
         """Write frames with masks, and overlays, into `folder`.
@@ -122,20 +124,16 @@ class BlockLabelling:
         placing = read_placing(Path(self.placing))
         footage = self._locate_cameras(self.camera.build(), placing.frame)
         clicked = footage.clicked, footage.clicked_pose
-        cuboid = place_cuboid(placing, *clicked)
-        corners_m, views = cuboid.world(np.array([cuboid.low_m, cuboid.high_m])), []
+        cuboid = place_mouths(place_cuboid(placing, *clicked), placing, *clicked)
         if self.num_refined:
             names = sorted(footage.poses)
-            count = min(self.num_refined, len(names))
-            chosen = np.linspace(0, len(names) - 1, count).round().astype(int)
-            for frame in self._read_frames({names[k] for k in chosen}):
-                views.append(prepare_view(frame, footage.poses[frame.name].world_from_camera))
-            cuboid = refine_cuboid(cuboid, views, self.noise_per_m, self.reach_px)
-        refined_m = cuboid.world(np.array([cuboid.low_m, cuboid.high_m]))
-        shift_m = float(np.linalg.norm(refined_m - corners_m, axis=1).max())
-        cuboid = place_mouths(cuboid, placing, *clicked)
-        if views:
-            cuboid = refine_mouths(cuboid, views, self.noise_per_m, self.reach_px)
+            chosen = np.linspace(0, len(names) - 1, min(self.num_refined, len(names)))
+            wanted = {names[number] for number in chosen.round().astype(int)}
+            views = []
+            for frame in self._read_frames():
+                if frame.name in wanted:
+                    views.append(self._prepare(frame, footage.poses[frame.name]))
+            cuboid = refine_cuboid(cuboid, views, self.reach_px)
         self._write(cuboid, footage, folder)
         entries = footage.entries
         num_labelled = sum(entry["left_out"] is None for entry in entries.values())
@@ -147,15 +145,12 @@ class BlockLabelling:
             "origin_m": cuboid.origin_m.tolist(),
             "size_m": cuboid.size_m.tolist(),
         }
-        return {
-            "schema": 1,
-            "block": block,
-            "refined_by_m": shift_m,
-            "num_labelled": num_labelled,
-            "frames": entries,
-        }
+        return {"schema": 2, "block": block, "num_labelled": num_labelled, "frames": entries}
 
-    def _read_frames(self, names: set[str] | None = None) -> Iterator[Frame]:
+    def _prepare(self, frame: Frame, pose: CameraPose) -> RefinementView:
+        return prepare_view(frame, pose.world_from_camera, self.noise_per_m)
+
+    def _read_frames(self) -> Iterator[Frame]:
         with self.source.build() as source:
             while True:
                 try:
@@ -165,8 +160,7 @@ class BlockLabelling:
                     continue
                 if frame is None:
                     return
-                if names is None or frame.name in names:
-                    yield frame
+                yield frame
 
     def _locate_cameras(self, tracker: CameraTracker, clicked_in: str) -> _Footage:
         """Return the cameras of all frames, and the frame that was clicked in."""
@@ -176,7 +170,7 @@ class BlockLabelling:
         for frame in self._read_frames():
             stem = Path(frame.name).name
             entry: dict[str, Any] = dict.fromkeys(
-                ("left_out", "board_px", "outline_px", "outline_sigmas", "depth_share")
+                ("left_out", "board_px", "outline_px", "depth_share")
             )
             entries[stem] = entry
             try:
@@ -195,43 +189,38 @@ class BlockLabelling:
         return _Footage(poses, entries, *clicked)
 
     def _write(self, cuboid: Cuboid, footage: _Footage, folder: Path) -> None:
-        (folder / OVERLAYS).mkdir(parents=True, exist_ok=True)
-        poses = footage.poses
-        with ItemProgress("masks", len(poses)) as progress:
-            for frame in self._read_frames(set(poses)):
-                name, pose = Path(frame.name).name, poses[frame.name].world_from_camera
-                label, share = self._build_label(cuboid, frame, pose)
-                match = self._match_outline(cuboid, frame, pose)
-                outline_px = None if match is None else match.offset_px
-                reason = self._find_fault(match, share)
+        with ItemProgress("masks", len(footage.poses)) as progress:
+            for frame in self._read_frames():
+                if frame.name not in footage.poses:
+                    continue
+                name, pose = Path(frame.name).name, footage.poses[frame.name].world_from_camera
+                view = self._build_view(cuboid, frame, pose)
+                prepared = self._prepare(frame, footage.poses[frame.name])
+                outline_px = measure_misfit_px(cuboid, prepared, self.reach_px)
+                reason = self._find_fault(view, outline_px)
                 footage.entries[name] |= {
                     "outline_px": outline_px,
-                    "outline_sigmas": None if match is None else match.num_sigmas,
-                    "depth_share": share,
+                    "depth_share": view.depth_share,
                     "left_out": reason,
                 }
-                picture = _draw_overlay(cuboid, frame, pose, label, reason is None)
+                picture = _draw_overlay(frame, view.label, reason is None)
                 dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
                 if reason is None:
-                    truth = _build_truth(cuboid, frame, pose, outline_px or 0.0, self.noise_per_m)
+                    truth = _build_truth(cuboid, frame, pose, view.hidden)
                     stem = folder / FRAMES / name
-                    dataset.write_frame(stem, frame.color, None, label=label, truth=truth)
+                    dataset.write_frame(stem, frame.color, None, label=view.label, truth=truth)
                 progress.advance()
 
-    def _find_fault(self, match: OutlineMatch | None, share: float | None) -> str | None:
+    def _find_fault(self, view: _LabelledView, outline_px: float | None) -> str | None:
         """Return why a frame is left out, `None` where it is not."""
-        if match is None:
+        if outline_px is None:
             return "too little of the block's outline is in view"
-        if not match.is_significant:
+        if outline_px > self.max_outline_px:
             return (
-                "it cannot be told where the outline lies: its best place stands out by "
-                f"{match.num_sigmas:.1f} standard deviations, {LEAST_SIGMAS:g} are needed"
-            )
-        if match.offset_px > self.max_outline_px:
-            return (
-                f"the outline fits the picture best {match.offset_px:.1f} px off, "
+                f"edges of the picture lie {outline_px:.1f} px beside the outline, "
                 f"{self.max_outline_px:g} are allowed"
             )
+        share = view.depth_share
         if share is not None and share < self.min_depth_share:
             return (
                 f"{share:.0%} of the depth agrees with the block, {self.min_depth_share:.0%} are "
@@ -239,29 +228,23 @@ class BlockLabelling:
             )
         return None
 
-    def _match_outline(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> OutlineMatch | None:
-        """Return the place at which the block's outline fits best; `None` where too little is seen."""
-        # Only what touches a label that may be kept counts as an occluder. Within all of `reach_px`
-        # the block's own top, seen at a slant, would hide its rear edges.
-        outline = sample_block_outline(cuboid, frame, pose, self.noise_per_m, self.max_outline_px)
-        return match_outline(outline, smooth_gray(frame), self.reach_px)
-
-    def _build_label(
-        self, cuboid: Cuboid, frame: Frame, pose: np.ndarray
-    ) -> tuple[FrameLabel, float | None]:
-        """Return the masks, and which part of the known depth agrees with the block."""
+    def _build_view(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> _LabelledView:
         view = trace_rays(cuboid, compute_pixel_rays(frame), pose)
-        block = view.face >= 0
+        block, mouth = np.isfinite(view.depth_m), view.mouth >= 0
         with np.errstate(invalid="ignore"):
             away = frame.depth_m - np.where(block, view.depth_m, np.nan)
             depth_m = np.where(block, view.depth_m, 0.0)
             step = np.maximum(self.num_sigma * self.noise_per_m * depth_m**2, LEAST_STEP_M)
-            near, far = away < -step, (away > step) & ~view.mouth
-        known = block & ~view.mouth & np.isfinite(frame.depth_m)
+            near, far = away < -step, (away > step) & ~mouth
+        known = block & ~mouth & np.isfinite(frame.depth_m)
         share = float((known & ~near & ~far).sum() / known.sum()) if known.any() else None
         near, far = _remove_specks(near), _remove_specks(far)
         shown = block & ~near & ~far
-        return FrameLabel(shown, shown & view.mouth, block & near), share
+        hidden = []
+        for number in range(len(cuboid.mouths)):
+            there = view.mouth == number
+            hidden.append(1.0 - float(shown[there].mean()) if there.any() else 1.0)
+        return _LabelledView(FrameLabel(shown, shown & mouth, block & near), share, tuple(hidden))
 
 
 def _remove_specks(mask: np.ndarray) -> np.ndarray:
@@ -274,7 +257,7 @@ def _remove_specks(mask: np.ndarray) -> np.ndarray:
 
 
 def _build_truth(
-    cuboid: Cuboid, frame: Frame, pose: np.ndarray, outline_px: float, noise_per_m: float
+    cuboid: Cuboid, frame: Frame, pose: np.ndarray, hidden: tuple[float, ...]
 ) -> SceneTruth:
     """Return the block and its holes as a truth file has them.
 
@@ -284,12 +267,11 @@ def _build_truth(
     base = pose if frame.base_from_camera is None else frame.base_from_camera
     rotation = camera_from_world[:3, :3] @ cuboid.rotation
     middle = cuboid.world((cuboid.low_m + cuboid.high_m) / 2.0)
+    axis = rotation[:, 2]
     circles = []
-    for number, mouth in enumerate(cuboid.mouths):
+    for mouth, part in zip(cuboid.mouths, hidden, strict=True):
         center_in_world = cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0]))
         center = camera_from_world[:3, :3] @ center_in_world + camera_from_world[:3, 3]
-        seen = len(sample_mouth_outline(cuboid, number, frame, pose, noise_per_m, 0.0).points_m)
-        axis = rotation[:, 2]
         circle = TrueCircle(
             center_m=tuple(center.tolist()),
             axis=tuple(axis.tolist()),
@@ -297,8 +279,8 @@ def _build_truth(
             axis_in_base=tuple((base[:3, :3] @ axis).tolist()),
             radius_m=mouth.radius_m,
             depth_m=0.0,
-            hidden=1.0 - seen / POINTS_PER_MOUTH,
-            in_view=seen > 0,
+            hidden=part,
+            in_view=part < 1.0,
         )
         circles.append(circle)
     place = {
@@ -306,20 +288,17 @@ def _build_truth(
         "rotation": rotation.tolist(),
         "half_m": (cuboid.size_m / 2.0).tolist(),
     }
-    return SceneTruth("real", {"outline_px": outline_px}, tuple(circles), (), place)
+    return SceneTruth("real", {}, tuple(circles), (), place)
 
 
-def _draw_overlay(
-    cuboid: Cuboid, frame: Frame, pose: np.ndarray, found: FrameLabel, good: bool
-) -> np.ndarray:
-    """Return the frame with block, mouths and their occluders in colour, and the block's edges."""
+def _draw_overlay(frame: Frame, found: FrameLabel, good: bool) -> np.ndarray:
+    """Return the frame with block, mouths and their occluders in colour, and the mask's outline."""
     picture = frame.color.astype(np.float32)
     for mask, colour in ((found.block, GREEN), (found.arm, ORANGE), (found.hole_mask, RED)):
         picture[mask] = 0.6 * picture[mask] + 0.4 * np.array(colour, np.float32)
     picture = picture.astype(np.uint8)
-    for begin, end in cuboid.edges(pose[:3, 3]):
-        ends = project_points(cuboid.world(np.stack([begin, end])), frame, pose)
-        if np.isfinite(ends).all() and np.abs(ends).max() < 1e5:
-            one, other = (tuple(int(value) for value in np.rint(point)) for point in ends)
-            cv2.line(picture, one, other, (255, 255, 255) if good else RED, 1, cv2.LINE_AA)
+    outlines, _ = cv2.findContours(
+        found.block.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    cv2.drawContours(picture, outlines, -1, (255, 255, 255) if good else RED, 1)
     return picture

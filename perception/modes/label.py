@@ -41,8 +41,8 @@ def _show(result: dict[str, Any]) -> None:
     rows = []
     for name, entry in result["frames"].items():
         board = None if entry["board_px"] is None else f"{entry['board_px']:.2f}"
-        outline = None if entry["outline_px"] is None else f"{entry['outline_px']:.2f}"
         share = None if entry["depth_share"] is None else f"{entry['depth_share']:.0%}"
+        outline = None if entry["outline_px"] is None else f"{entry['outline_px']:.2f}"
         rows.append((name, board, outline, share, entry["left_out"] or ""))
     print_table(
         ("frame", "board [px]", "outline [px]", "depth agrees", "left out because"),
