@@ -8,10 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol, runtime_checkable
-
-import numpy as np
 
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
@@ -41,30 +38,6 @@ class SegmenterSpec(Protocol):
         ...
 
 
-class EllipseDetector(Protocol):
-    """Finds ellipses in a grey picture."""
-
-    def detect(
-        self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
-    ) -> list[Ellipse]:
-        """Return ellipses, the best first.
-
-        Args:
-            gray: Picture, `(h, w)` uint8.
-            roi: Region to search, `(h, w)` bool; `None` for everywhere.
-            prior: Range of their size; `None` for any size.
-        """
-        ...
-
-
-class EllipseDetectorSpec(Protocol):
-    """The spec in `conf/ellipse.yaml`."""
-
-    def build(self) -> EllipseDetector:
-        """Return a detector."""
-        ...
-
-
 class PoseEstimator(Protocol):
     """Turns an ellipse of a picture into a hole in space."""
 
@@ -78,18 +51,6 @@ class PoseEstimatorSpec(Protocol):
 
     def build(self) -> PoseEstimator:
         """Return an estimator."""
-        ...
-
-
-class Overlay(Protocol):
-    """Draws detections into their picture."""
-
-    def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
-        """Write a picture file.
-
-        Raises:
-            StorageError: it could not be written.
-        """
         ...
 
 

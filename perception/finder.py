@@ -15,7 +15,8 @@ from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks,
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception import pair_check, rim_scale, search
-from perception.contracts import EllipseDetectorSpec, PoseEstimatorSpec, SegmenterSpec
+from perception.contracts import PoseEstimatorSpec, SegmenterSpec
+from perception.ellipse.detector import ContourArcs
 from perception.pair_check import PairCheck
 from perception.pair_depth import PairDepth
 from perception.pose import consistency
@@ -136,7 +137,7 @@ class StagedPerception:
     """
 
     segmenter: SegmenterSpec
-    ellipse: EllipseDetectorSpec
+    ellipse: ContourArcs
     pose: PoseEstimatorSpec
     radius_m: Positive
     size_slack: NonNegative

@@ -41,7 +41,7 @@ class OverlayDrawing:
     num_sigma: float
 
     def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
-        """Write the picture in one step; see `perception.contracts.Overlay`."""
+        """Write the picture in one step."""
         dataset.write_picture(path, self.draw(frame, detections))
 
     def draw(self, frame: Frame, detections: FrameDetections) -> np.ndarray:

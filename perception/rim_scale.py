@@ -15,8 +15,8 @@ from annotated_types import Ge
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Share, spec
-from perception.contracts import EllipseDetector
 from perception.ellipse import conic
+from perception.ellipse.detector import ArcDetector
 
 OF_PAIR = "size of dark rims over that of the holes, by the pair"
 OF_DEPTH = "size of dark rims over that of the holes, by depth"
@@ -53,7 +53,7 @@ class RimScale:
     least: Annotated[float, Ge(1)]
 
     def measure_scale(
-        self, frame: Frame, detector: EllipseDetector, radius_m: float
+        self, frame: Frame, detector: ArcDetector, radius_m: float
     ) -> tuple[float, float] | None:
         """Return the size of the surest rim over that of the holes, and its score.
 

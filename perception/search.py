@@ -9,7 +9,8 @@ import numpy as np
 
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
-from perception.contracts import EllipseDetector, SizePrior
+from perception.contracts import SizePrior
+from perception.ellipse.detector import ArcDetector
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py), unless a comment says
 # otherwise.
@@ -35,9 +36,6 @@ DRAWN_PX = 1
 HALF_HIDDEN = 1.5
 """Factor on the size from which a hole that is half occluded is found: 2 finds little more and
 takes three times as long."""
-UNSEEN_SIZES = 3.0
-"""Sizes of a hole across which a face may go on where depth is unknown: beside an arm, in the part
-that only one camera sees."""
 SIZE_PERCENTILES = 2.0, 98.0
 """Percentiles of the sizes in a region that limit the size of its holes."""
 
@@ -85,7 +83,7 @@ class SearchLevel:
             return float(lowest)
         return float(highest) if one.a > highest else None
 
-    def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
+    def detect(self, detector: ArcDetector, gray: np.ndarray) -> list[Ellipse]:
         """Return the ellipses of the region in px of the picture `(h, w)`, whatever their size there."""
         # Only the bounding box is searched: the cost of the detector is proportional to its area.
         x, y, wide, high = cv2.boundingRect(self.region)
@@ -140,8 +138,7 @@ def plan_search_levels(
 
     The major semi-axis of a circle is focal length times radius over depth, however it is tilted.
     The search reaches beyond the mask by the size of a hole: a hole may be a gap of the mask, or
-    lie at its border where something hides half of it. Where depth is unknown beside the mask, the
-    face may go on a few times as far.
+    lie at its border where something hides half of it.
 
     Args:
         frame: Frame with depth and camera matrix.
@@ -191,7 +188,7 @@ def plan_search_levels(
             break
         # Cells that have found their resolution are not searched again in another.
         rest &= ~here
-        for piece, prior in _split_region(here, size_px, unknown, slack):
+        for piece, prior in _split_region(here, size_px, slack):
             level = SearchLevel(
                 2**number, piece, prior, everywhere_px, slack, frame.depth_m, nearest_m
             )
@@ -200,21 +197,19 @@ def plan_search_levels(
 
 
 def _split_region(
-    here: np.ndarray, size_px: np.ndarray, unknown: np.ndarray, slack: float
+    here: np.ndarray, size_px: np.ndarray, slack: float
 ) -> list[tuple[np.ndarray, SizePrior]]:
     """Return the connected regions around cells, uint8, each with its range of sizes.
 
     Args:
         here: Cells of one resolution, bool.
         size_px: Size of a hole at each cell.
-        unknown: Cells without depth, bool.
         slack: Allowed relative error of the size.
     """
     # The upper percentile and not the maximum: one wrong depth must not enlarge the region.
     reach = float(np.percentile(size_px[here], SIZE_PERCENTILES[1])) * (1.0 + slack) / STEP
-    hidden = (_dilate(here, UNSEEN_SIZES * reach) > 0) & unknown
     # Separate regions get separate ranges of size: two blocks at two distances do not share one.
-    count, pieces = cv2.connectedComponents(_dilate(here | hidden, reach))
+    count, pieces = cv2.connectedComponents(_dilate(here, reach))
     found = []
     for piece in range(1, count):
         part = pieces == piece

@@ -45,8 +45,8 @@ from scoring import FinderScore, score_frame
 from brokk_rl.contracts.vision import FrameDetections
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.contracts import Overlay
 from perception.finder import StagedFinder
+from perception.overlay import OverlayDrawing
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
@@ -240,7 +240,7 @@ def build_finder(option: str) -> StagedFinder:
 
 
 @functools.cache
-def drawing() -> Overlay:
+def drawing() -> OverlayDrawing:
     return composed("overlay", "mode=perceive", "perceive.input=.")
 
 

@@ -254,7 +254,7 @@ class BoardCalibration:
             more["disparity"] = error.to_dict()
         residuals = [*evaluation.list_residuals(views, solution), *refused]
         camera, cov = solution.guess.base_from_camera, solution.cov[:6, :6]
-        return build_calibration("board", machine, camera, cov, residuals, self.work_m, more)
+        return build_calibration(machine, camera, cov, residuals, self.work_m, more)
 
     def _find_boards(self) -> tuple[list[BoardObservation], list[PoseResidual]]:
         """Return the boards in the frames, and the frames without one."""

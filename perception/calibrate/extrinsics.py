@@ -146,7 +146,6 @@ class PoseResidual:
 
 
 def build_calibration(
-    kind: str,
     machine: Machine,
     base_from_camera: np.ndarray,
     cov: np.ndarray,
@@ -157,7 +156,6 @@ def build_calibration(
     """Return the content of `calibration.yaml`.
 
     Args:
-        kind: `board`.
         machine: Whose base it is.
         base_from_camera: The camera, `(4, 4)`.
         cov: Covariance of a small motion of it in its own frame, `(6, 6)`.
@@ -171,7 +169,7 @@ def build_calibration(
             used.append(one)
     return {
         "schema": SCHEMA,
-        "kind": kind,
+        "kind": "board",
         "created": record.format_now(),
         "machine": machine.name,
         "T_base_cam": round_to_lists(base_from_camera),

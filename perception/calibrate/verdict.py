@@ -83,17 +83,15 @@ def judge_fit(
     arm_factor: float,
     zeros: Mapping[str, tuple[float, float]],
     missing: Sequence[str],
-    least_used: int = MIN_VIEWS_JUDGED,
 ) -> Verdict:
     """Return the verdict on a fit, without a comparison with other models.
 
     Args:
-        num_used: Views or points that agree.
+        num_used: Views that agree.
         num_views: Those that could be used.
         arm_factor: The arm's uncertainty over the assumed one.
         zeros: Estimated zero and standard deviation of its prior by joint, rad or m.
         missing: Motions that the poses lack, in words.
-        least_used: Views or points that have to agree.
     """
     reasons = []
     if num_views - num_used > MAX_LEFT_OUT * num_views:
@@ -108,8 +106,8 @@ def judge_fit(
             )
     if reasons:
         return Verdict(WRONG, tuple(reasons))
-    if num_used < least_used:
-        return Verdict(OPEN, (f"{num_used} agree, {least_used} are needed for a verdict",))
+    if num_used < MIN_VIEWS_JUDGED:
+        return Verdict(OPEN, (f"{num_used} agree, {MIN_VIEWS_JUDGED} are needed for a verdict",))
     return Verdict(OPEN, tuple(missing)) if missing else Verdict(GOOD)
 
 

@@ -139,7 +139,13 @@ class ArcDetector:
     def detect(
         self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
     ) -> list[Ellipse]:
-        """Return ellipses, the best first; see `EllipseDetector`."""
+        """Return ellipses, the best first.
+
+        Args:
+            gray: Picture, `(h, w)` uint8.
+            roi: Region to search, `(h, w)` bool; `None` for everywhere.
+            prior: Range of their size; `None` for any size.
+        """
         s = self.settings
         # Only the box of the region is searched: time is proportional to its area.
         left, top, width, height = (

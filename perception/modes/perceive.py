@@ -32,7 +32,8 @@ from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, spec
-from perception.contracts import Overlay, RejectionExplainer
+from perception.contracts import RejectionExplainer
+from perception.overlay import OverlayDrawing
 from perception.tracking.steered_search import SteeredSearch
 
 log = logging.getLogger(__name__)
@@ -108,7 +109,7 @@ class Perceive:
     perception: FinderSpec
     tracker: TrackerSpec
     source: FrameSourceSpec
-    overlay: Overlay
+    overlay: OverlayDrawing
     perceive: PerceiveOptions
 
     def run(self) -> None:

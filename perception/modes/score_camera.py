@@ -6,7 +6,6 @@ measured holes have a place in each frame. Real sessions and rendered ones are d
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from perception.benchmark.session_score import SessionScore, merge_scores, score_holes
+from perception.benchmark.session_score import HoleError, match_found_holes
 from perception.label.camera_pose import CameraTrackerSpec
 
 log = logging.getLogger(__name__)
@@ -52,13 +51,11 @@ class ScoreOptions:
         truth: YAML file of the measured holes.
         kind: `real` or `rendered`: rows of one kind are never mixed with the other's.
         name: Name of the row: camera, place and day.
-        table: JSON file of rows that this one is added to; `null`: `score.json` alone.
     """
 
     truth: str
     kind: Literal["real", "rendered"]
     name: Annotated[str, MinLen(1)]
-    table: str | None
 
 
 @spec
@@ -80,7 +77,7 @@ class ScoreCamera:
     score: ScoreOptions
 
     def run(self) -> float | None:
-        """Write `score.json`, add the row to the table, and show all rows, the real ones first.
+        """Write `score.json`, and show its row.
 
         Returns:
             The median error of the centre, m; `None` where nothing was found.
@@ -90,26 +87,43 @@ class ScoreCamera:
             FrameError: no frame shows the board.
         """
         holes, std_m = read_measured(Path(self.score.truth))
-        scores, refused = self._score_frames(holes)
-        if not scores:
+        frames, refused = self._score_frames(holes)
+        if not frames:
             raise FrameError(
                 f"score_camera: no frame can be judged; the first: {next(iter(refused.values()), 'none')}"
             )
-        total = merge_scores(scores)
-        row = self._build_row(total, std_m, len(refused))
-        errors = [vars(one) for one in total.errors]
-        content = {"schema": 1, **row, "refused": refused, "errors": errors}
+        errors = [one for some, _ in frames for one in some]
+        position_m = [one.position_m for one in errors]
+        median_m, high_m = (
+            float(np.percentile(position_m, part)) if errors else None for part in (50, 95)
+        )
+        row = {
+            "kind": self.score.kind,
+            "name": self.score.name,
+            "frames": len(frames),
+            "refused_frames": len(refused),
+            "holes": len(frames) * len(holes),
+            "found": len(errors),
+            "false": sum(num_false for _, num_false in frames),
+            "position_m_median": median_m,
+            "position_m_p95": high_m,
+            "normal_rad_median": float(np.median([one.normal_rad for one in errors]))
+            if errors
+            else None,
+            "inside_3_sigma": sum(one.sigmas <= 3.0 for one in errors),
+            "truth_std_m": std_m,
+        }
+        content = {"schema": 1, **row, "refused": refused, "errors": [vars(one) for one in errors]}
         write_json(self.session.folder / FILE, content)
-        rows = [row]
-        if self.score.table is not None:
-            rows = _add_row(Path(self.score.table), row)
-        _show(rows)
-        return total.compute_position_m(50)
+        _show(row)
+        return median_m
 
-    def _score_frames(self, holes: list[MeasuredHole]) -> tuple[list[SessionScore], dict[str, str]]:
-        """Return the scores of frames, and why others were left out."""
+    def _score_frames(
+        self, holes: list[MeasuredHole]
+    ) -> tuple[list[tuple[list[HoleError], int]], dict[str, str]]:
+        """Return errors and false holes of each frame, and why others were left out."""
         finder, tracker = self.perception.build(), self.board.build()
-        scores: list[SessionScore] = []
+        frames: list[tuple[list[HoleError], int]] = []
         refused: dict[str, str] = {}
         with self.source.build() as source, ItemProgress("frames", source.num_frames) as progress:
             number = 0
@@ -119,45 +133,16 @@ class ScoreCamera:
                 try:
                     frame = source.read_latest()
                     if frame is None:
-                        return scores, refused
+                        return frames, refused
                     camera_from_board = np.linalg.inv(tracker.locate(frame).world_from_camera)
                     # In camera coordinates, as the board tells the truth.
                     found = finder.find(replace(frame, base_from_camera=None))
                 except FrameError as error:
                     refused[f"{number - 1:05d}"] = str(error)
                     continue
-                true = []
-                for hole in holes:
-                    center = camera_from_board[:3, :3] @ hole.center_m + camera_from_board[:3, 3]
-                    axis = camera_from_board[:3, :3] @ hole.axis
-                    true.append((center, axis, float(np.linalg.norm(center))))
-                detected = []
-                for one in found.holes:
-                    hole_in_camera = {
-                        "center_m": one.center_m,
-                        "axis": one.axis,
-                        "cov_m2": one.cov_m2,
-                    }
-                    detected.append(hole_in_camera)
-                scores.append(score_holes(Path(frame.name).name, detected, true))
-
-    def _build_row(self, score: SessionScore, std_m: float, num_refused: int) -> dict[str, Any]:
-        median_m, high_m = (score.compute_position_m(part) for part in (50, 95))
-        normal = [one.normal_rad for one in score.errors]
-        return {
-            "kind": self.score.kind,
-            "name": self.score.name,
-            "frames": score.num_frames,
-            "refused_frames": num_refused,
-            "holes": score.num_holes,
-            "found": score.num_found,
-            "false": score.num_false,
-            "position_m_median": median_m,
-            "position_m_p95": high_m,
-            "normal_rad_median": float(np.median(normal)) if normal else None,
-            "inside_3_sigma": score.count_inside(3.0),
-            "truth_std_m": std_m,
-        }
+                turn, shift_m = camera_from_board[:3, :3], camera_from_board[:3, 3]
+                true = [(turn @ hole.center_m + shift_m, turn @ hole.axis) for hole in holes]
+                frames.append(match_found_holes(Path(frame.name).name, found.holes, true))
 
 
 def read_measured(path: Path) -> tuple[list[MeasuredHole], float]:
@@ -187,31 +172,20 @@ def read_measured(path: Path) -> tuple[list[MeasuredHole], float]:
     return holes, std_m
 
 
-def _add_row(path: Path, row: dict[str, Any]) -> list[dict[str, Any]]:
-    """Add a row to a table, in place of one of the same kind and name; return all rows."""
-    rows = []
-    if path.is_file():
-        try:
-            rows = list(json.loads(path.read_text())["rows"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ConfigError(
-                f"score.table={path}: expected a table of this mode ({error})"
-            ) from error
-    kept = [one for one in rows if (one["kind"], one["name"]) != (row["kind"], row["name"])]
-    rows = sorted([*kept, row], key=lambda one: (one["kind"], one["name"]))
-    write_json(path, {"schema": 1, "rows": rows})
-    return rows
-
-
-def _show(rows: list[dict[str, Any]]) -> None:
-    cells = []
-    for row in rows:
-        errors = []
-        for key in ("position_m_median", "position_m_p95"):
-            errors.append(None if row[key] is None else f"{1000 * row[key]:.1f} mm")
-        found = f"{row['found']} of {row['holes']}"
-        inside = f"{row['inside_3_sigma']} of {row['found']}"
-        frames, false = str(row["frames"]), str(row["false"])
-        cells.append((row["kind"], row["name"], frames, found, false, *errors, inside))
+def _show(row: dict[str, Any]) -> None:
+    errors = []
+    for key in ("position_m_median", "position_m_p95"):
+        errors.append(None if row[key] is None else f"{1000 * row[key]:.1f} mm")
+    found = f"{row['found']} of {row['holes']}"
+    inside = f"{row['inside_3_sigma']} of {row['found']}"
+    cells = (
+        row["kind"],
+        row["name"],
+        str(row["frames"]),
+        found,
+        str(row["false"]),
+        *errors,
+        inside,
+    )
     head = ("kind", "session", "frames", "found", "no hole", "median", "95 %", "inside 3 σ")
-    print_table(head, cells)
+    print_table(head, [cells])

@@ -10,7 +10,7 @@ import numpy as np
 
 from perception.render.drilled_block import FRONT, Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
-from perception.render.solids import Cylinder, Solid, SolidPose
+from perception.render.solids import SolidPose, build_frame
 
 if TYPE_CHECKING:
     from perception.render.scene_ranges import BlockRanges
@@ -20,18 +20,6 @@ MARK_M = 0.002
 _TRIES = 60
 _SPACING = 1.3
 """Two discs or holes are farther apart than the sum of their radii by this factor."""
-
-
-def build_frame(normal: np.ndarray, turn_rad: float) -> np.ndarray:
-    """Return a rotation whose third column is along `normal`, `(3,)`, turned about it."""
-    normal = normal / np.linalg.norm(normal)
-    first = np.cross(
-        np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), normal
-    )
-    first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
-    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
-    return np.stack([cos * first + sin * second, cos * second - sin * first, normal], 1)
 
 
 def draw_block(
@@ -66,7 +54,7 @@ def draw_block(
     for _ in range(int(generator.integers(kind.side_holes[0], kind.side_holes[1] + 1))):
         holes.append(_draw_side_hole(kind, half, radius, edge, generator))
     discs = tuple(
-        Disc(np.array([*place, half[2]]), size, "paint")
+        Disc(np.array([*place, half[2]]), size)
         for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
     )
     chips = tuple(chip for hole in holes[:num_holes] for chip in _draw_chips(kind, hole, generator))
@@ -109,10 +97,7 @@ def _scatter_discs(
 def _draw_hole(
     kind: BlockRanges, center: np.ndarray, radius: float, part: int, generator: np.random.Generator
 ) -> DrilledHole:
-    lamp = (
-        float(generator.uniform(*kind.lamp)) if generator.random() < kind.lamp_probability else 0.0
-    )
-    return DrilledHole(center, radius, float(generator.uniform(*kind.depth_m)), part, lamp)
+    return DrilledHole(center, radius, float(generator.uniform(*kind.depth_m)), part)
 
 
 def _draw_side_hole(
@@ -126,40 +111,7 @@ def _draw_side_hole(
     for other in {0, 1, 2} - {axis}:
         room = max(half[other] - radius - edge, 0.0)
         center[other] = generator.uniform(-room, room)
-    return DrilledHole(center, radius, min(0.05, kind.depth_m[0]), part, 0.0)
-
-
-def draw_bars(
-    kind: BlockRanges, block: DrilledBlock, generator: np.random.Generator
-) -> list[Solid]:
-    """Return reinforcing bars inside the concrete that some of the holes cut bare."""
-    bars: list[Solid] = []
-    for hole in block.holes:
-        if hole.part != FRONT or generator.random() >= kind.bar_probability:
-            continue
-        angle, below = (
-            generator.uniform(-np.pi, np.pi),
-            float(generator.uniform(0.03, hole.depth_m + 0.02)),
-        )
-        along = block.pose.rotation @ [np.cos(angle), np.sin(angle), 0.0]
-        aside = (
-            0.7
-            * hole.radius_m
-            * generator.uniform(-1, 1)
-            * np.array([-np.sin(angle), np.cos(angle), 0.0])
-        )
-        place = block.pose.point(hole.center_m + aside - [0.0, 0.0, below])
-        rust = Material((0.25, 0.16, 0.1), 0.3, 0.001, 2)
-        bars.append(
-            Cylinder(
-                "block",
-                SolidPose(build_frame(along, 0.0), place),
-                float(generator.uniform(0.005, 0.012)),
-                1.2 * hole.radius_m,
-                (rust,),
-            )
-        )
-    return bars
+    return DrilledHole(center, radius, min(0.05, kind.depth_m[0]), part)
 
 
 def _draw_chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from pathlib import Path
 
@@ -17,14 +16,13 @@ from brokk_rl.record import Recording
 from brokk_rl.session import Session, write_text
 from brokk_rl.spec import Positive, spec
 from perception.calibrate.arm import compute_link_poses
+from perception.calibrate.transforms import make_transform
 from perception.label.camera_pose import Charuco
-from perception.render.block_sampler import build_frame
-from perception.render.materials import Material
 from perception.render.printed_board import build_plate
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import add_surroundings
-from perception.render.scene_sequence import StagedScene, build_pose
-from perception.render.solids import Cylinder, Solid, SolidPose
+from perception.render.scene_sequence import StagedScene
+from perception.render.solids import build_rods
 from perception.render.stereo_camera import StereoRig, measure_disparity_error
 
 JOINTS, TRUTH = "joints.parquet", "truth.yaml"
@@ -36,7 +34,6 @@ FACING = 0.5
 """Least cosine between the board's normal and the line of sight: 60 degrees."""
 GROUND_M = 0.0
 """Height of the ground in the base frame."""
-PAINT, STEEL = Material((0.6, 0.36, 0.07), 0.08, 0.002), Material((0.15, 0.15, 0.15), 0.15, 0.001)
 BOOM_M, CHISEL_M = 0.09, 0.04
 """Radii of the drawn links and of the tool; chosen by hand."""
 
@@ -95,7 +92,7 @@ class BoardOnArm:
 
 
 class BoardScenes:
-    """The frames of one recording; see `perception.render.scene_sequence.SceneSequence`."""
+    """The frames of one recording; like `perception.render.scene_sequence.RandomScenes`."""
 
     def __init__(self, settings: BoardOnArm, rig: StereoRig, session: Session) -> None:
         self._settings, self._rig, self._session = settings, rig, session
@@ -116,7 +113,10 @@ class BoardScenes:
         settings, generator = self._settings, self._session.generator(f"scene/{number}")
         q = self._read_joints(number / settings.rate_hz + settings.clock_s)
         plate = build_plate(settings.board, self._compute_board(q), settings.margin_m)
-        solids = (*self._draw_arm(q), plate)
+        tool = compute_tool_kinematics(settings.machine, q[None])
+        in_base_m = np.stack([*tool.joints_in_base_m[0], tool.tip_in_base_m[0]])
+        points_m = in_base_m @ self._camera_from_base[:3, :3].T + self._camera_from_base[:3, 3]
+        solids = (*build_rods(points_m, BOOM_M, CHISEL_M), plate)
         # The surroundings are drawn by the same numbers for each frame.
         scenery = self._session.generator("scene/surroundings")
         target = self._compute_board(np.array(settings.middle))[:3, 3]
@@ -167,7 +167,7 @@ class BoardScenes:
         x /= np.linalg.norm(x)
         turn = np.stack([x, np.cross(z, x), z], 1)
         corner = middle - turn[:, :2] @ (size_m / 2)
-        return np.linalg.inv(link) @ self.base_from_camera @ build_pose(turn, corner)
+        return np.linalg.inv(link) @ self.base_from_camera @ make_transform(turn, corner)
 
     def _compute_board(self, q: np.ndarray) -> np.ndarray:
         """Return the board in the camera at true joint positions, `(4, 4)`."""
@@ -205,20 +205,3 @@ class BoardScenes:
             f"scene={settings.name}: no pose about scene.middle={list(settings.middle)} shows the "
             "board to the camera; choose another pose or rig"
         )
-
-    def _draw_arm(self, q: np.ndarray) -> list[Solid]:
-        """Return links and tool as cylinders, camera coordinates."""
-        tool = compute_tool_kinematics(self._settings.machine, q[None])
-        in_base_m = np.stack([*tool.joints_in_base_m[0], tool.tip_in_base_m[0]])
-        points = in_base_m @ self._camera_from_base[:3, :3].T + self._camera_from_base[:3, 3]
-        solids: list[Solid] = []
-        for number, (begin, end) in enumerate(itertools.pairwise(points)):
-            along = end - begin
-            length_m = float(np.linalg.norm(along))
-            if length_m < CHISEL_M:
-                continue
-            is_tool = number == len(points) - 2
-            pose = SolidPose(build_frame(along, 0.0), (begin + end) / 2)
-            radius_m, material = (CHISEL_M, STEEL) if is_tool else (BOOM_M, PAINT)
-            solids.append(Cylinder("arm", pose, radius_m, length_m / 2, (material,)))
-        return solids

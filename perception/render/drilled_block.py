@@ -8,6 +8,7 @@ is in, until no cavity takes it further.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,14 +32,12 @@ class DrilledHole:
         radius_m: Radius.
         depth_m: From the face to the floor, or to the surface of a filling.
         part: The face.
-        lamp: Light that shines inside, relative to full daylight; 0 for none.
     """
 
     center_m: np.ndarray
     radius_m: float
     depth_m: float
     part: int = FRONT
-    lamp: float = 0.0
 
     @property
     def axis(self) -> int:
@@ -103,7 +102,9 @@ class Disc:
 
     center_m: np.ndarray
     radius_m: float
-    kind: str
+    depth_m: ClassVar[float] = 0.0
+    axis: ClassVar[int] = 2
+    outward: ClassVar[np.ndarray] = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -247,14 +248,9 @@ def _describe_inside(
     half = np.maximum(depth, 0.0) / (2.0 * hole.radius_m)
     ring = (half * half + 0.5) / np.sqrt(half * half + 1.0) - half
     sky = np.where(floor, hole.radius_m**2 / (hole.radius_m**2 + depth * depth), ring)
-    glow = (
-        hole.lamp * np.exp(-np.abs(hole.depth_m - depth) / (4.0 * hole.radius_m))
-        if hole.lamp
-        else 0.0
-    )
     rise = sun[hole.axis] * hole.sign
     way = np.maximum(depth, 0.0) / max(rise, 1e-6)
     sunlit = ((x + way * sun[one]) ** 2 + (y + way * sun[two]) ** 2 < hole.radius_m**2) & (rise > 0)
     around = np.stack([np.arctan2(y, x) * hole.radius_m, depth], 1)
     uv = np.where(floor[:, None], np.stack([x, y], 1), around)
-    return Surface(normal, uv.astype(np.float32), (sky + glow).astype(np.float32), sunlit)
+    return Surface(normal, uv.astype(np.float32), sky.astype(np.float32), sunlit)

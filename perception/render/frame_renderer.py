@@ -13,11 +13,13 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
-from perception.render.board_on_arm import BoardOnArm
+from perception.render.board_on_arm import BoardOnArm, BoardScenes
 from perception.render.camera_sensor import draw_dust, take_picture
+from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
-from perception.render.scene_sequence import RandomScenes, SceneSequence, StagedScene
+from perception.render.scene_sampler import sample_rim
+from perception.render.scene_sequence import RandomScenes, StagedScene
 from perception.render.stereo_camera import StereoRig
 from perception.stereo import Stereo
 
@@ -69,7 +71,7 @@ class FrameRenderer:
                 "studio.pair=false: there is no pair to match; choose studio.depth=exact or none"
             )
 
-    def prepare(self, folder: Path, session: Session, count: int) -> SceneSequence:
+    def prepare(self, folder: Path, session: Session, count: int) -> RandomScenes | BoardScenes:
         """Return the scenes, and write what their frames share.
 
         Args:
@@ -83,7 +85,7 @@ class FrameRenderer:
         """
         rig = self.rig
         if isinstance(self.scene, SceneRanges):
-            scenes: SceneSequence = RandomScenes(self.scene, rig, session)
+            scenes: RandomScenes | BoardScenes = RandomScenes(self.scene, rig, session)
         else:
             scenes = self.scene.open(rig, session)
         dataset.write_camera(
@@ -130,10 +132,8 @@ class FrameRenderer:
         exposure = scene.exposure
         cameras = self.rig.sensor.draw_pair(generator)
         density = draw_dust(exposure.patchiness, generator)
-        color, partner = (
-            take_picture(left.radiance, left.depth_m, exposure, density, cameras[0], generator),
-            None,
-        )
+        color = take_picture(left.radiance, left.depth_m, exposure, density, cameras[0], generator)
+        partner = None
         if self.pair:
             right = tracer.view(self.rig.right)
             partner = take_picture(
@@ -152,62 +152,30 @@ class FrameRenderer:
         block = scene.block
         if block is None:
             return SceneTruth(self.scene.name, scene.conditions, (), (), {})
-        holes = tuple(
-            self._circle(
-                block.pose.point(hole.center_m),
-                block.pose.rotation @ hole.outward,
-                hole.radius_m,
-                hole.depth_m,
-                hidden,
-                base,
-            )
-            for hole, hidden in zip(block.holes, scene.hidden, strict=True)
-        )
-        decoys = tuple(
-            self._circle(
-                block.pose.point(disc.center_m),
-                block.pose.rotation[:, 2],
-                disc.radius_m,
-                0.0,
-                hidden,
-                base,
-            )
-            for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True)
-        )
+        holes, decoys = [], []
+        for hole, hidden in zip(block.holes, scene.hidden, strict=True):
+            holes.append(self._describe_circle(block, hole, hidden, base))
+        for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True):
+            decoys.append(self._describe_circle(block, disc, hidden, base))
         place = {
             "center_m": np.asarray(block.pose.center_m).tolist(),
             "rotation": np.asarray(block.pose.rotation).tolist(),
             "half_m": np.asarray(block.half_m).tolist(),
         }
-        return SceneTruth(self.scene.name, scene.conditions, holes, decoys, place)
+        return SceneTruth(self.scene.name, scene.conditions, tuple(holes), tuple(decoys), place)
 
-    def _circle(
-        self,
-        center: np.ndarray,
-        axis: np.ndarray,
-        radius_m: float,
-        depth_m: float,
-        hidden: float,
-        base: np.ndarray,
+    def _describe_circle(
+        self, block: DrilledBlock, circle: DrilledHole | Disc, hidden: float, base: np.ndarray
     ) -> TrueCircle:
-        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-        first /= np.linalg.norm(first)
-        angle = np.linspace(0, 2 * np.pi, 64)[:, None]
-        rim = center + radius_m * (np.cos(angle) * first + np.sin(angle) * np.cross(axis, first))
-        in_view = False
-        if rim[:, 2].min() > 0.05:
-            pixel = self.rig.left.project(rim)
-            in_view = bool(
-                (pixel.min(0) >= 0).all()
-                and (pixel.max(0) <= [self.rig.width - 1, self.rig.height - 1]).all()
-            )
+        center = block.pose.point(circle.center_m)
+        axis = block.pose.rotation @ circle.outward
         return TrueCircle(
             center_m=tuple(center.tolist()),
             axis=tuple(axis.tolist()),
             center_in_base_m=tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
             axis_in_base=tuple((base[:3, :3] @ axis).tolist()),
-            radius_m=float(radius_m),
-            depth_m=float(depth_m),
+            radius_m=float(circle.radius_m),
+            depth_m=float(circle.depth_m),
             hidden=float(hidden),
-            in_view=in_view,
+            in_view=self.rig.left.is_inside(sample_rim(block, circle), 0.0),
         )

@@ -14,7 +14,7 @@ from brokk_rl.spec import Index, Ordered, PositiveRange, Range, spec
 from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import DrilledBlock
 from perception.render.ray_tracer import Light
-from perception.render.solids import Solid, SolidPose
+from perception.render.solids import Solid, move_solid
 
 Transmission = Annotated[float, Interval(gt=0, le=1)]
 CountRange = Annotated[tuple[Index, Index], Ordered()]
@@ -55,9 +55,6 @@ class BlockRanges:
         radius_m: Of the holes.
         depth_m: Of the holes, down to the surface of a filling.
         fill_brightness: Of the floor.
-        lamp: Light inside a hole, relative to daylight.
-        lamp_probability: That there is any.
-        bar_probability: That a reinforcing bar crosses a hole.
         edge_m: Concrete left between a hole and the edge of the face.
         chips: Pieces broken off each rim.
         chip_m: Radius of each, along the face.
@@ -82,9 +79,6 @@ class BlockRanges:
     radius_m: Range
     depth_m: Range
     fill_brightness: Range
-    lamp: Range
-    lamp_probability: float
-    bar_probability: float
     edge_m: Range
     chips: CountRange
     chip_m: Range
@@ -213,8 +207,7 @@ def view_from(scene: Scene, camera_from_reference: np.ndarray) -> Scene:
     turn, shift_m = camera_from_reference[:3, :3], camera_from_reference[:3, 3]
 
     def move(solid: Any) -> Any:
-        pose = SolidPose(turn @ solid.pose.rotation, turn @ solid.pose.center_m + shift_m)
-        return replace(solid, pose=pose)
+        return move_solid(solid, turn, shift_m)
 
     block = None if scene.block is None else move(scene.block)
     solids = tuple(block if solid is scene.block else move(solid) for solid in scene.solids)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from perception.render.block_sampler import build_frame, draw_bars, draw_block
+from perception.render.block_sampler import draw_block
 from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
@@ -19,7 +19,15 @@ from perception.render.scene_ranges import (
     draw_log_uniform,
     draw_uniform,
 )
-from perception.render.solids import Box, Cylinder, PlaneSolid, Solid, SolidPose
+from perception.render.solids import (
+    Box,
+    Cylinder,
+    PlaneSolid,
+    Solid,
+    SolidPose,
+    build_frame,
+    move_solid,
+)
 from perception.render.stereo_camera import StereoRig
 
 _CLEAR = 1.6
@@ -117,16 +125,7 @@ def _build_arm(
 
 def _shift_solids(parts: list[Solid], shift_m: np.ndarray) -> list[Solid]:
     """Return the arm elsewhere."""
-    found: list[Solid] = []
-    for part in parts:
-        pose = SolidPose(part.pose.rotation, part.pose.center_m + shift_m)  # type: ignore[attr-defined]
-        if isinstance(part, Box):
-            found.append(Box(part.role, pose, part.half_m, part.materials))
-        elif isinstance(part, Cylinder):
-            found.append(
-                Cylinder(part.role, pose, part.radius_m, part.half_length_m, part.materials)
-            )
-    return found
+    return [move_solid(part, np.eye(3), shift_m) for part in parts]
 
 
 NUM_RIM_POINTS = 360
@@ -181,7 +180,7 @@ def add_surroundings(
         )
     solids: list[Solid] = [*_draw_ground_and_backdrop(kind, down, ground_m, generator)]
     if block:
-        solids += [block, *draw_bars(kind.block, block, generator)]
+        solids.append(block)
     solids += arm
     solids += _draw_clutter(kind, rig, block, down, ground_m, generator)
     light = _draw_light(kind, down, target, float(np.mean(solids[0].materials[0].color)), generator)
@@ -209,7 +208,7 @@ def add_surroundings(
 
 def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
     """Return points on the rim of a hole or disc, camera coordinates, `(NUM_RIM_POINTS, 3)`."""
-    axis = circle.axis if isinstance(circle, DrilledHole) else 2
+    axis = circle.axis
     angle = np.linspace(0, 2 * np.pi, NUM_RIM_POINTS, endpoint=False)
     local = np.repeat(circle.center_m[None], NUM_RIM_POINTS, 0)
     local[:, (axis + 1) % 3] += circle.radius_m * np.cos(angle)
@@ -222,9 +221,7 @@ def compute_hidden_share(
 ) -> float:
     """Return the part of a rim that other solids or the block hide from the left camera."""
     rim = sample_rim(block, circle)
-    outward = block.pose.rotation @ (
-        circle.outward if isinstance(circle, DrilledHole) else np.array([0.0, 0.0, 1.0])
-    )
+    outward = block.pose.rotation @ circle.outward
     # A face that looks away hides its rim, whatever stands before it.
     if (outward @ rim.mean(0)) >= 0:  # on a face that looks away
         return 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -29,27 +28,6 @@ class StagedScene:
     generator: np.random.Generator
 
 
-class SceneSequence(Protocol):
-    """Scenes by number, and the records that belong to them."""
-
-    @property
-    def base_from_camera(self) -> np.ndarray | None:
-        """Pose of a camera that stands still, `(4, 4)`; `None` for one that is carried."""
-        ...
-
-    def view(self, number: int) -> StagedScene:
-        """Return scene `number`; the same session gives the same."""
-        ...
-
-    def write_records(self, folder: Path, count: int) -> None:
-        """Write what was recorded beside the first `count` frames.
-
-        Raises:
-            StorageError: a file could not be written.
-        """
-        ...
-
-
 class RandomScenes:
     """Scenes that have nothing in common but their kind.
 
@@ -71,10 +49,3 @@ class RandomScenes:
 
     def write_records(self, folder: Path, count: int) -> None:
         """Write nothing."""
-
-
-def build_pose(rotation: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
-    """Return a transform, `(4, 4)`."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, shift_m
-    return pose

@@ -8,13 +8,17 @@ with a material of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+import itertools
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from perception.render.materials import Material
 
+PAINT = Material((0.6, 0.35, 0.06), 0.1, 0.002)
+"""Faded yellow of a demolition machine."""
+SHORTEST_ROD_M = 1e-3
 NEAR_M = 1e-4
 """Hits nearer than this are those of the surface that a shadow ray starts on."""
 
@@ -71,6 +75,18 @@ class SolidPose:
     def point(self, local_m: np.ndarray) -> np.ndarray:
         """Return a point, `(…, 3)`, of the solid's coordinates in those of the camera."""
         return local_m @ self.rotation.T + self.center_m
+
+
+def build_frame(normal: np.ndarray, turn_rad: float) -> np.ndarray:
+    """Return a rotation whose third column is along `normal`, `(3,)`, turned about it."""
+    normal = normal / np.linalg.norm(normal)
+    first = np.cross(
+        np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), normal
+    )
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+    return np.stack([cos * first + sin * second, cos * second - sin * first, normal], 1)
 
 
 class Solid(Protocol):
@@ -229,3 +245,21 @@ class Cylinder:
         return Surface(
             normal, np.where((part == 0)[:, None], around, local[:, :2]).astype(np.float32)
         )
+
+
+def move_solid(solid: Any, turn: np.ndarray, shift_m: np.ndarray) -> Any:
+    """Return a solid turned about the origin, `(3, 3)`, and then shifted, `(3,)`."""
+    pose = SolidPose(turn @ solid.pose.rotation, turn @ solid.pose.center_m + shift_m)
+    return replace(solid, pose=pose)
+
+
+def build_rods(points_m: np.ndarray, link_m: float, tool_m: float) -> list[Solid]:
+    """Return an arm as cylinders of these radii between points, `(P, 3)`; the last one is the tool."""
+    rods: list[Solid] = []
+    for number, (begin, end) in enumerate(itertools.pairwise(points_m)):
+        length_m = float(np.linalg.norm(end - begin))
+        if length_m > SHORTEST_ROD_M:
+            radius_m = tool_m if number == len(points_m) - 2 else link_m
+            pose = SolidPose(build_frame(end - begin, 0.0), (begin + end) / 2)
+            rods.append(Cylinder("arm", pose, radius_m, length_m / 2, (PAINT,)))
+    return rods

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,12 @@ import numpy as np
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
-from perception.render.block_sampler import build_frame, draw_block_materials
+from perception.render.block_sampler import draw_block_materials
 from perception.render.drilled_block import FRONT, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer, RenderedFrame
-from perception.render.materials import Material
 from perception.render.scene_ranges import Scene, SceneRanges, view_from
 from perception.render.scene_sampler import add_surroundings
-from perception.render.solids import Cylinder, Solid, SolidPose
+from perception.render.solids import SolidPose, build_rods
 from perception.render.stereo_camera import StereoRig
 from perception.stereo import Stereo
 
@@ -163,41 +161,20 @@ class SimulatedSource:
             [[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
         )
         rotation = from_base[:3, :3] @ turn
-        hole = DrilledHole(
-            np.array([0.0, 0.0, half[2]]), radius_m, settings.hole_depth_m, FRONT, 0.0
-        )
+        hole = DrilledHole(np.array([0.0, 0.0, half[2]]), radius_m, settings.hole_depth_m, FRONT)
         pose = SolidPose(rotation, target - rotation @ hole.center_m)
         block = DrilledBlock(
             pose, half, draw_block_materials(kind.block, half, (hole,), (), chance), (hole,)
         )
+        points_m = self._chain @ from_base[:3, :3].T + from_base[:3, 3]
         down_m = float((from_base[:3, 3]) @ settings.rig.down_in_camera)
         return add_surroundings(
             kind,
             settings.rig,
             block,
-            self._arm(from_base),
+            build_rods(points_m, *settings.arm_m),
             target,
             rotation[:, 2],
             chance,
             max(down_m, 0.3),
         )
-
-    def _arm(self, from_base: np.ndarray) -> list[Solid]:
-        """Return the links as cylinders from point to point, in camera coordinates."""
-        points = self._chain @ from_base[:3, :3].T + from_base[:3, 3]
-        parts: list[Solid] = []
-        for number, (start, end) in enumerate(pairwise(points)):
-            length = float(np.linalg.norm(end - start))
-            if length > 1e-3:
-                radius_m = self._settings.arm_m[1 if number == len(points) - 2 else 0]
-                pose = SolidPose(build_frame(end - start, 0.0), (start + end) / 2)
-                parts.append(
-                    Cylinder(
-                        "arm",
-                        pose,
-                        radius_m,
-                        length / 2,
-                        (Material((0.6, 0.35, 0.06), 0.1, 0.002),),
-                    )
-                )
-        return parts

@@ -17,7 +17,6 @@ from composed import names, option
 from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
-from perception.render.block_sampler import build_frame
 from perception.render.camera_sensor import (
     CameraExposure,
     LinearCamera,
@@ -37,7 +36,7 @@ from perception.render.materials import Material
 from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
-from perception.render.solids import Box, PlaneSolid, SolidPose
+from perception.render.solids import Box, PlaneSolid, SolidPose, build_frame
 from perception.render.stereo_camera import StereoRig
 
 GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
@@ -173,7 +172,7 @@ def test_a_shadow_lies_where_the_light_is_blocked() -> None:
 
 def test_it_grows_darker_down_a_hole_and_stays_even_on_a_painted_disc() -> None:
     shade = Light(np.array([0.0, 0.0, 1.0]), 0.0, 1.0)  # light from everywhere alone
-    paint = Disc(np.array([-0.2, 0.0, 0.3]), 0.05, "paint")
+    paint = Disc(np.array([-0.2, 0.0, 0.3]), 0.05)
     rotation, center = (
         FACING @ cv2.Rodrigues(np.array([0.7, 0.0, 0.0]))[0],
         np.array([0.1, 0.0, 0.8]),

@@ -1,8 +1,7 @@
-"""Rendered sequences with a board: geometry against projection by hand, records against kinematics, and the day's page."""
+"""Rendered sequences with a board: geometry against projection by hand, records against kinematics."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,11 @@ import yaml
 from composed import option
 
 from brokk_rl import record
+from brokk_rl.contracts.vision import HolePose
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.benchmark.session_score import score_holes
+from perception.benchmark.session_score import match_found_holes
 from perception.calibrate.arm import compute_link_poses
 from perception.label.camera_pose import Charuco
 from perception.render.board_on_arm import BoardOnArm
@@ -75,13 +75,15 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
 
 
 def test_a_score_counts_each_hole_once() -> None:
-    cov = (np.eye(3) * 0.002**2).tolist()
-    near, twin, far = ([1.0, 0.0, 2.003], [1.0, 0.0, 2.01], [0.0, 0.0, 2.0])
-    found = [{"center_m": one, "axis": [0, 0, 1], "cov_m2": cov} for one in (near, twin, far)]
-    true = [([1.0, 0.0, 2.0], [0, 0, 1], 2.0), ([5.0, 0.0, 2.0], [0, 0, 1], 5.0)]
-    score = score_holes("00000", found, true)
-    assert (score.num_holes, score.num_found, score.num_false) == (2, 1, 2)
-    assert score.errors[0].position_m == pytest.approx(0.003)
-    assert score.errors[0].sigmas == pytest.approx(1.5)
-    assert score.compute_position_m(50) == pytest.approx(0.003)
-    assert json.dumps(score.count_inside(1.0)) == "0"
+    axis = np.array([0.0, 0.0, 1.0])
+    found = []
+    for place_m in ([1.0, 0.0, 2.003], [1.0, 0.0, 2.01], [0.0, 0.0, 2.0]):
+        cov_m2 = np.eye(3) * 0.002**2
+        found.append(
+            HolePose(np.array(place_m), axis, 0.05, cov_m2, np.zeros((3, 3)), "camera", 1.0, 0.0)
+        )
+    true = [(np.array([1.0, 0.0, 2.0]), axis), (np.array([5.0, 0.0, 2.0]), axis)]
+    errors, num_false = match_found_holes("00000", found, true)
+    assert (len(errors), num_false) == (1, 2)
+    assert errors[0].position_m == pytest.approx(0.003)
+    assert errors[0].sigmas == pytest.approx(1.5)

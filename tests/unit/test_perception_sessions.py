@@ -126,20 +126,21 @@ def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> f
     }
     built = {key: SimpleNamespace(build=lambda part=part: part) for key, part in parts.items()}
     options = ScoreOptions(
-        truth=str(tmp_path / "measured.yaml"), kind=kind, name=name, table=str(tmp_path / "table.json"),
+        truth=str(tmp_path / "measured.yaml"), kind=kind, name=name,
     )  # fmt: skip
     session = Session(out=str(tmp_path / name), seed=0, device="cpu")
     (tmp_path / name).mkdir(exist_ok=True)
     return ScoreCamera(session=session, score=options, **built).run()
 
 
-def test_real_and_rendered_sessions_are_different_rows(tmp_path: Path) -> None:
-    assert score(tmp_path, "rendered", "quarry", (0.3, 0.0, 2.0005)) == pytest.approx(0.0005)
-    assert score(tmp_path, "real", "quarry", (0.3, 0.003, 2.0)) == pytest.approx(0.003)
-    assert score(tmp_path, "real", "quarry", (0.3, 0.004, 2.0)) == pytest.approx(0.004)
-    rows = json.loads((tmp_path / "table.json").read_text())["rows"]
-    assert [(row["kind"], row["inside_3_sigma"]) for row in rows] == [("real", 0), ("rendered", 1)]
-    assert rows[0]["position_m_median"] == pytest.approx(0.004)
+def test_a_session_is_scored_by_holes_measured_in_the_frame_of_the_board(tmp_path: Path) -> None:
+    for kind, found_m, error_m, inside in (
+        ("rendered", (0.3, 0.0, 2.0005), 0.0005, 1),
+        ("real", (0.3, 0.004, 2.0), 0.004, 0),
+    ):
+        assert score(tmp_path, kind, kind, found_m) == pytest.approx(error_m)
+        row = json.loads((tmp_path / kind / "score.json").read_text())
+        assert (row["kind"], row["inside_3_sigma"]) == (kind, inside)
     (tmp_path / "wrong.yaml").write_text("holes: [{center_m: [1, 2]}]\nstd_m: 0.1\n")
     with pytest.raises(ConfigError, match=r"hole 1.*expected YAML such as"):
         read_measured(tmp_path / "wrong.yaml")
