@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 from annotated_types import Ge
 
@@ -15,9 +14,8 @@ from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
-from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
-from perception.calibrate import arm, clock_offset, evaluation, transforms, verdict
+from perception.calibrate import arm, clock_offset, evaluation, verdict
 from perception.calibrate.disparity_error import (
     BoardDisparity,
     estimate_disparity_error,
@@ -31,110 +29,12 @@ from perception.calibrate.hand_eye import (
     predict_board_poses,
     solve_hand_eye,
 )
-from perception.label.camera_pose import Charuco
+from perception.label.camera_pose import BoardPose, Charuco, estimate_board_pose
 
 log = logging.getLogger(__name__)
 
-MAX_ERROR_RATIO = 3.0
-"""A second pose is kept if its error is less than this many times the first's; chosen by hand.
-
-The poses of the arm then decide between the two.
-"""
-NUM_CANDIDATES = 2
 MIN_TURN_SHARE = 0.1
 """Below this part of `least_turn_rad` about the second axis the problem counts as singular."""
-
-
-@dataclass(frozen=True)
-class BoardPose:
-    """Pose of a board in one frame.
-
-    Attributes:
-        camera_from_board: Poses that fit, the better first, `(2, 4, 4)`; twice the same where the
-            corners leave no doubt.
-        cov: Covariance of each as a small motion in the board's frame, `(2, 6, 6)`.
-        error_px: Root mean square reprojection error of the better.
-    """
-
-    camera_from_board: np.ndarray
-    cov: np.ndarray
-    error_px: float
-
-
-def estimate_board_pose(
-    frame: Frame,
-    corners_m: np.ndarray,
-    corners_px: np.ndarray,
-    corner_px: float,
-    max_error_px: float,
-) -> BoardPose:
-    """Return the one or two poses of a flat board that fit its corners.
-
-    Args:
-        frame: Gives camera matrix and distortion.
-        corners_m: Corners on the board, `(n, 3)`.
-        corners_px: The same in the picture, `(n, 2)`.
-        corner_px: Least standard deviation of a corner; a larger reprojection error replaces it.
-        max_error_px: Largest root mean square reprojection error.
-
-    Raises:
-        FrameError: the corners fit no pose.
-    """
-    matrix, distortion = np.asarray(frame.camera_matrix, float), frame.distortion
-    # IPPE gives both poses of a flat board that fit about equally well.
-    fits = []
-    count, turns, shifts, _ = cv2.solvePnPGeneric(
-        corners_m, corners_px, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
-    )
-    for turn, shift in zip(turns[:count], shifts[:count], strict=True):
-        turn, shift = cv2.solvePnPRefineLM(corners_m, corners_px, matrix, distortion, turn, shift)
-        pose = transforms.make_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.ravel(shift))
-        # A pose behind the camera reproduces the picture too.
-        depth_m = (corners_m @ pose[:3, :3].T + pose[:3, 3])[:, 2]
-        if not np.isfinite(pose).all() or depth_m.min() <= 0:
-            continue  # behind the camera
-        projected = cv2.projectPoints(corners_m, turn, shift, matrix, distortion)[0][:, 0]
-        fits.append((float(np.sqrt(((projected - corners_px) ** 2).sum(1).mean())), pose))
-    fits.sort(key=lambda fit: fit[0])
-    if not fits:
-        raise FrameError(f"{frame.name}: the board's corners fit no pose")
-    best_px = fits[0][0]
-    if best_px > max_error_px:
-        raise FrameError(
-            f"{frame.name}: the board's corners miss by {best_px:.1f} px, {max_error_px:g} are "
-            "allowed"
-        )
-    # A second pose that fits much worse is no doubt.
-    largest_px = MAX_ERROR_RATIO * max(best_px, corner_px)
-    kept = [pose for error_px, pose in fits[:NUM_CANDIDATES] if error_px <= largest_px]
-    # The first pose stands in where there is no second, so that shapes stay the same.
-    poses = np.stack([*kept, *kept[:1]][:NUM_CANDIDATES])
-    # two numbers a corner, six of them spent on the pose
-    freedom = max(2 * len(corners_m) - 6, 1)
-    std_px = max(corner_px, best_px * np.sqrt(len(corners_m) / freedom))
-    information = [_compute_pose_information(pose, corners_m, matrix) for pose in poses]
-    return BoardPose(
-        poses, np.stack([std_px**2 * np.linalg.inv(one) for one in information]), best_px
-    )
-
-
-def _compute_pose_information(
-    pose: np.ndarray, corners_m: np.ndarray, matrix: np.ndarray
-) -> np.ndarray:
-    """Return the information of the corners on a small motion of the board, `(6, 6)`, px^2.
-
-    Lens distortion is neglected: its slope is small.
-    """
-    point = corners_m @ pose[:3, :3].T + pose[:3, 3]
-    x, y, z = point.T
-    slope = np.zeros((len(point), 2, 3))
-    slope[:, 0, 0], slope[:, 0, 2] = matrix[0, 0] / z, -matrix[0, 0] * x / z**2
-    slope[:, 1, 1], slope[:, 1, 2] = matrix[1, 1] / z, -matrix[1, 1] * y / z**2
-    shift = np.broadcast_to(np.eye(3), (len(point), 3, 3))
-    motion = np.concatenate([shift, -transforms.build_cross_matrices(corners_m)], 2)
-    rows = (slope @ pose[:3, :3] @ motion).reshape(-1, 6)
-    # The small addition keeps a board seen edge-on invertible.
-    return rows.T @ rows + 1e-9 * np.eye(6)
 
 
 @dataclass(frozen=True)

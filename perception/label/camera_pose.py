@@ -15,11 +15,18 @@ from annotated_types import Ge
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
+from perception.calibrate import transforms
 from perception.pose.plane_conic import convert_to_gray, linearize
 from perception.sources.validation import check_pose
 
 MIN_CORNERS = 4
 """Corners that determine a pose."""
+MAX_ERROR_RATIO = 3.0
+"""A second pose is kept if its error is less than this many times the first's; chosen by hand.
+
+The poses of the arm then decide between the two.
+"""
+NUM_CANDIDATES = 2
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,98 @@ class CameraTrackerSpec(Protocol):
     def build(self) -> CameraTracker:
         """Return a tracker."""
         ...
+
+
+@dataclass(frozen=True)
+class BoardPose:
+    """Pose of a board in one frame.
+
+    Attributes:
+        camera_from_board: Poses that fit, the better first, `(2, 4, 4)`; twice the same where the
+            corners leave no doubt.
+        cov: Covariance of each as a small motion in the board's frame, `(2, 6, 6)`.
+        error_px: Root mean square reprojection error of the better.
+    """
+
+    camera_from_board: np.ndarray
+    cov: np.ndarray
+    error_px: float
+
+
+def estimate_board_pose(
+    frame: Frame,
+    corners_m: np.ndarray,
+    corners_px: np.ndarray,
+    corner_px: float,
+    max_error_px: float,
+) -> BoardPose:
+    """Return the one or two poses of a flat board that fit its corners.
+
+    Args:
+        frame: Gives camera matrix and distortion.
+        corners_m: Corners on the board, `(n, 3)`.
+        corners_px: The same in the picture, `(n, 2)`.
+        corner_px: Least standard deviation of a corner; a larger reprojection error replaces it.
+        max_error_px: Largest root mean square reprojection error.
+
+    Raises:
+        FrameError: the corners fit no pose.
+    """
+    matrix, distortion = np.asarray(frame.camera_matrix, float), frame.distortion
+    # IPPE gives both poses of a flat board that fit about equally well.
+    fits = []
+    count, turns, shifts, _ = cv2.solvePnPGeneric(
+        corners_m, corners_px, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
+    )
+    for turn, shift in zip(turns[:count], shifts[:count], strict=True):
+        turn, shift = cv2.solvePnPRefineLM(corners_m, corners_px, matrix, distortion, turn, shift)
+        pose = transforms.make_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.ravel(shift))
+        # A pose behind the camera reproduces the picture too.
+        depth_m = (corners_m @ pose[:3, :3].T + pose[:3, 3])[:, 2]
+        if not np.isfinite(pose).all() or depth_m.min() <= 0:
+            continue  # behind the camera
+        projected = cv2.projectPoints(corners_m, turn, shift, matrix, distortion)[0][:, 0]
+        fits.append((float(np.sqrt(((projected - corners_px) ** 2).sum(1).mean())), pose))
+    fits.sort(key=lambda fit: fit[0])
+    if not fits:
+        raise FrameError(f"{frame.name}: the board's corners fit no pose")
+    best_px = fits[0][0]
+    if best_px > max_error_px:
+        raise FrameError(
+            f"{frame.name}: the board's corners miss by {best_px:.1f} px, {max_error_px:g} are "
+            "allowed"
+        )
+    # A second pose that fits much worse is no doubt.
+    largest_px = MAX_ERROR_RATIO * max(best_px, corner_px)
+    kept = [pose for error_px, pose in fits[:NUM_CANDIDATES] if error_px <= largest_px]
+    # The first pose stands in where there is no second, so that shapes stay the same.
+    poses = np.stack([*kept, *kept[:1]][:NUM_CANDIDATES])
+    # two numbers a corner, six of them spent on the pose
+    freedom = max(2 * len(corners_m) - 6, 1)
+    std_px = max(corner_px, best_px * np.sqrt(len(corners_m) / freedom))
+    information = [_compute_pose_information(pose, corners_m, matrix) for pose in poses]
+    return BoardPose(
+        poses, np.stack([std_px**2 * np.linalg.inv(one) for one in information]), best_px
+    )
+
+
+def _compute_pose_information(
+    pose: np.ndarray, corners_m: np.ndarray, matrix: np.ndarray
+) -> np.ndarray:
+    """Return the information of the corners on a small motion of the board, `(6, 6)`, px^2.
+
+    Lens distortion is neglected: its slope is small.
+    """
+    point = corners_m @ pose[:3, :3].T + pose[:3, 3]
+    x, y, z = point.T
+    slope = np.zeros((len(point), 2, 3))
+    slope[:, 0, 0], slope[:, 0, 2] = matrix[0, 0] / z, -matrix[0, 0] * x / z**2
+    slope[:, 1, 1], slope[:, 1, 2] = matrix[1, 1] / z, -matrix[1, 1] * y / z**2
+    shift = np.broadcast_to(np.eye(3), (len(point), 3, 3))
+    motion = np.concatenate([shift, -transforms.build_cross_matrices(corners_m)], 2)
+    rows = (slope @ pose[:3, :3] @ motion).reshape(-1, 6)
+    # The small addition keeps a board seen edge-on invertible.
+    return rows.T @ rows + 1e-9 * np.eye(6)
 
 
 class BoardTracker:
@@ -105,27 +204,8 @@ class BoardTracker:
         Raises:
             FrameError: too few corners are seen, or they fit no pose.
         """
-        corners_m, corners_px = self.find_corners(frame)
-        matrix, distortion = np.asarray(frame.camera_matrix, float), frame.distortion
-        # SQPNP needs no start and finds the global optimum.
-        done, turn, shift = cv2.solvePnP(
-            corners_m, corners_px, matrix, distortion, flags=cv2.SOLVEPNP_SQPNP
-        )
-        if not done:
-            raise FrameError(f"{frame.name}: the board's corners fit no pose of the camera")
-        turn, shift = cv2.solvePnPRefineLM(corners_m, corners_px, matrix, distortion, turn, shift)
-        projected, _ = cv2.projectPoints(corners_m, turn, shift, matrix, distortion)
-        error_px = float(np.sqrt(((projected[:, 0] - corners_px) ** 2).sum(-1).mean()))
-        if error_px > self._max_error_px:
-            raise FrameError(
-                f"{frame.name}: the board's corners miss by {error_px:.1f} px, "
-                f"{self._max_error_px:g} are allowed"
-            )
-        rotation = np.asarray(cv2.Rodrigues(turn)[0])
-        pose = np.eye(4)
-        # OpenCV gives the board in the camera; the inverse is wanted.
-        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ np.ravel(shift)
-        return CameraPose(pose, error_px)
+        found = estimate_board_pose(frame, *self.find_corners(frame), 0.0, self._max_error_px)
+        return CameraPose(transforms.invert(found.camera_from_board[0]), found.error_px)
 
 
 def _count_corners(found: Sequence[np.ndarray], numbers: np.ndarray | None) -> int:

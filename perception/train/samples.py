@@ -23,6 +23,8 @@ from brokk_rl.spec import PositiveRange, spec
 from perception import dataset
 from perception.segment.network import SMALLEST_PIECE, THRESHOLD
 from perception.segment.window import Window, bound_block, center_window, cover_picture
+from perception.sources.folder import read_picture
+from perception.sources.validation import convert_color
 
 ROOM = 1.5
 """Size of a stored view over the network's picture: room that a crop can use without loss of
@@ -106,6 +108,14 @@ class TrainingViews:
         """Return the chosen frames."""
         return TrainingViews(self.layers[chosen], self.conditions[chosen], self.names[chosen])
 
+    def join(self, other: TrainingViews) -> TrainingViews:
+        """Return the frames of both."""
+        return TrainingViews(
+            torch.cat([self.layers, other.layers]),
+            (*self.conditions, *other.conditions),
+            (*self.names, *other.names),
+        )
+
 
 class Samples:
     """Endless batches, cut and changed where the network is trained.
@@ -174,22 +184,12 @@ def list_frames(folders: str | Sequence[str]) -> list[Path]:
     Raises:
         FrameError: a folder holds none.
     """
-    stems: list[Path] = []
-    for folder in (folders,) if isinstance(folders, str) else folders:
-        here = sorted(Path(folder).rglob(f"*{dataset.MASK}"))
-        here = [
-            path.with_name(path.name.removesuffix(dataset.MASK))
-            for path in here
-            if not path.name.startswith(".")
-        ]
-        if not here:
-            raise FrameError(
-                f"training.frames: no *{dataset.MASK} in '{folder}' (seen from {Path.cwd()}); "
-                "`brokk mode=render` and "
-                "`brokk mode=label` make frames with masks"
-            )
-        stems += here
-    return stems
+    told = (
+        f"training.frames: no *{dataset.MASK}",
+        "`brokk mode=render` and `brokk mode=label` make frames with masks",
+    )
+    masks = _list_files(folders, (dataset.MASK,), *told)
+    return [path.with_name(path.name.removesuffix(dataset.MASK)) for path in masks]
 
 
 def list_pictures(folders: str | Sequence[str]) -> list[Path]:
@@ -198,20 +198,26 @@ def list_pictures(folders: str | Sequence[str]) -> list[Path]:
     Raises:
         FrameError: a folder holds none.
     """
+    told = (
+        f"training.negatives: no picture ({', '.join(PICTURES)})",
+        "expected photographs without a block",
+    )
+    return _list_files(folders, PICTURES, *told)
+
+
+def _list_files(
+    folders: str | Sequence[str], endings: tuple[str, ...], missing: str, remedy: str
+) -> list[Path]:
     found: list[Path] = []
     for folder in (folders,) if isinstance(folders, str) else folders:
-        here = [path for path in sorted(Path(folder).rglob("*")) if _is_picture(path)]
+        here = []
+        for path in sorted(Path(folder).rglob("*")):
+            if path.name.lower().endswith(endings) and path.name[0] != ".":
+                here.append(path)
         if not here:
-            raise FrameError(
-                f"training.negatives: no picture ({', '.join(PICTURES)}) in '{folder}' (seen from "
-                f"{Path.cwd()}); expected photographs without a block"
-            )
+            raise FrameError(f"{missing} in '{folder}' (seen from {Path.cwd()}); {remedy}")
         found += here
     return found
-
-
-def _is_picture(path: Path) -> bool:
-    return path.suffix.lower() in PICTURES and not path.name.startswith(".")
 
 
 def read_views(
@@ -236,10 +242,9 @@ def read_views(
     """
     width, height = (round(ROOM * side) for side in size_px)
     layers = np.empty((len(stems), len(LOOKS), 5, height, width), np.uint8)
-    read = _read_negative if negatives else _read_frame
 
     def fill(number: int) -> str:
-        picture, known, condition = read(stems[number])
+        picture, known, condition = _read_frame(stems[number], negatives)
         generator = np.random.default_rng((seed, number))
         for look, window in enumerate(_choose_windows(known, (width, height), margin, generator)):
             layers[number, look, :3] = window.take(picture, (width, height)).transpose(2, 0, 1)
@@ -259,40 +264,23 @@ def read_views(
     )
 
 
-def _read_frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return picture `(H, W, 3)`, shares `(H, W, 2)` and condition of one frame."""
-    path = Path(f"{stem}{dataset.COLOR}")
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
-    if picture is None:
-        raise FrameError(
-            f"{path}: {'no picture' if path.is_file() else 'there is no such file'}, but a mask lies beside it"
-        )
-    label = dataset.read_label(stem)
+def _read_frame(path: Path, is_negative: bool) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return picture `(H, W, 3)`, shares `(H, W, 2)` and condition of one frame, or of one picture.
+
+    A negative is a picture without a block, and needs no mask.
+    """
+    color = path if is_negative else Path(f"{path}{dataset.COLOR}")
+    picture = convert_color(read_picture(color), str(color))
+    if is_negative:
+        return picture, np.zeros((*picture.shape[:2], 2), np.uint8), "negative"
+    label = dataset.read_label(path)
     if label.block.shape != picture.shape[:2]:
         raise FrameError(
-            f"{path}: {picture.shape[1::-1]} px, its mask {label.block.shape[::-1]} px"
+            f"{color}: {picture.shape[1::-1]} px, its mask {label.block.shape[::-1]} px"
         )
-    condition = dataset.read_truth(stem).scene if dataset.is_whole(stem) else "unknown"
+    condition = dataset.read_truth(path).scene if dataset.is_whole(path) else "unknown"
     known = np.stack([label.block, label.hole_mask], axis=-1).astype(np.uint8) * np.uint8(255)
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), known, condition
-
-
-def _read_negative(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return a picture without a block as `_read_frame` does."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise FrameError(f"{path}: no picture that OpenCV can read")
-    known = np.zeros((*picture.shape[:2], 2), np.uint8)
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), known, "negative"
-
-
-def join_views(one: TrainingViews, other: TrainingViews) -> TrainingViews:
-    """Return the frames of both."""
-    return TrainingViews(
-        torch.cat([one.layers, other.layers]),
-        (*one.conditions, *other.conditions),
-        (*one.names, *other.names),
-    )
+    return picture, known, condition
 
 
 def _choose_windows(

@@ -210,7 +210,7 @@ class _Training:
                     some, settings.size_px, settings.margin, seed, negatives=True
                 )
             )
-        self._train = training_data.join_views(self._train, views[0])
+        self._train = self._train.join(views[0])
         return evaluation.crop_segmenter_views(views[1], settings.size_px)[0]
 
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 import yaml
 from composed import option
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from brokk_rl import record
@@ -29,32 +27,6 @@ from perception.sources.folder import FrameFolder
 
 EXACT = np.diag([0.0005, 0.0005, 0.001, 0.001, 0.001, 0.0005]) ** 2
 """How a board of 0.8 m is seen at 2 m: its corners to 0.1 px."""
-
-
-def draw_exact_poses(
-    seed: int, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns camera, board and poses of link and board that fit exactly: `A Y = X B`."""
-    chance = np.random.default_rng(seed)
-    x, y = (
-        transforms.make_transform(Rotation.random(rng=chance).as_matrix(), chance.normal(0, 1, 3))
-        for _ in range(2)
-    )
-    a = transforms.make_transform(
-        Rotation.random(count, rng=chance).as_matrix(), chance.normal(0, 1, (count, 3))
-    )
-    return x, y, a, transforms.invert(x) @ a @ y
-
-
-@settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 10_000), count=st.integers(4, 12))
-def test_both_closed_forms_are_exact_without_noise(seed: int, count: int) -> None:
-    x, y, a, b = draw_exact_poses(seed, count)
-    starts = list(hand_eye.generate_starts(a, b))
-    assert len(starts) == 2
-    for camera, link in starts:
-        np.testing.assert_allclose(camera, x, atol=1e-6)
-        np.testing.assert_allclose(link, y, atol=1e-6)
 
 
 def off(found: np.ndarray) -> tuple[float, float]:
@@ -100,33 +72,6 @@ def test_a_poor_arm_and_wrong_sights_leave_millimetres(
     assert not theirs or mm < (0.2 if wrong else 1.0) * np.median(theirs, axis=0)[0]
     # Six degrees of freedom: 6, and 1.4 is the standard deviation of a mean of six.
     assert 2.0 < np.mean(surprise) < 12.0
-
-
-@settings(deadline=None, max_examples=5)
-@given(
-    seed=st.integers(0, 10_000),
-    count=st.integers(4, 30),
-    wrong=st.floats(0.0, 1.0),
-    size=st.floats(0.0, 0.3),
-)
-def test_whatever_was_recorded_the_answer_is_a_place(
-    seed: int, count: int, wrong: float, size: float
-) -> None:
-    machine = option("machine", "brokk170")
-    chance = np.random.default_rng(seed)
-    poses = board.posed(machine, count, seed, 0.0087, 0.0017, 0.001)
-    # The arm hardly moves, or so it says.
-    poses = replace(poses, q=board.MIDDLE + size * (poses.q - board.MIDDLE))
-    views, _ = board.views(machine, poses, EXACT * 10 ** chance.uniform(-2, 2), seed, wrong)
-    found = hand_eye.solve_hand_eye(views)
-    assert found is not None
-    place = found.guess.base_from_camera
-    assert np.isfinite(place).all() and np.isfinite(found.cov).all()
-    spread = np.linalg.eigvalsh(found.cov)
-    # An arm that does not move leaves 1e12 square metres open: rounding.
-    assert spread[0] > -1e-12 * max(1.0, spread[-1])
-    np.testing.assert_allclose(place[:3, :3] @ place[:3, :3].T, np.eye(3), atol=1e-9)
-    assert found.used.sum() >= min(hand_eye.MIN_VIEWS, count)
 
 
 def test_of_two_poses_that_fit_the_corners_the_arm_chooses(machine: Machine) -> None:
@@ -362,13 +307,6 @@ def test_a_joint_with_a_wrong_scale_or_sign_is_named(
     else:
         told_factor = float(words.split("multiplied by ")[1].split(":")[0])
         assert told_factor == pytest.approx(1 / factor, abs=0.015)
-
-
-def test_joint_positions_of_other_frames_have_no_explanation(machine: Machine) -> None:
-    poses = board.posed(machine, 30, 0, 0.0044, 0.0017, 0.001)
-    told = judged(machine, poses, np.random.default_rng(0).permutation(poses.q), 0)
-    assert told.status == "not to be trusted" and told.reasons[-1] == "no joint explains it"
-    assert any("times as inaccurate" in reason for reason in told.reasons)
 
 
 def test_a_fit_is_judged_by_what_it_leaves_out_and_what_it_lacks() -> None:

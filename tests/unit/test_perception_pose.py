@@ -11,7 +11,7 @@ from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 
 from brokk_rl.contracts.vision import HolePose, Masks, Rejection
 from perception.ellipse import conic
-from perception.pose import alignment, appearance, consistency, plane, rim
+from perception.pose import alignment, appearance, consistency, plane
 from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
 from perception.pose.wall_light import IN_DUST
@@ -263,27 +263,6 @@ def test_what_stands_before_a_face_may_be_darker_than_dust(estimator) -> None:
     depth_m[below:] *= 0.5  # an arm, halfway: there is half of the dust before it
     pose = estimator.estimate(replace(frame, color=dusty, depth_m=depth_m), masks, ellipse)
     assert isinstance(pose, HolePose)
-
-
-@pytest.mark.parametrize("seen_rad", [np.pi, 2 * np.pi / 3])
-def test_a_rim_knows_its_centre_by_what_is_seen_of_it(seen_rad: float) -> None:
-    angles = np.linspace(-np.pi, np.pi, 72, endpoint=False)
-    edges = np.full((72, rim.PEAKS, 2), np.nan)
-    on = np.abs(angles) <= seen_rad
-    edges[on, 0] = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    fit = rim._fit_circle(np.array([0.0, 0.0, 0.05]), edges, np.full(72, 0.002), 0.03)
-    assert fit is not None
-    assert fit.rms_px == pytest.approx(0.0, abs=1e-6)
-    assert fit.coverage == pytest.approx(on.mean())
-    cov = fit.cov_m2
-    if on.all():
-        # a pixel is 2 mm long: 0.03 px are 60 um, in every direction; no other wave than the first
-        # moves the centre of a whole rim
-        assert cov == pytest.approx(np.eye(2) * (0.03 * 0.002) ** 2, abs=1e-12)
-    else:
-        # towards the part that is hidden, radius and centre are told apart by what bends: much
-        # worse than across it
-        assert cov[0, 0] > 2.5 * cov[1, 1] > 2.0 * (0.03 * 0.002) ** 2
 
 
 def test_the_mouth_channel_is_believed(estimator) -> None:

@@ -10,27 +10,22 @@ import numpy as np
 import pytest
 import torch
 from composed import option
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from brokk_rl.errors import CheckpointError, ConfigError, FrameError
+from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
-from perception import dataset
-from perception.dataset import FrameLabel
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_sampler import compose_scene
 from perception.segment import network as segment_network
 from perception.segment.network import NetworkSegmenter
 from perception.segment.unet import UNet, read_checkpoint
-from perception.segment.window import Window
 from perception.train import export
 
 SIZE_PX = (640, 360)
 
 
-@pytest.mark.parametrize("distance_m", [1.3, 2.0, 3.0, 4.0])
-@pytest.mark.parametrize("around_rad", [0.2, 0.7, 1.2])
+@pytest.mark.parametrize("distance_m", [1.3, 4.0])
+@pytest.mark.parametrize("around_rad", [0.2, 1.2])
 def test_planes_before_their_surroundings_are_the_block(
     distance_m: float, around_rad: float
 ) -> None:
@@ -71,29 +66,6 @@ def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
     assert view.occluder.sum() > 1000
     assert (found & view.occluder).mean() < 0.1 * view.occluder.mean()
     assert (found & view.mouth).sum() > 0.9 * view.mouth.sum()
-
-
-@settings(deadline=None, max_examples=60)
-@given(st.integers(-80, 200), st.integers(-60, 150), st.integers(40, 400), st.data())
-def test_a_window_brings_back_what_it_took(
-    left: int, top: int, width: int, data: st.DataObject
-) -> None:
-    size_px = (80, 48)
-    window = Window(left, top, width, round(width * 48 / 80))
-    picture = np.zeros((120, 160), np.float32)
-    middle = (data.draw(st.integers(10, 149)), data.draw(st.integers(10, 109)))
-    columns, rows = np.meshgrid(np.arange(160), np.arange(120))
-    picture[:] = np.exp(-((columns - middle[0]) ** 2 + (rows - middle[1]) ** 2) / (2 * 12.0**2))
-    back = np.full_like(picture, -1.0)
-    window.put(window.take(picture, size_px), back)
-    covered = back >= 0
-    inside = (
-        (columns >= left) & (columns < left + width) & (rows >= top) & (rows < top + window.height)
-    )
-    assert (covered & ~inside).sum() == 0
-    if covered.sum() > 400:
-        # a pixel of the window may be several of the picture
-        assert np.abs(back - picture)[covered].max() < 0.05 + 0.06 * width / 80
 
 
 def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
@@ -152,23 +124,6 @@ def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_
     assert not empty.block.any() and empty.hole_mask is not None and not empty.hole_mask.any()
 
 
-def test_the_truth_is_what_lies_beside_the_frame(tmp_path: Path) -> None:
-    view = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90))
-    stem = tmp_path / "0001"
-    dataset.write_frame(
-        stem, view.frame.color, None, label=FrameLabel(view.block, view.mouth, view.occluder)
-    )
-    truth = option("perception/segmenter", "truth").build()
-    masks = truth.segment(replace(view.frame, name=str(stem)))
-    np.testing.assert_array_equal(masks.block > 0.5, view.block)
-    assert masks.hole_mask is not None
-    np.testing.assert_array_equal(masks.hole_mask > 0.5, view.mouth)
-    with pytest.raises(FrameError, match="live source"):
-        truth.segment(view.frame)
-    with pytest.raises(FrameError, match="no mask"):
-        truth.segment(replace(view.frame, name=str(tmp_path / "0002")))
-
-
 def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = UNet((4, 8, 8)).eval().requires_grad_(False)
@@ -176,23 +131,6 @@ def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path:
     export.write_checkpoint(tmp_path / "a.safetensors", network, header)
     parity = export.write_onnx(tmp_path / "a.onnx", network, header, torch.rand(3, 3, 32, 64))
     assert parity < 1e-5
-
-
-def test_a_network_that_ships_is_loaded_by_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    torch.manual_seed(0)
-    network = UNet((4, 8)).eval().requires_grad_(False)
-    header = export.build_header(network, (64, 32), {})
-    monkeypatch.setattr(segment_network, "SHIPPED", tmp_path)
-    with pytest.raises(CheckpointError, match=r"in the package \(none\)"):
-        option("perception/segmenter", "onnx").build()
-    export.write_checkpoint(tmp_path / export.TENSORS, network, header)
-    export.write_onnx(tmp_path / export.ONNX, network, header, torch.rand(1, 3, 32, 64))
-    export.write_onnx(tmp_path / "gate.onnx", network, header, torch.rand(1, 3, 32, 64))
-    frame = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90)).frame
-    masks = option("perception/segmenter", "onnx").build().segment(frame)
-    assert masks.block.shape == frame.color.shape[:2]
 
 
 def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -> None:

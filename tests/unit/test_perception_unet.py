@@ -14,7 +14,7 @@ import torch
 
 from perception import dataset
 from perception.dataset import FrameLabel
-from perception.train import evaluation, samples, trainer
+from perception.train import evaluation, trainer
 
 SMALL = (
     "training.size_px=[64,40]", "training.widths=[6,12,16]", "training.batch=6", "training.rate=0.01",
@@ -137,16 +137,3 @@ def test_folders_without_masks_are_refused(brokk: Callable[..., Any], tmp_path: 
         "mode=train_perception", "training.frames=x", "training.size_px=[100,48]", "session.out=run"
     )
     assert done.code == 2 and "multiples of 32" in done.err
-
-
-@pytest.mark.parametrize(
-    ("side_px", "width_px"), [(200, 1.5 * 1.3 * 200 * 480 / 288), (40, 480 / 1.5)]
-)
-def test_a_small_block_is_not_enlarged_beyond_what_its_frame_shows(
-    side_px: int, width_px: float
-) -> None:
-    known = np.zeros((270, 480, 2), np.uint8)
-    known[50 : 50 + side_px, 60 : 60 + side_px, 0] = 255
-    _, closer = samples._choose_windows(known, (480, 288), 0.15, np.random.default_rng(0))
-    assert closer.width == pytest.approx(width_px, abs=2)
-    assert closer.left + closer.width / 2 == pytest.approx(60 + side_px / 2, abs=2)
