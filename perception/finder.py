@@ -102,12 +102,6 @@ EXPLANATIONS = {
         "it lies within a larger rim",
         "The far rim or the floor of a hole.",
     ),
-    "known depth at the centre": (
-        "the depth at its centre is unknown",
-        "Depth is missing inside most holes; perception=plane_conic needs none there.",
-    ),
-    "local normals around the rim": ("there is too little depth around it for normals", ""),
-    "angle between local normals, rad": ("the normals around it do not agree", ""),
 }
 """Explanation and remedy for each `Rejection.reason`."""
 

@@ -1,6 +1,6 @@
 """The table of perception: rendered scenes of each condition and distance, any options of perception side by side.
 
-    python benchmarks/perception/table.py <out> --count 200 --processes 64 plane_conic paper
+    python benchmarks/perception/table.py <out> --count 200 --processes 64 plane_conic
     'plane_conic perception/segmenter=onnx'
 
 Each scene is rendered, looked at and forgotten; what came of it is a line of `<out>/frames.jsonl`.

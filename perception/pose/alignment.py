@@ -105,14 +105,6 @@ class StereoPatch:
         )
         return column, row
 
-    def column(self, u: float) -> float:
-        """Return the column of `left` for a column of the picture."""
-        return (u - self.corner[0] + 0.5) / self.shrink - 0.5
-
-    def row(self, v: float) -> float:
-        """Return the row of `left` for a row of the picture."""
-        return (v - self.corner[1] + 0.5) / self.shrink - 0.5
-
     def inside(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
         """Find points of a plane that the right picture shows too, with room for its gradient."""
         x = self.on_plane(u, v, m)
@@ -383,7 +375,7 @@ def measure_parallax(
     across, down = (
         (max(0, int(middle - reach)), min(size, int(middle + reach) + 2))
         for middle, size in zip(
-            (both.column(ellipse[0]), both.row(ellipse[1])), both.left.shape[::-1], strict=True
+            both.locate(ellipse[0], ellipse[1]), both.left.shape[::-1], strict=True
         )
     )
     # The same part serves for both pictures, since their rows correspond.

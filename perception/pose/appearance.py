@@ -59,9 +59,9 @@ def measure_interior(
     depth_m: np.ndarray,
     ellipse: np.ndarray,
     camera_matrix: np.ndarray,
-    plane: FacePlane | None,
+    plane: FacePlane,
 ) -> Interior:
-    """Return the appearance inside an ellipse `(5,)`; slope and depth need the plane of the face."""
+    """Return the appearance inside an ellipse `(5,)` on a face."""
     x, y, a = ellipse[:3]
     reach = a * RING[1] + 2
     top, left = max(0, int(y - reach)), max(0, int(x - reach))
@@ -80,36 +80,32 @@ def measure_interior(
     inside &= smooth < face
     depth = depth_m[top:bottom, left:right]
     known = np.isfinite(depth)
-    nearer = 0.0
-    if plane is not None:
-        behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(
-            known, depth, np.inf
-        )
-        # An occluder hides a part of the inside.
-        before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)
-        nearer = float(np.mean(before[inside]))
-        inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
+    behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(
+        known, depth, np.inf
+    )
+    # An occluder hides a part of the inside.
+    before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)
+    nearer = float(np.mean(before[inside]))
+    inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
     if inside.sum() < 8:
         return Interior(np.nan, np.nan, np.nan, np.nan, nearer, np.nan, np.nan)
     values = smooth[inside]
     darkness = float(np.percentile(values, 25.0)) / face
     unknown = float(np.mean(~known[inside]))
-    slope = deeper = np.nan
-    if plane is not None:
-        middle = np.linalg.solve(camera_matrix, np.array([x, y, 1.0]))
-        clearly = max(4 * plane.sigma, CLEARLY_M * float(plane.m @ middle) ** 2)
-        deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
-        into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
-        away = _list_pixels(inside, left, top) - (x, y)
-        along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        # Uneven light changes hole and face by the same factor: take the face's change off.
-        level = np.log(part[ring] + 1.0)
-        drift = _fit_brightness_gradient(level, _list_pixels(ring, left, top) - (x, y))
-        values = np.log(values + 1.0) - away @ drift
-        contrast = float(np.log((face + 1.0) / (face * darkness + 1.0)))
-        apart = along - along.mean()
-        slope = float(apart @ values / max(float(apart @ apart), 1e-9))
-        slope /= max(contrast, FAINTEST)
+    middle = np.linalg.solve(camera_matrix, np.array([x, y, 1.0]))
+    clearly = max(4 * plane.sigma, CLEARLY_M * float(plane.m @ middle) ** 2)
+    deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
+    into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
+    away = _list_pixels(inside, left, top) - (x, y)
+    along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
+    # Uneven light changes hole and face by the same factor: take the face's change off.
+    level = np.log(part[ring] + 1.0)
+    drift = _fit_brightness_gradient(level, _list_pixels(ring, left, top) - (x, y))
+    values = np.log(values + 1.0) - away @ drift
+    contrast = float(np.log((face + 1.0) / (face * darkness + 1.0)))
+    apart = along - along.mean()
+    slope = float(apart @ values / max(float(apart @ apart), 1e-9))
+    slope /= max(contrast, FAINTEST)
     around = _measure_darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(
         darkness,
@@ -146,7 +142,7 @@ def _measure_darkest_around(
     depth_m: np.ndarray,
     ellipse: np.ndarray,
     camera_matrix: np.ndarray,
-    plane: FacePlane | None,
+    plane: FacePlane,
 ) -> float:
     """Return the grey level of the darkest hundredth of face and background around an ellipse.
 
@@ -157,11 +153,10 @@ def _measure_darkest_around(
     rows = np.arange(max(0, int(y - wide)), min(len(gray), int(y + wide)), step)
     columns = np.arange(max(0, int(x - wide)), min(len(gray[0]), int(x + wide)), step)
     near = gray[np.ix_(rows, columns)]
-    if plane is not None:
-        here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])
-        # False where depth is unknown.
-        behind = here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
-        near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
+    here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])
+    # False where depth is unknown.
+    behind = here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
+    near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
     return float(np.percentile(near, 1.0)) if near.size else 0.0
 
 

@@ -280,13 +280,6 @@ def test_without_depth_there_is_no_pose(estimator) -> None:
     assert isinstance(refused, Rejection) and refused.reason.startswith("pixels of the face")
 
 
-def test_the_papers_estimate_looks_into_the_hole() -> None:
-    pose = option("perception/pose", "centre_depth").build().estimate(*drawn())
-    assert isinstance(pose, HolePose)
-    assert 0.02 < np.linalg.norm(pose.center_m - CENTER) < 0.4
-    assert pose.axis == pytest.approx(AXIS, abs=0.05)
-
-
 @pytest.mark.parametrize(
     "rings", [(3.0,), (2.0, 3.0)]
 )  # found with a reach of 4.7 standard deviations; grown with one of 3
