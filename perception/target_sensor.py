@@ -94,7 +94,8 @@ class WatchedHole:
         num_missed: Last pictures from this position in which nothing was found.
         choice: The last choice of a view, `None` before the first.
         hole: The tracked hole, `None` before the first detection.
-        history: What happened at each frame, JSON data.
+        history: Of each frame, whether it showed a hole, and the error of the tracked one, m;
+            `None` before the first.
     """
 
     def __init__(
@@ -116,7 +117,7 @@ class WatchedHole:
         self.num_missed = 0
         self.choice: ViewChoice | None = None
         self.hole: TrackedHole | None = None
-        self.history: list[dict[str, Any]] = []
+        self.history: list[tuple[bool, float | None]] = []
 
     @property
     def center_m(self) -> np.ndarray:
@@ -180,20 +181,10 @@ class WatchedHole:
                     near.append(hole)
             # The person's choice: of several holes the surest that was seen most often.
             self.hole = max(near, key=lambda hole: hole.num_frames, default=self.hole)
-            self.history.append(self._describe(holes or (), t_s))
-
-    def _describe(self, holes: Sequence[HolePose], t_s: float) -> dict[str, Any]:
-        known = self.hole
-        error_m = None if known is None else known.pose.center_m - self.true_m
-        reason = None if self.choice is None else self.choice.view.explain()
-        return {
-            "reason": reason,
-            "t_s": round(t_s, 3),
-            "seen": len(holes) > 0,
-            "view": self._mount.describe(self.position),
-            "error_m": None if error_m is None else error_m.round(6).tolist(),
-            "std_m": None if known is None else round(known.std_m, 6),
-        }
+            error_m = None
+            if self.hole is not None:
+                error_m = float(np.linalg.norm(self.hole.pose.center_m - self.true_m))
+            self.history.append((bool(holes), error_m))
 
 
 class PerceivedTargets:
@@ -257,14 +248,16 @@ class PerceivedTargets:
 
     def summarize(self) -> dict[str, Any]:
         """Return figures of the episodes; see `TargetSensor.summarize`."""
-        frames = [frame for one in self.ended for frame in one.history]
-        known = [frame for frame in frames if frame["error_m"] is not None]
-        last = [one.history[-1] for one in self.ended if one.history and one.hole is not None]
-        errors_m = [float(np.linalg.norm(frame["error_m"])) for frame in last]
+        seen, errors_m, num_known = [], [], 0
+        for one in self.ended:
+            seen += [is_seen for is_seen, _ in one.history]
+            num_known += sum(error_m is not None for _, error_m in one.history)
+            if one.history and one.history[-1][1] is not None:
+                errors_m.append(one.history[-1][1])
         return {
-            "frames": len(frames),
-            "seen_share": float(np.mean([frame["seen"] for frame in frames])) if frames else None,
-            "known_share": len(known) / len(frames) if frames else None,
+            "frames": len(seen),
+            "seen_share": float(np.mean(seen)) if seen else None,
+            "known_share": num_known / len(seen) if seen else None,
             "never_seen": sum(one.hole is None for one in self.ended),
             "last_error_m": {
                 "median": float(np.median(errors_m)) if errors_m else None,

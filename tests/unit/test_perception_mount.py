@@ -173,7 +173,7 @@ def test_what_a_picture_shows_is_known_after_the_delay_and_near_the_pointed_plac
     assert eye.hole is None
     eye.learn(1.35)
     np.testing.assert_allclose(eye.center_m, HOLE_M)
-    assert [frame["seen"] for frame in eye.history] == [True, True]
+    assert [is_seen for is_seen, _ in eye.history] == [True, True]
 
 
 def test_a_picture_that_was_not_taken_is_no_miss(machine: Machine) -> None:
