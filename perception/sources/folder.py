@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -101,21 +102,17 @@ def read_camera(path: Path) -> CameraModel:
             f"{path}: expected a mapping with K, size_px, dist, baseline_m; K is missing"
         )
     where = str(path)
-    optional: dict[str, Any] = {}
-    for name in ("baseline_m", "T_base_cam", "disparity_std_px", "gamma"):
-        if told.get(name) is not None:
-            optional[name] = told[name]
+
+    def check(name: str, judge: Callable[[Any, str], Any], usual: Any = None) -> Any:
+        return usual if told.get(name) is None else judge(told[name], where)
+
     return CameraModel(
         validation.check_matrix(told["K"], where),
         validation.check_distortion(told.get("dist"), where),
-        validation.check_baseline(optional["baseline_m"], where)
-        if "baseline_m" in optional
-        else None,
-        validation.check_pose(optional["T_base_cam"], where) if "T_base_cam" in optional else None,
-        disparity_std_px=validation.check_disparity_std(optional["disparity_std_px"], where)
-        if "disparity_std_px" in optional
-        else None,
-        gamma=validation.check_gamma(optional.get("gamma", validation.USUAL_GAMMA), where),
+        check("baseline_m", validation.check_baseline),
+        check("T_base_cam", validation.check_pose),
+        disparity_std_px=check("disparity_std_px", validation.check_disparity_std),
+        gamma=check("gamma", validation.check_gamma, validation.USUAL_GAMMA),
         size_px=validation.parse_size(told.get("size_px"), where),
     )
 
