@@ -1,8 +1,9 @@
 """Conductor of a sitting: takes the messages of the page, watches the machine, and writes the files.
 
-Each finished step is written into the study's folder (`study.study_folder`) before the next
-one begins. So an interruption at any time costs at most the running trial, which is kept as aborted
-and repeated.
+A sitting is the participant's rows of the plan: consent, practice, the trials of the first period,
+its questionnaire, the trials of the second, its questionnaire. The next step is the first one that
+is not in the study's folder. Each finished step is written there before the next one begins. So an
+interruption at any time costs at most the running trial, which is kept as aborted and repeated.
 """
 
 from __future__ import annotations
@@ -10,21 +11,24 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from study import study_folder as folders
-from study.steps import Step, find_next_step, list_progress
+from study.design import PERIODS, Trial
 from study.study_folder import StudyData
 from study.tlx import Form
-from study.trial import Attempt, Times, keep_recording
-from study.twin_control import Stage
+from study.trial import Attempt, LoopStage, Times
 
 log = logging.getLogger(__name__)
+
+
+ENOUGH = 2
+"""Practice trials in a row that have to succeed for practice to be over."""
 
 
 @spec
@@ -44,6 +48,73 @@ class Consent:
             raise ConfigError(f"text: expected en and de, got no {' and '.join(sorted(missing))}")
 
 
+@dataclass(frozen=True)
+class Step:
+    """Next step of a sitting.
+
+    Attributes:
+        kind: Consent, a trial, a questionnaire, nothing more, or nothing because the participant
+            has stopped.
+        trial: The trial, where it is one.
+        period: Of the trial or questionnaire; 0 for practice.
+        condition: Of the trial, or of the period that the questionnaire is about.
+        done: Trials done in the period.
+        of: Trials in the period.
+    """
+
+    kind: Literal["consent", "trial", "questionnaire", "done", "stopped"]
+    trial: Trial | None = None
+    period: int = 0
+    condition: str = ""
+    done: int = 0
+    of: int = 0
+
+
+def find_next_step(data: StudyData, who: str) -> Step:
+    """Return the next step of a participant who is known to the plan."""
+    known = data.participants.get(who, {})
+    if known.get("stopped"):
+        return Step("stopped")
+    if not known.get("consent", {}).get("agreed"):
+        return Step("consent")
+    for period in (0, *PERIODS):
+        planned = [one for one in data.planned if (one.participant, one.period) == (who, period)]
+        lacking = [one for one in planned if one.key not in data.trials]
+        if lacking and not (period == 0 and is_practised(data, who)):
+            num_done, first = len(planned) - len(lacking), lacking[0]
+            return Step("trial", first, period, first.condition, num_done, len(planned))
+        # A questionnaire that was typed in from paper says nothing about being finished.
+        begun = data.questionnaires.get((who, period), {"finished": False})
+        if period and not begun.get("finished", True):
+            condition = data.plan["participants"][who][period - 1]
+            return Step("questionnaire", None, period, condition)
+    return Step("done")
+
+
+def is_practised(data: StudyData, who: str) -> bool:
+    """Return whether practice is over before all of it was done: by success, or because the experimenter said so."""
+    practice = [key for key in sorted(data.trials) if key[:2] == (who, 0)]
+    last = [data.trials[key].get("outcome") for key in practice[-ENOUGH:]]
+    ended = bool(data.participants.get(who, {}).get("practice_ended"))
+    return ended or last == ["inserted"] * ENOUGH
+
+
+def list_progress(data: StudyData) -> list[dict[str, Any]]:
+    """Return how far each participant is, for who chooses one."""
+    found = []
+    for who in data.plan["participants"]:
+        counted = [one for one in data.planned if one.participant == who and one.period]
+        done = sum(one.key in data.trials for one in counted)
+        state = "begun" if who in data.participants else "new"
+        kind = find_next_step(data, who).kind
+        if who in data.erased:
+            state = "erased"
+        elif kind in ("done", "stopped"):
+            state = kind
+        found.append({"name": who, "done": done, "of": len(counted), "state": state})
+    return found
+
+
 class Conductor:
     """One sitting after the other, each step chosen from the files of the study's folder.
 
@@ -53,8 +124,7 @@ class Conductor:
         stage: Where trials take place.
         consent: Text of the lab.
         times: Countdown and the like.
-        facts: Further fields of every trial: `simulated`, `twin`.
-        seed: From which the order of pairs comes: of participant and period.
+        facts: Further fields of every trial, such as `twin`.
         clock: Monotonic time, s.
     """
 
@@ -62,21 +132,14 @@ class Conductor:
         self,
         folder: Path,
         machine: Machine,
-        stage: Stage,
+        stage: LoopStage,
         consent: Consent,
         times: Times,
         facts: dict[str, Any],
-        seed: Callable[[str], int],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder, self._machine, self._stage = folder, machine, stage
-        self._consent, self._times, self._facts = consent, times, facts
-        self._seed, self._clock = seed, clock
-        # Trials that an interruption left half saved.
-        for path in sorted((folder / folders.TRIALS).glob("*.json")):
-            with suppress(ValueError):  # a file that cannot be read is said in the report
-                keep_recording(folder, path, machine, stage)
-        # Read after the repair above, so that the repaired trials count.
+        self._consent, self._times, self._facts, self._clock = consent, times, facts, clock
         self._data: StudyData = folders.read_study(folder)
         self._who: str | None = None
         self._step: Step | None = None
@@ -130,8 +193,7 @@ class Conductor:
 
     def view(self) -> dict[str, Any]:
         """Return the view of the pages, as plain data."""
-        simulated = self._facts["simulated"]
-        found = {"who": self._who, "problem": self.problem, "simulated": simulated}
+        found = {"who": self._who, "problem": self.problem}
         step = self._step
         # Nobody is chosen: the list of participants is shown.
         if self._who is None or step is None:
@@ -144,9 +206,9 @@ class Conductor:
         return found if shown is None else {**found, **shown.view()}
 
     def close(self) -> None:
-        """End trial or questionnaire at once."""
+        """End the trial under way at once; it is kept as aborted, and done again."""
         if self._attempt is not None:
-            self._attempt.leave()
+            self._attempt.abort("the program ended")
 
     def _take(self, do: str, said: dict[str, Any]) -> str:
         step, attempt, form = self._step, self._attempt, self._form
@@ -209,11 +271,7 @@ class Conductor:
                 self._data, step.trial, self._machine, self._stage, self._times, self._facts, self._clock
             )  # fmt: skip
         elif step.kind == "questionnaire":
-            # Seeded by participant and period, so that a resumed questionnaire asks the same
-            # pairs.
-            seed = self._seed(f"pairs {self._who} {step.period}")
-            simulated = {"simulated": self._facts["simulated"]}
-            self._form = Form(self._folder, self._who, step.period, seed, simulated)
+            self._form = Form(self._folder, self._who, step.period)
 
     def _close_attempt(self) -> None:
         if self._attempt is not None:
@@ -240,6 +298,5 @@ class Conductor:
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
-        simulated = {"simulated": self._facts["simulated"]}
-        folders.write_participant(self._folder, self._who, facts | simulated)
+        folders.write_participant(self._folder, self._who, facts)
         self._go_on()

@@ -84,17 +84,12 @@ class Design:
 
     def check_machine(self, machine: Machine) -> None:
         """Raise a `ConfigError` that names the start which the machine cannot take."""
+        lower, upper = machine.lower, machine.upper
         for name, q in self.starts.items():
-            if len(q) != machine.num_joints:
+            if len(q) != len(lower) or (q < lower).any() or (q > upper).any():
                 raise ConfigError(
-                    f"study.design.starts.{name}: expected {machine.num_joints} positions, got {len(q)}"
+                    f"study.design.starts.{name}: expected {len(lower)} positions from {lower} to {upper}, got {q}"
                 )
-            for joint, value in zip(machine.joints, q, strict=True):
-                if not joint.lower.value <= value <= joint.upper.value:
-                    raise ConfigError(
-                        f"study.design.starts.{name}: {joint.name} = {value} lies outside "
-                        f"[{joint.lower.value}, {joint.upper.value}]"
-                    )
 
 
 @dataclass(frozen=True)
@@ -116,6 +111,11 @@ class Trial:
     number: int
     hole: str
     start: str
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """Participant, period and number, which no other trial has."""
+        return self.participant, self.period, self.number
 
     @property
     def name(self) -> str:

@@ -10,7 +10,7 @@ draws of the sequences as `study.design` makes them: one coin for each pair of p
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,38 +76,38 @@ def estimate_effect(means: pd.DataFrame, measure: str) -> GuidanceEffect:
     guided, unguided = known[known.condition == "guided"], known[known.condition == "unguided"]
     guided_first = (guided.period == 1).to_numpy()
     num, num_first = len(guided), int(guided_first.sum())
-    effect = GuidanceEffect(num, num_first)
-    if num:
-        effect = replace(
-            effect, guided=float(guided[measure].mean()), unguided=float(unguided[measure].mean())
-        )
     if num < 2:
-        return effect
+        return GuidanceEffect(num, num_first)
     terms = pd.get_dummies(known.participant, dtype=float)
     terms["guided"] = (known.condition == "guided").astype(float)
     has_both_orders = min(num_first, num - num_first) >= 2
     if has_both_orders:
         terms["second"] = (known.period == 2).astype(float)
     fit = OLS(known[measure].astype(float), terms).fit()
-    difference = float(fit.params["guided"])
-    low, high = fit.conf_int(1 - CONFIDENCE).loc["guided"]
-    effect = replace(effect, difference=difference, ci95=(float(low), float(high)))
     # A person's difference has twice the variance of one figure.
-    std = math.sqrt(2 * fit.scale)
+    std, difference = math.sqrt(2 * fit.scale), float(fit.params["guided"])
     # Equal differences have no scale: dz would be a division by rounding errors.
     has_scale = std > 10.0**-ROUNDING_DIGITS * abs(difference)
-    if has_scale:
-        effect = replace(effect, dz=difference / std)
-    if has_both_orders:
-        by_period = guided[measure].to_numpy() - unguided[measure].to_numpy()
-        by_period = np.where(guided_first, by_period, -by_period)
-        effect = replace(
-            effect,
-            period=float(fit.params["second"]),
-            period_p=float(fit.pvalues["second"]) if has_scale else None,
-            p=compute_sequence_p(by_period, guided_first, guided.pair.to_numpy()),
-        )
-    return effect
+    low, high = fit.conf_int(1 - CONFIDENCE).loc["guided"]
+    effect = GuidanceEffect(
+        num,
+        num_first,
+        guided=float(guided[measure].mean()),
+        unguided=float(unguided[measure].mean()),
+        difference=difference,
+        ci95=(float(low), float(high)),
+        dz=difference / std if has_scale else None,
+    )
+    if not has_both_orders:
+        return effect
+    by_period = guided[measure].to_numpy() - unguided[measure].to_numpy()
+    by_period = np.where(guided_first, by_period, -by_period)
+    return replace(
+        effect,
+        p=compute_sequence_p(by_period, guided_first, guided.pair.to_numpy()),
+        period=float(fit.params["second"]),
+        period_p=float(fit.pvalues["second"]) if has_scale else None,
+    )
 
 
 def compute_sequence_p(by_period: np.ndarray, guided_first: np.ndarray, pairs: np.ndarray) -> float:
@@ -141,21 +141,26 @@ def find_smallest_size(alpha: float) -> int:
 
 def estimate_power(num_persons: int, dz: float, alpha: float) -> float:
     """Return the share of studies of `num_persons` that find an effect of `dz`."""
+    num_pairs = (num_persons + 1) // 2
+    if get_smallest_p(num_pairs) > alpha:
+        return 0.0
     # Seeded by the size: a table is the same each time.
-    chance = np.random.default_rng(num_persons).standard_normal(
-        (NUM_STUDIES, (num_persons + 1) // 2, 2)
-    )
+    chance = np.random.default_rng(num_persons).standard_normal((NUM_STUDIES, num_pairs, 2))
     if num_persons % 2:
         chance[:, -1, 1] = np.nan
     p = _permute_sequences(chance[..., 0] + dz, chance[..., 1] - dz, NUM_DRAWS)
     return float((p <= alpha).mean())
 
 
-def adjust_by_holm(p: Sequence[float]) -> list[float]:
-    """Return p-values after Holm's correction (Scand. J. Statist. 6 (1979) 65-70)."""
+def adjust_by_holm(
+    effects: Mapping[str, GuidanceEffect], family: Iterable[str]
+) -> dict[str, float]:
+    """Return p of a family after Holm's correction (Scand. J. Statist. 6 (1979) 65-70), where there is one."""
     from statsmodels.stats.multitest import multipletests
 
-    return multipletests(p, method="holm")[1].tolist() if p else []
+    p = {name: effects[name].p for name in family if effects[name].p is not None}
+    adjusted = multipletests(list(p.values()), method="holm")[1].tolist() if p else []
+    return dict(zip(p, adjusted, strict=True))
 
 
 def _permute_sequences(first: np.ndarray, other: np.ndarray, num_draws: int) -> np.ndarray:

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import savgol_filter
 
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
@@ -20,16 +21,14 @@ from study.design import Hole, Success
 PIECE_S = 0.5
 """A path is measured between means over so long: shorter pieces would add up the encoders' noise,
 longer ones cut corners."""
+SLOPE_SAMPLES = 5
+"""Samples, a quarter of a second, over which a line is fitted for a speed: differences of single
+samples are mostly noise."""
 MOVING = 0.05
 """Share of a joint's top speed above which it moves."""
 LEVER_ON, LEVER_OFF = 0.10, 0.05
 """Deflection from which a lever is being moved, and below which it is let go; two, so that tremor
 does not count."""
-MOST_LAG_S = 2.0
-"""Longest lag behind the advice that is looked for."""
-CONTACT_N = 50.0
-"""Force from which the tool touches something; the recordings' own column, not measured on every
-machine."""
 
 
 @dataclass(frozen=True)
@@ -53,21 +52,17 @@ MEASURES = (
     Measure("time_s", "time to insertion", "s", -1),
     Measure("success", "trials inserted", "share", 1),
     Measure("path_m", "path of the tool", "m", -1),
-    Measure("efficiency", "shortest way over path", "share", 1),
     Measure("several_joints", "time with two or more joints moving", "share", 1),
     Measure("lever_movements", "lever movements", "", -1),
     Measure("joint_switches", "changes from one joint to another", "", -1),
-    Measure("exclusive_share", "time with q2 commanded", "share", 0),
     Measure("smoothness", "smoothness of the tool's speed (SPARC)", "", 1),
     Measure("control_effort", "lever travel a second", "1/s", -1),
-    Measure("advice_error", "distance from the advice", "1", -1),
-    Measure("advice_lag_s", "lag behind the advice", "s", -1),
-    Measure("contacts", "contacts", "", -1),
     Measure("peak_force_n", "largest contact force", "N", -1),
+    Measure("advice_error", "distance from the advice", "1", -1),
 )
-GUIDED_ONLY = ("advice_error", "advice_lag_s")
-"""Measures that say something only where advice was shown, and so cannot be compared."""
-COMPARED = tuple(each.name for each in MEASURES if each.name not in GUIDED_ONLY)
+GUIDED_ONLY = "advice_error"
+"""Measure that says something only where advice was shown, and so cannot be compared."""
+COMPARED = tuple(each.name for each in MEASURES if each.name != GUIDED_ONLY)
 
 
 def measure_trial(
@@ -90,48 +85,30 @@ def measure_trial(
     # The sample of the insertion counts; after it the arm is moved away.
     num = last + 1 if inserted and last is not None else int(within.sum())
     period_s = 1.0 / recording.rate_hz
-    q, u, tip, t_s = (
-        recording.q[:num].astype(float),
-        recording.u[:num].astype(float),
-        tip[:num],
-        t_s[:num],
-    )
-    path_m = measure_path_length(tip, period_s)
-    # The goal lies below the rim by the required depth.
-    goal = np.array(hole.center_in_base_m) - [0.0, 0.0, success.depth_m]
+    q, u = recording.q[:num].astype(float), recording.u[:num].astype(float)
     onsets = detect_lever_movements(u)
+    moving = np.abs(differentiate(q, period_s)) > MOVING * machine.max_speed
+    tip_speed = np.linalg.norm(differentiate(tip[:num], period_s), axis=1)
     found = {
-        "time_s": float(t_s[-1]) if inserted else limit_s,
+        "time_s": float(t_s[num - 1]) if inserted else limit_s,
         "success": float(inserted),
-        "path_m": path_m,
-        # The straight way over the path; rounding may take it above 1.
-        "efficiency": min(1.0, float(np.linalg.norm(goal - tip[0])) / path_m)
-        if inserted and path_m
-        else math.nan,
-        "several_joints": float((detect_motion(q, machine, period_s).sum(1) >= 2).mean()),
+        "path_m": measure_path_length(tip[:num], period_s),
+        "several_joints": float((moving.sum(1) >= 2).mean()),
         "lever_movements": float(len(onsets)),
         "joint_switches": float(np.count_nonzero(np.diff(onsets[:, 1]))),
-        "exclusive_share": float((np.abs(u[:, machine.is_exclusive]) > LEVER_OFF).any(1).mean())
-        if machine.exclusive
-        else math.nan,
-        "smoothness": compute_sparc(
-            np.linalg.norm(np.diff(average_windows(tip, 5), axis=0), axis=1), recording.rate_hz
-        ),
+        "smoothness": compute_sparc(tip_speed, recording.rate_hz),
         "control_effort": float(np.abs(np.diff(u, axis=0)).sum() / (period_s * max(1, num - 1))),
-        "advice_error": math.nan,
-        "advice_lag_s": math.nan,
-        "contacts": math.nan,
         "peak_force_n": math.nan,
+        "advice_error": math.nan,
     }
     # Without advice in the recording there is nothing to follow.
     names = [f"advice_{joint}" for joint in recording.joints]
     if all(name in recording.extra for name in names):
-        advice = np.stack([recording.extra[name][:num] for name in names], 1).astype(float)
-        found |= measure_tracking(u, advice, period_s)
+        advice = np.stack([recording.extra[name][:num] for name in names], 1)
+        shown = ~np.isnan(advice).any(1)
+        if shown.any():
+            found["advice_error"] = float(np.sqrt(np.square((u - advice)[shown]).mean()))
     if "force_n" in recording.extra:
-        touching = recording.extra["force_n"][:num] > CONTACT_N
-        # Each rise of the contact is one contact, also one at the start.
-        found["contacts"] = float(np.count_nonzero(np.diff(touching.astype(int), prepend=0) > 0))
         found["peak_force_n"] = float(np.max(recording.extra["force_n"][:num], initial=0.0))
     return found
 
@@ -155,13 +132,11 @@ def measure_path_length(tip_in_base_m: np.ndarray, period_s: float) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def detect_motion(q: np.ndarray, machine: Machine, period_s: float) -> np.ndarray:
-    """Return which joints move, `(T, J)` bool, by the slope over a quarter of a second."""
-    if len(q) < 2:
-        return np.zeros(q.shape, bool)
-    # Five samples around each: differences of single samples are mostly noise.
-    speed = np.gradient(average_windows(q, 5), period_s, axis=0)
-    return np.abs(speed) > MOVING * machine.max_speed
+def differentiate(values: np.ndarray, period_s: float) -> np.ndarray:
+    """Return the slope over `SLOPE_SAMPLES` (Savitzky and Golay 1964), `(T, …)`; 0 in shorter ones."""
+    if len(values) < SLOPE_SAMPLES:
+        return np.zeros_like(values)
+    return savgol_filter(values, SLOPE_SAMPLES, 1, deriv=1, delta=period_s, axis=0)
 
 
 def detect_lever_movements(u: np.ndarray) -> np.ndarray:
@@ -174,36 +149,6 @@ def detect_lever_movements(u: np.ndarray) -> np.ndarray:
     newest = np.maximum.accumulate(rows, axis=0)
     held = np.where(newest >= 0, np.take_along_axis(crossed, np.maximum(newest, 0), 0), 0)
     return np.argwhere(np.diff(held.astype(int), axis=0, prepend=0) > 0)
-
-
-def measure_tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict[str, float]:
-    """Return root mean square distance of commands from the advice, and the lag at which both agree best; `(T, J)` each.
-
-    Advice that is NaN was not shown.
-    """
-    shown = np.asarray(~np.isnan(advice).any(1))
-    if not shown.any():
-        return {"advice_error": math.nan, "advice_lag_s": math.nan}
-    away = np.where(shown[:, None], u - np.nan_to_num(advice), 0.0)
-    error = math.sqrt(float((away**2).sum() / (shown.sum() * u.shape[1])))
-    asked = np.nan_to_num(advice)
-    # No lag longer than the trial.
-    most = min(round(MOST_LAG_S / period_s), len(u) - 1)
-    agreement = [float((u[lag:] * asked[: len(u) - lag]).sum()) for lag in range(most + 1)]
-    # Correlation without normalisation: only the place of its maximum counts.
-    return {
-        "advice_error": error,
-        "advice_lag_s": int(np.argmax(agreement)) * period_s if max(agreement) > 0 else math.nan,
-    }
-
-
-def average_windows(values: np.ndarray, size: int) -> np.ndarray:
-    """Return centred moving means over `size` samples, `(T, …)`, over fewer at the ends."""
-    # Differences of cumulative sums: the time does not depend on the window.
-    total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, 0)))
-    index = np.arange(len(values))
-    low, high = np.maximum(index - size // 2, 0), np.minimum(index + size // 2 + 1, len(values))
-    return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (values.ndim - 1))
 
 
 # Defaults of SPARC (Balasubramanian et al., J. NeuroEng. Rehabil. 12 (2015) 112): cut-off, share

@@ -20,6 +20,11 @@ from study.analysis import TITLES, Analysis
 from study.design import CONDITIONS
 
 LOOK = {"guided": (BLUE, "-"), "unguided": (ORANGE, ":")}
+VIEWS = {
+    "from above": ("x, m", "y, m"),
+    "from the side": ("distance from the slew axis, m", "height, m"),
+}
+"""Labels of the axes of each view of the paths."""
 COLUMNS = 3
 """Panels beside each other."""
 
@@ -27,26 +32,20 @@ COLUMNS = 3
 def draw_paths(found: Analysis) -> Figure:
     """Draw the tool's paths from above and from the side, a column a hole; a star is where a trial begins, a dot the hole."""
     holes = found.data.design.holes
-    drawn = found.trials[found.trials.counts.astype(bool) & found.trials.hole.isin(list(holes))]
+    drawn = found.trials[found.trials.counts]
     figure = make_figure(3.6 * len(holes), 6.8)
     panels = figure.subplots(2, len(holes), squeeze=False)
     for column, (name, hole) in enumerate(holes.items()):
-        paths = drawn[drawn.hole == name]
-        above, beside = panels[:, column]
-        for axis, project in ((above, _project_above), (beside, _project_beside)):
-            for _, trial in paths.iterrows():
+        for axis, view in zip(panels[:, column], VIEWS, strict=True):
+            for _, trial in drawn[drawn.hole == name].iterrows():
                 colour, line = LOOK[trial.condition]
-                path = project(trial.tip_in_base_m)
-                axis.plot(*path.T, line, color=colour, linewidth=0.9, alpha=0.75)
-                axis.plot(*path[:1].T, "*", color=colour, markersize=8)
-            center = project(np.array([hole.center_in_base_m]))
-            axis.plot(*center.T, "o", color="black", markersize=9)
+                x, y = _project(trial.tip_in_base_m, view)
+                axis.plot(x, y, line, color=colour, linewidth=0.9, alpha=0.75)
+                axis.plot(x[:1], y[:1], "*", color=colour, markersize=8)
+            axis.plot(*_project(np.array([hole.center_in_base_m]), view), "ko", markersize=9)
+            axis.set(title=f"hole {name}, {view}", xlabel=VIEWS[view][0], ylabel=VIEWS[view][1])
             axis.set_aspect("equal", adjustable="datalim")
             remove_frame(axis)
-        above.set(title=f"hole {name}, from above", xlabel="x, m")
-        beside.set(title=f"hole {name}, from the side", xlabel="distance from the slew axis, m")
-    panels[0, 0].set_ylabel("y, m")
-    panels[1, 0].set_ylabel("height, m")
     for condition, (colour, line) in LOOK.items():
         # An empty line gives the legend its entry, however many trials there are.
         panels[0, 0].plot([], [], line, color=colour, label=condition)
@@ -54,13 +53,9 @@ def draw_paths(found: Analysis) -> Figure:
     return figure
 
 
-def _project_above(tip_in_base_m: np.ndarray) -> np.ndarray:
-    return tip_in_base_m[:, :2]
-
-
-def _project_beside(tip_in_base_m: np.ndarray) -> np.ndarray:
-    distance_m = np.hypot(tip_in_base_m[:, 0], tip_in_base_m[:, 1])
-    return np.stack((distance_m, tip_in_base_m[:, 2]), 1)
+def _project(tip_in_base_m: np.ndarray, view: str) -> tuple[np.ndarray, np.ndarray]:
+    x, y, z = tip_in_base_m.T
+    return (x, y) if view == "from above" else (np.hypot(x, y), z)
 
 
 def draw_radar(found: Analysis) -> Figure:

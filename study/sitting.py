@@ -13,9 +13,8 @@ import json
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from websockets.asyncio.server import ServerConnection
 
@@ -36,8 +35,7 @@ from deploy.runtime.target import FileTarget
 from deploy.twin.bench import TwinBench
 from study import study_folder as folders
 from study.conductor import Conductor, Consent
-from study.trial import Times
-from study.twin_control import LoopStage
+from study.trial import LoopStage, Times
 
 log = logging.getLogger(__name__)
 
@@ -95,17 +93,10 @@ class Sitting:
             data.require_participant(participant)
         target = FileTarget(path=str(session.folder / TARGET))
         loop = replace(self.loop, page=None, video=None, record=False, target=target)
-        server = StudyServer(
-            page=loop.build_page_config(self.page, machine, session),
-            folder=folder.resolve(),
-            participant=participant,
-            consent=self.consent,
-            times=self.times,
-            facts={"simulated": False, "twin": self.bench is not None, "run": session.folder.name},
-            port=self.bench.twin.fault_port if self.bench else None,
-        )
+        page = loop.build_page_config(self.page, machine, session)
+        arguments = (self, page, folder.resolve(), participant)
         beside = self.bench.companions(machine, session) if self.bench else []
-        beside.append(CompanionProcess("study", "study.sitting:run_server", (server,), None))
+        beside.append(CompanionProcess("study", "study.sitting:run_server", arguments, None))
         with reserve_study(folder):
             loop.run(machine, session, beside)
 
@@ -123,52 +114,41 @@ def reserve_study(folder: Path) -> Iterator[None]:
         yield
 
 
-@dataclass(frozen=True)
-class StudyServer:
-    """Settings of the process that leads sittings.
+def run_server(
+    stop: Stop,
+    sitting: Sitting,
+    page: PageProcessConfig,
+    folder: Path,
+    participant: str | None,
+    memory: LoopMemory,
+) -> None:
+    """Lead sittings until it is asked to stop.
 
-    Attributes:
+    Args:
+        stop: Returns whether to stop.
+        sitting: Settings.
         page: The page, and how the loop is shown.
         folder: The study's.
         participant: Who comes first; `None`: chosen on the page.
-        consent: Text of the lab for participants.
-        times: Countdown and the like.
-        facts: Further fields of every trial.
-        port: Where the twin can be put elsewhere; `None` on a machine.
-    """
-
-    page: PageProcessConfig
-    folder: Path
-    participant: str | None
-    consent: Consent
-    times: Times
-    facts: dict[str, Any]
-    port: int | None
-
-
-def run_server(stop: Stop, config: StudyServer, memory: LoopMemory) -> None:
-    """Lead sittings until it is asked to stop.
+        memory: Of the loop.
 
     Raises:
         LinkError: the page's address is taken.
     """
-    machine, session = config.page.machine, config.page.session
-    stage = LoopStage(memory, machine, session.folder / TARGET, config.port)
-    conductor = Conductor(
-        config.folder, machine, stage, config.consent, config.times, config.facts, session.stream
-    )
-    if config.participant:
-        conductor.choose(config.participant)
+    machine, session, bench = page.machine, page.session, sitting.bench
+    stage = LoopStage(memory, session.folder / TARGET, bench.twin.fault_port if bench else None)
+    facts = {"twin": bench is not None, "run": session.folder.name}
+    conductor = Conductor(folder, machine, stage, sitting.consent, sitting.times, facts)
+    if participant:
+        conductor.choose(participant)
 
     def announce(address: str) -> None:
         place = session.folder / LINK
-        log.info(
-            "%s; the link that leads the sitting stands in %s", address.partition("#")[0], place
-        )
+        log.info("%s; the link that leads the sitting: %s", address.partition("#")[0], place)
 
+    feed = StudyFeed(LoopFeed(page, memory), conductor)
     try:
-        feed = StudyFeed(LoopFeed(config.page, memory), conductor)
-        serve_page(config.page.page, stop, machine, feed, session, announce, StudyPages(conductor))
+        serve_page(page.page, stop, machine, feed, session, announce, StudyPages(conductor))
     finally:
         conductor.close()
 

@@ -6,7 +6,6 @@
     captures/<P>_<period>_<nn>/        the loop's whole recording: messages and frames of the bus
     questionnaires/<P>_<period>.json   NASA-TLX after a period
     participants/<P>.json              a participant's record: whether they stopped, and why
-    reports.json                       where reports were written, for who wants to be forgotten
 
 Nothing that is there is passed over in silence: a file that cannot be used, stands twice or is missing
 becomes a remark.
@@ -25,22 +24,13 @@ from typing import Any
 from brokk_rl.errors import ConfigError, StorageError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_json
-from study.design import CONDITIONS, PERIODS, Design, Trial
+from study.design import PERIODS, Design, Trial
 
-PLAN, REPORTS = "plan.json", "reports.json"
+PLAN = "plan.json"
 TRIALS, RECORDINGS, CAPTURES = "trials", "recordings", "captures"
 QUESTIONNAIRES, PARTICIPANTS = "questionnaires", "participants"
 NOTICE = "simulated operators: no person took part, and nothing here is evidence about people"
 """What stands on all that simulated operators have done."""
-TRIAL_FIELDS = {
-    "participant": str,
-    "period": int,
-    "condition": str,
-    "number": int,
-    "hole": dict,
-    "limit_s": (int, float),
-}
-"""Required fields of a trial."""
 
 
 @dataclass(frozen=True)
@@ -159,11 +149,9 @@ def rewrite(path: Path, changes: dict[str, Any]) -> None:
 def write_questionnaire(
     folder: Path, participant: str, period: int, answers: dict[str, Any]
 ) -> Path:
-    """Write a questionnaire; answers given again take the place of those before, which are kept within the file."""
+    """Begin a questionnaire."""
     path = folder / QUESTIONNAIRES / f"{participant}_{period}.json"
-    # Nothing that a participant said is thrown away.
-    before = {"before": _read(path)} if path.exists() else {}
-    return _write(path, {"participant": participant, "period": period, **answers, **before})
+    return _write(path, {"participant": participant, "period": period, **answers})
 
 
 def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> Path:
@@ -173,25 +161,13 @@ def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> 
     return _write(path, {**known, "participant": participant, **facts})
 
 
-def note_report(folder: Path, report: Path) -> None:
-    """Remember where a report of this study was written; reports may be written anywhere."""
-    path = folder / REPORTS
-    known = _read(path) if path.exists() else []
-    if str(report.resolve()) not in known:
-        write_json(path, [*known, str(report.resolve())])
-
-
 def format_now() -> str:
     """Return the present time as it stands in files."""
     return datetime.now().astimezone().isoformat(timespec="microseconds")
 
 
-def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
-    """Delete every file about a participant; the plan keeps an empty place that says so.
-
-    Returns:
-        Deleted paths, and folders with reports that were made with the participant's data, to be
-        deleted and made again.
+def erase(folder: Path, participant: str) -> list[Path]:
+    """Delete every file about a participant, return their paths; the plan keeps an empty place that says so.
 
     Raises:
         ConfigError: the study has no such participant.
@@ -217,10 +193,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
             gone.append(path)
     # The plan keeps the place, so that the sequences of the others still make sense.
     write_json(folder / PLAN, data.plan | {"erased": data.erased | {participant: format_now()}})
-    reports = (
-        [Path(name) for name in _read(folder / REPORTS)] if (folder / REPORTS).exists() else []
-    )
-    return gone, [path for path in reports if path.exists()]
+    return gone
 
 
 def _is_of_participant(path: Path, participant: str) -> bool:
@@ -244,21 +217,15 @@ def _read_trials(data: StudyData) -> None:
 
 def _find_problem(data: StudyData, trial: dict[str, Any]) -> str:
     """Return why a trial does not count, from the gravest reason to the mildest; empty if it does."""
-    lacking = [key for key, kind in TRIAL_FIELDS.items() if not isinstance(trial.get(key), kind)]
-    if lacking:
-        return f"the trial lacks {', '.join(lacking)}; it does not count"
-    who, period, condition = trial["participant"], trial["period"], trial["condition"]
-    if who not in data.plan["participants"]:
-        return f"'{who}' is no participant of the plan; kept, but it does not count"
-    if period not in (0, *PERIODS) or condition not in CONDITIONS:
+    key = trial.get("participant"), trial.get("period"), trial.get("number")
+    planned = [one.condition for one in data.planned if one.key == key]
+    if not planned:
+        return f"{key[0]}, period {key[1]}, trial {key[2]} is not in the plan; kept, but it does not count"
+    if trial.get("condition") != planned[0]:
         return (
-            f"period {period}, condition '{condition}': expected 0, 1 or 2 and"
-            f" {' or '.join(CONDITIONS)}; it does not count"
+            f"done {trial.get('condition')}, but planned {planned[0]}; kept, but it does not count"
         )
-    planned = data.plan["participants"][who][period - 1]
-    if period and planned != condition:
-        return f"done {condition}, but planned {planned}; kept, but it does not count"
-    if (who, period, trial["number"]) in data.trials:
+    if key in data.trials:
         return "done twice: the first counts, since the second had more practice; the other is kept"
     if trial.get("outcome") == "aborted":
         reason = trial.get("reason", "no reason given")
@@ -290,10 +257,7 @@ def _note_missing(data: StudyData) -> None:
             continue
         # Practice has period 0 and need not be complete.
         planned = [one for one in data.planned if one.participant == who and one.period]
-        lost = []
-        for trial in planned:
-            if (who, trial.period, trial.number) not in data.trials:
-                lost.append(f"{trial.period}.{trial.number}")
+        lost = [f"{one.period}.{one.number}" for one in planned if one.key not in data.trials]
         num_done = len(planned) - len(lost)
         known = data.participants.get(who, {})
         if known.get("stopped"):
@@ -308,7 +272,9 @@ def _note_missing(data: StudyData) -> None:
                 " means are over the others",
             )
         for period in PERIODS:
-            if num_done and (who, period) not in data.questionnaires:
+            # Simulated operators have no workload.
+            has_answers = data.is_simulated or (who, period) in data.questionnaires
+            if num_done and not has_answers:
                 data.note(who, f"no questionnaire for period {period}")
 
 

@@ -1,31 +1,32 @@
-"""The running trial of a sitting, with its phases: ready, recording, countdown, running, saving."""
+"""The machine during a sitting, and the trial that runs on it, phase by phase."""
 
 from __future__ import annotations
 
 import json
-import logging
+import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from brokk_rl.errors import BrokkError
+from brokk_rl.errors import RecordingError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording, write_recording
+from brokk_rl.session import write_json
 from brokk_rl.spec import spec
+from deploy.runtime.operator_state import AdviceStatus
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.twin.faults import request_fault
 from study import study_folder as folders
-from study.design import Trial
+from study.design import Hole, Trial
 from study.measures import find_insertion
 from study.study_folder import StudyData
-from study.twin_control import FILLED, Stage
 
-log = logging.getLogger(__name__)
-
-Phase = Literal["ready", "starting", "countdown", "running", "settling", "saving", "over"]
+Phase = Literal["ready", "starting", "countdown", "running", "settling", "over"]
+FRESH_S = 0.3
+"""Age of positions and advice from which they are not there."""
 LOST_S = 1.0
 """Time without positions after which a trial is aborted."""
 STARTING_S = 10.0
@@ -48,6 +49,66 @@ class Times:
     start_tolerance: float
 
 
+@dataclass(frozen=True)
+class MachineView:
+    """Present state of the machine.
+
+    Attributes:
+        q: Joint positions, `(J,)`; `None` where nothing fresh is known.
+        advised: Why there is no advice; `valid` where there is.
+        recording: Whether it is recorded.
+    """
+
+    q: np.ndarray | None
+    advised: str
+    recording: bool
+
+
+class LoopStage:
+    """The loop's machine or twin, where trials take place.
+
+    Args:
+        memory: Of the loop.
+        target: File that says to the loop where the hole is.
+        port: Where the twin can be told to be put elsewhere; `None` on a machine.
+    """
+
+    def __init__(self, memory: LoopMemory, target: Path, port: int | None) -> None:
+        self._memory, self._target, self._port = memory, target, port
+
+    def sight(self) -> MachineView:
+        """Return the current state."""
+        memory, now_s = self._memory, time.monotonic()
+        state, advice, controls = memory.state.read(), memory.advice.read(), memory.controls.read()
+        q, advised = None, AdviceStatus.NO_STATE
+        if state is not None and now_s - state.q_t_s < FRESH_S and state.q_plausible:
+            q = np.array(state.q)
+        if advice is not None and now_s - advice.t_s < FRESH_S:
+            advised = advice.reason
+        return MachineView(q, advised.value, controls is not None and controls.recording)
+
+    def prepare(self, hole: Hole, start: np.ndarray) -> None:
+        """Make the hole known to the policy; a twin is put to the start, a machine has to be driven there."""
+        center = list(hole.center_in_base_m)
+        write_json(self._target, {"center_in_base_m": center})
+        if self._port is None:
+            return
+        try:
+            place = {"q": start.tolist(), "hole_in_base_m": center}
+            request_fault(self._port, {"place": place}, timeout_s=2.0)
+        except OSError as error:
+            raise RecordingError(
+                f"the twin does not answer on port {self._port} ({error}); is it running?"
+            ) from error
+
+    def record(self, folder: Path | None) -> None:
+        """Begin a recording in `folder`, or end it."""
+        request = {"kind": "record", "value": "off"}
+        if folder is not None:
+            request = {"kind": "record", "value": "on", "into": str(folder)}
+        self._memory.requests.put(json.dumps(request).encode())
+
+
 class Attempt:
     """The trial that runs now; see the module.
 
@@ -66,7 +127,7 @@ class Attempt:
         data: StudyData,
         trial: Trial,
         machine: Machine,
-        stage: Stage,
+        stage: LoopStage,
         times: Times,
         facts: dict[str, Any],
         clock: Callable[[], float],
@@ -81,9 +142,6 @@ class Attempt:
         self._since_s = self._began_s = self._seen_s = clock()
         self._path = Path()
         self._outcome, self._reason, self._seconds = "", "", 0.0
-        self._saving: Future[None] | None = None
-        # One worker: recordings are converted beside the page, one after the other.
-        self._worker = ThreadPoolExecutor(1)
         stage.prepare(self._hole, self._start)
 
     @property
@@ -105,8 +163,6 @@ class Attempt:
         entry = {
             **asdict(self.trial),
             **self._facts,
-            "hole": {"name": self.trial.hole, **asdict(self._hole)},
-            "limit_s": self._design.limit_s,
             # Until the trial is over, its file describes it as interrupted.
             "outcome": "aborted",
             "reason": "interrupted: the sitting ended during the trial",
@@ -143,10 +199,6 @@ class Attempt:
             self.abort("the recording did not begin")
         elif self._phase == "countdown" and in_phase_s >= self._times.countdown_s:
             self._began_s = now_s
-            if sight.q is not None:
-                # The start error tells later how well the start was met.
-                error = np.round(sight.q - self._start, 4).tolist()
-                folders.rewrite(self._path, {"start_error": error})
             self._enter("running")
         elif self._phase == "running" and sight.q is not None:
             tip_m = compute_tool_kinematics(self._machine, sight.q).tip_in_base_m
@@ -156,9 +208,7 @@ class Attempt:
             elif in_phase_s >= self._design.limit_s:
                 self._end("time limit", "")
         elif self._phase == "settling" and in_phase_s >= self._times.settle_s:
-            self._save()
-        elif self._phase == "saving" and self._saving is not None and self._saving.done():
-            self._enter("over")
+            self.close()
 
     def view(self) -> dict[str, Any]:
         """Return the trial as plain data for the pages."""
@@ -183,15 +233,17 @@ class Attempt:
         }
 
     def close(self) -> None:
-        """Wait until everything is on the disk."""
-        if self._phase == "settling":
-            self._save()
-        self._worker.shutdown(wait=True)
-
-    def leave(self) -> None:
-        """End the trial now; a missing recording is made from the capture at the next start."""
-        self.abort("the program ended")
-        self._worker.shutdown(wait=False, cancel_futures=True)
+        """End the recording, and write down which part of it is the trial."""
+        if self._phase != "settling":
+            return
+        end_s = self._clock()
+        self._stage.record(None)
+        # Without a window there is nothing to keep: the trial never ran.
+        if self._seconds:
+            capture = f"{folders.CAPTURES}/{self._path.stem}"
+            window_s = [self._began_s, end_s]
+            folders.rewrite(self._path, {"capture": capture, "window_s": window_s})
+        self._enter("over")
 
     def _enter(self, phase: Phase) -> None:
         self._phase, self._since_s = phase, self._clock()
@@ -206,55 +258,5 @@ class Attempt:
         self._enter("settling")
         # Nothing to settle where nothing moved.
         if not has_run:
-            self._save()
+            self.close()
         return ""
-
-    def _save(self) -> None:
-        end_s = self._clock()
-        self._stage.record(None)
-        # Without a window there is nothing to keep: the trial never ran.
-        if self._seconds:
-            capture = f"{folders.CAPTURES}/{self._path.stem}"
-            window_s = [self._began_s, end_s]
-            folders.rewrite(self._path, {"capture": capture, "window_s": window_s})
-        # The conversion takes seconds; the page must go on.
-        self._saving = self._worker.submit(
-            keep_recording, self._folder, self._path, self._machine, self._stage
-        )
-        self._enter("saving")
-
-
-def keep_recording(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
-    """Write the captured trial as a recording to the file `path`; faults are reported in that file.
-
-    A trial that began has a `window_s`, so that this can be done again where it was interrupted:
-    the clock is that of the capture.
-    """
-    trial = json.loads(path.read_text())
-    # Already kept, or found impossible: this makes the call safe to repeat.
-    if "window_s" not in trial or "recording" in trial or "recording_problem" in trial:
-        return
-    changes: dict[str, Any] = {}
-    try:
-        found = stage.keep(folder.resolve() / trial["capture"], *trial["window_s"])
-        name = f"{folders.RECORDINGS}/{path.stem}.parquet"
-        write_recording(_describe_target(found, trial), folder / name)
-        changes["recording"] = name
-        if FILLED in found.metadata:
-            changes["recording_problem"] = found.metadata[FILLED]
-    except (BrokkError, OSError) as error:
-        log.error("%s: %s", path.stem, error)
-        changes["recording_problem"] = str(error)
-    folders.rewrite(path, changes)
-
-
-def _describe_target(found: Recording, trial: dict[str, Any]) -> Recording:
-    """Return the recording with the hole, and without advice that was not shown."""
-    extra = {}
-    for name, values in found.extra.items():
-        if trial["condition"] == "guided" or not name.startswith("advice_"):
-            extra[name] = values
-    # The hole stands in the recording as constant columns, as in recordings of other tools.
-    for axis, value in zip("xyz", trial["hole"]["center_in_base_m"], strict=True):
-        extra[f"target_{axis}_m"] = np.full(len(found.t_s), value, np.float32)
-    return replace(found, extra=extra)

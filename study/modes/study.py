@@ -8,13 +8,13 @@ from typing import Literal
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.progress import track_items
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from study import study_folder as folders
-from study.design import Design, Trial, format_plan, plan_trials
+from study.analysis import analyse
+from study.design import Design, format_plan, plan_trials
 from study.measures import COMPARED
-from study.plan_page import build_plan_page
+from study.report import judge_primary, write_plan_page, write_report
 from study.sitting import Sitting, reserve_study
 from study.twins import TwinGround
 
@@ -88,15 +88,15 @@ class StudyMode:
             study.sitting.run(machine, session, folder, study.participant)
         elif study.do == "simulate":
             assert self.ground is not None
-            planned = self._plan(folder, f"The trials of this study are done by {folders.NOTICE}.")
-            self.ground.conduct(folder, study.design, planned, machine, session)
+            self._plan(folder, f"The trials of this study are done by {folders.NOTICE}.")
+            self.ground.conduct(folders.read_study(folder), machine, session)
             self._report(folder)
         elif study.do == "report":
             self._report(folder)
         else:
             self._erase(folder)
 
-    def _plan(self, folder: Path, notice: str) -> list[Trial]:
+    def _plan(self, folder: Path, notice: str) -> None:
         design, machine, seed = self.study.design, self.machine, self.session.seed
         design.check_machine(machine)
         if (folder / folders.PLAN).exists():
@@ -105,32 +105,23 @@ class StudyMode:
             )
         planned = plan_trials(design, self.session.generator("study plan"))
         write_json(folder / folders.PLAN, format_plan(design, machine, seed, planned))
-        page = build_plan_page(design, machine.name, seed, planned, notice)
-        page.write(folder / "plan.html")
+        write_plan_page(folders.read_study(folder), notice)
         log.info("planned: %s", folder / "plan.html")
-        return planned
 
     def _report(self, folder: Path) -> None:
-        from study.analysis import analyse
-        from study.report import state_verdict, write_report
-
         data = folders.read_study(folder, self.machine)
-        found = analyse(data, self.machine, lambda trials: track_items(trials, "measuring trials"))
+        found = analyse(data, self.machine)
         path = write_report(self.session.folder, found)
-        folders.note_report(folder, self.session.folder)
         for remark in data.remarks:
             log.warning("%s: %s", remark.where, remark.text)
-        log.info("%s", state_verdict(found)[0])
-        log.info("report: %s", path)
+        log.info("report: %s; guidance, by the primary measure: %s", path, judge_primary(found))
 
     def _erase(self, folder: Path) -> None:
         assert self.study.participant is not None
         folders.read_study(folder)
         with reserve_study(folder):
-            gone, reports = folders.erase(folder, self.study.participant)
+            gone = folders.erase(folder, self.study.participant)
         log.info("%s erased: %d files deleted", self.study.participant, len(gone))
-        for place in reports:
-            log.warning(
-                "%s was made with this participant's data: delete it, and make it again with study.do=report",
-                place,
-            )
+        log.warning(
+            "delete the reports that were made before, and make them again: study.do=report"
+        )

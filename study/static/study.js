@@ -10,7 +10,7 @@ root.tabIndex = -1;
 document.body.append(root);
 document.body.classList.add("study");
 
-const BAR = ["starting", "countdown", "running", "settling", "saving"];  // the operator's page is seen then
+const BAR = ["starting", "countdown", "running", "settling"];  // the operator's page is seen then
 const SURE_MS = 4000;
 let study = null, drawn = "", primary = null, sure = 0, refused = "";
 let language = "en", say = words(language);
@@ -81,7 +81,7 @@ const screens = {
     row("answers", button(say("decline"), () => tell("consent", { agreed: false, language })), button(say("agree"), () => tell("consent", { agreed: true, language }), "primary")),
   ],
   trial: () => study.phase === "over" ? over() : ready(),
-  questionnaire: () => study.at < study.scales.length ? rate() : study.at < study.last ? pair() : review(),
+  questionnaire: () => study.at < study.scales.length ? rate() : review(),
   done: () => [element("h1", say("done")), element("p", say("thanks")), row("answers", button(say("list"), () => tell("leave"), "primary"))],
   stopped: () => [
     element("h1", say("stopped")), element("p", say("kept")),
@@ -131,24 +131,9 @@ function rate() {
   const answered = study.ratings[scale] !== undefined;
   const next = button(say(answered ? "next" : "skip"), () => go(study.at + 1), answered ? "primary" : "");
   return [
-    element("h2", `${study.at + 1}/${study.last} · ${say("period")} ${study.period}, ${say(study.condition)}`), element("h1", title),
+    element("h2", `${study.at + 1}/${study.scales.length} · ${say("period")} ${study.period}, ${say(study.condition)}`), element("h1", title),
     element("p", question), cells, row("ends", element("span", `◀ ${low}`), element("span", `${high} ▶`)),
     row("answers", ...(study.at ? [back()] : []), next),
-  ];
-}
-
-function pair() {
-  const index = study.at - study.scales.length, both = study.pairs[index];
-  const choose = name => {
-    const [title, question] = scales(language)[name], made = button(title, () => tell("pair", { pair: index, chosen: name }));
-    made.append(element("small", question));
-    made.dataset.scale = name;
-    made.setAttribute("aria-pressed", study.chosen[index] === name);
-    return made;
-  };
-  return [
-    element("h2", `${study.at + 1}/${study.last}`), element("h1", say("pair")), row("pair", ...both.map(choose)),
-    row("answers", back(), button(say(study.chosen[index] ? "next" : "skip"), () => go(study.at + 1), study.chosen[index] ? "primary" : "")),
   ];
 }
 
@@ -162,7 +147,7 @@ function review() {
 // ---- the bar in a trial
 function bar() {
   const stop = button(say("end trial"), () => tell("stop_trial")), fault = button(say("fault"), () => tell("abort"), "small");
-  return [element("b", `${say(study.condition)} · ${where()}`), element("output"), ...(study.phase === "running" ? [stop, fault] : study.phase.startsWith("s") && study.phase !== "starting" ? [] : [fault])];
+  return [element("b", `${say(study.condition)} · ${where()}`), element("output"), ...(study.phase === "running" ? [stop, fault] : study.phase === "settling" ? [] : [fault])];
 }
 
 function draw() {
@@ -189,7 +174,7 @@ function draw() {
 
 function moving() {
   const output = root.querySelector("output"), list = root.querySelector(".joints"), waiting = root.querySelector(".waiting");
-  const texts = { countdown: Math.ceil(study.left_s), running: `${Math.ceil(study.left_s)} s`, starting: say("starting"), settling: say("saving"), saving: say("saving") };
+  const texts = { countdown: Math.ceil(study.left_s), running: `${Math.ceil(study.left_s)} s`, starting: say("starting"), settling: say("saving") };
   if (output) output.textContent = texts[study.phase] ?? "";
   if (!list) return;
   list.replaceChildren(...study.joints.map(one => element("span", `${one.joint} ${one.there ? "✓" : `${one.away > 0 ? "+" : ""}${one.away.toFixed(2)}`}`, one.there ? "there" : "away")));
@@ -200,8 +185,8 @@ function moving() {
 }
 
 function footer() {
-  const nodes = [element("span", study.simulated ? say("simulated") : "", "simulated"), element("p", "", "problem")];
-  nodes[1].setAttribute("role", "alert");
+  const nodes = [element("p", "", "problem")];
+  nodes[0].setAttribute("role", "alert");
   if (["consent", "trial", "questionnaire"].includes(study.kind)) {
     const stop = button(say("stop taking part"), () => {
       if (performance.now() - sure < SURE_MS && sure) tell("stop_sitting", { reason: "" });
@@ -225,9 +210,6 @@ addEventListener("keydown", event => {
     const scale = study.scales[study.at], now = study.ratings[scale];
     const value = event.key === "Home" ? 0 : event.key === "End" ? 100 : now === undefined ? 50 : Math.min(100, Math.max(0, now + way * study.step));
     rateAs(scale, value);
-  } else if (study?.kind === "questionnaire" && study.at < study.last && way) {
-    event.preventDefault();
-    root.querySelectorAll(".pair button")[way > 0 ? 1 : 0]?.click();
   } else if (event.key === "Backspace") root.querySelector(".back")?.click();
   else if (event.key === "Enter" && !event.repeat && !document.activeElement?.closest("#study button")) { event.preventDefault(); primary?.click(); }
 }, true);

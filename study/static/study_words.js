@@ -9,10 +9,10 @@ const EN = {
   "not there": "The arm is not at its start yet", "no positions": "Nothing is known of the arm", "no advice": "No advice yet", starting: "Recording begins …", saving: "Saving …",
   "end trial": "End trial", fault: "Fault: do it again", again: "It is kept, does not count, and is done again",
   "outcome inserted": "Inserted", "outcome time limit": "Time is over", "outcome stopped": "Trial ended", "outcome aborted": "Trial aborted",
-  pair: "Which of the two contributed more to the load you felt?", missing: "questions are open", complete: "All questions are answered", "to missing": "To the first open one",
+  missing: "questions are open", complete: "All questions are answered", "to missing": "To the first open one",
   finish: "Finish", "finish half": "Finish as it is", done: "That was everything", thanks: "Thank you for taking part.", list: "List of participants",
   stopped: "You have stopped taking part", kept: "What was done until now is kept, unless you ask for it to be erased.", "go on": "Go on after all",
-  "stop taking part": "Stop taking part", "really stop": "Really stop? Press again", simulated: "SIMULATED PARTICIPANT",
+  "stop taking part": "Stop taking part", "really stop": "Really stop? Press again",
   "refused failed": "It could not be done", "refused no positions": "Nothing is known of the arm", "refused not now": "Not now", "refused malformed": "Not understood", "refused nobody": "Nobody was chosen",
 };
 const DE = {
@@ -25,10 +25,10 @@ const DE = {
   "not there": "Der Arm ist noch nicht an seinem Start", "no positions": "Vom Arm ist nichts bekannt", "no advice": "Noch kein Vorschlag", starting: "Aufnahme beginnt …", saving: "Wird gespeichert …",
   "end trial": "Versuch beenden", fault: "Störung: wiederholen", again: "Er wird behalten, zählt nicht und wird wiederholt",
   "outcome inserted": "Eingeführt", "outcome time limit": "Die Zeit ist um", "outcome stopped": "Versuch beendet", "outcome aborted": "Versuch abgebrochen",
-  pair: "Was hat mehr zu Ihrer Beanspruchung beigetragen?", missing: "Fragen sind offen", complete: "Alle Fragen sind beantwortet", "to missing": "Zur ersten offenen",
+  missing: "Fragen sind offen", complete: "Alle Fragen sind beantwortet", "to missing": "Zur ersten offenen",
   finish: "Fertig", "finish half": "So abschließen", done: "Das war alles", thanks: "Danke für Ihre Teilnahme.", list: "Liste der Teilnehmenden",
   stopped: "Sie haben die Teilnahme beendet", kept: "Was bis jetzt getan wurde, wird behalten, wenn Sie nicht um Löschung bitten.", "go on": "Doch weitermachen",
-  "stop taking part": "Teilnahme beenden", "really stop": "Wirklich beenden? Noch einmal drücken", simulated: "SIMULIERTE PERSON",
+  "stop taking part": "Teilnahme beenden", "really stop": "Wirklich beenden? Noch einmal drücken",
   "refused failed": "Das ging nicht", "refused no positions": "Vom Arm ist nichts bekannt", "refused not now": "Jetzt nicht", "refused malformed": "Nicht verstanden", "refused nobody": "Niemand ist gewählt",
 };
 // title, question, left end, right end; performance goes from good to poor, so that more is more load on all six

@@ -149,14 +149,11 @@ def test_the_whole_questionnaire_by_key_in_german(
             f"() => window.sitting().ratings[window.sitting().scales[{screen}]] === {45 + 5 * screen}",
         )
         page.keyboard.press("Enter")
-    for screen in range(6, 21):
-        at(page, screen)
-        page.keyboard.press("ArrowLeft")
-    at(page, 21)
+    at(page, 6)
     page.keyboard.press("Backspace")
-    at(page, 20)
+    at(page, 5)
     page.keyboard.press("Enter")
-    at(page, 21)
+    at(page, 6)
     assert page.locator("#study h1").inner_text() == "Alle Fragen sind beantwortet"
     page.keyboard.press("Enter")
     until(page, "() => window.sitting().kind === 'trial'")
@@ -165,9 +162,6 @@ def test_the_whole_questionnaire_by_key_in_german(
         list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70]
         and tlx.compute_scores(found)[0]["raw"] == 57.5
     )
-    assert [answer["chosen"] for answer in found["pairs"]] == [
-        pair[0] for pair in found["shown_pairs"]
-    ]
 
 
 def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
@@ -194,19 +188,15 @@ def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
             page,
             "() => document.querySelector('#study h1').textContent === 'Zeitliche Anforderung'",
         )
-        for screen in range(2, 21):
+        for screen in range(2, 6):
             at(page, screen)
             page.locator("#study .answers button").last.click()  # left open
-        at(page, 21)
-        assert page.locator("#study h1").inner_text() == "19 Fragen sind offen"
+        at(page, 6)
+        assert page.locator("#study h1").inner_text() == "4 Fragen sind offen"
         page.locator("#study .answers button").last.click()
         until(page, "() => window.sitting().kind === 'trial'")
     found = answers(tmp_path)
-    assert (
-        found["ratings"] == {"mental": 100, "physical": 0}
-        and found["pairs"] == []
-        and found["finished"]
-    )
+    assert found["ratings"] == {"mental": 100, "physical": 0} and found["finished"]
 
 
 def test_nobody_leads_a_sitting_without_the_key(port: int, lead: Conductor, browser: Any) -> None:
@@ -231,7 +221,4 @@ def test_stopping_takes_two_presses_and_is_kept(
     page.locator("#study .leave", has_text="Really stop").click()
     until(page, "() => window.sitting().kind === 'stopped'")
     assert json.loads((tmp_path / "participants" / "P01.json").read_text())["stopped"] is True
-    assert (
-        len(list((tmp_path / "trials").iterdir())) == 2
-        and len(list((tmp_path / "recordings").iterdir())) == 2
-    )
+    assert len(list((tmp_path / "trials").iterdir())) == 2

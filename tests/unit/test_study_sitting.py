@@ -9,15 +9,27 @@ from typing import Any
 
 import pytest
 from browser import SHOWN, Scripted
-from sitting import MACHINE, Arm, agreed, begun, conductor, done, plan, saved
+from sitting import (
+    MACHINE,
+    Arm,
+    agreed,
+    begun,
+    conductor,
+    done,
+    inserted_after,
+    plan,
+    recorded,
+    saved,
+)
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, StorageError
+from brokk_rl.record import Recording
 from deploy.page.protocol import OperatorRequest
+from deploy.recorder.conversion import CaptureLogReader
 from study import analysis, study_folder, tlx
-from study.conductor import Conductor
+from study.conductor import Conductor, find_next_step
 from study.sitting import StudyFeed, reserve_study
-from study.steps import find_next_step
 
 
 @pytest.fixture
@@ -34,11 +46,23 @@ def lead(tmp_path: Path, arm: Arm) -> Conductor:
     return made
 
 
+@pytest.fixture(autouse=True)
+def captures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every capture shows an insertion at the end of the trial, and advice."""
+
+    def between(
+        reader: CaptureLogReader, path: Path, machine: Any, begin_s: float, end_s: float
+    ) -> Recording:
+        q = inserted_after(int((end_s - begin_s) * 20) - 9)
+        return recorded(q, **{f"advice_{name}": q[:, 0] for name in MACHINE.joint_names})
+
+    monkeypatch.setattr(CaptureLogReader, "between", between)
+
+
 def answer(lead: Conductor, value: int = 40) -> None:
     for scale in tlx.SCALES:
         assert lead.take({"do": "rate", "scale": scale, "value": value}) == ""
-    for index, pair in enumerate(lead.view()["pairs"]):
-        assert lead.take({"do": "pair", "pair": index, "chosen": pair[0]}) == ""
+    assert lead.take({"do": "to", "to": len(tlx.SCALES)}) == ""
     assert lead.take({"do": "finish"}) == ""
 
 
@@ -70,14 +94,16 @@ def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(
     found = analysis.analyse(data, MACHINE)
     assert found.trials.success.tolist() == [1.0] * 4
     assert found.trials.outcome.tolist() == ["inserted"] * 4
-    assert found.means.tlx_weighted[:2].tolist() == found.means.tlx_raw[:2].tolist() == [40.0] * 2
-    assert "P01" not in remarks(tmp_path)  # nothing to say against it
+    assert found.means.tlx_raw[:2].tolist() == [40.0] * 2
+    assert "P01" not in remarks(tmp_path), "there is nothing to say against it"
     consent = read(tmp_path / "participants" / "P01.json")["consent"]
     assert consent["agreed"] and consent["language"] == "de" and consent["version"] == "v1"
-    for trial in data.trials.values():
-        columns = record.read_recording(tmp_path / trial["recording"], MACHINE).extra
-        assert ("advice_q1" in columns) == (trial["condition"] == "guided")
-        assert trial["start_error"] == [0.0] * 5 and trial["twin"] is True
+    for trial in data.planned[:4]:
+        columns = record.read_recording(
+            tmp_path / f"recordings/{trial.name}.parquet", MACHINE
+        ).extra
+        assert ("advice_q1" in columns) == (trial.condition == "guided")
+        assert data.trials[trial.key]["twin"] is True
 
 
 def test_who_does_not_agree_takes_no_part(tmp_path: Path, arm: Arm) -> None:
@@ -115,22 +141,16 @@ def test_half_a_questionnaire_is_kept_said_and_gone_on_with(
     for _ in range(2):
         done(lead, arm)
     lead.take({"do": "rate", "scale": "mental", "value": 35})
-    lead.take({"do": "to", "to": 6})
-    first = lead.view()["pairs"]
-    lead.take({"do": "pair", "pair": 0, "chosen": first[0][1]})
     again = conductor(tmp_path, arm)
     again.choose("P01")
     view = again.view()
-    assert view["ratings"] == {"mental": 35} and view["pairs"] == first
-    assert view["chosen"][0] == first[0][1]
+    assert view["ratings"] == {"mental": 35}
     assert view["at"] == 1, "the first screen without an answer"
     for wrong in ({"value": 101}, {"value": 33}, {"value": True}, {"scale": "joy", "value": 5}, {}):
         assert again.take({"do": "rate", "scale": "effort", **wrong}) == "malformed"
-    again.take({"do": "to", "to": 21})
+    again.take({"do": "to", "to": 6})
     assert again.take({"do": "finish"}) == "" and again.view()["kind"] == "trial"
-    said = remarks(tmp_path)
-    assert "physical, temporal, performance, effort, frustration not answered" in said
-    assert "1 of 15 pairs" in said
+    assert "frustration not answered: no mean" in remarks(tmp_path)
 
 
 def test_who_stops_in_a_trial_is_believed_and_may_come_back(
@@ -172,14 +192,15 @@ def test_how_a_trial_can_end(
     assert lead.view()["number"] == (1 if outcome == "aborted" else 2)
 
 
-def test_a_recording_that_cannot_be_used_is_said_and_the_outcome_kept(
-    tmp_path: Path, arm: Arm, lead: Conductor
+def test_a_capture_that_cannot_be_used_is_said_and_outcome_and_time_kept(
+    tmp_path: Path, arm: Arm, lead: Conductor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arm.fails = "a gap of 3 s"
     done(lead, arm)
-    told = read(tmp_path / "trials" / "P01_1_01.json")
-    assert told["outcome"] == "inserted" and "recording" not in told
-    assert "its recording cannot be used (a gap of 3 s)" in remarks(tmp_path)
+    monkeypatch.undo()
+    found = analysis.analyse(study_folder.read_study(tmp_path), MACHINE)
+    assert "P01 1.1: its recording cannot be used" in remarks(tmp_path)
+    assert found.trials.success.tolist() == [1.0]
+    assert found.trials.time_s.tolist() == pytest.approx([3.2], abs=0.3)
 
 
 def test_practice_ends_with_two_successes_in_a_row_or_when_it_is_said(tmp_path: Path) -> None:
@@ -249,20 +270,6 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     study_folder.erase(tmp_path, "P01")
     assert not list(tmp_path.rglob("P01*"))
     assert conductor(tmp_path, arm).view()["participants"][0]["state"] == "erased"
-
-
-def test_a_recording_that_an_interruption_left_unsaved_is_made_the_next_time(
-    tmp_path: Path, arm: Arm, lead: Conductor
-) -> None:
-    done(lead, arm)
-    path = tmp_path / "trials" / "P01_1_01.json"
-    told = read(path)
-    path.write_text(json.dumps({key: value for key, value in told.items() if key != "recording"}))
-    (tmp_path / told["recording"]).unlink()
-    conductor(tmp_path, Arm())
-    assert read(path) == told and (tmp_path / told["recording"]).exists()
-    (path.parent / "P02_1_01.json").write_text("{half")
-    assert conductor(tmp_path, Arm()).view()["kind"] == "choose"
 
 
 def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None:

@@ -96,8 +96,10 @@ def test_more_draws_than_can_be_counted_are_drawn() -> None:
 
 def test_holm_is_worked_by_hand() -> None:
     # sorted 0.005 0.01 0.03 0.04, times 4 3 2 1: 0.02 0.03 0.06 0.04, never falling: 0.06
-    adjusted = guidance_effect.adjust_by_holm([0.01, 0.04, 0.03, 0.005])
-    assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    found = dict(zip("abcde", (0.01, 0.04, None, 0.03, 0.005), strict=True))
+    effects = {name: GuidanceEffect(8, 4, p=p) for name, p in found.items()}
+    adjusted = guidance_effect.adjust_by_holm(effects, found)
+    assert adjusted == pytest.approx({"a": 0.03, "b": 0.06, "d": 0.06, "e": 0.02})
 
 
 def tabulate(guided: np.ndarray, unguided: np.ndarray, first: np.ndarray) -> pd.DataFrame:
@@ -168,4 +170,5 @@ def test_power_is_that_of_the_t_test_over_pairs() -> None:
     power = stats.nct.sf(stats.t.ppf(0.975, 7), 7, 2 * 0.8 / math.sqrt(2) * math.sqrt(8))
     assert guidance_effect.estimate_power(16, 0.8, 0.05) == pytest.approx(power, abs=0.04)
     assert guidance_effect.estimate_power(16, 0.0, 0.05) <= 0.065
-    assert guidance_effect.estimate_power(8, 3.0, 0.05) == 0.0, "the smallest p is 0.125"
+    for num_persons in (2, 8):
+        assert guidance_effect.estimate_power(num_persons, 3.0, 0.05) == 0.0, "p stays above 0.1"
