@@ -139,16 +139,13 @@ class Exploration:
 
 @spec
 class Teacher:
-    """A policy that a training follows at its beginning.
+    """The task's classical controller as the example that a training follows at its beginning.
 
     Attributes:
-        folder: Folder of a trained policy, whose task must act as the one that is trained; `null`
-            for the task's classical controller.
         weight: Weight of the mean squared distance between the actions of both at the beginning.
         until: Share of the budget at which the weight has fallen to 0, linearly.
     """
 
-    folder: str | None
     weight: Positive
     until: PositiveShare
 
@@ -189,7 +186,8 @@ class TrainingConfig:
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.ppo:CappedGaussian`.
-        teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
+        teacher: How to follow the classical controller at the beginning; `null` to learn from
+            rewards alone.
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.

@@ -88,5 +88,5 @@ def test_shares_outside_of_the_budget_are_refused(over: tuple[float, float]) -> 
 
 @pytest.mark.parametrize(("share", "weight"), [(0.0, 4.0), (0.25, 2.0), (0.5, 0.0), (0.9, 0.0)])
 def test_the_weight_of_a_teacher_falls_to_nothing(share: float, weight: float) -> None:
-    teacher = Teacher(folder="there", weight=4.0, until=0.5)
+    teacher = Teacher(weight=4.0, until=0.5)
     assert teacher.weight_at(share) == pytest.approx(weight)
