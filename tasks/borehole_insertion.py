@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, ClassVar
 
+from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import Finite, NonNegativeRange, Positive, Range, spec
+from brokk_rl.machine import Machine
+from brokk_rl.spec import Count, Finite, NonNegative, NonNegativeRange, Positive, Range, spec
 from tasks.settings import (
     CandidateTargets,
     PoseJudgement,
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
 
 RADIUS = 5
 """Column of a scene with the radius of its hole; see `brokk_rl.sim.scene`, which loads torch."""
+ROW_PROCESS = "tasks.hole_row:HoleRowProcess"
+"""Process of a row of holes; importing it loads torch."""
 
 
 @spec
@@ -72,6 +77,25 @@ class InsertionCriteria:
 
 
 @spec
+class HoleRow:
+    """Boreholes side by side, one after the other, in a block that gives way.
+
+    Attributes:
+        num_holes: Holes of a row.
+        spacing_m: Distance of two of them, across the bearing of the hole.
+        lift_m: Height above the rim to which the tool is drawn between them.
+        strike_n: Contact force from which the block moves, once for each hole.
+        strike_m: By how much it does, in a direction drawn for the episode.
+    """
+
+    num_holes: Count
+    spacing_m: Positive
+    lift_m: Positive
+    strike_n: Positive
+    strike_m: NonNegative
+
+
+@spec
 class BoreholeInsertion(ToolPoseTask):
     """Insert the 8 cm chisel into the 10 cm borehole of a concrete block.
 
@@ -79,11 +103,13 @@ class BoreholeInsertion(ToolPoseTask):
         depth_m: Depth below the rim of the target point (paper: 0.1 m; a little more makes the
             controller pass the strict depth).
         hole: Where the hole may be.
+        row: Further holes of an episode; `null`: one that stays where it is.
         success: Criteria.
     """
 
     depth_m: Finite
     hole: BoreholeRanges
+    row: HoleRow | None
     success: InsertionCriteria
 
     behaviour: ClassVar[tuple[str, ...]] = ("depth_m", *ToolPoseTask.behaviour)
@@ -100,6 +126,11 @@ class BoreholeInsertion(ToolPoseTask):
                 "scaling.pitch_rad: expected [mean, std], since holes lean (hole.lean_rad) and the "
                 "policy must observe by how much, got null"
             )
+        if self.leans and self.row is not None:
+            raise ConfigError(
+                "row: expected null where holes lean (hole.lean_rad), since the tool is drawn "
+                "straight up between the holes of a row, got a row; change one of them"
+            )
 
     @property
     def aim_below_m(self) -> float:
@@ -110,6 +141,13 @@ class BoreholeInsertion(ToolPoseTask):
     def fixed_pitch_rad(self) -> float:
         """Straight down, rad (the paper's 1.57)."""
         return math.pi / 2
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
+        """Return the task for `num_envs` environments on `device`."""
+        if self.row is None:
+            return super().build(machine, num_envs, device)
+        self.check_machine(machine)
+        return resolve_name(ROW_PROCESS)(self, machine, num_envs, device)
 
     def draw_targets(self, uniform: Uniform) -> CandidateTargets:
         """Draw boreholes; see `ToolPoseTask`."""

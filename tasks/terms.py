@@ -104,6 +104,7 @@ class ToolState(StepState):
         reach_range_m: Good working range (nearest, farthest).
         positioning: Whether only the exclusive joints could move in this step, `(N,)` bool.
         reached: The tool is where the task wants it, `(N,)` bool; `success` asks for more.
+        inserted: The same for the present hole of a row (`tasks.hole_row`), `(N,)` bool.
         paper_success: The paper's criterion holds, `(N,)` bool.
         closeness: How near the task is to done, 0 to about 1, `(N,)`.
         closeness_before: The same one step earlier.
@@ -115,6 +116,7 @@ class ToolState(StepState):
     reach_range_m: tuple[float, float]
     positioning: torch.Tensor
     reached: torch.Tensor
+    inserted: torch.Tensor
     paper_success: torch.Tensor
     closeness: torch.Tensor
     closeness_before: torch.Tensor

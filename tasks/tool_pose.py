@@ -133,6 +133,7 @@ class ToolPoseProcess(EpisodeProcess):
         values |= {
             "success": verdict.success,
             "reached": verdict.reached,
+            "inserted": verdict.reached,
             "target_m": self.control.aim(start["target_m"], start["target_pitch_rad"]),
             "target_pitch_rad": start["target_pitch_rad"],
             "reach_m": state["reach_m"],

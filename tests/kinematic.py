@@ -40,6 +40,9 @@ class KinematicWorld:
         self.contact_force_n.masked_fill_(mask, 0.0)
         self.faults.masked_fill_(mask, False)
 
+    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
+        self.placed = (mask.clone(), scene.clone())
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         return {
             "q": self.q.clone(),

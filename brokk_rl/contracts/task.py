@@ -117,6 +117,9 @@ class TaskProcess(ABC):
     episode: dict[str, torch.Tensor]
     """Figures of the running episode, by name, each `(N,)`; written in place. `SUCCESS` is one of
     them; evaluation reports the others too."""
+    moved: torch.Tensor | None = None
+    """Environments whose block moved in the last step, `(N,)` bool; `None`: none ever does. The loop
+    places these blocks as the entry `start.scene` of `state` says."""
     figures: Mapping[str, Figure] = {SUCCESS: SUCCESS_FIGURE}
     """Words for figures of `episode`, in the order of tables; the others are reported as means and
     stand in no table."""

@@ -376,7 +376,9 @@ class ControlLoop(VecEnv):
         self._perceive(start)
 
     def _reset_worlds(self, start: Starts) -> None:
-        """Put the worlds of finished environments to their starts."""
+        """Put blocks that moved to their places, and finished environments to their starts."""
+        if self.task.moved is not None:
+            self.world.place(self.task.moved, self.task.state["start.scene"])
         self.world.reset(self.done, start["q"], start["scene"])
 
     def _command(self) -> torch.Tensor:

@@ -11,6 +11,7 @@ import torch
 from composed import option
 from kinematic import KinematicWorld
 from scipy import optimize
+from training import plant
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -413,6 +414,42 @@ def test_success_ends_the_episode_only_where_it_shall(machine: Machine) -> None:
         assert bool(end.terminated) is ends
         assert int(end.reason) == (stage.process.reasons.index("success") if ends else -1)
         assert stage.process.episode["success_strict"].item() == 1.0
+
+
+def test_a_row_is_done_hole_by_hole_and_the_tool_drawn_out_between(machine: Machine) -> None:
+    stage = Stage(machine, "several", noise=noise())
+    state = stage.process.state
+    for hole in range(3):
+        stage.target_below_tip(z_m=-0.12)
+        assert bool(stage.step().terminated) is (hole == 2)
+        if hole == 2:
+            break
+        stage.process.observe(stage.history)
+        seen_m = state["estimate_m"] - state["start.target_m"]
+        assert seen_m[0].tolist() == pytest.approx([0.0, 0.0, 0.14 + 0.2], abs=1e-5)
+        stage.target_below_tip(z_m=0.15)  # drawn out
+        before_m = state["start.target_m"].clone()
+        stage.step()
+        way_m = (state["start.target_m"] - before_m)[0]
+        assert way_m.norm().item() == pytest.approx(0.25, abs=1e-5)
+        assert (way_m @ before_m[0]).item() == pytest.approx(0.0, abs=1e-5) and way_m[2] == 0.0
+        stage.process.observe(stage.history)
+        torch.testing.assert_close(state["estimate_m"], state["start.target_m"])
+    assert stage.process.episode["success_strict"].item() == 1.0
+
+
+def test_a_block_that_is_struck_gives_way_once(machine: Machine) -> None:
+    loop = plant(machine, option("task", "several")).build(CPU, 2, 8, 0)
+    world: Any = loop.world
+    loop.step(torch.zeros(2, 5))  # contact in the first step would void the episode
+    before_m = loop.task.state["start.scene"][:, :2].clone()
+    world.contact_force_n.copy_(torch.tensor([6e3, 4e3]))
+    for _ in range(2):
+        loop.step(torch.zeros(2, 5))
+        mask, scene = world.placed
+        moved_m = (scene[:, :2] - before_m).norm(dim=1)
+        torch.testing.assert_close(moved_m, torch.tensor([0.01, 0.0]), rtol=0, atol=1e-6)
+    assert not mask.any()
 
 
 def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
