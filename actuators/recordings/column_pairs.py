@@ -162,23 +162,24 @@ class PairFinder:
         """Return the joints whose columns a person gives; refuse one that is missing."""
         known = index_columns({name: [*table.columns] for name, table in self._run.tables.items()})
         joints = []
-        for joint, columns in given.items():
-            entries = []
-            for column in columns:
-                if column not in known:
-                    raise RecordingError(
-                        f"{self._run.where}: log.joints: '{joint}' has column '{column}', which is missing; "
-                        f"{list_choices(column, known)}"
-                    )
-                entry = self._read_entry(*known[column]) if column in self._places else None
-                if entry is None:
-                    raise RecordingError(
-                        f"{self._run.where}: log.joints: column '{column}' of '{joint}' has no clock or no numbers: no column of "
-                        "its table only increases"
-                    )
-                entries.append(entry)
-            joints.append(JointGuess(joint, *entries, [("as given by log.joints", 5.0)], True))
+        for joint, (command, position) in given.items():
+            u, q = (self._read_given(joint, column, known) for column in (command, position))
+            joints.append(JointGuess(joint, u, q, [("as given by log.joints", 5.0)], True))
         return joints
+
+    def _read_given(self, joint: str, column: str, known: Places) -> ColumnEntry:
+        """Return a column that a person gives."""
+        place = f"{self._run.where}: log.joints"
+        if column not in known:
+            raise RecordingError(
+                f"{place}: '{joint}' has column '{column}', which is missing; {list_choices(column, known)}"
+            )
+        entry = self._read_entry(*known[column]) if column in self._places else None
+        if entry is None:
+            raise RecordingError(
+                f"{place}: column '{column}' of '{joint}' has no clock or no numbers: no column of its table only increases"
+            )
+        return entry
 
     def find(self) -> list[JointGuess]:
         """Return the joints that names and numbers propose; refuse columns that say nothing."""
@@ -247,10 +248,10 @@ class PairFinder:
     ) -> list[JointGuess]:
         """Return joints of columns whose names share nothing: by their numbers, else by their order."""
         pairs = self._pair_by_numbers(commands, positions)
-        texts = ("paired by their numbers", 0.0)
+        evidence = ("paired by their numbers", 0.0)
         if len(commands) == len(positions) == 1:
             pairs = [(commands[0], positions[0])]
-            texts = ("the only command and the only position", 2.0)
+            evidence = ("the only command and the only position", 2.0)
         elif len(pairs) == min(len(commands), len(positions)):
             if is_all:
                 self.remarks.append(
@@ -260,7 +261,7 @@ class PairFinder:
             return []
         elif len(commands) == len(positions):
             pairs = list(zip(commands, positions, strict=True))
-            texts = ("same place in their order", -0.5)
+            evidence = ("same place in their order", -0.5)
             self.remarks.append(
                 "commands and positions have different names and are paired in their order"
             )
@@ -270,12 +271,12 @@ class PairFinder:
                 f"{len(positions)} positions ({', '.join(p.full_name for p in positions)}) share no names; "
             )
             self._refuse(listed, pairs, "")
-        by_order = texts[1] < 0
+        by_order = evidence[1] < 0
         found = []
         for u, q in pairs:
             first, second = (u, q) if by_order else (q, u)
             name = name_joint(first.name.joint or second.name.joint)
-            found.append(JointGuess(name, u, q, [texts]))
+            found.append(JointGuess(name, u, q, [evidence]))
         return found
 
     def _pair_by_numbers(
@@ -298,15 +299,13 @@ class PairFinder:
         if is_same:
             np.fill_diagonal(size, 0.0)
             size = np.where(size >= size.T, size, 0.0)
-        pairs, causes, effects = [], set[int](), set[int]()
+        pairs, causes = [], set[int]()
+        effects = causes if is_same else set[int]()  # of the same list each takes part once
         for flat in np.argsort(-size, axis=None):
             row, column = (int(at) for at in np.unravel_index(flat, size.shape))
             rest = np.concatenate([np.delete(size[row], column), np.delete(size[:, column], row)])
             rival = 0.0 if is_same else float(rest.max(initial=0.0))
             is_clear = size[row, column] >= max(CLEAR_CORRELATION, rival + MARGIN)
-            if is_same:
-                causes |= effects
-                effects |= causes
             if is_clear and row not in causes and column not in effects:
                 causes.add(row)
                 effects.add(column)
