@@ -25,7 +25,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from deploy.page.files import read_static_files
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
-from deploy.page.protocol import DrawReport, OperatorRequest, PageFeed, PageState
+from deploy.page.protocol import OperatorRequest, PageFeed, PageState
 from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
 from deploy.runtime.process import Stop
@@ -189,10 +189,6 @@ class StudyFeed:
     def confirms_stop(self) -> bool:
         """See `PageFeed`; a trial is ended by the conductor, and nothing is ever sent in a study."""
         return True
-
-    def report_drawn(self, report: DrawReport) -> None:
-        """See `PageFeed`."""
-        self._feed.report_drawn(report)
 
 
 class StudyPages:

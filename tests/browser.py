@@ -20,7 +20,6 @@ from brokk_rl.signals import Frame
 from deploy.guidance import LeverPositions
 from deploy.page.protocol import (
     BoreholeChoice,
-    DrawReport,
     InsertionReading,
     LoopHealth,
     OperatorRequest,
@@ -92,12 +91,11 @@ def lever(
 
 
 class Scripted:
-    """A feed that shows `now` and remembers requests and draw reports."""
+    """A feed that shows `now` and remembers requests."""
 
     def __init__(self, now: PageState = SHOWN) -> None:
         self.now, self.picture, self.confirms = now, None, True
         self.requests: list[OperatorRequest] = []
-        self.seen: list[DrawReport] = []
 
     def read_advice_number(self) -> int | None:
         return self.now.advice.number if self.now.advice else None
@@ -114,9 +112,6 @@ class Scripted:
 
     def confirms_stop(self) -> bool:
         return self.confirms
-
-    def report_drawn(self, report: DrawReport) -> None:
-        self.seen.append(report)
 
     def advise(self, number: int, due_s: float | None = None, **axes: Any) -> None:
         """Advises these lever positions, of full."""

@@ -28,7 +28,6 @@ from deploy.guidance import LeverGuidance, convert_to_positions, find_full_angle
 from deploy.kernel.bus_process import TEXT
 from deploy.page.protocol import (
     BoreholeChoice,
-    DrawReport,
     LoopHealth,
     OperatorRequest,
     PageState,
@@ -251,16 +250,6 @@ class LoopFeed:
         if self._memory.request is None:
             return True
         return state is not None and state.t_s > self._stopped_s and not state.guard.sends
-
-    def report_drawn(self, report: DrawReport) -> None:
-        """See `PageFeed`; goes into the recording as topic `drawn`."""
-        values = {
-            "advice": report.number,
-            "at_s": report.t_s,
-            "round_trip_s": report.round_trip_s,
-            "page": report.page,
-        }
-        self._log_text("drawn", values)
 
     def _log_text(self, topic: str, values: dict[str, Any]) -> None:
         text = json.dumps({"topic": topic, "t_s": self._clock(), **values})

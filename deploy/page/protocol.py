@@ -1,4 +1,4 @@
-"""Protocol between the page and its feed: `PageState` goes out, requests and draw reports come back.
+"""Protocol between the page and its feed: `PageState` goes out, requests come back.
 
 Plain data in SI units, made anew at every moment and never queued: a reader takes the newest state
 and misses the rest. Old values are never left out: their age is part of the state, and the page
@@ -29,7 +29,7 @@ class ShownAdvice:
     Attributes:
         valid: Whether there is an advice; if not, `reason` says why.
         reason: Value of `deploy.runtime.operator_state.AdviceStatus`.
-        number: Counts up; draw reports refer to it.
+        number: Counts up.
         levers: Positions to move to.
         button_due_s: Time until the right button is to be held, 0 where that is now; `None` where
             it is not coming.
@@ -289,25 +289,6 @@ class OperatorRequest:
     value: str
 
 
-@dataclass(frozen=True)
-class DrawReport:
-    """Time at which an advice became visible on a page; reaction times count from then.
-
-    Attributes:
-        number: Of the advice.
-        t_s: Monotonic time of this computer at which its frame was drawn, by the browser's clock
-            and half the round trip.
-        round_trip_s: Of the shortest exchange with that page so far; `t_s` is wrong by at most half
-            of it.
-        page: Counts the pages that were opened.
-    """
-
-    number: int
-    t_s: float
-    round_trip_s: float
-    page: int
-
-
 class PageFeed(Protocol):
     """Source of the page's state, and receiver of its requests.
 
@@ -335,10 +316,6 @@ class PageFeed(Protocol):
 
     def confirms_stop(self) -> bool:
         """Return whether the guard sends nothing any more, after the last `stop` was submitted."""
-        ...
-
-    def report_drawn(self, report: DrawReport) -> None:
-        """Pass on when an advice became visible."""
         ...
 
 

@@ -23,7 +23,6 @@ from deploy.guidance import AXES, convert_to_positions, find_full_angles_rad
 from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.protocol import (
     BoreholeChoice,
-    DrawReport,
     LoopHealth,
     OperatorRequest,
     PageState,
@@ -214,9 +213,6 @@ class ReplayFeed:
     def confirms_stop(self) -> bool:
         """See `PageFeed`; nothing moves."""
         return True
-
-    def report_drawn(self, report: DrawReport) -> None:
-        """See `PageFeed`; nothing is recorded."""
 
     def _find(self, topic: str, at_s: float) -> tuple[int, float, dict[str, Any]] | None:
         """Return number, time and values of the last message of a topic at `at_s`."""

@@ -21,8 +21,9 @@ import secrets
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import asdict
+from functools import partial
 from http import HTTPStatus
-from typing import Protocol
+from typing import Any, Protocol
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -34,10 +35,9 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.page import access, frame_codec
 from deploy.page.alarms import list_alarms
-from deploy.page.clock import PageClock
 from deploy.page.connections import ConnectionBudget, LatestValue, SendWindow
 from deploy.page.files import FILES, SECURITY, load_files
-from deploy.page.protocol import DrawReport, PageFeed, PageState
+from deploy.page.protocol import PageFeed, PageState
 from deploy.page.settings import LINK, PageSettings
 
 log = logging.getLogger(__name__)
@@ -180,18 +180,16 @@ class PageServer:
         # The setup never changes during a run, so it is encoded once and served like a file.
         setup = page.describe_setup(machine) | {"extensions": [one.path for one in extensions]}
         self._files = load_files(json.dumps(setup).encode())
-        self._handlers = {
-            STATE: self._send_states,
-            FRAMES: self._send_frames,
+        self._state, self._frame = LatestValue(""), LatestValue(b"")
+        self._handlers: dict[str, Handler] = {
+            STATE: partial(self._send_newest, newest=self._state, most_undrawn=UNDRAWN_STATES),
+            FRAMES: partial(self._send_newest, newest=self._frame, most_undrawn=UNDRAWN_FRAMES),
             CONTROL: self._take_requests,
         }
         for extension in extensions:
             self._files |= extension.files
             self._handlers[extension.path] = extension.talk
         self._names = access.list_own_names(page.host, page.names)
-        self._state: LatestValue[tuple[PageState | None, str]] = LatestValue((None, ""))
-        self._frame = LatestValue(b"")
-        self._num_pages = 0
         self._budget = ConnectionBudget[ServerConnection](page.clients)
         self._guess, self._closing = asyncio.Lock(), set[asyncio.Task[None]]()
 
@@ -271,7 +269,7 @@ class PageServer:
                     shown = state.to_plain() | {"alarms": alarms}
                     message = {"number": self._state.number + 1, "shown": shown}
                     text = json.dumps(message, separators=(",", ":"))
-                    await self._state.put((state, text))
+                    await self._state.put(text)
             # Short sleeps only around the expected moment: polling costs processor time.
             await asyncio.sleep(EXPECTED_POLL_S if abs(until_s) < POLL_S else POLL_S)
 
@@ -354,37 +352,11 @@ class PageServer:
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
 
-    async def _send_states(self, connection: ServerConnection) -> None:
-        self._num_pages += 1
-        clock, page = PageClock(), self._num_pages
-        window = SendWindow(UNDRAWN_STATES)
-
-        async def listen() -> None:
-            async for text in connection:
-                self._budget.note_heard(connection, time.monotonic())
-                answer = clock.read_acknowledgement(text, time.monotonic())
-                if answer is None:
-                    await connection.close(POLICY_VIOLATION, "malformed")
-                    return
-                window.note_drawn(answer.number)
-                if answer.advice is not None:
-                    report = DrawReport(answer.advice, answer.drawn_s, clock.round_trip_s, page)
-                    self._feed.report_drawn(report)
-
-        async def speak() -> None:
-            number = 0
-            while True:
-                await window.wait()
-                number, (state, text) = await self._state.wait_after(number)
-                advice = state.advice if state else None
-                clock.note_sent(number, advice.number if advice else None, time.monotonic())
-                window.note_sent(number)
-                await connection.send(text)
-
-        await _run_both(listen(), speak())
-
-    async def _send_frames(self, connection: ServerConnection) -> None:
-        window = SendWindow(UNDRAWN_FRAMES)
+    async def _send_newest(
+        self, connection: ServerConnection, newest: LatestValue[Any], most_undrawn: int
+    ) -> None:
+        """Send the newest values, no more than `most_undrawn` ahead of those that the page has drawn."""
+        window = SendWindow(most_undrawn)
 
         async def listen() -> None:
             async for text in connection:
@@ -398,7 +370,7 @@ class PageServer:
             number = sent = 0
             while True:
                 await window.wait()
-                number, message = await self._frame.wait_after(number)
+                number, message = await newest.wait_after(number)
                 sent += 1
                 window.note_sent(sent)
                 await connection.send(message)

@@ -118,12 +118,6 @@ TOPICS: dict[str, tuple[TopicField, ...]] = {
         TopicField("std_m", "number", "its standard deviation, m", optional=True),
         TopicField("seen_s", "number", "when it was measured, s of the monotonic clock", optional=True),
     ),
-    "drawn": (
-        TopicField("advice", "integer", "number of the advice that became visible"),
-        TopicField("at_s", "number", "when, s of the monotonic clock"),
-        TopicField("round_trip_s", "number", "shortest round trip to that page, s; the error is half of it"),
-        TopicField("page", "integer", "number of the page"),
-    ),
 }  # fmt: skip
 """Fields by topic, beside those of the bus and of Foxglove's own schemas (`scene_topics`)."""
 

@@ -43,7 +43,6 @@ SAID: dict[str, dict[str, Any]] = {
         "kind": "target", "value": "1", "taken": False, "asked_s": 1.5, "center_in_base_m": [2.6, 0.0, 0.75],
         "std_m": 0.002, "seen_s": 1.25,
     },
-    "drawn": {"advice": 41, "at_s": 2.5, "round_trip_s": 0.001, "page": 2},
     "view": {
         "name": "lift 2.00 m", "is_moving": True, "travel_s": 1.5, "seen_s": 4.5, "seen_before_s": 0.5,
         "horizon_s": 6.0, "std_m": 0.001, "std_before_m": 0.004,

@@ -510,19 +510,11 @@ def test_the_token_leaves_the_address_bar(port: int, opened: Callable[..., Any])
     until(page, "document.getElementById('answer').textContent === ''")
 
 
-def test_two_pages_show_the_same_and_say_when(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
+def test_two_pages_show_the_same(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
     pages = [opened(port), opened(port)]
-    began_s = time.monotonic()
     feed.advise(41, left_psi=0.3)
     for page in pages:
         eventually(lambda page=page: drawn(page)["left advised"][0] == pytest.approx(0.3, abs=1e-3))
-    eventually(lambda: len([one for one in feed.seen if one.number == 41]) == 2)
-    seen = [one for one in feed.seen if one.number == 41]
-    assert {one.page for one in seen} == {1, 2}
-    for one in seen:
-        assert began_s - one.round_trip_s <= one.t_s <= time.monotonic() + one.round_trip_s
 
 
 def test_the_scene_shows_machine_points_and_picture(

@@ -18,7 +18,7 @@ from deploy.guidance import LeverPositions
 from deploy.kernel.bus_process import TEXT
 from deploy.kernel.guard import GuardState
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
-from deploy.page.protocol import DrawReport, OperatorRequest
+from deploy.page.protocol import OperatorRequest
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
@@ -147,12 +147,10 @@ def test_the_borehole_and_the_way_to_it(memory: LoopMemory, feed: LoopFeed) -> N
     assert not stopped.guiding and stopped.path_in_base_m == ()
 
 
-def test_what_was_wished_and_drawn_is_recorded(memory: LoopMemory, feed: LoopFeed) -> None:
-    feed.report_drawn(DrawReport(7, 12.5, 0.002, 1))
+def test_what_was_wished_is_recorded(memory: LoopMemory, feed: LoopFeed) -> None:
     feed.submit(OperatorRequest("record", "on"))
-    said = [json.loads(data.removeprefix(TEXT)) for data in memory.page_log.take()]
-    assert [one["topic"] for one in said] == ["drawn", "wish"]
-    assert (said[0]["advice"], said[0]["at_s"]) == (7, 12.5)
+    (said,) = [json.loads(data.removeprefix(TEXT)) for data in memory.page_log.take()]
+    assert (said["topic"], said["kind"], said["value"]) == ("wish", "record", "on")
 
 
 @dataclass

@@ -28,7 +28,6 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page import access, alarms, frame_codec
-from deploy.page.clock import PageClock
 from deploy.page.connections import ConnectionBudget, SendWindow
 from deploy.page.files import load_files
 from deploy.page.protocol import (
@@ -209,55 +208,6 @@ def test_depth_and_colour_of_different_sizes_are_refused() -> None:
         frame_codec.encode_frame(
             replace(frame(16, 32), depth_m=np.ones((8, 8), np.float32)), 640, 80
         )
-
-
-@given(
-    ahead_s=st.floats(-1e5, 1e5),
-    out_s=st.floats(0.0001, 0.05),
-    back_s=st.floats(0.0001, 0.05),
-    drawing_s=st.floats(0, 0.1),
-)
-def test_draw_times_are_right_within_half_the_round_trip(
-    ahead_s: float, out_s: float, back_s: float, drawing_s: float
-) -> None:
-    clock = PageClock()
-    clock.note_sent(1, 7, 100.0)
-    came_s = 100.0 + out_s
-    times = [1000 * (t_s + ahead_s) for t_s in (came_s, came_s + drawing_s, came_s + drawing_s)]
-    said = clock.read_acknowledgement(json.dumps([1, *times]), came_s + drawing_s + back_s)
-    assert said is not None and said.advice == 7
-    assert math.isclose(clock.round_trip_s, out_s + back_s, abs_tol=1e-6)
-    assert abs(said.drawn_s - (came_s + drawing_s)) <= clock.round_trip_s / 2 + 1e-6
-
-
-def test_an_advice_becomes_visible_once() -> None:
-    clock = PageClock()
-    seen = []
-    for number, advice in enumerate([5, 5, 6, None, 6]):
-        clock.note_sent(number, advice, float(number))
-        said = clock.read_acknowledgement(json.dumps([number, 0, 1, 1]), number + 0.01)
-        assert said is not None
-        seen.append(said.advice)
-    assert seen == [5, None, 6, None, 6]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "[]",
-        "[9, 0, 0, 0]",
-        "[1, null, 0, 0]",
-        "[1, 2, 3, 1]",
-        '["1", 0, 0, 0]',
-        "[[1], 0, 0, 0]",
-        "[1, 0, NaN, 0]",
-    ],
-)
-def test_nonsense_about_draw_times_is_noticed(text: str) -> None:
-    clock = PageClock()
-    clock.note_sent(1, None, 0.0)
-    assert clock.read_acknowledgement(text, 1.0) is None
 
 
 def test_a_page_has_no_more_undrawn_messages_than_the_limit() -> None:

@@ -94,8 +94,7 @@ def test_who_never_reads_or_answers_costs_the_others_nothing(feed: Scripted, por
             while time.monotonic() < end_s:
                 feed.advise(count)
                 last = json.loads(await quick.recv())["number"]
-                now_ms = 1000 * time.monotonic()
-                await quick.send(json.dumps([last, now_ms, now_ms, now_ms]))
+                await quick.send(str(last))
                 count += 1
             waiting = 0
             while True:

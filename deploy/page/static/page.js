@@ -21,18 +21,17 @@ const insertion = new InsertionView($("insertion")), overlay = new Overlay($("ov
 const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0, allowed: null, signals: [] };
 const signals = new Signals(name => measured.signals.push(name));
 const opened = performance.now(), PATIENCE_MS = 2000;
-let newest = null, came = 0, asked = false, video = null;
+let newest = null, came = 0, heard = 0, asked = false, video = null;
 
 // ---- state in, drawn back
 const painted = new MessageChannel();
-painted.port1.onmessage = ({ data: [number, at] }) => {
-  const now = performance.now();
-  state.send(JSON.stringify([number, at, now, performance.now()]));
-};
+painted.port1.onmessage = ({ data }) => state.send(String(data));
 const state = new Socket("/state", {
+  opened: () => { heard = 0; },
   heard: text => {
     came = performance.now();
     newest = JSON.parse(text);
+    heard += 1;
     if (!asked) { asked = true; requestAnimationFrame(frame); }
   },
 });
@@ -42,7 +41,7 @@ function frame() {
   draw();
   measured.drawn += 1;
   measured.number = newest.number;
-  painted.port2.postMessage([newest.number, came]);  // runs once the frame is through layout and paint
+  painted.port2.postMessage(heard);  // runs once the frame is through layout and paint
   scene?.postMessage({ state: newest.shown });
 }
 
