@@ -44,8 +44,6 @@ from deploy.runtime.operator_state import (
 
 CYCLE_S = 0.01
 """Half the cycle time of valve commands in the example DBC (20 ms)."""
-LARGEST_OVERRUNS = 4095
-"""Largest value of the signal `Overruns`, which has 12 bits."""
 LAST_ZEROS = 5
 """Zero commands before silence: 100 ms of the example bus, longer than the 70 ms after which the
 gateway misses commands. One of them would do; the others are for a bus that loses some."""
@@ -264,8 +262,7 @@ class BusLogic:
             self.receiver.note_own_command(command.data, now_s)
         # The gateway expects a heartbeat only where its DBC has one.
         if HEARTBEAT in self._description.layouts:
-            overruns = min(LARGEST_OVERRUNS, num_missed)
-            state = {"PcState": self.decision.state.value, "Overruns": overruns}
+            state = {"PcState": self.decision.state.value, "Overruns": num_missed}
             heartbeat = self._build_frame(HEARTBEAT, state, now_s, at_once=False)
             frames += [] if heartbeat is None else [heartbeat]
         return frames

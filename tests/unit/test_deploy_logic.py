@@ -483,13 +483,16 @@ def test_who_only_listens_is_told_of_a_fault_for_ten_seconds() -> None:
     assert probe.cleared > 0
 
 
-def test_without_an_envelope_no_ground_is_known() -> None:
+def test_without_an_envelope_no_ground_is_known_and_faces_lie_level() -> None:
     for limits, known in ((LIMITS, True), (replace(LIMITS, envelope=None), False)):
         loop = Loop(limits=limits)
         loop.target = SeenTarget((2.5, 0.1, -0.1), 0.0, ())
         loop.go(1.0)
         below = loop.logic.build_state(loop.now_s, True, 0).target is GuardTrip.TARGET_GROUND
         assert below is known
+        loop.target = SeenTarget((2.5, 0.1, 0.75), 0.0, ((2.5, 0.6, 0.75),))
+        loop.go(1.0)
+        assert loop.logic.build_state(loop.now_s, True, 0).target is GuardTrip.NONE
 
 
 @pytest.mark.parametrize("missing", ["JointPos1", "ValveFeedback"])
