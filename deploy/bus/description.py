@@ -42,6 +42,10 @@ KNOWN = (
     "ExclusiveSelected", "RoundTrip", "DescriptionHash", "MachineHash",
 )  # fmt: skip
 """Beginnings of the signals that decide about motion; each stands in one message."""
+TOGETHER = (
+    ("Command_", "CommandMode"), ("Flow_",), ("Lever_", "ButtonRight", "DeadMan", "RemoteOn"), ("EStop", "ExclusiveSelected"),
+)  # fmt: skip
+"""Beginnings of the signals that mean something at one moment alone: each group is one message."""
 HASH_BYTES = 3
 """Of the hash of description and machine; both fit into one message with counter and CRC."""
 PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
@@ -139,6 +143,13 @@ class BusDescription:
             if signal not in self._home:
                 raise ConfigError(
                     f"bus: {name} has no signal '{signal}', which machine '{machine.name}' needs"
+                )
+        for group in TOGETHER:
+            homes = {self._home[one] for one in required if one.startswith(group)}
+            if len(homes) > 1:
+                raise ConfigError(
+                    f"bus: {name}: expected {', '.join(group)} in one message, got "
+                    f"{', '.join(sorted(homes))}; mend the DBC"
                 )
         for joint in machine.joint_names:
             self._check_command_range(f"Command_{joint}")

@@ -119,9 +119,11 @@ def test_a_wire_that_is_not_there_is_an_error_that_says_what_to_change() -> None
         (" SG_ Crc : 56|8@1+ (1,0) [0|255] \"\" GATEWAY\n\nBO_ 2566918439", "\nBO_ 2566918439", "needs Counter, and Crc"),
         ("(0.001,0) [0|65.535]", "(0,0) [0|65.535]", "factor other than 0"),
         ("SG_ Position_q5", "SG_ Position_q1", "'Position_q1' in one message, got it in JointPos1 and JointPos3"),
+        ("SG_ Flow_q5", "SG_ Spare_q5", "no signal 'Flow_q5'"),
+        (" SG_ OilTemperature : 8", " SG_ Flow_q5 : 8", "in one message, got MachineStatus, ValveFeedback"),
         ("BO_ 2365592067 JointPos1: 8", "BO_ JointPos1: 8", "no valid DBC"),
     ],
-    ids=["signal", "crc", "factor", "twice", "syntax"],
+    ids=["signal", "crc", "factor", "twice", "missing", "apart", "syntax"],
 )  # fmt: skip
 def test_a_description_that_does_not_do_is_refused(
     machine: Machine, tmp_path: Path, old: str, new: str, message: str
@@ -129,7 +131,10 @@ def test_a_description_that_does_not_do_is_refused(
     text = described.resolve_package_path(DBC).read_text()
     assert old in text
     path = tmp_path / "other.dbc"
-    path.write_text(text.replace(old, new, 1))
+    text = text.replace(old, new, 1)
+    if new.endswith("Flow_q5 : 8"):  # moved, not doubled
+        text = text.replace("SG_ Flow_q5 : 36", "SG_ Spare : 36", 1)
+    path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         BusDescription(str(path), machine)
 
