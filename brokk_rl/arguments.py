@@ -152,6 +152,8 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
             reason = str(error).partition("while evaluating ")[2].splitlines()
             raise ConfigError(f"{word}: {reason[0] if reason else 'cannot be read'}") from error
         raise ConfigError(_explain_characters(key, value)) from error
+    if override.is_range_sweep() and not any(override.sweep_string_iterator()):
+        raise ConfigError(f"{word} holds no value: range(first, beyond the last, step)")
     is_single = key in groups and not _is_list_group(key)
     if override.is_sweep_override() and not sweep:
         raise ConfigError(_explain_several(key, value, key in groups, is_single))

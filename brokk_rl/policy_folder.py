@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 CONTRACT, WEIGHTS = "policy.json", "policy.safetensors"
 ONNX, GOLDEN = "policy.onnx", "golden.json"
+POLICY_FILES = (".pt", ".safetensors", ".onnx")
+"""Endings of files that hold a policy."""
 SCHEMA = 2
 """Version of `policy.json`."""
 TOLERANCE = 1e-3
@@ -352,6 +354,11 @@ def find_policy(name: str, may_lack: bool = False) -> StoredPolicy:
             "no such path; `ls runs` lists the runs of this folder"
         )
     if path.is_file():
+        if path.suffix not in POLICY_FILES:
+            raise CheckpointError(
+                f"policy={name}: expected a folder or a checkpoint (model_<iteration>.pt), got a "
+                f"file {path.name}"
+            )
         return StoredPolicy(name, _require_whole(path), read_contract(path.parent, name))
     weights, checkpoints = path / WEIGHTS, list_checkpoints(path)
     contract = read_contract(path, name)

@@ -21,10 +21,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from brokk_rl.contracts.task import FAULT, SUCCESS, Figure, TaskProcess
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.sim.simulator import find_site
 from brokk_rl.spec import Count, Finite, NonNegative, Positive, Share, spec
 
 if TYPE_CHECKING:
     import torch
+
+    from brokk_rl.contracts.world import Simulator
 
 BLOCK_AWAY_M = -20.0
 """Place of the block along x where a task has none: behind the machine and out of its reach, so
@@ -264,6 +267,10 @@ class EpisodeTask:
                 f"task.episode_s: expected at least a control step of machine '{machine.name}', "
                 f"{machine.period_s:g} s, got {self.episode_s:g}"
             )
+
+    def check_sim(self, sim: Simulator) -> None:
+        """Refuse a scene that there is not, or that the simulator does not build."""
+        find_site(self.scene, sim)
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""

@@ -7,9 +7,10 @@ import logging
 import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from annotated_types import Interval
 
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator
@@ -20,7 +21,7 @@ from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.session import Session, write_bytes, write_json, write_text
-from brokk_rl.spec import Count, name_spec, spec
+from brokk_rl.spec import WorldCount, name_spec, spec
 
 if TYPE_CHECKING:
     import torch
@@ -68,8 +69,8 @@ class CheckSubject:
     drive: Literal["auto", "electric", "hydraulic"]
     command: Literal["auto", "valve", "velocity", "position", "torque"]
     packages: tuple[str, ...]
-    num_poses: Count
-    num_starts: Count
+    num_poses: Annotated[int, Interval(ge=1, le=10**7)]
+    num_starts: WorldCount
 
     def check(self) -> None:
         if self.model is not None and not Path(self.model).is_file():

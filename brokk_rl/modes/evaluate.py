@@ -19,7 +19,7 @@ from brokk_rl.rl.loop import ControlLoop, SimulatedPlant, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session, write_json
-from brokk_rl.sim.scene import find_site
+from brokk_rl.sim.simulator import find_site
 from brokk_rl.sim.video import render_video
 from brokk_rl.spec import name_spec, spec
 

@@ -10,7 +10,7 @@ from annotated_types import Interval
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine
-from brokk_rl.spec import Count, Positive, Seed, spec
+from brokk_rl.spec import Positive, Seed, WorldCount, spec
 
 SPEEDS = (0.1, 10.0)
 """Slowest and fastest time; chosen by hand."""
@@ -36,7 +36,7 @@ class PlaySettings:
     """
 
     port: Annotated[int, Interval(ge=PORTS[0], le=PORTS[1])]
-    worlds: Count
+    worlds: WorldCount
     speed: Annotated[float, Interval(ge=SPEEDS[0], le=SPEEDS[1])]
     driver: Literal["policy", "classical", "person"]
     neutral: bool

@@ -35,8 +35,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import TaskDescription, describe_task
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
-from brokk_rl.sim.events import Event, list_events
-from brokk_rl.sim.scene import find_site
+from brokk_rl.sim.events import Event
+from brokk_rl.sim.simulator import find_site, list_events
 from brokk_rl.spec import spec
 
 Starts = dict[str, torch.Tensor]

@@ -313,7 +313,7 @@ class Evaluation:
         video: Whether to render a video.
     """
 
-    episodes: Count
+    episodes: WorldCount
     seed: Seed
     num_recorded: Count
     video: bool

@@ -8,13 +8,10 @@ motion; events change what the arm weighs, how it grips, and how hard it pushes.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import Finite, Interval, Ordered, name_spec, spec
+from brokk_rl.spec import Finite, Interval, Ordered, spec
 
 Property = Literal["mass", "friction", "stiffness", "yield_force"]
 """Properties of the machine that can change from world to world."""
@@ -45,21 +42,3 @@ class Event:
     def check(self) -> None:
         if self.when == "interval" and self.interval_s is None:
             raise ConfigError("interval_s: expected [low, high] in s, got null")
-
-
-def list_events(events: Mapping[str, Event], sim: Simulator) -> tuple[Event, ...]:
-    """Return events for the worlds of a simulator.
-
-    Raises:
-        ConfigError: The simulator cannot vary the machine, or two events change the same property.
-    """
-    names = [event.property for event in events.values()]
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(f"event: two of {', '.join(events)} change {name}; leave one out")
-    if events and "events" not in inspect.signature(sim.build).parameters:
-        raise ConfigError(
-            f"event={','.join(events)}: sim={name_spec(sim)} cannot vary the machine; choose "
-            "sim=native or sim=warp, or event=[]"
-        )
-    return tuple(events.values())

@@ -9,6 +9,7 @@ import mujoco
 import torch
 from mujoco.batch import Batch, SimulationError
 
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.events import Event
 from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model, mask_normal_forces
@@ -58,7 +59,15 @@ class NativeWorld(StoredWorld):
         self.num_worlds, self.device = num_worlds, torch.device("cpu")
         self.model = compile_model(machine, machine.period_s / substeps, site=site)
         check_simulated(self.model, machine.name, is_warp=False)
-        self._batch = Batch(self.model, num_worlds, num_threads)
+        try:
+            self._batch = Batch(self.model, num_worlds, num_threads)
+        except ValueError as error:
+            if "bad_alloc" not in str(error):
+                raise
+            raise ConfigError(
+                f"{num_worlds} worlds do not fit into the memory of this computer; take fewer: "
+                "rl.num_envs, evaluation.episodes, play.worlds or sim.num_worlds"
+            ) from error
         self.substeps = substeps
         self._state, self._warning = (
             torch.from_numpy(self._batch.state),

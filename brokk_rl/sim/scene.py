@@ -7,7 +7,6 @@ corners. The slabs serve as block and as wall of the hole, which halves the geom
 ring of eight walls.
 """
 
-import inspect
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +15,7 @@ import mujoco
 import numpy as np
 import torch
 
-from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
-from brokk_rl.registry import resolve_package_path
-from brokk_rl.spec import name_spec
 
 COLUMNS = ("hole_x_m", "hole_y_m", "rim_z_m", "yaw_rad", "block_scale", "hole_radius_m", "lean_rad")
 """Columns of a scene, `S` of them: centre of the rim in the base frame, turn of the block about the
@@ -193,29 +189,6 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
     )
     if visual:
         _add_visuals(body)
-
-
-def find_site(scene: str | None, sim: Simulator) -> Path | None:
-    """Return the MJCF file that a task names as its `scene`.
-
-    Args:
-        scene: A path, or `package:path`; `None` for nothing beside the block.
-        sim: Simulator that is to build it.
-
-    Raises:
-        ConfigError: There is no such file, or the simulator takes none.
-    """
-    if scene is None:
-        return None
-    path = resolve_package_path(scene)
-    if not path.is_file():
-        raise ConfigError(f"task.scene: expected an MJCF file, got {scene}; there is none")
-    if "site" not in inspect.signature(sim.build).parameters:
-        raise ConfigError(
-            f"task.scene: sim={name_spec(sim)} builds no scene; choose sim=native or sim=warp, or "
-            "task.scene=null"
-        )
-    return path
 
 
 def add_site(spec: mujoco.MjSpec, path: Path | None) -> None:

@@ -7,18 +7,21 @@ and a bad number is refused before.
 from __future__ import annotations
 
 import functools
+import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from brokk_rl.errors import DeviceError
+from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import Count, Index, Positive, WorldCount, spec
+from brokk_rl.registry import resolve_package_path
+from brokk_rl.sim.events import Event
+from brokk_rl.spec import Count, Index, Positive, WorldCount, name_spec, spec
 
 if TYPE_CHECKING:
     import torch
 
-    from brokk_rl.contracts.world import World
-    from brokk_rl.sim.events import Event
+    from brokk_rl.contracts.world import Simulator, World
     from brokk_rl.sim.native_world import NativeWorld
     from brokk_rl.sim.parity import ParityResult
     from brokk_rl.sim.warp_world import WarpWorld
@@ -147,6 +150,47 @@ class AutoSimulator:
         """Return the worlds on `device`; see `brokk_rl.contracts.world.Simulator`."""
         chosen = self.native if _is_cpu(device) else self.warp
         return chosen.build(machine, device, num_worlds, events, site)
+
+
+def find_site(scene: str | None, sim: Simulator) -> Path | None:
+    """Return the MJCF file that a task names as its `scene`.
+
+    Args:
+        scene: A path, or `package:path`; `None` for nothing beside the block.
+        sim: Simulator that is to build it.
+
+    Raises:
+        ConfigError: There is no such file, or the simulator takes none.
+    """
+    if scene is None:
+        return None
+    path = resolve_package_path(scene)
+    if not path.is_file():
+        raise ConfigError(f"task.scene: expected an MJCF file, got {scene}; there is none")
+    if "site" not in inspect.signature(sim.build).parameters:
+        raise ConfigError(
+            f"task.scene: sim={name_spec(sim)} builds no scene; choose sim=native or sim=warp, or "
+            "task.scene=null"
+        )
+    return path
+
+
+def list_events(events: Mapping[str, Event], sim: Simulator) -> tuple[Event, ...]:
+    """Return events for the worlds of a simulator.
+
+    Raises:
+        ConfigError: The simulator cannot vary the machine, or two events change the same property.
+    """
+    names = [event.property for event in events.values()]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"event: two of {', '.join(events)} change {name}; leave one out")
+    if events and "events" not in inspect.signature(sim.build).parameters:
+        raise ConfigError(
+            f"event={','.join(events)}: sim={name_spec(sim)} cannot vary the machine; choose "
+            "sim=native or sim=warp, or event=[]"
+        )
+    return tuple(events.values())
 
 
 @functools.lru_cache(maxsize=8)

@@ -52,12 +52,6 @@ def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machin
     check_task(option("task", "my_trace"), machine)
 
 
-def test_its_options_are_listed(site: Path, brokk: Callable[..., Any]) -> None:
-    out = brokk("mode=list").out
-    for text in ("my_rubber", "my_sink", "my_darkest", "my_arm", "A planar arm of two links."):
-        assert text in out
-
-
 def test_all_of_it_trains_together(site: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
     """A number of its own reward reaches the training from the command line, and so do its words."""
     done = brokk(*shlex.split(TRAINING)[1:], *SHORT, "task.reward.closeness.params.scale_m=0.2")

@@ -100,6 +100,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("rl.runner.actor.hidden_dims=(64,64)",): ("'rl.runner.actor.hidden_dims=[64,64]'",),
     ("rl.runner.algorithm.learning_rate=1,5",): ("learning_rate=1.5",),
     ("-m", "mode=list", "list.group=range(a,b)"): ("list.group", "start: str"),
+    ("-m", "mode=train", "session.seed=range(3,1)"): ("holds no value",),
     # files
     ("machine=@arm.xml",): ("brokk mode=check subject.model=arm.xml",),
     ("machine=bad.yaml",): ("machine=@bad.yaml",),

@@ -13,10 +13,10 @@ from promises import check_world
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.sim.events import Event, list_events
+from brokk_rl.sim.events import Event
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import make_nominal_scenes
-from brokk_rl.sim.simulator import NativeSimulator
+from brokk_rl.sim.simulator import NativeSimulator, list_events
 
 NUM = 4
 ALL = ("mass", "friction", "stiffness", "yield_force")

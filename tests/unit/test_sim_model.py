@@ -116,11 +116,6 @@ def test_joints_that_do_not_match_are_named(machine):
         compile_model(other, 0.01)
 
 
-def test_a_missing_mjcf_says_where_to_put_it(machine):
-    with pytest.raises(ConfigError, match="set `mjcf`"):
-        compile_model(dataclasses.replace(machine, mjcf="nowhere.xml"), 0.01)
-
-
 def test_a_second_machine_is_only_a_machine_and_an_mjcf(machine, tmp_path):
     small = _small(machine, tmp_path / "small.xml")
     world = NativeSimulator(num_worlds=2, substeps=5, num_threads=1).build(small, "cpu")

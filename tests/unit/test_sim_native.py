@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from brokk_rl.errors import ConfigError, DeviceError
+from brokk_rl.errors import DeviceError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import ASSETS
@@ -328,8 +328,3 @@ def test_a_gpu_asked_of_the_native_world_says_what_to_do(machine):
         NativeSimulator(num_worlds=1, substeps=5, num_threads=0).build(
             machine, torch.device("cuda")
         )
-
-
-def test_no_worlds_are_a_config_error():
-    with pytest.raises(ConfigError, match="num_worlds"):
-        NativeSimulator(num_worlds=0, substeps=5, num_threads=0)

@@ -28,7 +28,8 @@ from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session
 from brokk_rl.sim.model import compile_model
-from brokk_rl.sim.scene import find_site, make_nominal_scenes
+from brokk_rl.sim.scene import make_nominal_scenes
+from brokk_rl.sim.simulator import find_site
 from brokk_rl.spec import spec
 from deploy.policy.bundle import PolicyBundle
 from tasks.term_task import (
