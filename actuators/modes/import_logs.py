@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from dataclasses import fields
 from pathlib import Path
 
 from actuators.recordings import conversion, log_draft
@@ -134,15 +135,8 @@ class ImportLogs:
                 print_text(text)
             return
         paths = conversion.find_logs(self.log.input)
-        given = GivenColumns(
-            self.log.joints,
-            self.log.command,
-            self.log.position_unit,
-            self.log.clock_offset_s,
-            self.log.time,
-            self.log.rate_hz,
-            self.log.wraps,
-        )
+        keys = [one.name for one in fields(GivenColumns)]
+        given = GivenColumns(**{key: getattr(self.log, key) for key in keys})
         name = self.log.name or _name_machine(paths[0])
         draft = log_draft.make_draft(
             paths, name, given, self.log.dbc, self.log.damaged, self.log.channel

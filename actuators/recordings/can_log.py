@@ -8,7 +8,7 @@ missing in the rows of the others. Frames are read and decoded by blocks.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from datetime import datetime
 from io import StringIO
 from pathlib import Path
@@ -79,12 +79,11 @@ class CanLog(LogFile):
         for at, message in chosen.items():
             names[at] = [one.name for one in message.signals if one.name in wanted[message.name]]
             parts[at] = [np.empty((0, 1 + len(names[at])))]
-        for block in self._iterate():
+        for block in self._iterate(chosen):
             for at, frames in block.groupby("frame_id"):
-                if at in chosen:
-                    self._refuse_channels(chosen[at].name, frames)
-                    values = self._decode(chosen[at], names[at], frames)
-                    parts[at].append(np.column_stack([frames["time_s"], values]))
+                self._refuse_channels(chosen[at].name, frames)
+                values = self._decode(chosen[at], names[at], frames)
+                parts[at].append(np.column_stack([frames["time_s"], values]))
             counts = [sum(map(len, several)) for several in parts.values()]
             if max_rows is not None and min(counts, default=0) >= max_rows:
                 break
@@ -129,14 +128,12 @@ class CanLog(LogFile):
             return can.CanutilsLogReader(StringIO(read_candump(self.path)))
         return can.LogReader(self.path)
 
-    def _iterate(self) -> Iterator[pd.DataFrame]:
-        """Yield the frames of the chosen channel that carry data, by blocks; the index is their number in the log."""
-        for block in self._iterate_all():
-            if self._channel is not None:
-                block = block.loc[block["channel"] == str(self._channel)]
-            yield block
+    def _iterate(self, wanted: Container[int] | None = None) -> Iterator[pd.DataFrame]:
+        """Yield the frames of the chosen channel that carry data, by blocks; the index is their number in the log.
 
-    def _iterate_all(self) -> Iterator[pd.DataFrame]:
+        Args:
+            wanted: Identifiers of the frames; `None` for all.
+        """
         count, last_s = 0, 0.0
         waiting: dict[int, tuple[float, int, str, bytes]] = {}
         try:
@@ -150,7 +147,11 @@ class CanLog(LogFile):
                     if frame.is_error_frame or frame.is_remote_frame:
                         continue
                     frame_id = frame.arbitration_id | (EXTENDED if frame.is_extended_id else 0)
-                    waiting[count - 1] = (last_s, frame_id, str(frame.channel), bytes(frame.data))
+                    channel = str(frame.channel)
+                    is_other = self._channel is not None and channel != str(self._channel)
+                    if is_other or (wanted is not None and frame_id not in wanted):
+                        continue
+                    waiting[count - 1] = (last_s, frame_id, channel, bytes(frame.data))
                     if len(waiting) >= BLOCK_FRAMES:
                         yield gather_frames(waiting)
                         waiting = {}
