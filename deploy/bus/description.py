@@ -139,6 +139,7 @@ class BusDescription:
             "EStop",
             "ExclusiveSelected",
         ]
+        self._required = required
         for signal in required:
             if signal not in self._home:
                 raise ConfigError(
@@ -173,7 +174,7 @@ class BusDescription:
     def list_needed(self) -> set[str]:
         """Return the messages without which nothing may be commanded."""
         signals = ["DeadMan", "EStop", "ExclusiveSelected"]
-        signals += [one for one in self._home if one.startswith(("Position_", "Flow_"))]
+        signals += [one for one in self._required if one.startswith(("Position_", "Flow_"))]
         return {self._home[signal] for signal in signals}
 
     def check_protection(self) -> None:

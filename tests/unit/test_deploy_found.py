@@ -180,7 +180,10 @@ def test_ends_of_other_descriptions_never_get_ready(
         assert old in text
         text = text.replace(old, new)
     path.write_text(text)
-    stage = Stage(machine, "collect", tmp_path, again_s=0.5, **{side: str(path)})
+    ends = {"dbc": DBC, "twin_dbc": DBC} | {side: str(path)}
+    stage = Stage(
+        machine, "collect", tmp_path, again_s=0.5, dbc=ends["dbc"], twin_dbc=ends["twin_dbc"]
+    )
     highest, moved_ms = [0], [0]
 
     def look() -> bool:
@@ -284,10 +287,9 @@ def test_inside_a_box_the_slew_turns_outward_alone(
     machine: Machine, tmp_path: Path, side: float, record_property: Note
 ) -> None:
     tip_m = compute_tool_kinematics(machine, np.asarray(machine.home)).tip_in_base_m
+    x, y, z = map(float, tip_m)
     # The tip is 10 cm inside, and left is deeper.
-    lower_m = (tip_m[0] - 1.0, tip_m[1] - 0.1, tip_m[2] - 0.5)
-    upper_m = (tip_m[0] + 1.0, tip_m[1] + 3.0, tip_m[2] + 0.5)
-    box = StayOutBox(lower_m=tuple(map(float, lower_m)), upper_m=tuple(map(float, upper_m)))
+    box = StayOutBox(lower_m=(x - 1.0, y - 0.1, z - 0.5), upper_m=(x + 1.0, y + 3.0, z + 0.5))
     stage = Stage(machine, "collect", tmp_path, again_s=1.0, stay_out={"box": box})
     stage.wanted = (0.5 * side, 0.0, 0.0, 0.0, 0.0)
     stage.go(6.0)
