@@ -312,6 +312,7 @@ class ControlLoop(VecEnv):
         if fault_rate and isinstance(self.world, ExplainedWorld):
             log.warning("worlds diverged: %s", self.world.explain_faults())
         self._totals.zero_()
+        self._is_odd.zero_()
         self._steps = 0
         means = {name: value / max(1.0, episodes) for name, value in values.items()}
         return means | {"episodes": episodes, "fault_rate": fault_rate}

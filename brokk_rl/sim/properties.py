@@ -102,6 +102,8 @@ class WorldProperties:
 
     def advance(self) -> None:
         """Let a control period pass; draw where an interval is over."""
+        if all(event.when != "interval" for event in self._events):
+            return
         self.left_s.sub_(self._period_s)
         for left_s, event in zip(self.left_s, self._events, strict=True):
             if event.when == "interval":
