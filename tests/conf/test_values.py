@@ -71,7 +71,10 @@ BAD = {
     ("mode=diagnose", "diagnosis.field=x", "diagnosis.workers=0"): "diagnosis.workers: expected 1",
     ("mode=check", "subject.model=nowhere.urdf"): "subject.model: there is no file nowhere.urdf",
     ("mode=check", "subject.num_starts=0"): "subject.num_starts: expected",
-    ("mode=check", "subject.num_poses=1e12"): "from 1 to 1e+07, got 1e+12",
+    (
+        "mode=check",
+        "subject.num_poses=1e12",
+    ): "subject.num_poses: expected a whole number from 1 to 1e+07",
     ("mode=export",): "policy has no default and must be given",
     ("mode=compare", "compare.runs=[1]"): "compare.runs",
     ("mode=inspect", "inspect.recordings=3"): "inspect",
