@@ -8,7 +8,7 @@ from measurement import Measurement, Table, load_json, read_evaluation
 
 PLANTS = ("mlp", "hydraulic")
 CIRCUITS = ("load_sensing", "post_compensated", "open_center")
-LEVELS = ("flat", "gentle", "tight")
+LEVELS = ("flat", "gentle", "tight", "several")
 DELAYS_S = ("0.1", "0.3", "0.5")
 EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=false"
 POLICY_CODE = (
@@ -85,10 +85,14 @@ MEASUREMENTS = (
     Measurement(
         name="levels",
         title="Levels of the task",
-        conditions="The shipped policy and the classical controller (baseline), from the same 256 starts. `flat`: the chisel ends flat, and 10 kN end an episode; the policy learned there. `gentle`: 5 kN end it. `tight`: a hole of 8.4 cm, for which nothing was trained.",
-        commands=tuple(
-            f"{EVALUATE} policy=shipped task={level} evaluation.episodes=256 session.out={{out}}/{level}"
-            for level in LEVELS
+        conditions="The shipped policy and the classical controller (baseline), from the same 256 starts. `flat`: the chisel ends flat, and 10 kN end an episode; the policy learned there. `gentle`: 5 kN end it. `tight`: a hole of 8.4 cm, for which nothing was trained. "
+        "`several`: three holes in a row in a block that moves by a centimetre when struck with 5 kN; the shipped policy never learned to draw the chisel out. `slanted`: holes lean by up to 15 degrees, which the shipped policy does not observe.",
+        commands=(
+            *(
+                f"{EVALUATE} policy=shipped task={level} evaluation.episodes=256 session.out={{out}}/{level}"
+                for level in LEVELS
+            ),
+            f"{EVALUATE} policy=classical ~rivals.classical task=slanted evaluation.episodes=256 session.out={{out}}/slanted",
         ),
         code=POLICY_CODE,
         read=lambda folder: read_evaluations(folder, "task"),
