@@ -3,7 +3,7 @@
 The examiner fits a simulator to the reference, puts the effects of an answer around it, and runs it
 freely through recordings of the changed machine that no candidate got. The floor is the error of
 the same simulator on the same machine without what the case is about, under the same commands.
-Nothing of the diagnosis is used but the names of its files.
+Nothing of the diagnosis is used but its effects, which are simulated as it simulates them.
 Axes: `W` windows, `K` steps, `J` joints.
 """
 
@@ -21,17 +21,14 @@ import yaml
 
 from actuators import open_loop
 from actuators.contracts import ActuatorFit
-from actuators.effects.composition import ActuatorWithEffects, MeasuredActuatorModel
-from actuators.open_loop import FreeRunWindows
 from brokk_rl import record
-from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, read_answer
 from diagnosis.case import estimate_running_s
+from diagnosis.effect_library import EffectSimulator
 from diagnosis.effects_file import EFFECTS_FILE
 from exam.dataset import CASES_FOLDER, WITHHELD_FOLDER
 from exam.generate import UNCHANGED_FOLDER
@@ -96,17 +93,13 @@ class ExaminerSimulator:
             self._actuator = fit.fit(machine, reference, [], Path(scratch), 0, torch.device("cpu"))
         # of the field an answer knows how long the machine had run; the withheld part goes on
         running = estimate_running_s([*field, *withheld])[len(field) :]
-        self._cut, self._running_s = cut_with_times(withheld, running, machine)
-        self._unchanged, _ = cut_with_times(unchanged, running, machine)
-        self._before = self._squares(self._actuator, self._cut)
-        self._floor = self._squares(self._actuator, self._unchanged)
+        self._runs = self._cut_runs(withheld, running)
+        self._before = self._squares(self._runs, {})
+        self._floor = self._squares(self._cut_runs(unchanged, running), {})
 
     def examine(self, effects: Mapping[str, Any], said: Answer | None) -> Examination:
         """Return the errors with these effects, specs by name, beside what the answer says."""
-        after = self._before
-        if effects:
-            repaired = TimedActuator(self._actuator, effects, self._running_s)
-            after = self._squares(repaired, self._cut)
+        after = self._squares(self._runs, effects) if effects else self._before
         draws = np.random.default_rng(0).multinomial(
             len(after), np.full(len(after), 1.0 / len(after)), NUM_DRAWS
         )
@@ -131,12 +124,31 @@ class ExaminerSimulator:
             differs=differs,
         )
 
-    def _squares(self, actuator: Actuator, cut: FreeRunWindows) -> np.ndarray:
+    def _cut_runs(
+        self, recordings: Sequence[Recording], running_s: Sequence[float]
+    ) -> EffectSimulator:
+        """Return free runs through windows of recordings; `running_s`: when each of them begins."""
+        cuts, times = [], []
+        for recording, begun_s in zip(recordings, running_s, strict=True):
+            cut = open_loop.cut_windows([recording], self._machine, HORIZON_S, STRIDE_S)
+            cuts.append(cut)
+            times.append(begun_s + STRIDE_S * np.arange(len(cut.q)))
+        windows, begun = open_loop.join_windows(cuts), np.concatenate(times)
+        return EffectSimulator(self._actuator, self._machine, windows, begun, seed=0)
+
+    def _squares(self, runs: EffectSimulator, effects: Mapping[str, Any]) -> np.ndarray:
         """Return the mean square error of each window over all joints, `(W,)`.
 
         Joints count by their travel where rad and m meet.
         """
-        paths = open_loop.roll_out(actuator, self._machine, cut, torch.device("cpu"))
+        kinds = {kind.name: kind for kind in effect_library.load_effects(self._machine)}
+        chosen = []
+        for name, effect in effects.items():
+            model = self._actuator.build(self._machine, 1, torch.device("cpu"))
+            around = effect.wrap(model, self._machine, 1, torch.device("cpu"))
+            values = {key: value.numpy() for key, value in around.parameters.items()}
+            chosen.append((kinds[name], values))
+        paths, cut = runs.simulate(chosen)[0], runs.cut
         units = {joint.unit for joint in self._machine.joints}
         size = self._machine.upper - self._machine.lower if len(units) > 1 else 1.0
         return np.square((paths - cut.measured) / size).mean((1, 2))
@@ -153,77 +165,6 @@ def compute_closed(
     share = (before - after) / gap
     low, high = np.quantile(share[1:], [0.025, 0.975])
     return float(share[0]), (float(low), float(high))
-
-
-def cut_with_times(
-    recordings: Sequence[Recording], running_s: Sequence[float], machine: Machine
-) -> tuple[FreeRunWindows, np.ndarray]:
-    """Return windows of recordings, and how long the machine had run at the first sample of each."""
-    cuts, times = [], []
-    for recording, begun_s in zip(recordings, running_s, strict=True):
-        cut = open_loop.cut_windows([recording], machine, HORIZON_S, STRIDE_S)
-        cuts.append(cut)
-        times.append(begun_s + STRIDE_S * np.arange(len(cut.q)))
-    return open_loop.join_windows(cuts), np.concatenate(times)
-
-
-@dataclass(frozen=True)
-class TimedActuator:
-    """An actuator with effects, on a machine that has run for a while at the start of each window.
-
-    Attributes:
-        actuator: The actuator.
-        effects: Specs of the effects by name, the first nearest to the machine.
-        running_s: Running time of each environment, `(W,)`.
-    """
-
-    actuator: Actuator
-    effects: Mapping[str, Any]
-    running_s: np.ndarray
-
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> WarmedActuatorModel:
-        """Return a model for as many environments as there are running times."""
-        around = ActuatorWithEffects(actuator=self.actuator, effects=dict(self.effects))
-        model = around.build(machine, num_envs, device)
-        for name, effect in self.effects.items():
-            running = getattr(effect, "running", None)
-            if running is not None:
-                wrapped: Any = model.effects[name]
-                times = torch.as_tensor(self.running_s, dtype=torch.float32, device=device)
-                wrapped.parameters[running].copy_(times[:, None])
-        warm_up = open_loop.count_samples_before(machine) - machine.num_history + 1
-        return WarmedActuatorModel(model, warm_up)
-
-
-class WarmedActuatorModel:
-    """A measured actuator that takes the recorded positions until its free run begins.
-
-    By itself it keeps its own positions from its first step on, and would run freely through the
-    warm-up, where the simulator without effects sees the recording.
-
-    Args:
-        model: The model.
-        warm_up: Steps that begin at recorded positions.
-    """
-
-    def __init__(self, model: MeasuredActuatorModel, warm_up: int) -> None:
-        self._model, self._left = model, warm_up
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """State of the model."""
-        return self._model.state
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Forget the environments of `mask`, `(N,)` bool."""
-        self._model.reset(mask)
-
-    def step(self, history: History) -> torch.Tensor:
-        """Return the measured positions one control period later, `(N, J)`."""
-        if self._left:
-            self._model.state["fresh"].fill_(True)
-            self._left -= 1
-        return self._model.step(history)
 
 
 def read_effects(path: Path, machine: Machine) -> dict[str, Any]:
