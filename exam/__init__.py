@@ -1,6 +1,6 @@
 """Blind exam of a diagnosis: sealed cases, answers without a way to the labels, metrics.
 
-case_distribution  kinds, effects, joints, sizes of cases; the protocol of a plant family
+case_distribution  kinds, effects, joints, sizes of cases
 generate           plans and recordings of reference and field
 dataset            cases on disk, labels, seal
 run_cases          one process a case

@@ -1,86 +1,19 @@
-"""Distribution of the cases of an exam: kinds, effects, joints and sizes, drawn from a seed.
-
-`PlantFamily` is the seam to the plants: the configuration puts a family into the exam.
-"""
+"""Distribution of the cases of an exam: kinds, effects, joints and sizes, drawn from a seed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
-from brokk_rl.contracts.link import Link
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-
-
-@dataclass(frozen=True)
-class UnknownFault:
-    """Something outside the library that a machine has.
-
-    Attributes:
-        kind: Its name in the family.
-        severity: By joint, `(J,)`: 0 not at all, 1 plainly.
-    """
-
-    kind: str
-    severity: np.ndarray
-
-
-@dataclass(frozen=True)
-class PlantRun:
-    """One run of one machine.
-
-    Attributes:
-        seed: The machine: same seed, same machine.
-        roughness: Name of how much of the machine no tidy model has (`mild`, `strong`).
-        chance: Seed of the run's own chance.
-        elapsed_s: Time the machine has run before.
-        faults: Effects it has, by name: parameters in the library's words, `(J,)` each.
-        outside_fault: Its fault outside the library.
-        tracked: Whether its tool point is measured.
-    """
-
-    seed: int
-    roughness: str
-    chance: int
-    elapsed_s: float
-    faults: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-    outside_fault: UnknownFault | None = None
-    tracked: bool = False
-
-
-class PlantFamily(Protocol):
-    """A spec in `conf/exam_plants`: machines of many makes, written apart from the library."""
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of the effects that its plants can have."""
-        ...
-
-    @property
-    def outside_not_on(self) -> Mapping[str, tuple[str, ...]]:
-        """Joints on which nothing of a fault outside the library would be seen, by its name."""
-        ...
-
-    @property
-    def outside_faults(self) -> tuple[str, ...]:
-        """Names of the faults outside the library that its plants can have."""
-        ...
-
-    def makes(self, machine: Machine, specimens: Sequence[PlantRun]) -> list[str]:
-        """Return the make of each specimen; those of one make can run side by side."""
-        ...
-
-    def build(self, machine: Machine, specimens: Sequence[PlantRun], run_s: float) -> Link:
-        """Return a link to runs of one make, side by side, for `run_s`."""
-        ...
-
+from exam.plants.family import UnknownFault
 
 KINDS = ("none", "faint", "one", "several", "outside")
 """No gap; an effect too small to be seen; one effect; two or three; a fault outside the library."""

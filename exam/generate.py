@@ -23,7 +23,8 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
-from exam.case_distribution import CaseDesign, PlantFamily, PlantRun
+from exam.case_distribution import CaseDesign
+from exam.plants.family import DrawnPlants, PlantRun
 
 SIDE_BY_SIDE = 240
 """Runs simulated at once; their random numbers lie in memory."""
@@ -163,7 +164,7 @@ class CaseRecorder:
     def __init__(
         self,
         machine: Machine,
-        plants: PlantFamily,
+        plants: DrawnPlants,
         roughness: str,
         excitations: Mapping[str, Excitation],
         approach: Approach,

@@ -30,9 +30,10 @@ from exam.answer_scoring import (
     read_answers,
     read_run,
 )
-from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
+from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.dataset import CaseSet
 from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
+from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ class ExamSettings:
     answers: dict[str, str]
     fit: ActuatorFit
     mix: CaseDistribution
-    plants: PlantFamily
+    plants: DrawnPlants
     roughness: str
     known: Literal["full", "joints"]
     reference: HalfPlan

@@ -3,20 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.signals import JointState
-from exam.case_distribution import PlantRun
+from brokk_rl.signals import Command, JointState
 from exam.plants.changes import Change, PlantParameters
 from exam.plants.linkage import Arm
 
 TRACKER_SPREAD = (0.0015, 0.0015, 0.0015, 0.001)
 """Standard deviation of the measured tool point, m, and of its pitch, rad; chosen by hand."""
 TRACKED = ("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad")
+
+
+@dataclass(frozen=True)
+class UnknownFault:
+    """Something outside the library that a machine has.
+
+    Attributes:
+        kind: Its name in the family.
+        severity: By joint, `(J,)`: 0 not at all, 1 plainly.
+    """
+
+    kind: str
+    severity: np.ndarray
+
+
+@dataclass(frozen=True)
+class PlantRun:
+    """One run of one machine.
+
+    Attributes:
+        seed: The machine: same seed, same machine.
+        roughness: Name of how much of the machine no tidy model has (`mild`, `strong`).
+        chance: Seed of the run's own chance.
+        elapsed_s: Time the machine has run before.
+        faults: Effects it has, by name: parameters in the library's words, `(J,)` each.
+        outside_fault: Its fault outside the library.
+        tracked: Whether its tool point is measured.
+    """
+
+    seed: int
+    roughness: str
+    chance: int
+    elapsed_s: float
+    faults: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
+    outside_fault: UnknownFault | None = None
+    tracked: bool = False
 
 
 class PlantLink:
@@ -51,6 +87,10 @@ class PlantLink:
         """Return the present readings of the encoders."""
         return JointState(self._k * self._machine.period_s, self._measure())
 
+    def send(self, command: Command) -> Command:
+        """Move on by one control period with these commands, `(N, J)`."""
+        raise NotImplementedError
+
     def extra(self) -> Mapping[str, np.ndarray]:
         """Return the measured tool, NaN in runs without a tracker; empty where none has one."""
         arm = self._find_arm()
@@ -82,7 +122,15 @@ class PlantLink:
 
 
 class DrawnPlants:
-    """Base of plant families: each machine is drawn from its seed; see `PlantFamily`."""
+    """Base of the specs in `conf/exam_plants`: machines of many makes, each drawn from its seed.
+
+    Attributes:
+        roughness: By name, size of the nuisances.
+        outside_not_on: Joints on which nothing of a fault outside the library would be seen, by its name.
+        table: Change of the parameters by effect.
+        causes: Faults outside the library.
+        link: Builds the link to runs of one make.
+    """
 
     roughness: dict[str, float]
     outside_not_on: dict[str, tuple[str, ...]]

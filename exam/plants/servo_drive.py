@@ -8,7 +8,6 @@ that grows with the torque through the gear).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -93,19 +92,6 @@ class PositionLoop:
         return self._n["stall_n_m"] * (duty * supply - speed / self._n["no_load_rad_s"])
 
 
-class Friction(Protocol):
-    """Friction of all joints."""
-
-    @property
-    def changes(self) -> Mapping[str, np.ndarray]:
-        """Part of it that MuJoCo itself simulates, as `MjcfPlant.run` takes it."""
-        ...
-
-    def torque(self, speed: np.ndarray, extra_n_m: np.ndarray) -> np.ndarray:
-        """Return the torque against the motion, `(N, J)`, with this much more Coulomb friction."""
-        ...
-
-
 class BristleFriction:
     """LuGre: bristles bend up to a break-away torque, which falls with the speed.
 
@@ -123,7 +109,10 @@ class BristleFriction:
         self._bend = np.zeros_like(self._own)
 
     def torque(self, speed: np.ndarray, extra_n_m: np.ndarray) -> np.ndarray:
-        """See `Friction.torque`; implicit in the bend, so that no speed makes it unstable."""
+        """Return the torque against the motion, `(N, J)`, with this much more Coulomb friction.
+
+        It is implicit in the bend, so that no speed makes it unstable.
+        """
         n = self._n
         slow = np.exp(-np.square(speed / n["stribeck_rad_s"]))
         most = (self._own + extra_n_m) * (1.0 + (n["static_ratio"] - 1.0) * slow)
@@ -146,11 +135,11 @@ class DryFriction:
 
     @property
     def changes(self) -> Mapping[str, np.ndarray]:
-        """`friction` in Nm: a full command is 1 Nm."""
+        """Part of it that MuJoCo simulates: `friction` in Nm, as a full command is 1 Nm."""
         return {"friction": self._own}
 
     def torque(self, speed: np.ndarray, extra_n_m: np.ndarray) -> np.ndarray:
-        """See `Friction.torque`."""
+        """Return the torque against the motion, `(N, J)`, with this much more Coulomb friction."""
         n = self._n
         slow = np.exp(-np.square(speed / n["stribeck_rad_s"]))
         return (extra_n_m + self._own * (n["static_ratio"] - 1.0) * slow) * np.tanh(
@@ -158,8 +147,5 @@ class DryFriction:
         )
 
 
-FRICTIONS: dict[str, type[BristleFriction] | type[DryFriction]] = {
-    "bristle": BristleFriction,
-    "dry": DryFriction,
-}
+FRICTIONS = {"bristle": BristleFriction, "dry": DryFriction}
 """By make; see `servo_parameters.MAKES`."""

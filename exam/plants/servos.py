@@ -19,13 +19,12 @@ from brokk_rl.machine import Dimension, Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from diagnosis.mjcf.plant import MjcfPlant
-from exam.case_distribution import PlantRun
 from exam.plants import servo_parameters
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus
-from exam.plants.family import DrawnPlants, PlantLink
+from exam.plants.family import DrawnPlants, PlantLink, PlantRun
 from exam.plants.servo_causes import CAUSES, ServoCauses
-from exam.plants.servo_drive import FRICTIONS, STEP_S, Friction, PositionLoop, TargetFilter
+from exam.plants.servo_drive import FRICTIONS, STEP_S, PositionLoop, TargetFilter
 
 ARM = Path(__file__).parent / "so101_arm.xml"
 WANDER_S = 8.0
@@ -84,7 +83,7 @@ class ServoArm(PlantLink):
         self._bus.at(0.0)
         self._targets = TargetFilter(n, machine, q.copy())
         self._loop = PositionLoop(n)
-        self._friction: Friction = FRICTIONS[make](n)
+        self._friction = FRICTIONS[make](n)
         self._changes = dict(self._friction.changes)
         if n["added_armature"].any():
             self._changes["armature"] = n["added_armature"]

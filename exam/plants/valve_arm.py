@@ -13,10 +13,9 @@ import numpy as np
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
-from exam.case_distribution import PlantRun
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus, RunChance, SteppedEncoders
-from exam.plants.family import DrawnPlants, PlantLink
+from exam.plants.family import DrawnPlants, PlantLink, PlantRun
 from exam.plants.hydraulics import OPEN, STEP_S, Linkage, PilotedSpools, SensingHydraulics
 from exam.plants.linkage import Arm
 from exam.plants.valve_causes import CAUSES, OutsideCauses

@@ -11,10 +11,10 @@ from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
-from exam.case_distribution import PlantRun, UnknownFault
 from exam.plants import valve_causes, valve_parameters
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus, SteppedEncoders, draw_bursts
+from exam.plants.family import PlantRun, UnknownFault
 from exam.plants.linkage import Arm
 from exam.plants.valve_arm import SensingArm
 from exam.plants.valve_parameters import change_machine, draw_machine

@@ -14,8 +14,8 @@ from brokk_rl.commands import find_rest, read_targets
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
-from exam.case_distribution import PlantRun, UnknownFault
 from exam.plants import servo_parameters
+from exam.plants.family import PlantRun, UnknownFault
 from exam.plants.servo_causes import CAUSES
 from exam.plants.servos import ServoArm, ServoPlants
 
