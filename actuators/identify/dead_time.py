@@ -59,20 +59,13 @@ class DeadTimeEstimate:
         ci95_s: 95 % interval from resampling whole runs; at least the two neighbours in resolution.
         explained: Part of the variance of the increments that the delayed static curve explains; for a
             target, that of the positions.
-        tried_s: Delays that were tried, shape `(D,)`.
-        left: Part of the variance that each of them leaves unexplained, shape `(D,)`.
+        is_found: False where the best delay is the longest tried: it may be longer, or not exist.
     """
 
     value_s: float
     ci95_s: tuple[float, float]
     explained: float
-    tried_s: np.ndarray
-    left: np.ndarray
-
-    @property
-    def is_found(self) -> bool:
-        """False where the best delay is the longest tried: it may be longer, or not exist."""
-        return self.value_s < float(self.tried_s[-1]) - RESOLUTION_S / 2
+    is_found: bool
 
 
 def estimate_dead_times(
@@ -118,14 +111,27 @@ def _estimate_servo_delay(
     best = int(by_run.sum(0).argmin())
     picks = generator.integers(len(names), size=(RESAMPLED, len(names)))
     again = grid_s[by_run[picks].sum(1).argmin(1)]
-    low, high = np.percentile(again, (2.5, 97.5))
-    half_s = max(RESOLUTION_S, loops.step_s) / 2
-    interval = max(0.0, min(low, grid_s[best] - half_s)), max(high, grid_s[best] + half_s)
     total = sum(float(((q - q.mean()) ** 2).sum()) for _, q in pairs)
-    shares = by_run.sum(0) / total
-    return DeadTimeEstimate(
-        float(grid_s[best]), (float(interval[0]), float(interval[1])), float(1.0 - shares[best]), grid_s, shares
-    )  # fmt: skip
+    left = float(by_run.sum(0)[best] / total)
+    return _bound_delay(grid_s, best, again, max(RESOLUTION_S, loops.step_s) / 2, left)
+
+
+def _bound_delay(
+    grid_s: np.ndarray, best: int, again: np.ndarray, half_s: float, left: float
+) -> DeadTimeEstimate:
+    """Return the estimate with its interval.
+
+    Args:
+        grid_s: Delays that were tried.
+        best: Place of the best one.
+        again: Best delays of resamples, s.
+        half_s: Half of the resolution: no interval is narrower to either side.
+        left: Part of the variance that the best delay leaves unexplained.
+    """
+    low, high = np.percentile(again, (2.5, 97.5))
+    value_s = float(grid_s[best])
+    interval_s = float(max(0.0, min(low, value_s - half_s))), float(max(high, value_s + half_s))
+    return DeadTimeEstimate(value_s, interval_s, 1.0 - left, is_found=best < len(grid_s) - 1)
 
 
 class _ServoLoops:
@@ -204,14 +210,13 @@ def _estimate_dead_time(
     machine: Machine,
     generator: np.random.Generator,
 ) -> DeadTimeEstimate | None:
-    moving = []
+    moving, num_moving = [], 0
     for recording in recordings:
-        if (np.abs(recording.u[:, joint]) > KNOTS[1]).any():
+        count = int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum())
+        num_moving += count
+        if count:
             moving.append(recording)
-    if (
-        sum(int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum()) for recording in moving)
-        < MIN_MOVING
-    ):
+    if num_moving < MIN_MOVING:
         return None
     runs = group_by_run(moving).values()
     # (R, D, F + 1, F + 1)
@@ -224,20 +229,9 @@ def _estimate_dead_time(
     value = _find_best_delay(moments.sum(0))
     picks = (generator.integers(len(moments), size=len(moments)) for _ in range(RESAMPLED))
     again = grid_s[[_find_best_delay(moments[pick].sum(0)) for pick in picks]]
-    low, high = np.percentile(again, (2.5, 97.5))
     total = moments.sum(0)
-    left = _compute_residual(total) / total[:, -1, -1]
-    interval = (
-        max(0.0, min(low, grid_s[value] - RESOLUTION_S / 2)),
-        max(high, grid_s[value] + RESOLUTION_S / 2),
-    )
-    return DeadTimeEstimate(
-        float(grid_s[value]),
-        (float(interval[0]), float(interval[1])),
-        float(1.0 - left[value]),
-        grid_s,
-        left,
-    )
+    left = float(_compute_residual(total)[value] / total[value, -1, -1])
+    return _bound_delay(grid_s, value, again, RESOLUTION_S / 2, left)
 
 
 def _compute_moments(
