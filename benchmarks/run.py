@@ -154,7 +154,9 @@ def render_result(one: Measurement, result: dict[str, Any]) -> str:
 
 def render_table(rows: Table) -> str:
     """Return rows as a Markdown table; the first row names the columns."""
-    columns = list(dict.fromkeys(name for row in rows for name in row))
+    # A detail, which has names of its own, stands in the file alone.
+    shown = [name for row in rows for name in row if not isinstance(row[name], dict)]
+    columns = list(dict.fromkeys(shown))
     lines = ["|".join(columns), "|".join("---" for _ in columns)]
     for row in rows:
         cells = [row.get(name) for name in columns]

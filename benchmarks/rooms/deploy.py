@@ -46,10 +46,10 @@ def read_lateness(folder: Path) -> Table:
 
 
 BEFORE = {
-    "processes": "page dead or hung with auto: flow for all 20 s",
+    "processes": "page dead or hung: flow for 20 s",
     "sensors": "no alarm, advice valid",
-    "valves": "no alarm of its own in any; flow for 4 s with the dead-man released",
-    "description": "not noticed; a narrower range killed the bus process",
+    "valves": "no alarm; flow for 4 s",
+    "description": "not noticed; bus process killed",
     "borehole": "1.7 to 5.9 s of motion; 0.47 m/s at the face; jumps followed",
     "envelope": "0.25 to 2.43 rad deeper",
     "stops": "0.20 and 0.23 rad beyond",
@@ -57,8 +57,8 @@ BEFORE = {
     "capture": "7,093 of 78,503 messages read, exit code 0",
     "pulses": "30 in 3 s, 50 in 5 s, no alarm",
     "vigilance": "flow for 88 s, not asked",
-    "files": "hung, 30 s, 4 GB or a traceback; empty golden answers passed",
-    "page": "STOP unconfirmed: not said; 8 px beside it; forwarded port: 421; page.url: 666",
+    "files": "hung, 30 s, 4 GB, tracebacks",
+    "page": "not said; 8 px; page.url: 666",
 }
 """Figures of the same injections before these checks were built."""
 FOUND = (
@@ -72,26 +72,43 @@ NOTING = (
 
 
 def read_found(folder: Path) -> Table:
-    """Return the figures that tests have noted, by injection: the least and the largest."""
-    noted: dict[str, list[str]] = {}
-    for one in ElementTree.parse(folder / "found.xml").iter("property"):
-        noted.setdefault(one.attrib["name"], []).append(one.attrib["value"])
+    """Return the figures that tests have noted, by what was found: the least and the largest."""
     rows: Table = []
-    before = dict(BEFORE)
-    for name, values in sorted(noted.items()):
-        kind, _, injection = name.partition(": ")
-        ordered = sorted(set(values), key=lambda one: (len(one.partition(".")[0]), one))
-        now = ordered[0] if len(ordered) == 1 else f"{ordered[0]} to {ordered[-1]}"
-        row = {"what": kind, "injection; figure": injection, "trials": len(values)}
-        rows.append(row | {"before": before.pop(kind, ""), "now": now})
+    noted = [one.attrib for one in ElementTree.parse(folder / "found.xml").iter("property")]
+    for what, before in BEFORE.items():
+        figures: dict[str, list[str]] = {}
+        injections: dict[str, list[str]] = {}
+        for one in noted:
+            kind, _, injection = one["name"].partition(": ")
+            if kind == what:
+                injections.setdefault(injection, []).append(one["value"])
+                figures.setdefault(injection.rpartition("; ")[2], []).append(one["value"])
+        now = []
+        for figure, values in figures.items():
+            if values[0][0] in "-0123456789":
+                now.append(f"{figure}: {find_ends(values)}")
+        row = {
+            "what": what,
+            "injections": {name: find_ends(injections[name]) for name in injections},
+        }
+        rows.append(row | {"before": before, "now": "; ".join(now)})
     return rows
+
+
+def find_ends(values: list[str]) -> str:
+    """Return the least and the largest of figures; of words the first."""
+    try:
+        ordered = sorted(values, key=float)
+    except ValueError:
+        return values[0]
+    return ordered[0] if ordered[0] == ordered[-1] else f"{ordered[0]} to {ordered[-1]}"
 
 
 MEASUREMENTS = (
     Measurement(
         name="found",
         title="What was found, injected again",
-        conditions="Each injection by which a fault of the loop was found, into the running twin and loop: on a simulated clock, by real processes (processes) or in a browser (page). *Before* is the figure of the same injection when it was found.",
+        conditions="Injected into the running twin and loop again: on a simulated clock, by real processes or in a browser. *Before* is the figure when it was found.",
         commands=(
             f"python -m pytest -q -o junit_family=xunit1 --junitxml={{out}}/found.xml -k '{NOTING}' {' '.join(FOUND)}",
         ),
