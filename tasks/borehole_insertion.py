@@ -1,4 +1,4 @@
-"""Inserting the chisel into a vertical borehole in a concrete block (the paper's task)."""
+"""Inserting the chisel into boreholes of a concrete block (the paper's task)."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class BoreholeInsertion(ToolPoseTask):
         hole = self.hole
         distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
         x_m, y_m, z_m = distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)
-        columns = {
+        columns: dict[str, torch.Tensor | float] = {
             "hole_x_m": x_m,
             "hole_y_m": y_m,
             "rim_z_m": z_m,

@@ -34,7 +34,8 @@ class HoleRowProcess(ToolPoseProcess):
         assert task.row is not None
         self._row: HoleRow = task.row
         self._lift_m = torch.tensor([0.0, 0.0, task.aim_below_m + task.row.lift_m], device=device)
-        self.moved = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._moved = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.moved = self._moved
         super().__init__(task, machine, num_envs, device)
 
     def _list_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -96,7 +97,7 @@ class HoleRowProcess(ToolPoseProcess):
         # seen by the samples that follow only
         target_m += away_m * is_struck[:, None]
         state[f"{START}scene"][:, :3] += away_m * is_struck[:, None]
-        self.moved.copy_(goes_on | is_struck)
+        self._moved.copy_(goes_on | is_struck)
         state["hole"] += goes_on
         state["struck"].copy_((state["struck"].bool() | is_struck) & ~goes_on)
         state["lifting"].copy_(lifts)
