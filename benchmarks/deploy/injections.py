@@ -310,49 +310,6 @@ def measure_drift(stage: Stage) -> dict[str, object]:
     return {"delay_ms": round(seconds, 1), "stopped": not stage.moves}
 
 
-def measure_random_corruption(stage: Stage, trials: int) -> dict[str, object]:
-    """Wrong bits in 5 % of all messages: mean time until the guard latches."""
-    chance, found = np.random.default_rng(1), []
-    for _ in range(trials):
-        stage.get_going()
-        carry = stage.bridge._arrive
-
-        def arrive(frame, to_gateway, carry=carry):
-            if not to_gateway and chance.random() < 0.05:
-                frame = type(frame)(frame.frame_id, bytes([frame.data[0] ^ 1, *frame.data[1:]]))
-            carry(frame, to_gateway)
-
-        stage.bridge._arrive = arrive
-        begun_ms = stage.ms
-        stage.go(20.0, lambda: not stage.moves)
-        found.append((stage.ms - begun_ms) / 1e3)
-        del stage.bridge._arrive
-    return {"mean_s": round(float(np.mean(found)), 2), "worst_s": max(found)}
-
-
-def measure_reversals(stage: Stage) -> dict[str, object]:
-    """+-1 at 20 Hz on one joint for 1.7 s: reversals of the command sent."""
-    stage.get_going()
-    bundle, signs = stage.adviser._bundle, [1.0]
-    original = bundle.command
-
-    def command(observation):
-        signs[0] = -signs[0]
-        return np.array([[signs[0], 0, 0, 0, 0]])
-
-    bundle.command = command
-    sent: list[float] = []
-
-    def note() -> bool:
-        sent.append(float(stage.memory.state.read().sent[0]))
-        return False
-
-    stage.go(1.7, note)
-    bundle.command = original
-    directions = np.sign([one for one in sent if one])
-    return {"reversals": int((directions[1:] != directions[:-1]).sum())}
-
-
 def measure_ground(stage: Stage) -> dict[str, object]:
     """The third joint is driven down for 12 s: least height of arm and tool over the ground."""
     stage.get_going()
@@ -432,10 +389,6 @@ def measure_others(table: dict[str, object], folder: Path, trials: int) -> None:
     for measure in (measure_ground, measure_constant_delay, measure_drift):
         table[str(measure.__doc__)] = measure(stage)
     table[str(measure_start_delay.__doc__)] = measure_start_delay(folder)
-    table[str(measure_random_corruption.__doc__)] = measure_random_corruption(stage, 10)
-    stage.close()
-    stage = Stage(machine, "auto", folder)
-    table[str(measure_reversals.__doc__)] = measure_reversals(stage)
     stage.close()
 
 
