@@ -64,9 +64,10 @@ class Analysis:
 def analyse(data: StudyData, machine: Machine) -> Analysis:
     """Return the results of a study of the machine."""
     rows, num_at_twin = [], 0
-    for trial in track_items([*data.trials.values(), *data.spare], "measuring trials"):
-        key = trial.get("participant"), trial.get("period"), trial.get("number")
-        counts = bool(trial.get("period")) and data.trials.get(key) is trial
+    everything = track_items([*data.trials.values(), *data.spare], "measuring trials")
+    for number, trial in enumerate(everything):
+        # Practice and spare trials do not count.
+        counts = number < len(data.trials) and trial["period"] > 0
         num_at_twin += counts and bool(trial.get("twin"))
         rows.append(_read_measures(data, trial, machine) | {"counts": counts})
     names = [each.name for each in MEASURES]

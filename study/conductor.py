@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -152,12 +152,12 @@ class Conductor:
     def shows_advice(self) -> bool:
         """True during a guided trial."""
         attempt = self._attempt
-        return attempt is not None and attempt.running and attempt.trial.condition == "guided"
+        return self.running and attempt is not None and attempt.trial.condition == "guided"
 
     @property
     def running(self) -> bool:
         """True during a trial."""
-        return self._attempt is not None and self._attempt.running
+        return self._attempt is not None and self._attempt.phase == "running"
 
     def choose(self, who: str | None) -> None:
         """Begin, or goes on with, the sitting of a participant; `None` leaves it.
@@ -170,7 +170,6 @@ class Conductor:
         # Leaving is an abort: the trial under way is kept and done again.
         if self._attempt is not None:
             self._attempt.abort("the sitting was left")
-        self._close_attempt()
         self._who = who
         self._go_on()
 
@@ -193,13 +192,12 @@ class Conductor:
 
     def view(self) -> dict[str, Any]:
         """Return the view of the pages, as plain data."""
-        found = {"who": self._who, "problem": self.problem}
+        found: dict[str, Any] = {"who": self._who, "problem": self.problem}
         step = self._step
         # Nobody is chosen: the list of participants is shown.
         if self._who is None or step is None:
             return {**found, "kind": "choose", "participants": list_progress(self._data)}
-        found |= {"kind": step.kind, "period": step.period, "condition": step.condition}
-        found |= {"done": step.done, "of": step.of}
+        found |= asdict(step)
         if step.kind == "consent":
             return {**found, "text": self._consent.text, "version": self._consent.version}
         shown = self._attempt or self._form
@@ -227,10 +225,8 @@ class Conductor:
         elif do == "consent" and step.kind == "consent":
             self._take_consent(said)
         elif do == "end_practice" and attempt and not step.period and not self.running:
-            self._close_attempt()
             self._note({"practice_ended": True})
-        elif do == "next" and attempt and attempt.over:
-            self._close_attempt()
+        elif do == "next" and attempt and attempt.phase == "over":
             self._go_on()
         elif do == "begin" and attempt:
             return attempt.begin()
@@ -256,10 +252,12 @@ class Conductor:
         self.problem = str(error)
 
     def _go_on(self) -> None:
-        """Read the folder again, and begin the next step."""
+        """End what is under way, read the folder again, and begin the next step."""
+        if self._attempt is not None:
+            self._attempt.close()
         # The folder and not memory decides the next step: a crash anywhere then costs nothing.
-        self._data, self._step, self._form = folders.read_study(self._folder), None, None
-        self.problem = ""
+        self._data, self.problem = folders.read_study(self._folder), ""
+        self._step = self._attempt = self._form = None
         if self._who is None:
             return
         step = self._step = find_next_step(self._data, self._who)
@@ -272,11 +270,6 @@ class Conductor:
             )  # fmt: skip
         elif step.kind == "questionnaire":
             self._form = Form(self._folder, self._who, step.period)
-
-    def _close_attempt(self) -> None:
-        if self._attempt is not None:
-            self._attempt.close()
-        self._attempt = None
 
     def _take_consent(self, said: dict[str, Any]) -> None:
         consent = {
@@ -292,11 +285,11 @@ class Conductor:
     def _stop(self, reason: str) -> None:
         if self._attempt is not None:
             self._attempt.stop()
-        self._close_attempt()
         at = folders.format_now()
         self._note({"stopped": True, "reason": reason or "no reason given", "stopped_at": at})
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
-        folders.write_participant(self._folder, self._who, facts)
+        path = self._folder / folders.PARTICIPANTS / f"{self._who}.json"
+        folders.update_record(path, {"participant": self._who, **facts})
         self._go_on()

@@ -142,20 +142,12 @@ def draw_sequences(
 def make_latin_squares(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return two Latin squares, `(K, K)` each: row `i` is an order of holes and one of starts.
 
-    In each, every entry stands once in every row and column. For odd `K` without divisor 3, and 3
-    itself, they are orthogonal (every pair of hole and start occurs once over the rows); for even
-    `K` they cannot be made so by shifts, and pairs repeat.
+    In each, every entry stands once in every row and column. For odd `K` they are orthogonal: every
+    pair of hole and start occurs once over the rows. For even `K` pairs repeat.
     """
-    # Shifts of one row make a Latin square.
     row, place = np.mgrid[:size, :size]
-    # Shifts by `factor` are orthogonal to shifts by 1 if both it and the difference divide nothing
-    # of the size.
-    factor = size - 1
-    for candidate in range(2, size):
-        if math.gcd(candidate, size) == math.gcd(candidate - 1, size) == 1:
-            factor = candidate
-            break
-    return (row + place) % size, (row + factor * place) % size
+    # Sum and difference tell row and place apart where 2 divides nothing of the size.
+    return (row + place) % size, (row - place) % size
 
 
 def plan_trials(design: Design, generator: np.random.Generator) -> list[Trial]:

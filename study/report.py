@@ -6,9 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
+
 from brokk_rl.plot import save_figure
 from brokk_rl.report import embed_picture, render_page
-from brokk_rl.session import write_json, write_text
+from brokk_rl.session import write_text
 from study import pictures
 from study.analysis import LOADS, TITLES, Analysis
 from study.guidance_effect import (
@@ -58,24 +60,23 @@ def write_plan_page(data: StudyData, notice: str) -> None:
 
 
 def write_report(folder: Path, found: Analysis) -> Path:
-    """Write `report.html`, three pictures, `trials.csv`, `means.csv` and `report.json`; returns the page's path.
+    """Write `report.html`, its pictures, `trials.csv`, `means.csv` and `effects.csv`; returns the page's path.
 
     Raises:
         StorageError: a file could not be written.
     """
     data, trials, means = found.data, found.trials, found.means
-    write_text(folder / "trials.csv", trials.drop(columns="tip_in_base_m").to_csv(index=False))
-    write_text(folder / "means.csv", means.assign(simulated=data.is_simulated).to_csv(index=False))
-    facts = {
-        "schema": 2,
-        "primary": data.design.primary,
-        "alpha": data.design.alpha,
-        "simulated": data.is_simulated,
-        "effects": {name: asdict(effect) for name, effect in found.effects.items()},
-        "holm": found.holm,
-        "remarks": [asdict(remark) for remark in data.remarks],
+    effects = pd.DataFrame(map(asdict, found.effects.values()), index=list(found.effects))
+    tables = {
+        "trials": trials.drop(columns="tip_in_base_m"),
+        "means": means,
+        "effects": effects.assign(p_holm=pd.Series(found.holm, dtype=float)).reset_index(
+            names="measure"
+        ),
     }
-    write_json(folder / "report.json", facts)
+    for name, table in tables.items():
+        text = table.assign(simulated=data.is_simulated).to_csv(index=False)
+        write_text(folder / f"{name}.csv", text)
     drawn = {
         "paths": pictures.draw_paths(found),
         "pairs": pictures.draw_pairs(found, (*SHOWN, "tlx_raw")),

@@ -222,8 +222,6 @@ class StudyPages:
         try:
             async for text in connection:
                 refused = self._take(text)
-                if refused:
-                    log.info("refused: %s", refused)
                 answer = {"refused": refused, "study": self._conductor.view()}
                 await connection.send(json.dumps(answer))
         finally:

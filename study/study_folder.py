@@ -77,8 +77,7 @@ class StudyData:
     def is_simulated(self) -> bool:
         """True if any trial comes from a simulated operator."""
         # One simulated entry marks the whole study: nobody must take it for evidence.
-        entries = [*self.trials.values(), *self.spare, *self.questionnaires.values()]
-        return any(entry.get("simulated") for entry in entries)
+        return any(trial.get("simulated") for trial in (*self.trials.values(), *self.spare))
 
     @property
     def erased(self) -> dict[str, str]:
@@ -138,27 +137,14 @@ def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
     while path.exists():
         path = folder / TRIALS / f"{name}_again{again}.json"
         again += 1
-    return _write(path, trial)
+    update_record(path, trial)
+    return path
 
 
-def rewrite(path: Path, changes: dict[str, Any]) -> None:
-    """Change the record of a trial or questionnaire that is still going on."""
-    write_json(path, _read(path) | changes)
-
-
-def write_questionnaire(
-    folder: Path, participant: str, period: int, answers: dict[str, Any]
-) -> Path:
-    """Begin a questionnaire."""
-    path = folder / QUESTIONNAIRES / f"{participant}_{period}.json"
-    return _write(path, {"participant": participant, "period": period, **answers})
-
-
-def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> Path:
-    """Add to the record of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
-    path = folder / PARTICIPANTS / f"{participant}.json"
-    known = _read(path) if path.exists() else {}
-    return _write(path, {**known, "participant": participant, **facts})
+def update_record(path: Path, facts: dict[str, Any]) -> None:
+    """Change the record of a trial, questionnaire or participant, or begin it; it holds no name and no address."""
+    known = _read(path) if path.exists() else {"schema": 1, "created": format_now()}
+    write_json(path, known | facts)
 
 
 def format_now() -> str:
@@ -175,17 +161,11 @@ def erase(folder: Path, participant: str) -> list[Path]:
     data = read_study(folder)
     data.require_participant(participant)
     gone = []
-    for part in (TRIALS, RECORDINGS, CAPTURES, QUESTIONNAIRES, PARTICIPANTS):
-        for path in sorted((folder / part).glob("*")):
-            # Also files that were renamed by hand: their content tells whose they are.
-            is_named = path.stem == participant or path.stem.startswith(f"{participant}_")
-            if not is_named and not _is_of_participant(path, participant):
-                continue
+    for path in sorted(folder.glob("*/*")):
+        is_named = path.name.startswith((f"{participant}_", f"{participant}."))
+        if is_named or _is_about(path, participant):
             try:
-                if path.is_dir():
-                    shutil.rmtree(path)
-                else:
-                    path.unlink()
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
             except OSError as error:
                 raise StorageError(
                     f"cannot delete {path}: {error.strerror}; {len(gone)} files are gone, run it again"
@@ -196,8 +176,8 @@ def erase(folder: Path, participant: str) -> list[Path]:
     return gone
 
 
-def _is_of_participant(path: Path, participant: str) -> bool:
-    """Return whether a file with another name is about the participant."""
+def _is_about(path: Path, participant: str) -> bool:
+    """Return whether a file that was renamed by hand is about the participant."""
     try:
         return path.suffix == ".json" and _read(path).get("participant") == participant
     except (ConfigError, AttributeError):
@@ -244,10 +224,6 @@ def _read_questionnaires(data: StudyData) -> None:
             data.note(name, "a second questionnaire for the same period; the first one counts")
         else:
             data.questionnaires[who, period] = entry
-            if "before" in entry:
-                data.note(
-                    name, "was filled in twice: the later answers count, the earlier are kept"
-                )
 
 
 def _note_missing(data: StudyData) -> None:
@@ -296,9 +272,3 @@ def _read(path: Path) -> Any:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {error}") from error
-
-
-def _write(path: Path, entry: dict[str, Any]) -> Path:
-    """Write an entry with its schema, and the time of its making where it has none."""
-    write_json(path, {"schema": 1, "created": format_now(), **entry})
-    return path

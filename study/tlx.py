@@ -55,9 +55,9 @@ class Form:
 
     def __init__(self, folder: Path, who: str, period: int) -> None:
         self._path = folder / folders.QUESTIONNAIRES / f"{who}_{period}.json"
-        begun = {"ratings": {}, "finished": False}
+        begun = {"participant": who, "period": period, "ratings": {}, "finished": False}
         if not self._path.exists():
-            folders.write_questionnaire(folder, who, period, begun)
+            folders.update_record(self._path, begun)
         self._entry: dict[str, Any] = begun | json.loads(self._path.read_text())
         self._at = min([*self._list_missing(), len(SCALES)])
 
@@ -78,7 +78,7 @@ class Form:
             self._entry["finished"] = True
         else:
             return "malformed"
-        folders.rewrite(self._path, self._entry)
+        folders.update_record(self._path, self._entry)
         return ""
 
     def view(self) -> dict[str, Any]:

@@ -112,6 +112,10 @@ class LoopStage:
 class Attempt:
     """The trial that runs now; see the module.
 
+    Attributes:
+        trial: The row of the plan.
+        phase: Its phase.
+
     Args:
         data: The study.
         trial: The planned trial.
@@ -137,26 +141,16 @@ class Attempt:
         self._stage, self._times, self._facts, self._clock = stage, times, facts, clock
         self._hole = data.design.holes[trial.hole]
         self._start = np.array(data.design.starts[trial.start])
-        self._phase: Phase = "ready"
+        self.phase: Phase = "ready"
         # All clocks begin now, so that nothing has timed out before the first tick.
         self._since_s = self._began_s = self._seen_s = clock()
         self._path = Path()
-        self._outcome, self._reason, self._seconds = "", "", 0.0
+        self._ended: dict[str, Any] = {"outcome": "", "reason": "", "seconds": 0.0}
         stage.prepare(self._hole, self._start)
-
-    @property
-    def running(self) -> bool:
-        """True while the trial runs."""
-        return self._phase == "running"
-
-    @property
-    def over(self) -> bool:
-        """True once the trial is saved."""
-        return self._phase == "over"
 
     def begin(self) -> str:
         """Begin the recording, then the countdown; returns why not, where it cannot."""
-        if self._phase != "ready":
+        if self.phase != "ready":
             return "not now"
         if self._stage.sight().q is None:
             return "no positions"
@@ -175,13 +169,13 @@ class Attempt:
 
     def stop(self) -> str:
         """End the trial at the participant's wish; a trial that has not begun stays as it is."""
-        if self._phase == "running":
+        if self.phase == "running":
             return self._end("stopped", "")
         return self.abort("stopped before it began")
 
     def abort(self, reason: str) -> str:
         """End the trial for a fault: it is kept, does not count, and is repeated."""
-        if self._phase in ("starting", "countdown", "running"):
+        if self.phase in ("starting", "countdown", "running"):
             return self._end("aborted", reason)
         return "not now"
 
@@ -191,23 +185,23 @@ class Attempt:
         in_phase_s = now_s - self._since_s
         # The time at which positions were last known.
         self._seen_s = now_s if sight.q is not None else self._seen_s
-        if self._phase in ("countdown", "running") and now_s - self._seen_s > LOST_S:
+        if self.phase in ("countdown", "running") and now_s - self._seen_s > LOST_S:
             self.abort("positions stopped coming")
-        elif self._phase == "starting" and sight.recording:
+        elif self.phase == "starting" and sight.recording:
             self._enter("countdown")
-        elif self._phase == "starting" and in_phase_s > STARTING_S:
+        elif self.phase == "starting" and in_phase_s > STARTING_S:
             self.abort("the recording did not begin")
-        elif self._phase == "countdown" and in_phase_s >= self._times.countdown_s:
+        elif self.phase == "countdown" and in_phase_s >= self._times.countdown_s:
             self._began_s = now_s
             self._enter("running")
-        elif self._phase == "running" and sight.q is not None:
+        elif self.phase == "running" and sight.q is not None:
             tip_m = compute_tool_kinematics(self._machine, sight.q).tip_in_base_m
             # Inserted wins where both happen in one tick.
             if find_insertion(tip_m[None], self._hole, self._design.success) is not None:
                 self._end("inserted", "")
             elif in_phase_s >= self._design.limit_s:
                 self._end("time limit", "")
-        elif self._phase == "settling" and in_phase_s >= self._times.settle_s:
+        elif self.phase == "settling" and in_phase_s >= self._times.settle_s:
             self.close()
 
     def view(self) -> dict[str, Any]:
@@ -218,43 +212,38 @@ class Attempt:
                 is_there = bool(abs(away) <= self._times.start_tolerance)
                 joints.append({"joint": name, "away": round(float(away), 3), "there": is_there})
         lasts_s = {"countdown": self._times.countdown_s, "running": self._design.limit_s}
-        left_s = lasts_s.get(self._phase, 0.0) - (self._clock() - self._since_s)
+        left_s = lasts_s.get(self.phase, 0.0) - (self._clock() - self._since_s)
         return {
-            "phase": self._phase,
-            "number": self.trial.number,
-            "hole": self.trial.hole,
-            "start": self.trial.start,
+            **asdict(self.trial),
+            **self._ended,
+            "phase": self.phase,
             "joints": joints,
             "advised": sight.advised,
             "left_s": round(max(0.0, left_s), 1),
-            "outcome": self._outcome,
-            "reason": self._reason,
-            "seconds": round(self._seconds, 1),
         }
 
     def close(self) -> None:
         """End the recording, and write down which part of it is the trial."""
-        if self._phase != "settling":
+        if self.phase != "settling":
             return
         end_s = self._clock()
         self._stage.record(None)
         # Without a window there is nothing to keep: the trial never ran.
-        if self._seconds:
+        if self._ended["seconds"]:
             capture = f"{folders.CAPTURES}/{self._path.stem}"
             window_s = [self._began_s, end_s]
-            folders.rewrite(self._path, {"capture": capture, "window_s": window_s})
+            folders.update_record(self._path, {"capture": capture, "window_s": window_s})
         self._enter("over")
 
     def _enter(self, phase: Phase) -> None:
-        self._phase, self._since_s = phase, self._clock()
+        self.phase, self._since_s = phase, self._clock()
 
     def _end(self, outcome: str, reason: str) -> str:
-        has_run = self._phase == "running"
+        has_run = self.phase == "running"
         # A trial that never ran took no time.
-        self._seconds = self._clock() - self._began_s if has_run else 0.0
-        self._outcome, self._reason = outcome, reason
-        seconds = round(self._seconds, 2)
-        folders.rewrite(self._path, {"outcome": outcome, "reason": reason, "seconds": seconds})
+        seconds = round(self._clock() - self._began_s, 2) if has_run else 0.0
+        self._ended = {"outcome": outcome, "reason": reason, "seconds": seconds}
+        folders.update_record(self._path, self._ended)
         self._enter("settling")
         # Nothing to settle where nothing moved.
         if not has_run:

@@ -20,7 +20,7 @@ from brokk_rl.contracts.link import Connection
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.progress import track_items
-from brokk_rl.record import Recording, write_recording
+from brokk_rl.record import Recording, make_motion, write_recording
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
 from brokk_rl.spec import Index, name_spec, spec
@@ -39,6 +39,8 @@ BEGIN_S = 1000.0
 """Start of the simulated clock, s; large, so that no small number passes for a time."""
 BEFORE_S = 1.0
 """For which everything runs before a trial begins: the policy's history is full then."""
+MOST_SEED = 10**9
+"""Largest seed of a session."""
 NEVER_S = 1e9
 """Age at which positions and borehole are too old for an advice: never, as the study gives them."""
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,))])
@@ -106,7 +108,8 @@ class TwinGround:
         torch.set_num_threads(1)
         q, hole = np.array(design.starts[trial.start]), design.holes[trial.hole]
         rim_m, is_guided = np.array(hole.center_in_base_m), trial.condition == "guided"
-        own = replace(session, seed=session.stream(f"twin {trial.name}"))
+        # A session's seed is smaller than a stream's.
+        own = replace(session, seed=session.stream(f"twin {trial.name}") % MOST_SEED)
         person = Person(number, session.stream("study operators"), own.generator("operator"))
         operator = self._choose_operator(trial).build(machine, person)
         desk = TwinDesk(self, machine, own, q, rim_m, is_guided)
@@ -160,8 +163,8 @@ class TwinDesk:
         rim_m: np.ndarray,
         is_guided: bool,
     ) -> None:
-        self._seed, self._is_guided = session.seed, is_guided
-        self._machine, self._rim_m, self._now_s = machine, rim_m, BEGIN_S
+        self._machine, self._rim_m, self._is_guided = machine, rim_m, is_guided
+        self._now_s = BEGIN_S
         start, hole = tuple(q.tolist()), tuple(rim_m.tolist())
         # A plant that cannot be placed has no such fields; `link=site` has.
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
@@ -225,23 +228,12 @@ class TwinDesk:
 
     def recording(self) -> Recording:
         """Return the trial at the control rate, commands as the valves got them."""
-        machine = self._machine
         q, u, advice, force_n = map(np.array, zip(*self._rows, strict=True))
+        t_s = np.arange(len(q)) * self._machine.period_s
         extra = {"force_n": force_n.astype(np.float32)}
         for index, axis in enumerate("xyz"):
             extra[f"target_{axis}_m"] = np.full(len(q), self._rim_m[index], np.float32)
         if self._is_guided:
-            for j, name in enumerate(machine.joint_names):
+            for j, name in enumerate(self._machine.joint_names):
                 extra[f"advice_{name}"] = advice[:, j].astype(np.float32)
-        return Recording(
-            machine=machine.name,
-            joints=machine.joint_names,
-            units=tuple(joint.unit for joint in machine.joints),
-            rate_hz=1.0 / machine.period_s,
-            t_s=np.arange(len(q)) * machine.period_s,
-            # Flow may exceed full by rounding.
-            u=u.astype(np.float32).clip(-1.0, 1.0),
-            q=q.astype(np.float32),
-            extra=extra,
-            metadata={"source": "simulated operator, twin", "seed": str(self._seed)},
-        )
+        return replace(make_motion(self._machine, "simulated operator", t_s, u, q), extra=extra)

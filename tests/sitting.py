@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from composed import option
 
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
+from brokk_rl.record import Recording, make_motion
 from brokk_rl.session import write_json
 from study import design, study_folder
 from study.conductor import Conductor, Consent
@@ -52,16 +53,9 @@ def plan(place: Path, count: int = 2, practice: int = 0, trials: int = 2) -> lis
 
 def recorded(q: np.ndarray, u: np.ndarray | None = None, **extra: np.ndarray) -> Recording:
     """Returns a recording at 20 Hz of positions and commands, `(T, J)`."""
-    return Recording(
-        machine=MACHINE.name,
-        joints=MACHINE.joint_names,
-        units=("rad",) * 5,
-        rate_hz=20.0,
-        t_s=np.arange(len(q)) / 20.0,
-        u=np.zeros_like(q) if u is None else u,
-        q=q,
-        extra=extra,
-    )
+    commands = np.zeros_like(q) if u is None else u
+    motion = make_motion(MACHINE, "a test", np.arange(len(q)) / 20.0, commands, q)
+    return replace(motion, extra=extra)
 
 
 def inserted_after(num: int) -> np.ndarray:

@@ -45,14 +45,9 @@ class StudySteps:
                 f"design.primary: expected a measure, got '{self.design.primary}'; "
                 + list_choices(self.design.primary, COMPARED)
             )
-        if self.do == "run" and self.folder is None:
-            raise ConfigError(
-                "folder: study.do=run needs study.folder=<folder>, the study that study.do=plan has planned"
-            )
-        if self.do == "erase" and self.participant is None:
-            raise ConfigError(
-                "participant: study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>"
-            )
+        for do, key in (("run", "folder"), ("erase", "folder"), ("erase", "participant")):
+            if self.do == do and getattr(self, key) is None:
+                raise ConfigError(f"{key}: study.do={do} needs study.{key}=<{key}>, got none")
 
 
 @spec

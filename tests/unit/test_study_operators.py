@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from composed import option
 from sitting import MACHINE
@@ -101,8 +102,8 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
     assert done.code == 0, done.err
     run = tmp_path / "run"
     assert len(list((run / "recordings").iterdir())) == 16
-    report = json.loads((run / "report.json").read_text())
-    assert report["simulated"] is True and report["effects"]["several_joints"]["num_persons"] == 4
+    effects = pd.read_csv(run / "effects.csv", index_col="measure")
+    assert effects.simulated.all() and effects.num_persons["several_joints"] == 4
     assert "no person took part" in (run / "report.html").read_text()
     trial = json.loads((run / "trials" / "P01_1_01.json").read_text())
     assert trial["simulated"] is True and trial["operator"] in ("follower", "novice")
@@ -119,7 +120,7 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
     [
         (["study.do=simulate"], "needs simulated operators; ground=twin"),
         (["study.do=run"], "needs study.folder=<folder>"),
-        (["study.do=erase", "study.folder=there"], "needs study.participant=<pseudonym>"),
+        (["study.do=erase", "study.folder=there"], "needs study.participant=<participant>"),
         (["study.do=plan", "study.design.primary=time"], "did you mean 'time_s'"),
         (["study.do=report", "study.folder=nowhere"], "holds no study"),
     ],

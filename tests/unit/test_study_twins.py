@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from composed import option
-from sitting import MACHINE
+from sitting import MACHINE, make_design
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
 from deploy.twin.faults import ActiveFaults
+from study.design import plan_trials
 from study.twins import BEFORE_S, TwinDesk
 
 GROUND = option("ground", "twin")
@@ -59,6 +60,15 @@ def test_advice_is_shown_from_the_beginning_and_follows_hands_that_follow_it(
     # Followed exactly, it leads into the hole.
     assert np.hypot(*(tip - RIM_M)[:2]) < 0.013 and tip[2] < RIM_M[2] - 0.05
     assert np.abs(one.recording().extra["advice_q1"]).max() > 0.02
+
+
+def test_a_trial_is_the_same_whoever_does_it_beside(tmp_path: Path) -> None:
+    design = replace(make_design(), limit_s=1.0)
+    session = Session(out=str(tmp_path), seed=0, device="cpu")
+    for trial in plan_trials(design, np.random.default_rng(0))[1:3]:
+        one, two = (GROUND.run_trial(design, trial, 0, MACHINE, session) for _ in range(2))
+        assert len(one.q) == 20 and (one.q == two.q).all() and (one.u == two.u).all()
+        assert ("advice_q1" in one.extra) == (trial.condition == "guided")
 
 
 def test_a_twin_is_put_elsewhere_with_its_block(tmp_path: Path) -> None:
