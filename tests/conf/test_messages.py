@@ -118,7 +118,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     # values
     ("mode=compare",): ("compare.runs=<value>",),
     (*COMPARE, "session.seed=abc"): ("session.seed: expected a whole number", "'abc'"),
-    (*COMPARE, "session.seed=-1"): ("session.seed", "0 or more"),
+    (*COMPARE, "session.seed=-1"): ("session.seed", "from 0 to 1e+09"),
     ("mode=evaluate", "sim=native", "sim.num_worlds=1e12"): ("sim.num_worlds: expected", "1e+07"),
 }
 """A command, and parts of its message."""

@@ -16,6 +16,7 @@ from composed import option
 
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.sim.scene import make_nominal_scenes
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "examples" / "run_policy.py"
@@ -92,6 +93,7 @@ def test_it_ends_where_the_task_does(example: Any, machine: Machine) -> None:
         start = {
             "target_m": torch.tensor(target_m, dtype=torch.float32)[None],
             "target_pitch_rad": torch.zeros(1),
+            "scene": make_nominal_scenes(1),
         }
         tip = torch.tensor(tip_m, dtype=torch.float32)[None]
         expected = bool(task.judge(tip, torch.zeros(1), torch.zeros(1), start).reached)

@@ -46,6 +46,7 @@ def state() -> ToolState:
         u_before=torch.tensor([[0.25, 0.0, 0.25, 0.0, 1.0]]),
         success=NO,
         reached=NO,
+        inserted=NO,
         paper_success=NO,
         failed=NO,
         closeness=torch.tensor([0.5]),
