@@ -61,7 +61,7 @@ MEASUREMENTS = (
     Measurement(
         name="exam_valves",
         title="Sealed exam: machines with valves",
-        conditions="150 simulated machines of a make that nothing was fitted to until then (the command calls it `held_out`, today `valves`), answered once; the labels were sealed by a hash. It is the second exam of this make: the first, on 2026-11-23, was sat by another engine (0.58 of 105, exact sets 0.20 of 60). The baseline is one name always, the best for these cases.",
+        conditions="150 simulated machines of a make that nothing was fitted to until then (`held_out`, today `valves`), answered once, sealed by a hash. An earlier engine had 0.58 of 105, exact sets 0.20 of 60. Baseline: one name always.",
         commands=list_exam_commands(
             "exam_plants=valves", 150, "exam_candidate=diagnosis", "fit@exam.fit=valve"
         ),
@@ -73,7 +73,7 @@ MEASUREMENTS = (
     Measurement(
         name="exam_servos",
         title="Sealed exam: tabletop arms of position servos",
-        conditions="100 simulated arms, the fourth sealed exam of this kind, the first of this engine. The third, of another engine, had 33 of 35 single effects. The baseline is one name always, the best for these cases.",
+        conditions="100 simulated arms, the fourth sealed exam of this kind. An earlier engine had 33 of 35 single effects. Baseline: one name always.",
         commands=list_exam_commands(
             "machine=so101 exam_plants=servos exam_mix=servos",
             100,
