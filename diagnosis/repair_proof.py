@@ -282,10 +282,11 @@ class EngineProof(RepairProof):
         return any(one.rows or one.hold for one in self._findings)
 
     def judge(self) -> list[Gate]:
-        """Return the gates of all repairs, and one that fails for each effect without a number in the library."""
+        """Return the gates of all repairs, and one that fails for each simulated effect without a number in the library."""
         found = super().judge()
         for one in self._findings:
-            if one.hold is None and not self.sizes[one.effect]:
+            # What shows by itself, such as a coarse sensor, was not simulated and has no number.
+            if one.rows and not self.sizes[one.effect]:
                 joints = ", ".join(self.machine.joint_names[j] for j in one.joints)
                 text = f"{joints} moves as by {one.name}, which the library takes from the weight, and bears none"
                 found.append(Gate("in_library", False, None, None, text))

@@ -247,6 +247,14 @@ def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine)
     assert "in_library" in [gate.name for gate in answer.gates if not gate.passed]
 
 
+def test_a_coarse_sensor_is_named_without_a_number(two_joints: Machine) -> None:
+    case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
+    for recording in case.field:
+        recording.q[:, 1] = 0.02 * np.round(recording.q[:, 1] / 0.02)
+    answer = diagnose(case)
+    assert [(one.effect, one.joints) for one in answer.selected] == [("quantisation", ("q4",))]
+
+
 def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machine) -> None:
     # The second joint goes the other way: a simulator without this errs by twice its motion.
     case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, -1.0]))
