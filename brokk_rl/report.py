@@ -125,10 +125,6 @@ class Report:
             "table", columns=columns, rows=cells, numeric=numeric, caption=caption, digits=digits
         )
 
-    def add_facts(self, facts: Mapping[str, str | float | None]) -> None:
-        """Add names and their values, one a line."""
-        self.add_table(["", ""], list(facts.items()))
-
     def add_picture(self, source: Figure | Path, caption: str = "", description: str = "") -> None:
         """Add a picture; its data become part of the page.
 

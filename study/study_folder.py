@@ -30,7 +30,7 @@ PLAN = "plan.json"
 TRIALS, RECORDINGS, CAPTURES = "trials", "recordings", "captures"
 QUESTIONNAIRES, PARTICIPANTS = "questionnaires", "participants"
 NOTICE = "simulated operators: no person took part, and nothing here is evidence about people"
-"""What stands on all that simulated operators have done."""
+"""Notice on the plan, report and pictures of a simulated study."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from tasks.borehole_insertion import BoreholeInsertion, HoleRow
@@ -23,6 +24,8 @@ from tasks.tool_pose import ToolPoseProcess
 
 DRAWN_OUT = 0.5
 """Part of the lift after which the chisel counts as drawn out. Chosen by hand."""
+MOST_DRAWS = 8
+"""Draws of as many starts as are asked for, after which rows count as out of reach. Chosen by hand."""
 
 
 class HoleRowProcess(ToolPoseProcess):
@@ -39,14 +42,18 @@ class HoleRowProcess(ToolPoseProcess):
         super().__init__(task, machine, num_envs, device)
 
     def _list_shapes(self) -> dict[str, tuple[int, ...]]:
-        return super()._list_shapes() | dict.fromkeys(
-            ("hole", "lifting", "struck", "strike_rad"), ()
-        )
+        own = dict.fromkeys(("hole", "lifting", "struck", "strike_rad"), ())
+        return super()._list_shapes() | own
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draw starts from which each hole of the row can be reached; see `TaskProcess.starts`."""
         search, found = StartSearch(self.task, self._machine), []
         while sum(len(part["q"]) for part in found) < count:
+            if len(found) == MOST_DRAWS:
+                raise ConfigError(
+                    f"task.row: expected {self._row.num_holes} holes within reach from 1 start in "
+                    f"{MOST_DRAWS} at least, got fewer; change task.row.spacing_m or num_holes"
+                )
             part = search.draw(count, seed + len(found))
             is_good = torch.ones(count, dtype=torch.bool)
             shifted = part
@@ -103,5 +110,5 @@ class HoleRowProcess(ToolPoseProcess):
         state["lifting"].copy_(lifts)
 
     def _estimate_target(self, shift_m: torch.Tensor | None) -> torch.Tensor:
-        estimate_m = super()._estimate_target(shift_m)
-        return estimate_m + self.state["lifting"][:, None] * self._lift_m
+        lift_m = self.state["lifting"][:, None] * self._lift_m
+        return super()._estimate_target(shift_m) + lift_m

@@ -398,7 +398,7 @@ class ToolPoseTask(EpisodeTask):
             tip_m: Tool points in the base frame, `(N, 3)`.
             pitch_rad: Pitches of the tool, `(N,)`.
             peak_force_n: Largest contact forces of the episodes so far, `(N,)`.
-            start: What was drawn, `(N, …)` each.
+            start: What was drawn, `(N, …)` each: `target_m`, `target_pitch_rad` and `scene`.
         """
         raise NotImplementedError
 

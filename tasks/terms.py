@@ -145,11 +145,6 @@ def joint_positions(state: StepState) -> torch.Tensor:
     return (2.0 * state.q - state.lower - state.upper) / (state.upper - state.lower)
 
 
-def joint_speeds(state: StepState) -> torch.Tensor:
-    """Speeds over the last control period, `(N, J)`, rad/s or m/s."""
-    return state.speed
-
-
 def commands(state: StepState) -> torch.Tensor:
     """Valve commands in force, `(N, J)`, in [-1, 1]."""
     return state.history.u[:, -1]
@@ -158,11 +153,6 @@ def commands(state: StepState) -> torch.Tensor:
 def tip_position(state: StepState) -> torch.Tensor:
     """Tool point in the base frame, `(N, 3)`, m."""
     return state.tip_m
-
-
-def tip_velocity(state: StepState) -> torch.Tensor:
-    """Velocity of the tool point over the last control period, `(N, 3)`, m/s."""
-    return state.tip_velocity_m_s
 
 
 def tool_pitch(state: StepState) -> torch.Tensor:

@@ -6,7 +6,8 @@ import asyncio
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -169,3 +170,31 @@ def chromium() -> Iterator[Any]:
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield browser
         browser.close()
+
+
+def watch_page(context: Any, port: int, complaints: list[str], scene: bool) -> Any:
+    """Returns a page whose errors and requests to elsewhere become complaints; without `scene` nothing is drawn."""
+    page = context.new_page()
+    if not scene:
+        page.route(
+            "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
+        )
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on(
+        "requestfinished",
+        lambda request: None if f":{port}/" in request.url else complaints.append(request.url),
+    )
+    return page
+
+
+def eventually(claim: Callable[[], bool], seconds: float = 30.0) -> None:
+    """Waits until a claim is true."""
+    end_s = time.monotonic() + seconds
+    while not claim():
+        assert time.monotonic() < end_s, "it did not come true"
+        time.sleep(0.02)
+
+
+def until(page: Any, claim: str, seconds: float = 20.0) -> None:
+    """Waits for something on a page; Playwright's own way needs `eval`, which the page forbids."""
+    eventually(lambda: page.evaluate(claim), seconds)

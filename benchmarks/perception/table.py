@@ -209,7 +209,7 @@ def show_failure(
     """Writes the picture of what went wrong and why, unless there are enough of its kind."""
     task.failures.mkdir(parents=True, exist_ok=True)
     if len(list(task.failures.glob(f"{name}_*.png"))) < task.pictures:
-        drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, found)
+        make_drawing().write(task.failures / f"{name}_{task.number:04d}.png", frame, found)
         told = [
             f"score {hole.score:.2f}, radius {hole.radius_m:.4f} m at {hole.center_m.round(4).tolist()}"
             for hole in found.holes
@@ -240,7 +240,7 @@ def build_finder(option: str) -> StagedFinder:
 
 
 @functools.cache
-def drawing() -> OverlayDrawing:
+def make_drawing() -> OverlayDrawing:
     return composed("overlay", "mode=perceive", "perceive.input=.")
 
 

@@ -21,13 +21,13 @@ from deploy.runtime.operator_state import (
 from deploy.runtime.shared_memory import Pipe, RecordSlot, Slot
 
 LOG_BYTES = 8 << 20
-"""Of each pipe to the log: about two minutes of a full bus, so that a slow disk costs nothing."""
+"""Size of each pipe to the log: about two minutes of a full bus, so that a slow disk costs nothing."""
 VISION_LOG_BYTES = 1 << 20
-"""Of perception's pipe to the log, a short text a frame. Chosen by hand."""
+"""Size of perception's pipe to the log, a short text a frame. Chosen by hand."""
 REQUEST_BYTES = 1 << 12
-"""Of the page's requests; the supervisor takes them 50 times a second. Chosen by hand."""
+"""Size of the pipe for the page's requests, which the supervisor takes 50 times a second. Chosen by hand."""
 REPORT_BYTES = 1 << 16
-"""Of the processes' reports on their timing, one each. Chosen by hand."""
+"""Size of the pipe for the processes' reports on their timing, one each. Chosen by hand."""
 MOST_HOLES = 8
 """Boreholes that perception hands on, the surest first. Chosen by hand."""
 

@@ -1,4 +1,4 @@
-"""What injections into the running twin and loop once found, injected again.
+"""Faults that once reached the valves or the operator unnoticed, injected into the running twin and loop again.
 
 Each test notes its figures as properties of the report; `benchmarks/run.py measure found` makes the
 table of them. Simulated clock, but for `test_deploy_processes.py`.

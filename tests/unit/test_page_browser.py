@@ -11,7 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import READING, SHOWN, STATE, TOKEN, Scripted, change_state, chromium, lever, served
+from browser import (
+    READING,
+    SHOWN,
+    STATE,
+    TOKEN,
+    Scripted,
+    change_state,
+    chromium,
+    eventually,
+    lever,
+    served,
+    until,
+    watch_page,
+)  # fmt: skip
 from composed import option
 from PIL import Image
 
@@ -52,16 +65,7 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
         port: int, token: str | None = TOKEN, scene: bool = False, query: str = "", **how: Any
     ) -> Any:
         contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", **how))
-        page = contexts[-1].new_page()
-        if not scene:
-            page.route(
-                "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
-            )
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on(
-            "requestfinished",
-            lambda request: None if f":{port}/" in request.url else complaints.append(request.url),
-        )
+        page = watch_page(contexts[-1], port, complaints, scene)
         page.goto(f"http://localhost:{port}/{query}" + (f"#token={token}" if token else ""))
         until(page, "() => window.measured?.drawn > 0")
         if token:  # what is wished before the page was let in is refused
@@ -72,18 +76,6 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
     for context in contexts:
         context.close()
     assert complaints == []
-
-
-def eventually(claim: Callable[[], bool], seconds: float = 10.0) -> None:
-    end_s = time.monotonic() + seconds
-    while not claim():
-        assert time.monotonic() < end_s, "it did not come true"
-        time.sleep(0.02)
-
-
-def until(page: Any, claim: str, seconds: float = 20.0) -> None:
-    """Waits for something on a page; Playwright's own way needs `eval`, which the page forbids."""
-    eventually(lambda: page.evaluate(claim), seconds)
 
 
 def drawn(page: Any) -> dict[str, tuple[float, float]]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import TOKEN, chromium, served
+from browser import TOKEN, chromium, served, until
 from composed import option
 from desk import DBC
 from websockets.asyncio.client import connect
@@ -246,11 +245,3 @@ def test_the_page_draws_the_timeline_and_moves_along_it(feed: ReplayFeed) -> Non
         assert feed.position_s == pytest.approx(5.0)
         page.keyboard.press("Space")
         until(page, "document.querySelector('#play').getAttribute('aria-pressed') === 'true'")
-
-
-def until(page: Any, claim: str) -> None:
-    """Waits for something on a page; Playwright's own way needs `eval`, which the page forbids."""
-    end_s = time.monotonic() + 20.0
-    while not page.evaluate(f"() => Boolean({claim})"):
-        assert time.monotonic() < end_s, "it did not come true"
-        time.sleep(0.02)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import SHOWN, TOKEN, Scripted, chromium, served
+from browser import SHOWN, TOKEN, Scripted, chromium, served, until, watch_page
 from sitting import MACHINE, Arm, agreed, conductor, done, plan
 
 from study import tlx
@@ -57,15 +56,7 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
 
     def open_page(port: int, query: str = "") -> Any:
         contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", has_touch=True))
-        page = contexts[-1].new_page()
-        page.route(
-            "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
-        )
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on(
-            "requestfinished",
-            lambda request: None if f":{port}/" in request.url else complaints.append(request.url),
-        )
+        page = watch_page(contexts[-1], port, complaints, scene=False)
         page.goto(f"http://localhost:{port}/{query}#token={TOKEN}")
         until(page, "() => window.measured?.drawn > 0 && Boolean(window.sitting())")
         return page
@@ -74,16 +65,6 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
     for context in contexts:
         context.close()
     assert complaints == []
-
-
-def until(page: Any, claim: str, seconds: float = 20.0) -> None:
-    """Waits for something on a page; Playwright's own way needs `eval`, which the page forbids."""
-    end_s = time.monotonic() + seconds
-    while not page.evaluate(claim):
-        assert time.monotonic() < end_s, (
-            f"it did not come true: {claim}; {page.evaluate('window.sitting()')}"
-        )
-        time.sleep(0.02)
 
 
 def at(page: Any, screen: int) -> None:

@@ -438,6 +438,13 @@ def test_a_row_is_done_hole_by_hole_and_the_tool_drawn_out_between(machine: Mach
     assert stage.process.episode["success_strict"].item() == 1.0
 
 
+def test_rows_that_leave_the_reach_are_refused(machine: Machine) -> None:
+    task: Any = option("task", "several")
+    wide = replace(task, row=replace(task.row, spacing_m=20.0))
+    with pytest.raises(ConfigError, match=r"change task\.row\.spacing_m"):
+        wide.build(machine, 2, CPU).starts(2, seed=0)
+
+
 def test_a_block_that_is_struck_gives_way_once(machine: Machine) -> None:
     loop = plant(machine, option("task", "several")).build(CPU, 2, 8, 0)
     world: Any = loop.world

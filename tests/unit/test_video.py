@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import TOKEN, Scripted, chromium, served
+from browser import TOKEN, Scripted, chromium, eventually, served
 from composed import option
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
@@ -40,13 +40,6 @@ CODECS = """async () => [...(await window.measured.video.peer.getStats()).values
 SHOWS = (
     "() => (window.measured.video?.cameras ?? []).filter(one => one.shown && one.delay_ms).length"
 )
-
-
-def eventually(claim: Any, seconds: float = 30.0) -> None:
-    end_s = time.monotonic() + seconds
-    while not claim():
-        assert time.monotonic() < end_s, "it did not come true"
-        time.sleep(0.05)
 
 
 def read_time_code(picture: np.ndarray) -> float | None:
