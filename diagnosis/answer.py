@@ -1,4 +1,4 @@
-"""The answer of a diagnosis (`diagnosis.json`) and the free runs of its report (`diagnosis.npz`).
+"""The answer of a diagnosis (`diagnosis.json`), and the free runs that its report draws.
 
 Effects, joints and parameters have the names of the effect registry. A reader may rely on the
 fields of `Answer`; `Answer.more` holds further plain JSON.
@@ -8,19 +8,13 @@ Axes: `W` windows, `K` steps, `J` joints.
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from brokk_rl.errors import RecordingError, StorageError
-from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
+from brokk_rl.errors import RecordingError
 from brokk_rl.session import write_json
 from diagnosis.closure import (
     Estimate,
@@ -308,9 +302,6 @@ def _serialize_tuples(fields: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-ARRAYS_FILE = "diagnosis.npz"
-
-
 @dataclass(frozen=True)
 class Outcome:
     """A finished diagnosis with the free runs that its report draws.
@@ -328,89 +319,6 @@ class Outcome:
     before: WindowedRuns
     after: WindowedRuns | None
     floor: WindowedRuns | None
-
-    def save(self, folder: Path) -> None:
-        """Write `diagnosis.json` and `diagnosis.npz`, each in one step.
-
-        Raises:
-            StorageError: something could not be written.
-        """
-        arrays: dict[str, Any] = {}
-        for name in ("before", "after", "floor"):
-            runs = getattr(self, name)
-            if runs is not None:
-                arrays |= _pack_runs(name, runs)
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        temporary = folder / f".{ARRAYS_FILE}.{os.getpid()}.part"
-        try:
-            temporary.write_bytes(buffer.getvalue())
-            os.replace(temporary, folder / ARRAYS_FILE)
-        except OSError as error:
-            temporary.unlink(missing_ok=True)
-            raise StorageError(
-                f"cannot write {folder / ARRAYS_FILE}: {error.strerror or error}; nothing was left behind"
-            ) from error
-        self.answer.write(folder / ANSWER_FILE)
-
-
-def load_outcome(folder: Path, machine: Machine) -> Outcome:
-    """Read the files of `Outcome.save`.
-
-    Raises:
-        RecordingError: a file is missing or damaged.
-    """
-    try:
-        with np.load(folder / ARRAYS_FILE, allow_pickle=False) as arrays:
-            found = {
-                name: _unpack_runs(name, arrays, machine) for name in ("before", "after", "floor")
-            }
-    except (OSError, ValueError, KeyError) as error:
-        raise RecordingError(
-            f"{folder / ARRAYS_FILE}: cannot be read as the arrays of a diagnosis ({error})"
-        ) from error
-    if found["before"] is None:
-        raise RecordingError(f"{folder / ARRAYS_FILE}: holds no free runs; run mode=diagnose again")
-    return Outcome(
-        read_answer(folder / ANSWER_FILE), found["before"], found["after"], found["floor"]
-    )
-
-
-def _pack_runs(name: str, runs: WindowedRuns) -> dict[str, Any]:
-    arrays: dict[str, Any] = {
-        f"{name}.source": runs.source, f"{name}.row": runs.row, f"{name}.simulated": runs.simulated.astype(np.float32),
-        f"{name}.titles": np.array([r.path.stem if r.path else r.run for r in runs.recordings]),
-        f"{name}.created": np.array([r.metadata.get("created", "") for r in runs.recordings]),
-        f"{name}.rate_hz": np.array([r.rate_hz for r in runs.recordings]),
-    }  # fmt: skip
-    for number, recording in enumerate(runs.recordings):
-        arrays |= {f"{name}.{number}.{key}": getattr(recording, key) for key in ("t_s", "u", "q")}
-    return arrays
-
-
-def _unpack_runs(name: str, arrays: Any, machine: Machine) -> WindowedRuns | None:
-    if f"{name}.row" not in arrays:
-        return None
-    empty = Recording(
-        machine=machine.name, joints=machine.joint_names, units=tuple(joint.unit for joint in machine.joints),
-        rate_hz=1.0 / machine.period_s, t_s=np.zeros(0), u=np.zeros(0), q=np.zeros(0),
-    )  # fmt: skip
-    titles, created, rates = (
-        arrays[f"{name}.{key}"].tolist() for key in ("titles", "created", "rate_hz")
-    )
-    recordings = [
-        replace(
-            empty, rate_hz=rate_hz, metadata={"run": title} | ({"created": begun} if begun else {}),
-            **{key: arrays[f"{name}.{number}.{key}"] for key in ("t_s", "u", "q")},
-        )
-        for number, (title, begun, rate_hz) in enumerate(zip(titles, created, rates, strict=True))
-    ]  # fmt: skip
-    return WindowedRuns(
-        recordings,
-        arrays[f"{name}.source"],
-        arrays[f"{name}.row"],
-        arrays[f"{name}.simulated"].astype(float),
-    )
 
 
 def format_error(value: float, unit: str) -> str:

@@ -28,7 +28,7 @@ from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import describe_numbers
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.repair_proof import EngineProof
-from diagnosis.stages import Survey, examine_gap
+from diagnosis.survey import Survey, examine_gap
 
 ProgressCallback = Callable[[str, float], None]
 """Receives the name of a step and the share of the whole that is done."""
@@ -169,7 +169,7 @@ class ReferenceDiagnosis:
             verdict=verdict,
             selected=tuple(selected),
             ranking=rank_effects(selected, decision.rivals, verdict, machine),
-            where=survey.where(),
+            where=survey.where(selected, self.kinds),
             gap=proof.measure_gap(bool(named)),
             rivals=proof.rivals,
             gates=tuple(told),

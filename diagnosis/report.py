@@ -73,9 +73,8 @@ def _describe_tool(answer: Answer) -> str:
     cause = str((answer.more.get("geometry") or {}).get("cause") or "").split(" ")[0]
     if cause not in {one.effect for one in answer.selected}:
         return ""
-    texts = [
-        stage["text"] for stage in answer.more.get("stages", ()) if stage["stage"] == "kinematics"
-    ]
+    found = answer.more.get("tool", ())
+    texts = [one["text"] for one in found if one["stage"] == "kinematics"]
     return "".join(f" {text[0].upper()}{text[1:]}." for text in texts)
 
 

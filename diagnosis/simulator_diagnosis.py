@@ -43,7 +43,7 @@ from diagnosis.reference_diagnosis import (
 from diagnosis.repair_proof import RepairProof
 from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
 from diagnosis.simulator_search import SimulatorSearch
-from diagnosis.stages import examine_gap
+from diagnosis.survey import examine_gap
 
 LEAST_NEED = 0.05
 """Least share of the error without an effect that the effect takes away, on the half of the field that its
@@ -248,7 +248,7 @@ class SimulatorDiagnosis:
             verdict=verdict,
             selected=tuple(sorted(selected, key=lambda one: -one.probability)),
             ranking=rank_effects(selected, rivals, verdict, machine),
-            where=survey.where(),
+            where=survey.where(selected, self.kinds),
             gap=proof.measure_gap(bool(selected)),
             rivals=proof.rivals,
             gates=tuple(told),

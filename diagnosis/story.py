@@ -6,7 +6,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,15 +77,8 @@ def write_groups(
     return given
 
 
-def run_story(
-    session: Session, stages: Mapping[str, StoryStage], write_page: Callable[[], None] | None = None
-) -> None:
-    """Run the stages one after another.
-
-    Args:
-        session: Folder and device of the story.
-        stages: The stages, in order.
-        write_page: Is called after each stage.
+def run_story(session: Session, stages: Mapping[str, StoryStage]) -> None:
+    """Run the stages one after another, in folder and on device of the session.
 
     Raises:
         BrokkError: a stage failed.
@@ -97,8 +90,6 @@ def run_story(
             break
         log.info("%d of %d, %s: %s", number, len(stages), name, stage.title)
         _play_stage(session, name, stage, folder)
-        if write_page is not None:
-            write_page()
 
 
 def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) -> None:

@@ -1,58 +1,43 @@
-"""The answer of `mode=why` (`why.json`): cause, evidence, cost, and the next steps, in words.
+"""The answer of `mode=why`: cause, cost and next steps, as `why.json` and a page.
 
-It is read from the files that the stages left: `doctor.json`, `diagnosis.json`, `evaluation.json`.
+It is read from the files that the stages left: `doctor.json`, `diagnosis.json`, `evaluation.json`. Their own
+pages show the evidence.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.report import Tone
+from brokk_rl.report import Cell, Report, Tone
 from diagnosis import answer, effects_file, report
 from diagnosis.answer import Answer
-from diagnosis.deployment.page import REMEDIES
-from diagnosis.retraining import SuccessRate, subtract_rates
+from diagnosis.deployment.page import EVIDENCE_FILE, PAGE_FILE, REMEDIES
+from diagnosis.retraining import SuccessRate, format_rate, subtract_rates
 from diagnosis.story import HANDED_ON_FOLDER
 
-WHY_FILE = "why.json"
+WHY_FILE, WHY_PAGE = "why.json", "why.html"
 DOCTOR, DIAGNOSIS = "doctor", "diagnosis"
 BEFORE, ALL_EFFECTS = "as_trained", "with_effects"
+LOW_SUCCESS = 0.8
+"""Success without the effects below which the simulator is doubted; chosen by hand."""
 
 Cause = Literal["code", "actuator", "task", "nothing", "cannot_tell"]
-TITLES: Mapping[Cause, str] = {
-    "code": "The deployed code is the cause",
-    "actuator": "The machine is the cause: it moves otherwise than in training",
-    "task": "The task is the cause: it lies outside of the training",
-    "nothing": "No cause found in these logs",
-    "cannot_tell": "These logs do not suffice for an answer",
+TITLES: Mapping[Cause, tuple[str, Tone]] = {
+    "code": ("The deployed code is the cause", "bad"),
+    "actuator": ("The machine is the cause: it moves otherwise than in training", "bad"),
+    "task": ("The task is the cause: it lies outside of the training", "bad"),
+    "nothing": ("No cause found in these logs", "good"),
+    "cannot_tell": ("These logs do not suffice for an answer", "warn"),
 }
-TONES: Mapping[Cause, Tone] = {
-    "code": "bad", "actuator": "bad", "task": "bad", "nothing": "good", "cannot_tell": "warn"
-}  # fmt: skip
-NO_TELLING = "cannot tell"
-"""Begins the reason of a diagnosis whose recordings do not suffice."""
-
-
-@dataclass(frozen=True)
-class WhyRequest:
-    """Words of the command that its next steps repeat.
-
-    Attributes:
-        policy: Folder of the policy.
-        simulator: The simulator, as `simulator=` takes it.
-        is_own: It is a simulator of one's own, a function or an MJCF file.
-    """
-
-    policy: str
-    simulator: str
-    is_own: bool
+NextStep = tuple[str, str]
+"""A sentence, and the command for it or nothing."""
 
 
 @dataclass(frozen=True)
@@ -64,42 +49,30 @@ class WhyResult:
         doctor: `doctor.json`.
         diagnosis: Answer of the diagnosis; `None` where it did not run.
         success: Strict success by stage of evaluation.
-        unmeasured: Selected effects whose cost no stage could measure.
-        request: Words of the command; `None` for results without one.
+        policy: Folder of the policy, as the command has it.
+        simulator: The simulator, as the command has it.
     """
 
     folder: Path
     doctor: Mapping[str, Any]
     diagnosis: Answer | None
     success: Mapping[str, SuccessRate]
-    unmeasured: tuple[str, ...] = ()
-    request: WhyRequest | None = field(default=None)
+    policy: str
+    simulator: str
 
     @property
     def costs(self) -> dict[str, SuccessRate]:
         """Loss of success by stage, with 95 % intervals."""
-        if BEFORE not in self.success:
-            return {}
-        return {
-            name: subtract_rates(self.success[BEFORE], rate)
-            for name, rate in self.success.items()
-            if name != BEFORE
-        }
+        found = {}
+        for name, rate in self.success.items():
+            if name != BEFORE and BEFORE in self.success:
+                found[name] = subtract_rates(self.success[BEFORE], rate)
+        return found
 
     @property
     def has_effects(self) -> bool:
         """True if the diagnosis names effects."""
         return self.diagnosis is not None and bool(self.diagnosis.selected)
-
-    @property
-    def has_unknown_gap(self) -> bool:
-        """True if the diagnosis finds a gap that no effect of the library explains."""
-        found = self.diagnosis
-        return (
-            found is not None
-            and found.verdict == "unknown"
-            and not found.reason.startswith(NO_TELLING)
-        )
 
     @property
     def cause(self) -> Cause:
@@ -114,30 +87,18 @@ class WhyResult:
         return told
 
     @property
-    def title(self) -> str:
-        """The answer in a few words."""
-        if self.cause == "nothing" and self.has_effects:
+    def title(self) -> tuple[str, Tone]:
+        """The answer in a few words, and its tone."""
+        if self.cause != "nothing":
+            return TITLES[self.cause]
+        if self.has_effects:
             if ALL_EFFECTS in self.costs:
-                return "No cause found: what differs costs no success for sure"
-            return "No sure cause: the machine differs from the simulator"
-        if self.cause == "nothing" and not self.is_complete:
-            return "No cause found, but not all could be judged"
-        return TITLES[self.cause]
-
-    @property
-    def is_complete(self) -> bool:
-        """True if machine and effects could be judged."""
+                return "No cause found: what differs costs no success for sure", "warn"
+            return "No sure cause: the machine differs from the simulator", "warn"
         found = self.diagnosis
-        return (
-            found is not None
-            and found.verdict != "unknown"
-            and not self.doctor["actuator"]["cannot_tell"]
-        )
-
-    @property
-    def tone(self) -> Tone:
-        """Tone of the first paragraph."""
-        return "warn" if self.title != TITLES[self.cause] else TONES[self.cause]
+        if found is None or found.verdict == "unknown" or self.doctor["actuator"]["cannot_tell"]:
+            return "No cause found, but not all could be judged", "warn"
+        return TITLES["nothing"]
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as plain JSON data, as `why.json` holds it."""
@@ -156,7 +117,12 @@ class WhyResult:
         }
 
 
-def read_result(folder: Path, request: WhyRequest | None = None) -> WhyResult:
+def is_own_simulator(simulator: str) -> bool:
+    """Return whether a simulator is one's own: `module:function`, or an MJCF file."""
+    return ":" in simulator or simulator.endswith(".xml")
+
+
+def read_result(folder: Path, policy: str, simulator: str) -> WhyResult:
     """Return what the stages have left in a run folder so far."""
     doctor = json.loads((folder / DOCTOR / "doctor.json").read_text())
     try:
@@ -166,11 +132,7 @@ def read_result(folder: Path, request: WhyRequest | None = None) -> WhyResult:
     success = {}
     for path in sorted(folder.glob("*/evaluation.json")):
         success[path.parent.name] = json.loads(path.read_text())["success_strict"]
-    unmeasured = ()
-    if found is not None:
-        measurable = read_effects(folder) if ALL_EFFECTS in success else {}
-        unmeasured = tuple(one.effect for one in found.selected if one.effect not in measurable)
-    return WhyResult(folder, doctor, found, success, unmeasured, request)
+    return WhyResult(folder, doctor, found, success, policy, simulator)
 
 
 def read_effects(folder: Path) -> dict[str, Any]:
@@ -180,190 +142,122 @@ def read_effects(folder: Path) -> dict[str, Any]:
 
 
 def write_summary(result: WhyResult) -> str:
-    """Return the answer in a few sentences: cause, effect, cost, and what is not the cause."""
-    cause, doctor = result.cause, result.doctor
-    if cause == "code":
-        start = (
-            "The deployed code departs from the contract of the policy: " if doctor["named"] else ""
-        )
-        return f"{start}{doctor['reason']} Mend this first, then ask again about the machine."
-    if doctor["verdict"] in ("task", "cannot_tell") and cause == doctor["verdict"]:
-        return f"{doctor['reason']}{_append(_describe_effects(result))}"
-    texts = [_describe_effects(result)]
-    if cause == "nothing":
-        texts.append(doctor["reason"])
-    else:
-        code, _, task = judge_suspects(result)
-        cleared = [
-            words
-            for (state, _), words in ((code, "the deployed code"), (task, "the task"))
-            if state == CLEARED
-        ]
-        if cleared:
-            verb = "is" if len(cleared) == 1 else "are"
-            told = report.join_words(cleared)
-            texts.append(f"{told[0].upper()}{told[1:]} {verb} not the cause.")
+    """Return what each stage says, in a few sentences."""
+    texts = [result.doctor["reason"]]
+    if result.cause == "code":
+        texts.append("Mend this first, then ask again about the machine.")
+    elif result.diagnosis is not None:
+        texts += [report.write_headline(result.diagnosis)[0], _describe_cost(result)]
     return " ".join(filter(None, texts))
 
 
-def _append(text: str) -> str:
-    return f" {text}" if text else ""
-
-
-def _describe_effects(result: WhyResult) -> str:
-    """Return what the machine does otherwise, and what that costs."""
-    found = result.diagnosis
-    blamed = [name for name, one in result.doctor["actuator"]["joints"].items() if one["blamed"]]
-    if found is None or not found.selected:
-        if result.has_unknown_gap:
-            place = report.list_on_joints(blamed)
-            return f"The machine moves otherwise than the simulator{place}, by an effect that is unknown to the library."
-        if blamed:
-            names = report.join_words(blamed)
-            return (
-                f"{names} moved otherwise than nearly all machines of the training. Which effect it is "
-                "could not be told."
-            )
+def _describe_cost(result: WhyResult) -> str:
+    if not result.has_effects:
         return ""
-    names = report.join_words([report.describe_selected(one) for one in found.selected])
-    text = f"The machine shows an effect that the simulator lacks: {names}."
-    if len(found.selected) > 1:
-        text = f"The machine shows effects that the simulator lacks: {names}."
     cost = result.costs.get(ALL_EFFECTS)
     if cost is None:
-        return f"{text} Its cost in success was not measured."
-    before, after = (
-        f"{100 * result.success[name]['mean']:.0f} %" for name in (BEFORE, ALL_EFFECTS)
-    )
-    it = "It" if len(found.selected) == 1 else "Together they"
+        return "The cost in success was not measured."
+    before, after = (format_rate(result.success[name]) for name in (BEFORE, ALL_EFFECTS))
     if cost["ci95"][0] > 0.0:
-        lowers = "lowers" if it == "It" else "lower"
-        return f"{text} {it} {lowers} the success of the policy in simulation from {before} to {after}."
-    return (
-        f"{text} That costs no success for sure: {before} without, {after} with it in simulation."
-    )
+        return f"It lowers the success of the policy in simulation from {before} to {after}."
+    return f"It costs no success for sure: {before} without, {after} with it in simulation."
 
 
-CLEARED, GUILTY, UNJUDGED, POSSIBLE = "cleared", "cause", "not judged", "possible"
-Judgement = tuple[str, str]
-"""Result for a suspect, and the evidence for it."""
-
-
-def judge_suspects(result: WhyResult) -> tuple[Judgement, Judgement, Judgement]:
-    """Return result and evidence for code, machine and task."""
-    doctor, logs = result.doctor, result.doctor["logs"]
-    findings = [one for log in logs for one in log["findings"]]
-    replayed = [one for log in logs for one in log["code"] if one["stage"] in ("policy", "network")]
-    rows = sum(one["rows"] for one in replayed)
-    runs = f"{len(logs)} log" + ("s" if len(logs) > 1 else "")
-    if findings:
-        texts = []
-        for one in findings:
-            begin_s, end_s = one["time_s"]
-            texts.append(f"{one['text']} ({one['field']}, {begin_s:.2f} to {end_s:.2f} s)")
-        code = (GUILTY, "; ".join(dict.fromkeys(texts)))
-    elif replayed:
-        code = (CLEARED, f"replayed on {rows:,} rows of {runs}: each command is the policy's own")
-    else:
-        reasons = dict.fromkeys(text for log in logs for text in log["cannot_tell"])
-        code = (UNJUDGED, "; ".join(reasons) or "the policy could not be replayed")
-    return code, _judge_machine(result), _judge_task(doctor)
-
-
-def _judge_machine(result: WhyResult) -> Judgement:
-    motion, found = result.doctor["actuator"], result.diagnosis
-    joints = [name for name, one in motion["joints"].items() if one["blamed"]]
-    texts = []
-    if motion["cannot_tell"]:
-        texts.append(f"against the training: {motion['cannot_tell']}")
-    elif joints:
-        texts.append(
-            f"{report.join_words(joints)} moved otherwise than 98 % of the training's machines"
-        )
-    else:
-        texts.append("moved as the machines of the training do")
-    if found is not None and found.selected:
-        names = [
-            report.name_effect(one.effect) + report.list_on_joints(one.joints)
-            for one in found.selected
-        ]
-        texts.append(f"the simulator lacks {report.join_words(names)}")
-    elif found is not None:
-        texts.append(f"effects: {found.verdict}{f', {found.reason}' if found.reason else ''}")
-    if result.cause == "actuator":
-        return GUILTY, "; ".join(texts)
-    if result.has_effects and ALL_EFFECTS not in result.costs:
-        return POSSIBLE, "; ".join(texts)
-    return (UNJUDGED if motion["cannot_tell"] else CLEARED), "; ".join(texts)
-
-
-def _judge_task(doctor: Mapping[str, Any]) -> Judgement:
-    blamed = [log["task"] for log in doctor["logs"] if log["task"]["blamed"]]
-    outside = dict.fromkeys(one["field"] for task in blamed for one in task["outside"])
-    reasons = [log["task"]["cannot_tell"] for log in doctor["logs"] if log["task"]["cannot_tell"]]
-    if outside:
-        return GUILTY, f"outside of the training: {', '.join(outside)}"
-    if reasons:
-        return UNJUDGED, reasons[0]
-    return CLEARED, "target and positions lie within the range that the policy saw in training"
-
-
-def list_changes(result: WhyResult) -> list[tuple[str, str]]:
-    """Return what to change: a sentence, and the command for it or nothing."""
+def list_changes(result: WhyResult) -> list[NextStep]:
+    """Return what to change."""
     if result.cause == "code":
         kinds = [one["kind"] for log in result.doctor["logs"] for one in log["findings"]]
         return [(REMEDIES[kind], "") for kind in dict.fromkeys(kinds)]
-    changes, asked = [], result.request
-    policy = asked.policy if asked else "<policy>"
-    simulator = asked.simulator if asked else "<simulator>"
+    changes = []
     if result.cause == "task":
-        changes.append(
-            ("Ask the policy for what it was trained for, or widen the ranges of the task (task.…) and train on:",
-             f"brokk mode=train policy={policy}")
-        )  # fmt: skip
+        text = "Ask the policy for what it was trained for, or widen the ranges of the task (task.…) and train on:"
+        changes.append((text, f"brokk mode=train policy={result.policy}"))
     if not result.has_effects:
         return changes
-    machine = f"machine=@{result.folder / HANDED_ON_FOLDER / 'machine.yaml'}"
+    machine, simulator = _name_machine(result), result.simulator
+    if is_own_simulator(simulator):
+        text = "Put the effects into your simulator, and train in it again. This writes them as ranges and changes:"
+        command = (
+            f"brokk mode=change_simulator {machine} simulator={simulator} changes.diagnosis={result.folder / DIAGNOSIS} "
+            f"changes.why={result.folder / WHY_FILE} session.out={result.folder / 'changes'}"
+        )
+        return [*changes, (text, command)]
+    text = "Train on with the effects that were found, then run this command again with the new policy:"
     effects = f"@{result.folder / DIAGNOSIS / effects_file.EFFECTS_FILE}"
-    if asked is not None and asked.is_own:
-        form = "changes of the file and as " if simulator.endswith(".xml") else ""
-        changes.append(
-            (f"Put the effects into your simulator, and train in it again. This writes them as {form}ranges for randomisation:",
-             f"brokk mode=change_simulator {machine} simulator={simulator} changes.diagnosis={result.folder / DIAGNOSIS} "
-             f"changes.why={result.folder / WHY_FILE} session.out={result.folder / 'changes'}")
-        )  # fmt: skip
-    else:
-        changes.append(
-            ("Train on with the effects that were found, then run this command again with the new policy:",
-             f"brokk mode=train {machine} actuator={simulator} policy={policy} 'effect=[library,{effects}]'")
-        )  # fmt: skip
-    return changes
+    command = f"brokk mode=train {machine} actuator={simulator} policy={result.policy} 'effect=[library,{effects}]'"
+    return [*changes, (text, command)]
 
 
-def list_records(result: WhyResult) -> list[tuple[str, str]]:
-    """Return what to record next: a sentence, and the command for it or nothing."""
+def list_records(result: WhyResult) -> list[NextStep]:
+    """Return what to record next."""
     doctor, found = result.doctor, result.diagnosis
-    records = [(f"Log what could not be judged: {text}.", "") for log in doctor["logs"] for text in log["cannot_tell"]]  # fmt: skip
-    if doctor["verdict"] == "code" and not doctor["named"]:
-        records.append(
-            ("Log the observation vector too (obs_0, obs_1, …): the first wrong number tells the place.", "")
-        )  # fmt: skip
-    machine = f"machine=@{result.folder / HANDED_ON_FOLDER / 'machine.yaml'}"
-    if found is not None and found.next_experiment is not None:
-        following = found.next_experiment
+    texts = [text for log in doctor["logs"] for text in log["cannot_tell"]]
+    if doctor["verdict"] == "code":
+        if not doctor["named"]:
+            texts.append("the observation vector (obs_0, obs_1, …), whose first wrong number tells the place")  # fmt: skip
+    elif doctor["actuator"]["cannot_tell"]:
+        texts.append(doctor["actuator"]["cannot_tell"])
+    records = [(f"Not judged: {text}.", "") for text in dict.fromkeys(texts)]
+    following = found.next_experiment if found else None
+    excitation, text = "'[levels,ramps,holds,reversals]'", ""
+    if following is not None:
         names = report.join_words([report.name_effect(name) for name in following.separates])
-        records.append((
-            f"These recordings cannot tell {names} apart. The motions '{following.excitation}' can; the plan of them:",
-            f"brokk mode=collect {machine} excitation={following.excitation} collect.only_plan=true",
-        ))  # fmt: skip
-    elif result.cause != "code" and (found is None or (not found.selected and found.reason)):
-        why = f" ({found.reason})" if found is not None else ""
-        records.append((
-            f"The diagnosis had too little to name an effect{why}. Log more runs, a minute or more in two files; "
-            "motions made for it tell most:" if found is None or not result.has_unknown_gap
-            else f"No effect of the library explains the gap{why}. Motions made for it tell more:",
-            f"brokk mode=collect {machine} 'excitation=[levels,ramps,holds,reversals]' collect.only_plan=true",
-        ))  # fmt: skip
-    if doctor["actuator"]["cannot_tell"] and result.cause != "code":
-        records.append((f"The motion was not compared with training: {doctor['actuator']['cannot_tell']}.", ""))  # fmt: skip
-    return list(dict.fromkeys(records))
+        text = f"These recordings cannot tell {names} apart. These motions can:"
+        excitation = following.excitation
+    elif result.cause != "code" and not result.has_effects and (found is None or found.reason):
+        text = "The diagnosis names no effect. Log a minute or more in two files; motions made for it tell most:"
+    if text:
+        command = f"brokk mode=collect {_name_machine(result)} excitation={excitation} collect.only_plan=true"
+        records.append((text, command))
+    return records
+
+
+def _name_machine(result: WhyResult) -> str:
+    return f"machine=@{result.folder / HANDED_ON_FOLDER / 'machine.yaml'}"
+
+
+def write_page(result: WhyResult) -> None:
+    """Write `why.html`: the answer, the cost of each effect, next steps, and where the evidence is.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    title, tone = result.title
+    page = Report(title, write_summary(result), tone)
+    picture = result.folder / DOCTOR / EVIDENCE_FILE
+    if picture.is_file():
+        page.add_picture(picture, "The policy's own command and the log's, or the motion beside that of the training.")  # fmt: skip
+    if result.costs:
+        page.add_heading("What it costs in success")
+        rows = []
+        for name, rate in result.success.items():
+            loss = result.costs.get(name)
+            change = Cell(None)
+            if loss is not None:
+                low, high = (-100.0 * bound for bound in reversed(loss["ci95"]))
+                change = Cell(f"{-100 * loss['mean']:+.0f}", f"{low:+.0f} to {high:+.0f}")
+            rows.append([name.replace("_", " "), format_rate(rate), change])
+        page.add_table(
+            ["simulator", "strict success", "change, points"],
+            rows,
+            "Share of simulated episodes that succeed, from the same starts, with 95 % intervals",
+        )
+        if result.success[BEFORE]["mean"] < LOW_SUCCESS:
+            text = "The policy often fails in this simulator even without the effects. Is it the one that it was trained in?"
+            page.add_text(text, "warn")
+    for heading, steps in (
+        ("What to change", list_changes(result)),
+        ("What to record next", list_records(result)),
+    ):
+        if steps:
+            page.add_heading(heading)
+        for text, command in steps:
+            page.add_text(text)
+            if command:
+                page.add_code(command)
+    page.add_heading("Evidence")
+    places = [f"{DOCTOR}/{PAGE_FILE}: code, task and motion"]
+    if result.diagnosis is not None:
+        places.append(f"{DIAGNOSIS}/{report.REPORT_FILE}: where the simulator errs, and which effects it lacks")  # fmt: skip
+    page.add_list(places)
+    page.write(result.folder / WHY_PAGE)

@@ -73,7 +73,7 @@ class Diagnose:
         return replace(self.own, source=self.simulator)
 
     def run(self) -> None:
-        """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
+        """Write `diagnosis.json`, `report.html` and `effects.yaml`.
 
         Raises:
             RecordingError: a recording cannot be used, or there is too little data to fit a
@@ -113,13 +113,13 @@ class Diagnose:
             return search.run(tell)
 
     def write(self, outcome: Outcome) -> None:
-        """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
+        """Write `diagnosis.json`, `report.html` and `effects.yaml`.
 
         Raises:
             StorageError: something could not be written.
         """
         folder = self.session.folder
-        outcome.save(folder)
+        outcome.answer.write(folder / answer.ANSWER_FILE)
         effects_file.write_effects(outcome.answer, self._kinds, folder / effects_file.EFFECTS_FILE)
         with use_workers(self.diagnosis.workers):
             report.write_report(outcome, folder, self.machine)

@@ -23,7 +23,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
-from diagnosis import report, why_answer, why_report
+from diagnosis import report, why_answer
 from diagnosis.deployment.contract import load_policy
 from diagnosis.own_simulator import OwnSimulator
 from diagnosis.story import HANDED_ON_FOLDER, StoryStage, run_story, write_groups
@@ -33,10 +33,10 @@ from diagnosis.why_answer import (
     DIAGNOSIS,
     DOCTOR,
     WHY_FILE,
-    WhyRequest,
+    WHY_PAGE,
     WhyResult,
+    is_own_simulator,
 )
-from diagnosis.why_report import WHY_PAGE
 
 log = logging.getLogger(__name__)
 
@@ -91,25 +91,32 @@ class Why:
         """
         self._try_inputs()
         folder = self.session.folder.resolve()
-        write_groups(folder, HANDED_ON_GROUPS, {"machine": "", "evaluation": ""})
-        titles: dict[str, str] = {}
-        self._play({DOCTOR: self._examine()}, titles)
-        told = json.loads((folder / DOCTOR / "doctor.json").read_text())
-        if told["verdict"] != "code":
-            self._try_to_play({DIAGNOSIS: self._diagnose()}, titles)
+        write_groups(folder, HANDED_ON_GROUPS)
+        run_story(self.session, {DOCTOR: self._examine()})
+        result = self._write_answer()
+        if result.doctor["verdict"] != "code":
+            self._try_to_play({DIAGNOSIS: self._diagnose()})
             if effects := why_answer.read_effects(folder):
-                self._try_to_play(self._list_evaluations(folder, effects), titles)
-        result = why_answer.read_result(folder, self._request)
+                self._try_to_play(self._list_evaluations(folder, effects))
+            result = self._write_answer()
+        print_text(result.title[0], "bold")
+        print_text(why_answer.write_summary(result))
+        for step in (*why_answer.list_changes(result), *why_answer.list_records(result)):
+            for line in filter(None, step):
+                print_text(line)
+        print_text(f"page: {self.session.folder / WHY_PAGE}", "bold")
+
+    def _write_answer(self) -> WhyResult:
+        """Write `why.json` and `why.html` from what the stages have left so far, and return it."""
+        folder = self.session.folder.resolve()
+        result = why_answer.read_result(folder, self.policy_path, self.simulator)
         write_json(folder / WHY_FILE, result.to_json())
-        self._print(result)
+        why_answer.write_page(result)
+        return result
 
     @property
     def _is_own(self) -> bool:
-        return ":" in self.simulator or self.simulator.endswith(".xml")
-
-    @property
-    def _request(self) -> WhyRequest:
-        return WhyRequest(self.policy_path, self.simulator, self._is_own)
+        return is_own_simulator(self.simulator)
 
     def _build_own(self) -> OwnSimulator:
         return replace(self.own, source=self.simulator)
@@ -121,31 +128,12 @@ class Why:
             self._build_own().build(self.machine, 1, torch.device("cpu"))
         record.read_recordings(self.log, self.machine)
 
-    def _print(self, result: WhyResult) -> None:
-        print_text(result.title, "bold")
-        print_text(why_answer.write_summary(result))
-        for step in (*why_answer.list_changes(result), *why_answer.list_records(result)):
-            for line in filter(None, step):
-                print_text(line)
-        print_text(f"page: {self.session.folder / WHY_PAGE}", "bold")
-
-    def _try_to_play(self, stages: Mapping[str, StoryStage], titles: dict[str, str]) -> None:
-        """Run stages whose failure leaves the rest of the page true."""
+    def _try_to_play(self, stages: Mapping[str, StoryStage]) -> None:
+        """Run stages whose failure leaves the rest of the answer true."""
         try:
-            self._play(stages, titles)
+            run_story(self.session, stages)
         except BrokkError as error:
             log.warning("%s", error)
-
-    def _play(self, stages: Mapping[str, StoryStage], titles: dict[str, str]) -> None:
-        """Run stages, add their titles to those of the page, and write the page."""
-        folder = self.session.folder.resolve()
-        for name, stage in stages.items():
-            titles[name] = stage.title
-
-        def write_page() -> None:
-            why_report.write_why_page(folder, titles, self.machine, self._request)
-
-        run_story(self.session, stages, write_page)
 
     def _choose_simulator(self) -> list[str]:
         """Return the overrides that choose the simulator."""

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, write_recording
-from diagnosis import why_report
+from diagnosis import why_answer
 from diagnosis.deployment import page
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
 from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
@@ -266,8 +266,8 @@ def test_the_page_of_the_whole_question_holds_verdict_and_next_step(
     found = ask(policy, run_loop(policy, machine, see_q=turn_joint), machine)
     (tmp_path / "doctor").mkdir()
     found.write(tmp_path / "doctor")
-    why_report.write_why_page(tmp_path, {"doctor": "Is the code to blame?"})
-    text = (tmp_path / why_report.WHY_PAGE).read_text()
+    why_answer.write_page(why_answer.read_result(tmp_path, "policy", "mlp"))
+    text = (tmp_path / why_answer.WHY_PAGE).read_text()
     assert "q.q3 has the wrong sign" in text
     assert page.REMEDIES["sign"] in text
 

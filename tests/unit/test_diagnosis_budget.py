@@ -1,4 +1,4 @@
-"""Errors at the tool and of geometry, and stages, against what was planted or worked out by hand."""
+"""Errors at the tool and of geometry, against what was planted or worked out by hand."""
 
 from __future__ import annotations
 
@@ -13,19 +13,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, compare_tool_points
-from diagnosis.stages import (
-    TARGET_COLUMNS,
-    assess_kinematics,
-    assess_perception,
-    estimate_sensor_noise,
-    measure_tip_error,
-    select_stage,
-    split_joint_gap,
-)
-from diagnosis.where import locate_gap
+from diagnosis.sensors import estimate_sensor_noise
+from diagnosis.survey import TARGET_COLUMNS, assess_kinematics, assess_perception, measure_tip_error
 
 PERIOD_S, DELAY = 0.05, 11
-DEAD_TIME_S = np.full(5, DELAY * PERIOD_S)
 
 
 def recording(
@@ -62,10 +53,6 @@ def runs(
     speed = empty.cut([change(np.diff(r.q, axis=0, prepend=r.q[:1]), r) for r in recordings])
     start = np.stack([recordings[s].q[k - 1] for s, k in zip(source, row, strict=True)])
     return replace(empty, simulated=start[:, None] + np.cumsum(speed, 1))
-
-
-def scaled(joint: int, factor: float):
-    return lambda speed, _: speed * np.where(np.arange(5) == joint, factor, 1.0)
 
 
 def test_a_slewing_error_moves_the_tip_along_its_circle(machine: Machine) -> None:
@@ -136,40 +123,6 @@ def test_the_noise_of_a_sensor_is_told_from_its_motion(machine: Machine) -> None
     assert estimate_sensor_noise([moved]).max() < 1e-6
 
 
-def test_the_stage_is_where_the_error_was_planted(machine: Machine) -> None:
-    field = [recording(machine, seed) for seed in range(4)]
-    reference = runs(machine, [recording(machine, seed) for seed in range(10, 18)])
-    rng = np.random.default_rng(0)
-
-    def found(run: WindowedRuns) -> tuple[str | None, dict[str, float | None]]:
-        mine, other = (
-            replace(
-                r, simulated=r.simulated + 1e-4 * rng.standard_normal(r.simulated.shape).cumsum(1)
-            )
-            for r in (run, reference)
-        )
-        location = locate_gap(mine, other, machine, DEAD_TIME_S, np.random.default_rng(0))
-        tip_m = measure_tip_error(mine, machine).tip_rms_m
-        rows = split_joint_gap(location, mine, other, machine, tip_m)
-        return select_stage(rows, location.has_gap), {row.stage: row.part for row in rows}
-
-    gain, parts = found(runs(machine, field, scaled(3, 1.2)))
-    assert gain == "actuation" and sum(part or 0.0 for part in parts.values()) == pytest.approx(1.0)
-    assert found(runs(machine, field, lambda v, _: np.roll(v, -3, 0)))[0] == "timing"
-    noisy = [replace(r, q=r.q + 0.004 * rng.standard_normal(r.q.shape)) for r in field]
-    quiet = runs(machine, field)
-    start = np.stack(
-        [
-            noisy[s].q[k - 1] - field[s].q[k - 1]
-            for s, k in zip(quiet.source, quiet.row, strict=True)
-        ]
-    )[:, None]
-    assert (
-        found(replace(quiet, recordings=noisy, simulated=quiet.simulated + start))[0] == "sensing"
-    )
-    assert found(runs(machine, field))[0] is None
-
-
 def test_touches_are_held_against_the_estimated_hole(machine: Machine) -> None:
     still = recording(machine, 0)
     tip = (
@@ -191,29 +144,17 @@ def test_touches_are_held_against_the_estimated_hole(machine: Machine) -> None:
     assert assess_perception([still], machine) is None
 
 
-def test_a_biased_encoder_is_a_matter_of_kinematics_only_where_tool_points_were_measured(
-    machine: Machine,
+@pytest.mark.parametrize(("bias_rad", "low_m", "high_m"), [(0.0, 0.0, 0.0), (0.02, 0.02, 0.1)])
+def test_a_biased_encoder_shows_at_measured_tool_points(
+    machine: Machine, bias_rad: float, low_m: float, high_m: float
 ) -> None:
-    def stage(bias_rad: float) -> tuple[str | None, float | None]:
-        shapes = []
-        for bias in (bias_rad, 0.0):
-            moved = recording(machine, 0)
-            tip = (
-                Kinematics(machine)
-                .pose(torch.as_tensor(moved.q, dtype=torch.float32))
-                .tip_in_base_m.numpy()
-            )
-            tip = tip + 0.002 * np.random.default_rng(0).standard_normal(tip.shape)
-            biased = replace(
-                moved,
-                q=moved.q + bias * (np.arange(5) == 2),
-                extra=dict(zip(TOOL_COLUMNS, tip.T, strict=True)),
-            )
-            shapes.append(compare_tool_points([biased], machine))
-        found = assess_kinematics(*shapes)
-        assert found is not None
-        return select_stage([found], False), found.rms_m
-
-    assert stage(0.0) == (None, 0.0)
-    name, rms_m = stage(0.02)
-    assert name == "kinematics" and rms_m is not None and 0.02 < rms_m < 0.1
+    moved, seen = recording(machine, 0), []
+    pose = Kinematics(machine).pose(torch.as_tensor(moved.q, dtype=torch.float32))
+    noise_m = 0.002 * np.random.default_rng(0).standard_normal((1800, 3))
+    extra = dict(zip(TOOL_COLUMNS, (pose.tip_in_base_m.numpy() + noise_m).T, strict=True))
+    for bias in (bias_rad, 0.0):
+        shown = moved.q + bias * (np.arange(5) == 2)
+        seen.append(compare_tool_points([replace(moved, q=shown, extra=extra)], machine))
+    found = assess_kinematics(*seen)
+    assert found is not None and found.stage == "kinematics"
+    assert low_m <= found.rms_m <= high_m
