@@ -9,9 +9,10 @@ for each: `/joint_states@2`. A message need not have all columns.
 from __future__ import annotations
 
 import json
-import re
+import math
 import struct
 from abc import abstractmethod
+from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import IO, Any, NamedTuple
@@ -19,14 +20,15 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from actuators.recordings.log_tables import LogFile, Table, Wanted
-from actuators.recordings.message_numbers import NumberReader, find_leaves
+from actuators.recordings.message_numbers import list_numbers
 from brokk_rl.errors import RecordingError
 
-LOG_TIME = "log_time"
 HEAD_MESSAGES = 200
 """Messages of a topic from which its columns are listed: two sources may alternate on it."""
 HEAD_S = 5.0
 """Time from the first message within which all sources of a topic send one."""
+HEAD_UNLISTED = 65536
+"""Messages in the first of which topics are looked for in a log that does not list them."""
 
 
 class LoggedMessage(NamedTuple):
@@ -50,106 +52,93 @@ class LoggedMessage(NamedTuple):
 class MessageLog(LogFile):
     """A log of messages, one table a topic."""
 
+    clock = "log_time"
+    """Column of the time since the first message, s."""
+
     @abstractmethod
     def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
         """Yield the messages of some tables, or all, in the order of the log."""
 
-    @abstractmethod
     def _list_known(self) -> set[str]:
         """Return the tables that the log lists itself; empty where it lists none."""
+        return set()
+
+    def _list_units(self, table: str) -> Mapping[str, str]:
+        """Return the units that the log states for the columns of a table."""
+        return {}
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the numbers in the first messages of each topic."""
         known = self._list_known()
-        found: dict[str, dict[str, None]] = {}
-        counts = Counter[str]()
-        begin_ns = None
-        for message in self._iterate_safely(None):
-            begin_ns = message.time_ns if begin_ns is None else begin_ns
-            table = message.table
-            counts[table] += 1
-            if counts[table] <= HEAD_MESSAGES:
-                content = self._decode(message, counts[table] - 1, begin_ns)
-                names = [] if content is None else [name for name, _ in find_leaves(content)]
-                found.setdefault(table, {}).update(dict.fromkeys(names))
-            is_late = message.time_ns - begin_ns > HEAD_S * 1e9
-            if is_late and known and known <= found.keys():
+        found: dict[str, dict[str, float]] = {}
+        messages = self._read_messages(None, HEAD_MESSAGES)
+        for number, (table, elapsed_s, numbers) in enumerate(messages):
+            found.setdefault(table, {}).update(numbers)
+            is_all = known <= found.keys() if known else number > HEAD_UNLISTED
+            if is_all and elapsed_s > HEAD_S:
                 break
-        return {
-            table: [LOG_TIME, *sorted(found[table], key=_pad_numbers)]
-            for table in sorted(found)
-            if found[table]
-        }
+        return {table: [self.clock, *found[table]] for table in sorted(found) if found[table]}
 
     def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
         """Return the numbers of each topic; messages without any wanted number are left out."""
-        readers = {
-            table: NumberReader(sorted(set(names) - {LOG_TIME}, key=_pad_numbers))
-            for table, names in wanted.items()
-        }
-        times: dict[str, list[int]] = {table: [] for table in wanted}
-        rows: dict[str, list[list[Any]]] = {table: [] for table in wanted}
-        counts = Counter[str]()
-        begin_ns = None
-        for message in self._iterate_safely(wanted):
-            begin_ns = message.time_ns if begin_ns is None else begin_ns
-            table = message.table
-            if max_rows is not None and len(rows[table]) >= max_rows:
-                if all(len(several) >= max_rows for several in rows.values()):
-                    break
-                continue
-            counts[table] += 1
-            content = self._decode(message, counts[table] - 1, begin_ns)
-            values = None if content is None else readers[table].read(content)
-            if values is not None:
-                times[table].append(message.time_ns)
-                rows[table].append(values)
+        names = {table: [one for one in wanted[table] if one != self.clock] for table in wanted}
+        rows = {table: array("d") for table in wanted}
+        counts = dict.fromkeys(wanted, 0)
+        for table, elapsed_s, numbers in self._read_messages(wanted, max_rows):
+            values = [numbers.get(name, math.nan) for name in names[table]]
+            if not names[table] or not numbers.keys().isdisjoint(names[table]):
+                rows[table].extend((elapsed_s, *values))
+                counts[table] += 1
+            if max_rows is not None and min(counts.values()) >= max_rows:
+                break
         tables = {}
-        for table, reader in readers.items():
-            # seconds since 1970 would be rounded to 0.2 µs
-            time_s = (np.array(times[table], dtype=np.int64) - (begin_ns or 0)) * 1e-9
-            try:
-                numbers = np.array(rows[table], dtype=float)  # None becomes NaN
-            except (TypeError, ValueError) as error:
-                raise RecordingError(
-                    f"{self.path}: topic {table}: a value is no number ({error})"
-                ) from error
-            numbers = numbers.reshape(len(time_s), len(reader.names))
-            order = np.argsort(time_s, kind="stable")  # several programs may send to one topic
-            columns = {LOG_TIME: time_s[order]}
-            for at, name in enumerate(reader.names):
-                columns[name] = numbers[order, at]
-            tables[table] = Table(columns, {}, LOG_TIME, is_sparse=True)
+        for table, several in names.items():
+            numbers = np.array(rows[table]).reshape(-1, 1 + len(several))
+            # several programs may send to one topic
+            numbers = numbers[np.argsort(numbers[:, 0], kind="stable")]
+            columns = dict(zip([self.clock, *several], numbers.T, strict=True))
+            tables[table] = Table(columns, self._list_units(table), self.clock, is_sparse=True)
         return tables
 
-    def _decode(self, message: LoggedMessage, number: int, begin_ns: int) -> Any:
-        """Return the content of a message, `None` for a damaged one that is left out."""
+    def _read_messages(
+        self, tables: Collection[str] | None, most: int | None
+    ) -> Iterator[tuple[str, float, dict[str, float]]]:
+        """Yield table, time since the first message in s, and numbers of each message.
+
+        Args:
+            tables: Tables to read; `None` for all.
+            most: Messages of each table of which the numbers are read; `None` for all.
+        """
+        counts = Counter[str]()
+        begin_ns, elapsed_s = None, 0.0
         try:
-            return message.decode(message.data)
+            for message in self._iterate(tables):
+                begin_ns = message.time_ns if begin_ns is None else begin_ns
+                elapsed_s = (message.time_ns - begin_ns) * 1e-9
+                counts[message.table] += 1
+                numbers: dict[str, float] = {}
+                if most is None or counts[message.table] <= most:
+                    numbers = self._read_message(message, counts[message.table] - 1, elapsed_s)
+                yield message.table, elapsed_s, numbers
+        except RecordingError:
+            raise
+        except Exception as error:  # the libraries raise what they stumble over
+            where = f"after {counts.total()} messages, {elapsed_s:.3f} s from the first one"
+            self.report_damage(f"damaged {where} ({describe(error)})", error)
+
+    def _read_message(
+        self, message: LoggedMessage, number: int, elapsed_s: float
+    ) -> dict[str, float]:
+        """Return the numbers of a message, none of a damaged one that is left out."""
+        try:
+            return dict(list_numbers(message.decode(message.data)))
         except Exception as error:  # decoders raise what they stumble over
-            elapsed_s = (message.time_ns - begin_ns) * 1e-9
             self.report_damage(
                 f"topic {message.table}, message {number}, {elapsed_s:.3f} s from the first one{message.place}: "
                 f"cannot be decoded ({describe(error)})",
                 error,
             )
-            return None
-
-    def _iterate_safely(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
-        """Yield messages; damage becomes a `RecordingError`."""
-        count, begin_ns, last_ns = 0, None, 0
-        try:
-            for message in self._iterate(tables):
-                begin_ns = message.time_ns if begin_ns is None else begin_ns
-                last_ns = message.time_ns
-                yield message
-                count += 1
-        except RecordingError:
-            raise
-        except Exception as error:  # the libraries raise what they stumble over
-            elapsed_s = (last_ns - (begin_ns or 0)) * 1e-9
-            where = f"after {count} messages, {elapsed_s:.3f} s from the first one"
-            self.report_damage(f"damaged {where} ({describe(error)})", error)
+            return {}
 
 
 class BagLog(MessageLog):
@@ -161,9 +150,6 @@ class BagLog(MessageLog):
 
         # Bags from before 2023 have no definitions; messages of joints are the same in all versions.
         return AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-
-    def _list_known(self) -> set[str]:
-        return set()
 
     def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
         from rosbags.highlevel import AnyReaderError
@@ -245,11 +231,6 @@ def describe(error: Exception) -> str:
     if isinstance(error, struct.error):  # its name is `error`
         return f"cut off ({error})"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-
-
-def _pad_numbers(name: str) -> str:
-    """Return a key that puts `q[10]` after `q[2]`."""
-    return re.sub(r"\d+", lambda number: number[0].zfill(9), name)
 
 
 def _read_channels(file: IO[bytes]) -> Mapping[int, Any]:

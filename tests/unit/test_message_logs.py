@@ -17,7 +17,7 @@ from carriage import check, make_carriage, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
-from actuators.recordings.can_log import CanLog, extract_signal
+from actuators.recordings.can_log import CanLog
 from actuators.recordings.column_map import AlignedTime, Column
 from actuators.recordings.log_files import open_log
 from brokk_rl.errors import ConfigError, RecordingError
@@ -348,29 +348,6 @@ def test_can_logs_are_decoded_by_their_dbc(tmp_path: Path, carriage: Machine, en
     np.testing.assert_allclose(recording.u[:, 0], signals["u"][: recording.num_samples], atol=1e-6)
     np.testing.assert_allclose(recording.q[:, 0], signals["q"][: recording.num_samples], atol=1e-3)
     assert recording.num_samples >= len(signals["t"]) - 1
-
-
-SIGNALS = """VERSION ""
-BU_: X
-BO_ 1 Short: 8 X
- SG_ a : 3|13@1- (0.01,-2) [0|0] "" X
- SG_ b : 16|9@1+ (2,1) [0|0] "" X
- SG_ c : 38|11@0- (0.5,3) [0|0] "" X
- SG_ d : 55|16@0+ (1,0) [0|0] "" X
-BO_ 2 Whole: 8 X
- SG_ e : 0|64@1- (1,0) [0|0] "" X
-BO_ 3 Swapped: 8 X
- SG_ f : 7|64@0+ (1,0) [0|0] "" X
-"""
-
-
-def test_signals_of_a_block_are_those_that_cantools_reads_frame_by_frame() -> None:
-    data = np.random.default_rng(0).integers(0, 256, (50, 8), dtype=np.uint8)
-    database: Any = cantools.database.load_string(SIGNALS)
-    for message in database.messages:
-        for signal in message.signals:
-            expected = [message.decode(row.tobytes())[signal.name] for row in data]
-            np.testing.assert_allclose(extract_signal(signal, data), np.array(expected, float), rtol=1e-15)  # fmt: skip
 
 
 def test_a_cut_off_blf_is_refused_by_its_frame(tmp_path: Path, carriage: Machine) -> None:
