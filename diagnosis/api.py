@@ -120,7 +120,7 @@ def from_arrays(
     with TemporaryDirectory() as folder:
         log = Path(folder) / "arrays.npz"
         np.savez(log, **columns)  # pyright: ignore[reportArgumentType]
-        draft = log_draft.make_draft([log], "arrays", given, None)
+        draft = log_draft.make_draft([log], "arrays", given)
         texts = {
             "machine": draft.format(log_draft.MACHINE_TEMPLATE),
             "import": draft.format(log_draft.MAP_TEMPLATE),

@@ -16,18 +16,14 @@ from actuators.recordings.log_draft import Draft
 from brokk_rl import extensions
 from brokk_rl.errors import BrokkError
 
-GIVEN = {"joints", "command", "position_unit", "clock_offset_s", "time", "rate_hz", "wraps"}
-
 
 def make_draft(*options: str) -> Draft:
     values: dict[str, Any] = {}
     for option in options:
         key, _, value = option.removeprefix("log.").partition("=")
         values[key] = yaml.safe_load(value)
-    paths = conversion.find_logs(values["input"])
-    given = GivenColumns(**{key: value for key, value in values.items() if key in GIVEN})
-    dbc, damaged = values.get("dbc"), values.get("damaged", "refuse")
-    return log_draft.make_draft(paths, "leg", given, dbc, damaged, values.get("channel"))
+    paths = conversion.find_logs(values.pop("input"))
+    return log_draft.make_draft(paths, "leg", GivenColumns(**values))
 
 
 def describe_draft(draft: Draft) -> str:

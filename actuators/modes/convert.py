@@ -1,10 +1,23 @@
 """`brokk mode=convert`: makes recordings of the logs of other machines and programs."""
 
+from __future__ import annotations
+
 from actuators.recordings import conversion
 from actuators.recordings.conversion import LogReader
+from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.recording_checks import examine_recordings
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.machine import Machine
-from brokk_rl.session import Session
+from brokk_rl.record import Recording
+from brokk_rl.session import Session, read_record
 from brokk_rl.spec import spec
+
+SIMULATORS = {
+    "position": "actuator=servo",
+    "torque": "actuator=force actuator.mass_kg=<of your simulator>",
+    "speed": "actuator=ideal",
+}
+"""Ideal simulator of each command interface, by which recordings are diagnosed first."""
 
 
 @spec
@@ -25,10 +38,11 @@ class Convert:
     session: Session
     machine: Machine
     reader: LogReader
+    thresholds: InspectionThresholds
     convert: Conversion
 
     def run(self) -> None:
-        """Write `recordings/<log>_<piece>.parquet`; nothing if any log cannot be used.
+        """Write `recordings/<log>_<piece>.parquet`, nothing if any log cannot be used, and print what is odd.
 
         Raises:
             RecordingError: no log matches, one of them cannot be used, two have the same name, or,
@@ -36,5 +50,23 @@ class Convert:
             StorageError: a file could not be written.
         """
         pieces = conversion.read_logs(self.convert.input, self.reader, self.machine)
-        conversion.write_recordings(pieces, self.session.folder / conversion.FOLDER)
+        folder = self.session.folder / conversion.FOLDER
+        conversion.write_recordings(pieces, folder)
+        self._show_remarks([one for several in pieces.values() for one in several])
+        choices = (read_record(self.session.folder) or {}).get("choices", {})
+        print_text("then:")
+        print_text(
+            f"brokk mode=diagnose machine={choices.get('machine', '…')} 'diagnosis.field={folder}/*' "
+            f"{SIMULATORS[self.machine.interface]}"
+        )
         conversion.check_damage(pieces)
+
+    def _show_remarks(self, recordings: list[Recording]) -> None:
+        """Print what limits the conclusions from the recordings, joint by joint."""
+        rows = []
+        for one in examine_recordings(recordings, self.machine, self.thresholds):
+            if one.severity != "note":
+                span = f"{one.from_s:.2f} to {one.to_s:.2f} s"
+                rows.append([one.recording, one.joint or "all", one.name, span, one.amount])
+        if rows:
+            print_table(["run", "joint", "remark", "when", "what"], rows, "look at these first")

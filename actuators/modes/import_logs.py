@@ -9,30 +9,18 @@ from pathlib import Path
 
 from actuators.recordings import conversion, log_draft
 from actuators.recordings.column_names import UNITS, read_unit
-from actuators.recordings.conversion import LogReader
-from actuators.recordings.guess import CommandKind, GivenColumns, Guess
-from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.guess import CommandKind, Damaged, GivenColumns, Guess
 from actuators.recordings.log_draft import Draft
-from actuators.recordings.log_files import Damaged
-from actuators.recordings.recording_checks import examine_recordings
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from brokk_rl.report import Report
-from brokk_rl.session import Session, read_record, write_json, write_text
+from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import Positive, spec
 
 log = logging.getLogger(__name__)
 
 MAP_FILE, MACHINE_FILE = "column_map.yaml", "machine.yaml"
 GUESS_FILE, PICTURE_FILE, PAGE_FILE = "import.json", "import.png", "import.html"
-SIMULATORS = {
-    "position": "actuator=servo",
-    "torque": "actuator=force actuator.mass_kg=<of your simulator>",
-    "speed": "actuator=ideal",
-}
-"""Ideal simulator of each command interface, by which recordings are diagnosed first."""
 HEAD = ["subject", "guess", "how sure", "evidence"]
 
 
@@ -88,73 +76,32 @@ class LogSelection:
 
 @spec
 class ImportLogs:
-    """Draft a column map and a machine from logs; with both of them, make recordings.
+    """Draft a column map and a machine from logs, by which `mode=convert` makes recordings of them.
 
     Attributes:
         session: Folder.
-        machine: The machine; `null` to draft one.
-        reader: Reads the logs; `null` to draft a column map.
-        thresholds: From which on a stretch of a recording is remarked.
         log: Logs to import.
     """
 
     session: Session
-    machine: Machine | None
-    reader: LogReader | None
-    thresholds: InspectionThresholds
     log: LogSelection
 
-    def check(self) -> None:
-        if (self.machine is None) != (self.reader is None):
-            lacking = "machine" if self.machine is None else "import"
-            raise ConfigError(
-                f"mode=import needs machine=… and import=… to make recordings, or neither to draft both; {lacking}=… is missing"
-            )
-
     def run(self) -> None:
-        """Write a picture, the guesses, a column map and a machine file, or recordings.
+        """Write a picture, the guesses, a column map and a machine file.
 
         Raises:
             RecordingError: No log matches, or one cannot be used; names its place.
             StorageError: A file could not be written.
         """
-        if self.machine is not None and self.reader is not None:
-            pieces = conversion.read_logs(self.log.input, self.reader, self.machine)
-            place = self.session.folder / conversion.FOLDER
-            conversion.write_recordings(pieces, place)
-            self._show_remarks(
-                [one for several in pieces.values() for one in several], self.machine
-            )
-            simulator = SIMULATORS[self.machine.interface]
-            choices = (read_record(self.session.folder) or {}).get("choices", {})
-            machine = choices.get("machine", "…")
-            command = (
-                f"brokk mode=diagnose machine={machine} 'diagnosis.field={place}/*' {simulator}"
-            )
-            for text in ("then:", command):
-                print_text(text)
-            return
         paths = conversion.find_logs(self.log.input)
         keys = [one.name for one in fields(GivenColumns)]
         given = GivenColumns(**{key: getattr(self.log, key) for key in keys})
         name = self.log.name or _name_machine(paths[0])
-        draft = log_draft.make_draft(
-            paths, name, given, self.log.dbc, self.log.damaged, self.log.channel
-        )
+        draft = log_draft.make_draft(paths, name, given)
         picture = self.session.folder / PICTURE_FILE
         log_draft.draw_draft(draft).savefig(picture, dpi=110)
         log.info("picture: %s", picture)
         self._write(draft, paths)
-
-    def _show_remarks(self, recordings: list[Recording], machine: Machine) -> None:
-        """Print what limits the conclusions from the recordings, joint by joint."""
-        rows = []
-        for one in examine_recordings(recordings, machine, self.thresholds):
-            if one.severity != "note":
-                span = f"{one.from_s:.2f} to {one.to_s:.2f} s"
-                rows.append([one.recording, one.joint or "all", one.name, span, one.amount])
-        if rows:
-            print_table(["run", "joint", "remark", "when", "what"], rows, "look at these first")
 
     def _write(self, draft: Draft, paths: list[Path]) -> None:
         folder, guesses = self.session.folder, draft.list_guesses()
@@ -189,8 +136,8 @@ def _format_next(folder: Path, patterns: str | tuple[str, ...]) -> str:
     """Return the command that makes recordings with the drafts."""
     given = patterns if isinstance(patterns, str) else f"[{','.join(patterns)}]"
     return (
-        f"brokk mode=import machine=@{folder / MACHINE_FILE} import=@{folder / MAP_FILE} "
-        f"'log.input={given}' session.out={folder.with_name(f'{folder.name}_recordings')}"
+        f"brokk mode=convert machine=@{folder / MACHINE_FILE} import=@{folder / MAP_FILE} "
+        f"'convert.input={given}' session.out={folder.with_name(f'{folder.name}_recordings')}"
     )
 
 

@@ -25,7 +25,8 @@ from typing import Literal
 import numpy as np
 
 from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn, list_time_columns
-from actuators.recordings.log_files import Damaged, open_log
+from actuators.recordings.guess import Damaged
+from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import (
     Piece,
     Places,

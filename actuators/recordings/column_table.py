@@ -71,18 +71,17 @@ class ColumnTable:
     signals: RunSignals
 
 
-def read_columns(run: LogRun, given: GivenColumns, skip: bool) -> ColumnTable:
+def read_columns(run: LogRun, given: GivenColumns) -> ColumnTable:
     """Return what the columns of a run are.
 
     Args:
         run: Beginning of a log, with all columns.
         given: Meanings that a person gives.
-        skip: Rows whose time does not increase will be left out.
 
     Raises:
         RecordingError: No time, no command or no position can be proposed, or a given column is missing.
     """
-    times = _guess_times(run, given, skip)
+    times = _guess_times(run, given)
     places = index_columns({name: [*table.columns] for name, table in run.tables.items()})
     places = {name: place for name, place in places.items() if place[0] in times}
     signals = RunSignals(run, places, lambda name: times[name].time, True, 1.0, quiet=True)
@@ -109,11 +108,11 @@ def read_columns(run: LogRun, given: GivenColumns, skip: bool) -> ColumnTable:
     return ColumnTable(times, joints, remarks, signals)
 
 
-def _guess_times(run: LogRun, given: GivenColumns, skip: bool) -> dict[str, TimeGuess]:
+def _guess_times(run: LogRun, given: GivenColumns) -> dict[str, TimeGuess]:
     """Return the clock of each table that has one."""
     times, faults = {}, []
     for name, table in run.tables.items():
-        found = guess_time(name, table, given, skip)
+        found = guess_time(name, table, given)
         if isinstance(found, TimeGuess):
             times[name] = found
         else:

@@ -16,6 +16,8 @@ CommandKind = Literal["velocity", "position", "torque"]
 """Quantity that commands set."""
 SURE, LIKELY = 0.97, 0.8
 """Least probabilities of a sure and of a likely guess."""
+Damaged = Literal["refuse", "skip"]
+"""What is done about damaged parts of a log."""
 Evidence = tuple[str, float]
 """An observation as text, and the logarithm of the odds that it adds."""
 
@@ -88,6 +90,9 @@ class GivenColumns:
         time: Column of the time, or those of seconds and nanoseconds; `None` to guess it.
         rate_hz: Rate of equally spaced rows; `None` for a log with times.
         wraps: Value at which positions begin again, 0 for none; `None` to guess it.
+        dbc: DBC file of logs of a CAN bus.
+        channel: Channel of the recorder of a CAN bus; `None` for all.
+        damaged: What to do about damaged parts.
     """
 
     joints: Mapping[str, tuple[str, str]] | None = None
@@ -97,6 +102,14 @@ class GivenColumns:
     time: Sequence[str] | None = None
     rate_hz: float | None = None
     wraps: float | Mapping[str, float] | None = None
+    dbc: str | None = None
+    channel: int | str | None = None
+    damaged: Damaged = "refuse"
+
+    @property
+    def is_skipping(self) -> bool:
+        """True where damaged parts are left out."""
+        return self.damaged == "skip"
 
     def find_unit(self, joint: str) -> str | None:
         """Return the unit of a joint's positions, where it is given."""

@@ -17,7 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from actuators.recordings.column_pairs import JointGuess
 from actuators.recordings.column_table import read_columns
 from actuators.recordings.guess import GivenColumns, Guess
-from actuators.recordings.log_files import Damaged, open_log
+from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import RunSignals
 from actuators.recordings.log_survey import JointSurvey, LogSurvey, measure_logs
 from actuators.recordings.text_log import TextLog
@@ -76,9 +76,7 @@ class Draft:
         survey: Their numbers over all logs.
         signals: Signals of the run that each joint was judged by.
         signs: Delimiter and decimal sign of text files.
-        dbc: DBC file of logs of a CAN bus.
-        channel: Channel of the recorder.
-        damaged: What is done about damaged parts.
+        given: Meanings that a person gave.
         remarks: Further remarks.
     """
 
@@ -88,9 +86,7 @@ class Draft:
     survey: LogSurvey
     signals: Mapping[str, RunSignals]
     signs: tuple[str, str]
-    dbc: str | None
-    channel: int | str | None
-    damaged: Damaged
+    given: GivenColumns
     remarks: Sequence[str]
 
     @property
@@ -175,14 +171,7 @@ class Draft:
         return environment.get_template(template).render(draft=self, **names)
 
 
-def make_draft(
-    paths: Sequence[Path],
-    name: str,
-    given: GivenColumns,
-    dbc: str | None,
-    damaged: Damaged = "refuse",
-    channel: int | str | None = None,
-) -> Draft:
+def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
     """Return the draft of map and machine; joints that are never commanded are left out.
 
     Raises:
@@ -193,13 +182,13 @@ def make_draft(
     remarks: dict[str, None] = {}
     signs = (",", ".")
     for path in paths[:SAMPLED_LOGS]:
-        opened = open_log(path, None, dbc, damaged, channel)
+        opened = open_log(path, None, given.dbc, given.damaged, given.channel)
         if isinstance(opened, TextLog):
             signs = (opened.layout.delimiter, opened.layout.decimal)
         run = next(opened.read_runs(opened.list_tables(), SAMPLED_ROWS), None)
         if run is None:
             raise RecordingError(f"{path}: no row")
-        sample = read_columns(run, given, damaged == "skip")
+        sample = read_columns(run, given)
         clocks = clocks or sample.times
         remarks |= dict.fromkeys(sample.remarks)
         for joint in sample.joints:
@@ -208,7 +197,7 @@ def make_draft(
     joints = [joint for joint, _ in best.values()]
     used = {column.name.table for joint in joints for column in (joint.u, joint.q)}
     times = {table: time for table, time in clocks.items() if table in used}
-    survey = measure_logs(paths, times, joints, signs, dbc, damaged, channel)
+    survey = measure_logs(paths, times, joints, signs, given)
     moving = []
     for joint in joints:
         numbers = survey.joints[joint.name]
@@ -220,7 +209,7 @@ def make_draft(
         raise RecordingError(f"{paths[0]}: no command of any joint changes in {len(paths)} logs")
     all_remarks = [*remarks, *survey.gaps]
     signals = {name: one for name, (_, one) in best.items()}
-    return Draft(name, times, moving, survey, signals, signs, dbc, channel, damaged, all_remarks)
+    return Draft(name, times, moving, survey, signals, signs, given, all_remarks)
 
 
 def _rank(joint: JointGuess) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from typing import Literal
 
 from actuators.recordings.advice import advise
 from actuators.recordings.array_log import FORMATS, ArrayLog, LeRobotLog, TableLog
+from actuators.recordings.guess import Damaged
 from actuators.recordings.log_tables import LogFile, Table, Wanted
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import ConfigError, RecordingError
@@ -17,8 +18,6 @@ CAN_ENDINGS = (".blf", ".asc", ".trc")
 BAG_ENDINGS = (".db3", ".bag")
 ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *BAG_ENDINGS, *FORMATS, ".mcap", ".npz", ".mat")
 """Endings of the files that are logs."""
-SAGE_FILES = ("control.csv", "state_motor.csv")
-"""Files of a motion in a folder of SAGE: targets, and what the motors answered."""
 SIGNATURES = {
     b"\x89MCAP0\r\n": (".mcap", "an MCAP file"),
     b"LOGG": (".blf", "a BLF file"),
@@ -44,24 +43,17 @@ FOREIGN = {
 """Files that are no logs yet, and what makes logs of them, by their ending."""
 CANDUMP_LINE = re.compile(rb"^\s*\([-\d:. ]+\)\s+\S+\s+[0-9A-Fa-f]+(#|\s+\[\d+\])", re.MULTILINE)
 """A line of candump, as a file (`candump -l`) or as printed on a terminal (`candump -t a`)."""
-Damaged = Literal["refuse", "skip"]
-JOINT_LIST = "joint_list.txt"
-"""File in which SAGE names the joints, one a line."""
 
 
 class CsvFolderLog(LogFile):
-    """A folder with the CSV files of one run, each on its clock, as SAGE writes them."""
+    """A folder with the CSV files of one run, each on its clock."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        labels = []
-        if (path / JOINT_LIST).is_file():
-            labels = (path / JOINT_LIST).read_text(errors="replace").split()
-        names = SAGE_FILES if tell_folder(path) == "sage" else _list_csv_files(path)
-        self._logs = {Path(name).stem: TextLog(path / name, None, labels) for name in names}
+        self._logs = {Path(name).stem: TextLog(path / name) for name in _list_csv_files(path)}
 
     def list_tables(self) -> dict[str, list[str]]:
-        """Return the columns of both files, items of lists by the joints where they are listed."""
+        """Return the columns of each file."""
         return {table: log.list_tables()[""] for table, log in self._logs.items()}
 
     def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
@@ -105,8 +97,6 @@ def open_log(
 
 def _open_folder(path: Path) -> LogFile:
     kind = tell_folder(path)
-    if kind == "sage":
-        return CsvFolderLog(path)
     if kind == "lerobot":
         return LeRobotLog(path)
     if kind == "bag":
@@ -117,8 +107,8 @@ def _open_folder(path: Path) -> LogFile:
     if len(_list_csv_files(path)) > 1:
         return CsvFolderLog(path)
     raise RecordingError(
-        f"{path}: expected a folder of SAGE ({', '.join(SAGE_FILES)}), a LeRobotDataset (meta/info.json) or a bag "
-        "of ROS 2 (metadata.yaml)"
+        f"{path}: expected a folder with the CSV files of one run, a LeRobotDataset (meta/info.json) or a bag of "
+        "ROS 2 (metadata.yaml)"
     )
 
 
@@ -171,10 +161,8 @@ def _check_ending(path: Path, ending: str) -> None:
             )
 
 
-def tell_folder(path: Path) -> Literal["sage", "lerobot", "bag"] | None:
+def tell_folder(path: Path) -> Literal["lerobot", "bag"] | None:
     """Return the kind of log that a folder is, `None` for a folder of something else."""
-    if all((path / name).is_file() for name in SAGE_FILES):
-        return "sage"
     if (path / "meta" / "info.json").is_file():
         return "lerobot"
     if (path / "metadata.yaml").is_file():

@@ -12,7 +12,7 @@ import numpy as np
 
 from actuators.recordings.column_map import Column, ColumnMap, JointColumns, TargetColumn
 from actuators.recordings.column_pairs import JointGuess
-from actuators.recordings.log_files import Damaged
+from actuators.recordings.guess import GivenColumns
 from actuators.recordings.log_signals import Signal
 from actuators.recordings.time_guess import TimeGuess
 
@@ -152,9 +152,7 @@ def measure_logs(
     times: Mapping[str, TimeGuess],
     joints: Sequence[JointGuess],
     signs: tuple[Any, Any],
-    dbc: str | None,
-    damaged: Damaged,
-    channel: int | str | None,
+    given: GivenColumns,
 ) -> LogSurvey:
     """Return the numbers of all logs.
 
@@ -171,7 +169,7 @@ def measure_logs(
     clocks = {table: one.time for table, one in times.items()}
     reader = ColumnMap(
         delimiter=signs[0], decimal=signs[1], time=clocks[""] if list(clocks) == [""] else clocks, joints=columns,
-        optional={}, overrun=0.0, longest_gap_s=1.0, shortest_s=0.0, damaged=damaged, dbc=dbc, channel=channel,
+        optional={}, overrun=0.0, longest_gap_s=1.0, shortest_s=0.0, damaged=given.damaged, dbc=given.dbc, channel=given.channel,
     )  # fmt: skip
     survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
     for path in paths:

@@ -14,7 +14,7 @@ import itertools
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -88,15 +88,12 @@ class TextLayout:
 class TextLog(LogFile):
     """A text file as a log with one table."""
 
-    def __init__(
-        self, path: Path, signs: tuple[str, str] | None = None, labels: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, path: Path, signs: tuple[str, str] | None = None) -> None:
         """Open a text file.
 
         Args:
             path: The file.
             signs: Its delimiter and decimal sign; `None` to tell them.
-            labels: Names for the items of lists of this length, instead of numbers.
         """
         super().__init__(path)
         self.layout = detect_layout(path, signs)
@@ -105,8 +102,7 @@ class TextLog(LogFile):
             kind = self.layout.kinds[at]
             if kind == "list":
                 length = len(split_list(self.layout.samples[0][at]))
-                tags = labels if len(labels) == length else range(length)
-                self._places |= {f"{name}[{tag}]": (at, item) for item, tag in enumerate(tags)}
+                self._places |= {f"{name}[{item}]": (at, item) for item in range(length)}
             elif name and kind != "text":
                 self._places[name] = (at, 0)
 

@@ -63,7 +63,7 @@ def shift_clock(time: TimeColumn, offset_s: float) -> TimeColumn:
     return time
 
 
-def guess_time(name: str, table: Table, given: GivenColumns, skip: bool) -> TimeGuess | list[str]:
+def guess_time(name: str, table: Table, given: GivenColumns) -> TimeGuess | list[str]:
     """Return the clock of a table, or what is wrong with the columns that could be one."""
     subject = f"time of '{name}'" if name else "time"
     if given.rate_hz is not None:
@@ -75,7 +75,7 @@ def guess_time(name: str, table: Table, given: GivenColumns, skip: bool) -> Time
         return _guess_own_clock(subject, table)
     candidates, faults = [], []
     for text, values in _list_clocks(table, given.time):
-        judged = _judge_clock(subject, text, values, table, skip, given.time is not None)
+        judged = _judge_clock(subject, text, values, table, given)
         if isinstance(judged, TimeGuess):
             candidates.append(judged)
         elif judged:
@@ -140,9 +140,10 @@ def quote(name: str) -> str:
 
 
 def _judge_clock(
-    subject: str, text: str, values: np.ndarray, table: Table, skip: bool, is_given: bool
+    subject: str, text: str, values: np.ndarray, table: Table, given: GivenColumns
 ) -> TimeGuess | str | None:
     """Return a clock made of a column, a sentence about one that is broken, or `None` for no clock."""
+    skip, is_given = given.is_skipping, given.time is not None
     plain, stated = split_unit(text)
     words = {*split_words(plain)}
     is_chosen = is_given or text not in table.columns  # a pair is chosen by its two units

@@ -135,7 +135,7 @@ def test_an_older_lerobot_dataset_is_refused_by_its_version(tmp_path: Path) -> N
         open_log(tmp_path / "set")
 
 
-def write_sage(folder: Path, shift_s: float = 0.0) -> None:
+def write_folder(folder: Path, shift_s: float = 0.0) -> None:
     signals = make_signals()
     folder.mkdir(parents=True)
     for name, kind, values, t_s in (
@@ -147,21 +147,19 @@ def write_sage(folder: Path, shift_s: float = 0.0) -> None:
         (folder / f"{name}.csv").write_text(text)
 
 
-def make_sage_map(label: str = "0") -> ColumnMap:
+def make_folder_map() -> ColumnMap:
     return replace(
-        make_map(f"control:positions[{label}]", f"state_motor:positions[{label}]"),
+        make_map("control:positions[0]", "state_motor:positions[0]"),
         time=Column(column="timestamp", scale=1e-6, offset=0.0),
     )
 
 
-def test_the_two_files_of_a_sage_folder_keep_their_clocks(
-    tmp_path: Path, carriage: Machine
-) -> None:
-    write_sage(tmp_path / "same")
-    (recording,) = make_sage_map().read(tmp_path / "same", carriage)
+def test_the_two_files_of_a_folder_keep_their_clocks(tmp_path: Path, carriage: Machine) -> None:
+    write_folder(tmp_path / "same")
+    (recording,) = make_folder_map().read(tmp_path / "same", carriage)
     check(recording)
-    write_sage(tmp_path / "late", shift_s=0.005)
-    (late,) = make_sage_map().read(tmp_path / "late", carriage)
+    write_folder(tmp_path / "late", shift_s=0.005)
+    (late,) = make_folder_map().read(tmp_path / "late", carriage)
     signals = make_signals()
     # the piece begins with the later file, half a period after the other one
     expected = np.interp(signals["t"][:-1] + 0.005, signals["t"] + 0.005, signals["q"])
@@ -169,16 +167,9 @@ def test_the_two_files_of_a_sage_folder_keep_their_clocks(
     np.testing.assert_array_equal(late.u[:, 0], signals["u"][:-1].astype(np.float32))
 
 
-def test_sage_names_its_joints_in_a_list(tmp_path: Path, carriage: Machine) -> None:
-    write_sage(tmp_path / "lift")
-    (tmp_path / "lift" / "joint_list.txt").write_text("slide\njaw\n")
-    (recording,) = make_sage_map("slide").read(tmp_path / "lift", carriage)
-    check(recording)
-
-
 def test_a_folder_of_folders_gives_the_logs_below_it(tmp_path: Path) -> None:
     for name in ("b", "a"):
-        write_sage(tmp_path / "raw" / name)
+        write_folder(tmp_path / "raw" / name)
     (tmp_path / "raw" / "notes").mkdir()
     write_csv(tmp_path / "raw" / "c.csv", make_signals())
     found = expand_logs([tmp_path / "raw"])
@@ -213,7 +204,7 @@ def test_an_expression_is_what_python_computes(a: float, b: float, c: float, d: 
     "text",
     [
         "__import__('os').system('true')", "a.b()", "a if b else c", "a ** b", "lambda: a", "[a]",
-        "a @ b", "'a'", "a and b", "3 + 4", "", "a[b()]", "True + a", "(" * 400 + "a" + ")" * 400,
+        "a @ b", "'a'", "a and b", "3 + 4", "", "a[b()]", "(" * 400 + "a" + ")" * 400,
         "a;b", "a\x00b", "1j * a", "a" * 2000,
     ],
 )  # fmt: skip
@@ -319,5 +310,5 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path, carriage: Machine) -> 
 def test_a_folder_of_something_else_is_refused(
     tmp_path: Path, brokk: Callable[..., object]
 ) -> None:
-    with pytest.raises(RecordingError, match="expected a folder of SAGE"):
+    with pytest.raises(RecordingError, match="expected a folder with the CSV files"):
         open_log(tmp_path)

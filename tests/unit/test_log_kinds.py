@@ -534,7 +534,9 @@ def test_commands_for_logs_that_a_page_prints_run_as_they_stand(
     rows = make_rows()
     Path("raw").mkdir()
     text = (Path(__file__).parents[2] / page).read_text()
-    commands = re.findall(r"^brokk (mode=import log.input=raw .*)$", text, re.MULTILINE)
+    commands = re.findall(
+        r"^brokk (mode=(?:import log|convert convert)\.input=raw .*)$", text, re.MULTILINE
+    )
     assert len(commands) >= 2
     for command in commands:
         given = re.search(r"\[(\w+), (\w+)\]", command)
@@ -618,7 +620,7 @@ def test_the_next_log_of_a_kind_fits_into_the_draft() -> None:
     assert recording.num_samples == len(rows)
 
 
-def test_a_joint_that_hangs_is_remarked_by_import_and_inspect(brokk: Callable[..., Done]) -> None:
+def test_a_joint_that_hangs_is_remarked_by_convert_and_inspect(brokk: Callable[..., Done]) -> None:
     rows = make_rows(1500)
     rows[300:700, 4] = 1.5  # it hangs, while its target goes on
     write_text("a.csv", rows)
@@ -626,7 +628,7 @@ def test_a_joint_that_hangs_is_remarked_by_import_and_inspect(brokk: Callable[..
     given = f"log.joints={{{pairs}}}"
     brokk("mode=import", "log.input=a.csv", "log.name=leg", "session.out=draft", given)
     options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml")
-    done = brokk("mode=import", "log.input=a.csv", *options, "session.out=read")
+    done = brokk("mode=convert", "convert.input=a.csv", *options, "session.out=read")
     assert done.code == 0, done.err
     (line,) = [line for line in done.out.splitlines() if "does not obey" in line]
     assert "knee" in line and "6.0" in line and "13." in line
