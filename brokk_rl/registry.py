@@ -8,8 +8,10 @@ is therefore cheap, and a broken option can be listed too.
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata, resources, util
@@ -67,6 +69,12 @@ def find_packages() -> dict[str, Path]:
     Raises:
         ConfigError: An extension names a package that cannot be found.
     """
+    return dict(_find_packages(tuple(sys.path)))
+
+
+@functools.cache  # the metadata of all that is installed takes 8 ms to read
+def _find_packages(paths: tuple[str, ...]) -> dict[str, Path]:
+    """Return the packages that can be imported from these paths."""
     found = {CORE: _find_folder(CORE, "brokk_rl")}
     for point in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
         found[point.value] = _find_folder(
@@ -104,8 +112,13 @@ def read_mode_name(cfg: Mapping[Any, Any]) -> str:
 
 def list_targets() -> frozenset[str]:
     """Return every class that the file of an option names."""
+    return _read_targets(tuple(list_options()))
+
+
+@functools.cache
+def _read_targets(options: tuple[Option, ...]) -> frozenset[str]:
     found: set[str] = set()
-    for option in list_options():
+    for option in options:
         found.update(re.findall(r"_target_['\"]?:\s*['\"]?([\w.]+)", option.path.read_text()))
     return frozenset(found)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,15 +10,23 @@ from pathlib import Path
 import pytest
 import torch
 from composed import option
-from yaml_cache import parse_once
+from quick_compose import compose_once
 
 from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl import cli
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 
-parse_once()
+compose_once()
 torch.set_num_threads(1)  # small tensors: threads would only wait for each other
+
+
+gc.set_threshold(50_000, 20, 50)  # the libraries' objects stay: searching them took a fifth
+
+
+def pytest_collection_finish() -> None:
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
+import io
 import json
 import os
 import subprocess
@@ -89,16 +91,28 @@ def _import_all(modules: Sequence[str]) -> None:
                 importlib.import_module(name)
 
 
+def _warm_up() -> None:
+    """Runs a refused command here, so that what every command does first is done for all."""
+    from brokk_rl import cli
+
+    sys.argv = ["brokk", "rl.num_envs=0"]
+    with contextlib.redirect_stderr(io.StringIO()):
+        assert cli.main() == 2
+    assert "torch" not in sys.modules
+    gc.disable()
+
+
 def main() -> None:
     """Reads commands as JSON and writes how each ended."""
-    from yaml_cache import load_cached, parse_once
+    from quick_compose import compose_once, load_cached
 
     import brokk_rl.cli  # for all that are forked
 
-    parse_once()
+    compose_once()
     for path in Path(brokk_rl.cli.__file__).parents[1].glob("conf/**/*.yaml"):
         load_cached(path)
 
+    _warm_up()
     commands = json.load(sys.stdin)
     found = []
     with tempfile.TemporaryDirectory() as folder:
