@@ -210,7 +210,7 @@ class Desk:
                 for _, values in self.heard("ValveFeedback", 0.05)
             ):
                 return
-        raise AssertionError(f"the machine does not move: {self.memory.read_snapshot().to_plain()}")
+        raise AssertionError(f"the machine does not move: {self.memory.read_snapshot()}")
 
     def still_after(self, since_s: float, seconds: float = 1.0) -> Stop:
         """Returns how long after `since_s` the valves got nothing any more, and zero was commanded, to the end of `seconds`.

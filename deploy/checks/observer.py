@@ -7,10 +7,13 @@ when it exceeds
     slack_s * max_speed + share * (way that was predicted),
 
 thresholds of the observer's file, which `brokk mode=observe` takes from recordings of the very
-machine. The fault is named by the ratio of measured to predicted motion: about none is a joint that stands still, a negative
-one a turned sign, less than one a joint that moves too little. A residual without predicted motion,
-or beyond it, is a joint that moves unasked. A sensor that drifts against the motion looks like a
-weak valve at first.
+machine. Where the chisel may touch a borehole, contact can withhold all of the predicted motion, so
+that the share is 1: a joint may stand still there.
+
+The fault is named by the ratio of measured to predicted motion: about none is a joint that stands
+still, a negative one a turned sign, less than one a joint that moves too little. A residual without
+predicted motion, or beyond it, is a joint that moves unasked. A sensor that drifts against the
+motion looks like a weak valve at first.
 
 A named fault stays until `clear`. Axes: `J` joints.
 """
@@ -80,6 +83,8 @@ class Observer:
             deque[np.ndarray]([], length),
             deque[np.ndarray]([], length),
         )
+        # By how much each step may be missed.
+        self._borne = deque[np.ndarray]([], length)
         self._slack = np.array(thresholds["slack_s"], float) * machine.max_speed
         # Commands that were given before the first look act for so long.
         self._num_blind = round((machine.dead_time_s + BLIND_S) / machine.period_s)
@@ -106,33 +111,37 @@ class Observer:
         """Take back the named fault, when the operator has let go of the dead-man."""
         if self._fault is not GuardTrip.NONE:
             self._fault, self._joint = GuardTrip.NONE, -1
-            self._measured.clear()
-            self._predicted.clear()
+            self._begin_window()
 
-    def update(self, now_s: float, q: np.ndarray, u: np.ndarray) -> None:
+    def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool = False) -> None:
         """Take in one control period.
 
         Args:
             now_s: Its end.
             q: Joint positions at its end, `(J,)`.
             u: Mean flow of the valves in it, `(J,)`.
+            may_touch: Whether contact may hold the arm.
         """
         late = self._q is None or now_s - self._t_s > LATE * self._machine.period_s
         if late or self._q is None:
-            self._measured.clear()
-            self._predicted.clear()
+            self._begin_window()
             self._predictor.reset()
             self._blind = self._num_blind
         else:
             predicted, measured = self._predictor.predict(u, self._q), q - self._q
             self._blind -= 1
             if self._blind < 0:
-                self._compare(measured, predicted)
+                self._compare(measured, predicted, 1.0 if may_touch else self._share)
         self._q, self._t_s = q.copy(), now_s
 
-    def _compare(self, measured: np.ndarray, predicted: np.ndarray) -> None:
+    def _begin_window(self) -> None:
+        for steps in (self._measured, self._predicted, self._borne):
+            steps.clear()
+
+    def _compare(self, measured: np.ndarray, predicted: np.ndarray, share: float) -> None:
         self._measured.append(measured)
         self._predicted.append(predicted)
+        self._borne.append(share * np.abs(predicted))
         if self._fault is GuardTrip.NONE:
             self._find_fault()
 
@@ -141,7 +150,7 @@ class Observer:
         """The motions of the newest window; zeros before the first."""
         predicted, measured = np.array(self._predicted), np.array(self._measured)
         way = np.abs(predicted).sum(0)
-        limit = self._slack + self._share * way
+        limit = self._slack + np.array(self._borne).sum(0)
         return ObservedWindow(measured.sum(0), predicted.sum(0), way, limit)
 
     def _find_fault(self) -> None:

@@ -86,8 +86,8 @@ class MotionObserver(Protocol):
         """Return whether a control period has gone by since the last update."""
         ...
 
-    def update(self, now_s: float, q: np.ndarray, u: np.ndarray) -> None:
-        """Take in a control period: positions at its end, and mean flow, `(J,)` each."""
+    def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool) -> None:
+        """Take in a control period: positions at its end, mean flow, whether contact may hold the arm."""
         ...
 
     def forget(self) -> None:
@@ -169,7 +169,7 @@ class BusLogic:
         self._controls_age_s = math.inf if controls is None else now_s - controls.t_s
         self._note_page(now_s, inputs.page)
         if self._observer is not None:
-            self._observe(self._observer, now_s)
+            self._observe(self._observer, now_s, inputs.target)
         seen = self._build_guard_input(now_s, bus_up)
         request = self._build_request(now_s, requested, inputs.target)
         before = self.decision
@@ -211,7 +211,7 @@ class BusLogic:
         u, age_s = tuple(requested.u.tolist()), now_s - requested.t_s
         return CommandRequest(u, age_s, self._target, faces_m, is_seen)
 
-    def _observe(self, observer: MotionObserver, now_s: float) -> None:
+    def _observe(self, observer: MotionObserver, now_s: float, target: SeenTarget | None) -> None:
         """Let the observer compare the last control period with its model, where one is over."""
         known = self.receiver
         # An armed operator clears a fault by the dead-man. Who only listens has to be told for a while.
@@ -226,7 +226,8 @@ class BusLogic:
             # Without news the flow stays as it is.
             flow = (known.flow_sum - self._flow_sum) / number if number else known.flow
             self._flow_sum, self._flow_number = known.flow_sum, known.flow_number
-            observer.update(now_s, known.q, flow)
+            may_touch = self._target_check.may_touch(known.q, target)
+            observer.update(now_s, known.q, flow, may_touch)
         known.observation = observer.observation
 
     def build_state(self, now_s: float, bus_up: bool, num_missed: int) -> OperatorState:

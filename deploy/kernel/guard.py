@@ -7,7 +7,7 @@ Pure: no clock, no bus, no file, no tensor; the caller hands in everything.
     READY    zero is sent, until the dead-man is pressed, levers in neutral.
     ACTIVE   the requested command is sent, within the limits.
 
-    SILENT --armed on purpose--> LATCHED --released, neutral, healthy--> READY
+    SILENT --armed on purpose--> LATCHED --released, neutral, healthy, a fresh command--> READY
     READY --pressed, neutral, healthy--> ACTIVE
     ACTIVE --released--> READY
     ACTIVE or READY --anything wrong--> LATCHED
@@ -271,10 +271,10 @@ class Guard:
             self._state, self._cause = GuardState.LATCHED, GuardTrip.NOT_ARMED
         if wrong is GuardTrip.NONE:
             wrong = self._check_way(seen)
+        if wrong is GuardTrip.NONE:
+            wrong = self._check_request(request)
         if wrong is GuardTrip.NONE and self._state is GuardState.ACTIVE and seen.deadman:
             wrong = self._check_vigilance(now_s, seen)
-            if wrong is GuardTrip.NONE:
-                wrong = self._check_request(request)
         if wrong is not GuardTrip.NONE:
             if self._state is not GuardState.LATCHED:
                 self._state, self._cause = GuardState.LATCHED, wrong
@@ -347,10 +347,10 @@ class Guard:
 
     def _check_request(self, request: CommandRequest | None) -> GuardTrip:
         """Return the fault of a request."""
+        if request is not None and request.target is not GuardTrip.NONE:
+            return request.target
         if request is None or not _is_recent(request.age_s, self._limits.request_s):
             return GuardTrip.REQUEST_STALE
-        if request.target is not GuardTrip.NONE:
-            return request.target
         full = 1.0 + self._limits.overrun
         if len(request.u) != len(self._still) or not all(
             -full <= value <= full for value in request.u

@@ -80,6 +80,8 @@ class TargetLimits:
         face_step_m: Height above or below the boreholes seen around it from which it is not on
             their face.
         face_radius_m: Distance along the face up to which they count.
+        contact_m: Height over the rim, and distance from the axis, up to which the chisel may touch
+            the borehole. There a joint may stand still against its command.
     """
 
     age_s: Positive
@@ -88,6 +90,7 @@ class TargetLimits:
     seen_s: Positive
     face_step_m: Positive
     face_radius_m: Positive
+    contact_m: Positive
 
 
 @spec

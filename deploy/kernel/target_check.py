@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from deploy.kernel.guard import GuardTrip
 from deploy.kernel.limits import Numbers, TargetLimits
@@ -47,6 +48,7 @@ class TargetCheck:
         self, limits: TargetLimits, machine: Machine, ground_m: float | None, normal: Numbers
     ) -> None:
         self._limits, self._ground_m, self._normal = limits, ground_m, np.array(normal)
+        self._machine = machine
         self._root_m, self._reach_m = np.zeros(3), math.inf
         self._slew: tuple[float, float] | None = None
         if machine.has_bodies:
@@ -79,12 +81,24 @@ class TargetCheck:
         )
         return next((trip for fine, trip in checks if not fine), GuardTrip.NONE)
 
+    def may_touch(self, q: np.ndarray, target: SeenTarget | None) -> bool:
+        """Return whether the chisel, at joint positions `(J,)`, may touch the borehole."""
+        if target is None or not self._machine.has_bodies:
+            return False
+        tip_m = compute_tool_kinematics(self._machine, q).tip_in_base_m
+        height_m, aside_m = self._measure_from(target.center_in_base_m, tip_m)
+        return max(height_m, aside_m) <= self._limits.contact_m
+
+    def _measure_from(self, point_m: Numbers, place_m: np.ndarray) -> tuple[float, float]:
+        """Return the height of a place over the face at a point, and its distance along the face."""
+        off_m = place_m - np.array(point_m)
+        height_m = float(off_m @ self._normal)
+        return height_m, float(np.linalg.norm(off_m - height_m * self._normal))
+
     def _is_on_face(self, center_m: np.ndarray, seen_m: Sequence[Numbers]) -> bool:
         """Return whether a borehole lies on the face of those seen around it."""
         for point_m in seen_m:
-            off_m = center_m - np.array(point_m)
-            height_m = float(off_m @ self._normal)
-            aside_m = float(np.linalg.norm(off_m - height_m * self._normal))
+            height_m, aside_m = self._measure_from(point_m, center_m)
             if aside_m <= self._limits.face_radius_m and abs(height_m) > self._limits.face_step_m:
                 return False
         return True

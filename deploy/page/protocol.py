@@ -7,6 +7,7 @@ greys them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Protocol, get_args
@@ -15,7 +16,7 @@ from brokk_rl.contracts.vision import CameraView
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from deploy.guidance import LeverPositions
-from deploy.runtime.operator_state import OperatorState, convert_to_plain
+from deploy.runtime.operator_state import OperatorState
 
 Vector = tuple[float, float, float]
 RequestKind = Literal["start", "stop", "present", "record", "target", "point", "seek", "play"]
@@ -266,6 +267,15 @@ class PageState:
             "replay": self.replay and asdict(self.replay),
         }
         return convert_to_plain(found)
+
+
+def convert_to_plain(value: Any) -> Any:
+    """Return nested data with lists for tuples, and `None` for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {key: convert_to_plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [convert_to_plain(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_view(values: Mapping[str, Any]) -> CameraView:

@@ -16,6 +16,7 @@ import numpy as np
 import onnxruntime
 
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, restore_encoder
 from brokk_rl.plain_files import check_plain_file, parse_json, read_json
@@ -67,7 +68,7 @@ class PolicyBundle:
             ) from error
 
     def _load(self, folder: str, machine: Machine) -> None:
-        place = resolve_package_path(folder)
+        place, self._machine = resolve_package_path(folder), machine
         self.contract = _read(place / CONTRACT, folder)
         _check_contract(self.contract, machine, folder)
         self.task = _read_task(self.contract, folder)
@@ -123,6 +124,16 @@ class PolicyBundle:
         scaling = self.contract["observation"]["target"]
         off_m = np.abs(target_m - np.array(scaling["mean_m"]))
         return bool((off_m <= TRAINED * np.array(scaling["std_m"])).all())
+
+    def is_done(self, q: np.ndarray, target_m: np.ndarray) -> bool:
+        """Return whether the tool, at joint positions `(J,)`, is where episodes of the training end."""
+        success = self.contract.get("stop", {}).get("success")
+        if success is None or not self._machine.has_bodies:
+            return False
+        left_m = target_m - compute_tool_kinematics(self._machine, q).tip_in_base_m
+        lateral_m = float(np.hypot(left_m[0], left_m[1]))
+        is_deep = left_m[2] >= success["least_depth_below_target_m"]
+        return bool(is_deep and lateral_m <= success["largest_lateral_m"])
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         """Return masked commands, `(B, J)`, for observation vectors, `(B, O)`."""

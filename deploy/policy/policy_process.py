@@ -173,6 +173,9 @@ class PolicyAdviser:
                 status = AdviceStatus.TARGET_REFUSED
             elif not self._bundle.is_trained_for(target_m):
                 status = AdviceStatus.TARGET_UNKNOWN
+            # What comes after the end of its episodes no policy has been trained for.
+            elif self._bundle.is_done(self._history.q[-1], target_m):
+                status = AdviceStatus.DONE
         if status is AdviceStatus.VALID:
             begun = time.perf_counter()
             answer = self._infer(target_m)
@@ -228,7 +231,7 @@ class PolicyAdviser:
 
     def _build_request(self, status: AdviceStatus, u: np.ndarray, now_s: float) -> RequestedCommand:
         """Return the command to ask for; without advice the last one must not go on."""
-        if status is AdviceStatus.VALID:
+        if status in (AdviceStatus.VALID, AdviceStatus.DONE):
             return RequestedCommand(now_s, u)
         if status is AdviceStatus.REJECTED:
             return RequestedCommand(now_s, np.full(len(u), np.nan))

@@ -7,10 +7,8 @@ yet. Old values are never left out: their age says how old they are.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 from deploy.guidance import LeverPositions
 from deploy.kernel.guard import GuardState, GuardTrip
@@ -35,6 +33,7 @@ class AdviceStatus(Enum):
     TARGET_UNKNOWN = "the policy was not trained for such a borehole"
     FAULT = "a sensor or valve is faulty"
     REJECTED = "the policy's answer makes no sense"
+    DONE = "the chisel is in the borehole"
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,74 +219,3 @@ class LoopSnapshot:
     def alive(self) -> bool:
         """True while the bus process is running."""
         return self.state is not None and self.t_s - self.state.t_s < ALIVE_S
-
-    def to_plain(self) -> dict[str, Any]:
-        """Return it as plain JSON data; a number that is not finite is null."""
-        found = {
-            "t_s": self.t_s,
-            "alive": self.alive,
-            "advice": self._describe_advice(),
-            "machine": self._describe_machine(),
-            "safety": self._describe_safety(),
-        }
-        return convert_to_plain(found)
-
-    def _describe_advice(self) -> dict[str, Any] | None:
-        advice = self.advice
-        if advice is None:
-            return None
-        names = ("left_theta_rad", "left_psi_rad", "right_theta_rad", "right_psi_rad")
-        angles = dict(zip(names, advice.lever_rad.tolist(), strict=True))
-        return {
-            "valid": advice.valid,
-            "reason": advice.reason.value,
-            "age_s": self.t_s - advice.t_s,
-            "number": advice.number,
-            "levers": angles | {"button_right": advice.button_right},
-            "command": advice.u.tolist(),
-            "target_in_base_m": advice.target_in_base_m.tolist(),
-        }
-
-    def _describe_machine(self) -> dict[str, Any] | None:
-        state = self.state
-        if state is None:
-            return None
-        return {
-            "q": state.q.tolist(),
-            "q_age_s": self.t_s - state.q_t_s,
-            "flow": state.flow.tolist(),
-            "levers": dict(vars(state.levers)),
-            "levers_age_s": self.t_s - state.levers_t_s,
-            "exclusive_selected": state.exclusive_selected,
-            "oil_c": state.oil_c,
-        }
-
-    def _describe_safety(self) -> dict[str, Any] | None:
-        state = self.state
-        if state is None:
-            return None
-        return {
-            "commands": self.commands,
-            "state": state.guard.name,
-            "trip": state.trip.value,
-            "cause": state.cause.value,
-            "deadman": state.deadman,
-            "estop": state.estop,
-            "bus_up": state.bus_up,
-            "trusted": state.trusted,
-            "plausible": state.q_plausible,
-            "sent": state.sent.tolist(),
-            "refused": state.refused,
-            "lost": state.lost,
-            "log_dropped": self.log_dropped,
-            "observed_joint": state.observed_joint,
-        }
-
-
-def convert_to_plain(value: Any) -> Any:
-    """Return nested data with lists for tuples, and `None` for numbers that are not finite."""
-    if isinstance(value, dict):
-        return {key: convert_to_plain(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [convert_to_plain(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

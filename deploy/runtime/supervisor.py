@@ -243,6 +243,5 @@ def _write_timing_report(memory: LoopMemory, session: Session) -> None:
             1e3 * one["late_p99_s"],
             1e3 * one["late_max_s"],
         )
-    last = memory.read_snapshot()
-    report = {"processes": reports, "log_dropped": last.log_dropped, "last": last.to_plain()}
+    report = {"processes": reports, "log_dropped": memory.read_snapshot().log_dropped}
     write_json(session.folder / TIMING, report)

@@ -34,8 +34,9 @@ CYCLE_S = 0.01
 """Shortest cycle time of the gateway's messages in the example DBC."""
 PRESS_S = 1.0
 """Time after the PC is first heard until the operator presses the dead-man. Chosen by hand."""
-LET_GO_S = 0.3
-"""Time for which the operator lets go of it before pressing again. Chosen by hand."""
+LET_GO_S = 1.0
+"""Time for which the operator lets go of it before pressing again. Chosen by hand: longer than the
+history that a policy fills anew after a fault."""
 HEADER = "gateway.h"
 TWIN_PRIORITY = 45
 """Of SCHED_FIFO, below bus and policy: the loop must not run better or worse beside a twin."""

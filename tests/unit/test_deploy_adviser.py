@@ -46,10 +46,13 @@ class Bundle:
 
     def __init__(self) -> None:
         self.encoder, self.answer, self.asked = Encoder(), ANSWER, 0
-        self.knows = True
+        self.knows, self.done = True, False
 
     def is_trained_for(self, target_m: np.ndarray) -> bool:
         return self.knows
+
+    def is_done(self, q: np.ndarray, target_m: np.ndarray) -> bool:
+        return self.done
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         assert observation.shape == (1, self.encoder.size)
@@ -365,3 +368,10 @@ def test_a_borehole_unlike_those_of_the_training_gets_no_advice(desk: Desk) -> N
     desk.advised()
     desk.bundle.knows = False
     assert desk.go() is AdviceStatus.TARGET_UNKNOWN
+
+
+def test_where_the_training_ends_there_is_no_advice_and_zero_is_asked_for(desk: Desk) -> None:
+    desk.advised()
+    desk.bundle.done = True
+    assert desk.go() is AdviceStatus.DONE
+    assert not desk.advice.valid and desk.request.t_s == desk.now_s and not desk.request.u.any()

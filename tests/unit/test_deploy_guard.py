@@ -30,7 +30,13 @@ BODY = build_joint_bounds(
 )
 FLOW = FlowLimits(tolerance=0.02, settle_s=0.04, num_messages=2, lever_scale=1.5)
 TARGET = TargetLimits(
-    age_s=600.0, jump_m=0.05, settle_s=0.5, seen_s=5.0, face_step_m=0.15, face_radius_m=1.0
+    age_s=600.0,
+    jump_m=0.05,
+    settle_s=0.5,
+    seen_s=5.0,
+    face_step_m=0.15,
+    face_radius_m=1.0,
+    contact_m=0.1,
 )
 LIMITS = GuardLimits(
     max_command=0.8, max_rate_1_s=5.0, max_reversals_1_s=3, max_starts_1_s=30, overrun=0.001, neutral=0.05,
@@ -262,7 +268,8 @@ def test_a_request_that_makes_no_sense_is_refused_before_use(
     [
         {"dt": LIMITS.gap_s - 1e-9}, {"dt": 0.0}, {"status_age_s": LIMITS.status_s}, {"levers_age_s": LIMITS.levers_s},
         {"joints_age_s": LIMITS.joints_s}, {"lever": LIMITS.neutral}, {"age_s": LIMITS.request_s}, {"u": (1.001, 0.0, -1.001)},
-        {"u": (0.0, -0.1, 0.0)},
+        {"u": (0.0, -0.1, 0.0)}, {"controls_age_s": LIMITS.controls_s}, {"round_trip_s": LIMITS.round_trip_s},
+        {"feedback_age_s": LIMITS.status_s}, {"page_age_s": LIMITS.page_s},
     ],
     ids=str,
 )  # fmt: skip
@@ -271,9 +278,13 @@ def test_what_lies_on_a_limit_is_allowed(change: dict[str, Any]) -> None:
     assert hand.decide(**change).state is GuardState.ACTIVE
 
 
-def test_a_request_is_not_judged_before_it_can_have_an_effect() -> None:
+def test_a_press_is_taken_only_once_there_is_a_fresh_command() -> None:
     hand = Hand().active()
-    assert hand.decide(RELEASED, u=None).state is GuardState.READY
+    for _ in range(3):
+        decision = hand.decide(RELEASED, u=None)
+        assert (decision.state, decision.trip) == (GuardState.LATCHED, GuardTrip.REQUEST_STALE)
+    assert hand.decide(RELEASED, u=STILL).state is GuardState.READY
+    assert hand.decide(u=STILL).state is GuardState.ACTIVE
 
 
 def test_disarming_is_silence_at_once() -> None:
@@ -461,13 +472,6 @@ def test_a_gateway_of_another_description_never_gets_ready(described: bool | Non
     assert hand.decide(RELEASED).state is GuardState.READY
 
 
-def test_switches_and_way_at_their_limits_will_do() -> None:
-    hand = Hand().active()
-    seen = {"controls_age_s": LIMITS.controls_s, "round_trip_s": LIMITS.round_trip_s}
-    seen |= {"feedback_age_s": LIMITS.status_s, "page_age_s": LIMITS.page_s}
-    assert hand.decide(u=(0.1, 0.0, 0.1), **seen).u == pytest.approx((0.1, 0.0, 0.1))
-
-
 def test_a_joint_changes_its_direction_so_often_in_a_second_and_no_more() -> None:
     hand = Hand().active()
     sent = []
@@ -632,26 +636,6 @@ def test_limits_that_make_no_sense_are_refused(change: dict[str, Any]) -> None:
         replace(LIMITS, **change)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"max_command": 1.0},
-        {"overrun": 0.0},
-        {"stop_margin": 0.0},
-        {"jump_margin": 1.0},
-        {"num_jumps": 1},
-        {"neutral": 0.999},
-    ],
-    ids=str,
-)
-def test_limits_at_their_ends_are_allowed(change: dict[str, Any]) -> None:
-    replace(LIMITS, **change)
-
-
-def test_the_shipped_limits_are_limits() -> None:
-    assert option("guard", "default").max_command <= 1.0
-
-
 def test_a_gateway_that_does_not_follow_is_noticed() -> None:
     hand = Hand().active()
     for _ in range(3):
@@ -686,15 +670,6 @@ def test_nobody_needs_to_follow_what_is_not_commanded() -> None:
     assert hand.decide(WELL, estop=True, dt=0.19, followed=False).trip is GuardTrip.ESTOP
     hand.decide(WELL, dt=0.19, followed=False)
     assert hand.decide(RELEASED, followed=False).state is GuardState.READY
-
-
-def test_the_states_have_the_numbers_that_travel_on_the_bus() -> None:
-    assert {state.name: state.value for state in GuardState} == {
-        "SILENT": 0,
-        "LATCHED": 1,
-        "READY": 2,
-        "ACTIVE": 3,
-    }
 
 
 def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:

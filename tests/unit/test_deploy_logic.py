@@ -14,6 +14,7 @@ from desk import DBC
 from sender import BUS, LIMITS, MACHINE, Sender
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
@@ -402,7 +403,8 @@ class Probe:
     def is_due(self, now_s: float) -> bool:
         return self.due
 
-    def update(self, now_s: float, q: np.ndarray, u: np.ndarray) -> None:
+    def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool) -> None:
+        self.may_touch = may_touch
         self.seen.append((now_s, q.tolist(), u.tolist()))
 
     def forget(self) -> None:
@@ -436,6 +438,25 @@ def test_the_observer_gets_positions_and_the_mean_flow_of_its_period() -> None:
     # Without news in between the flow is the newest.
     loop.decide()
     assert probe.seen[-1][2][0] == pytest.approx(0.8, abs=0.01)
+
+
+def test_the_observer_hears_where_the_chisel_may_touch_the_borehole() -> None:
+    probe = Probe()
+    loop = Loop(observer=probe)  # type: ignore[arg-type]
+    tip_m = compute_tool_kinematics(MACHINE, np.array(MACHINE.home)).tip_in_base_m
+    contact_m = LIMITS.target.contact_m
+    for off_m, may_touch in (
+        ((0.0, 0.0, -0.9 * contact_m), True),
+        ((0.0, 0.9 * contact_m, 0.5), True),
+        ((0.0, 0.0, -1.1 * contact_m), False),
+        ((1.1 * contact_m, 0.0, 0.5), False),
+    ):
+        loop.target = SeenTarget(tuple(tip_m + off_m), 0.0, ())
+        loop.go(0.1)
+        assert probe.may_touch is may_touch
+    loop.target = None
+    loop.go(0.1)
+    assert probe.may_touch is False
 
 
 def test_the_first_period_of_the_observer_has_the_mean_of_its_own_messages() -> None:

@@ -24,6 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanBus
 from deploy.guidance import AXES, LeverDisplay, LeverMap
@@ -242,6 +243,14 @@ def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> 
     )
     found = bundle.command(np.array(golden["observation"], np.float32))
     assert np.abs(found - np.array(golden["command"])).max() < 1e-3 and np.abs(found).max() > 0.5
+    q = np.array(machine.home)
+    tip_m = compute_tool_kinematics(machine, q).tip_in_base_m
+    for off_m, is_done in (
+        ((0.01, 0.0, 0.11), True),
+        ((0.01, 0.0, 0.09), False),
+        ((0.02, 0.0, 0.11), False),
+    ):
+        assert bundle.is_done(q, tip_m + off_m) is is_done
 
 
 def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
@@ -474,7 +483,6 @@ def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(
     assert adviser.run_cycle(0, now_s + 0.16) is AdviceStatus.STALE
     advice = memory.advice.read()
     assert advice is not None and not advice.u.any() and memory.request is None
-    json.dumps(memory.read_snapshot().to_plain(), allow_nan=False)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ const DE = {
   "arm too near to ground, machine or a stay-out box": "Arm zu nah an Boden, Maschine oder Sperrbereich",
   "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
   "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
-  "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",
+  "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar", "the chisel is in the borehole": "Der Meißel ist im Bohrloch",
   "no live picture": "KEIN LIVEBILD", "no picture": "kein Bild", "packets lost": "verloren", "watched elsewhere": "andere sehen zu",
   "camera moves": "Kamera fährt", "camera stays": "Kamera bleibt", "hole in sight for": "Loch sichtbar {seen} von {of} s", "no view of the hole": "Loch verdeckt", "instead of": "statt",
 };
