@@ -145,9 +145,7 @@ class MeasuredActuatorModel:
         return {"q": self._q, "fresh": self._fresh} | inner
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Forget the true positions in the environments of `mask`, `(N,)` bool; cuts gradients."""
-        if self._q.requires_grad:
-            self._q.detach_()
+        """Forget the true positions in the environments of `mask`, `(N,)` bool."""
         self._fresh.logical_or_(mask)
         self._model.reset(mask)
 

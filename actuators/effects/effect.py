@@ -47,7 +47,6 @@ class EffectSpec:
             `diagnosis.json`).
         numbers: Unit, neutral value, typical size and bounds of each number.
         stochastic: Whether it draws random numbers in every step.
-        smooth: Whether its numbers can be fitted by gradient.
         delays: Whether it shifts all commands that the inner model sees, not only the newest; its
             number is then the shift, s.
         pointwise: Whether each command that it returns depends on the same command only, so that
@@ -74,7 +73,6 @@ class EffectSpec:
     )
     numbers: ClassVar[dict[str, EffectNumber]]
     stochastic: ClassVar[bool] = False
-    smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
@@ -190,8 +188,7 @@ class EffectChain:
         plant: Constants of the machine.
         is_weighed: Whether an effect on motion asks for the weight.
         parameters: Numbers by name, `(N, J)` or `(N, 1)`. Write in place or replace an entry to
-            simulate `N` candidates side by side. Gradients flow to an entry that requires them
-            until the next `reset`.
+            simulate `N` candidates side by side.
     """
 
     def __init__(
@@ -257,11 +254,8 @@ class EffectChain:
         return own | getattr(self.inner, "sides", frozenset())
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Forget in the environments of `mask`, `(N,)`; draw parameters; cut gradients."""
+        """Forget in the environments of `mask`, `(N,)`; draw parameters."""
         self.inner.reset(mask)
-        for value in self._memory.values():
-            if value.requires_grad:
-                value.detach_()
         self._fresh.logical_or_(mask)
         self._ranges.redraw(mask)
 
@@ -270,11 +264,7 @@ class EffectChain:
         self._change_drives()
         if not (self.commands or self.motions):
             return self.inner.step(history)
-        fresh = self._fresh
-        if torch.is_grad_enabled():
-            # history and `fresh` are written in place, and autograd may need what they were
-            history, fresh = History(q=history.q.clone(), u=history.u.clone()), fresh.clone()
-        counter, memory = self.advance_draws(), StepMemory(self._memory, fresh)
+        counter, memory = self.advance_draws(), StepMemory(self._memory, self._fresh)
         u = self._change_commands(history, memory, counter)
         if self.motions:
             q = self._change_motion(history, u, memory, counter)

@@ -78,8 +78,8 @@ class ParameterRanges:
     """Parameters of one or several effects for all environments; all draws are one draw.
 
     Attributes:
-        value: `(N, J)` or `(N, 1)` by name. An entry may be written in place or replaced, by one
-            that wants gradients for example; a replaced entry is not drawn again.
+        value: `(N, J)` or `(N, 1)` by name. An entry may be written in place or replaced; a replaced
+            entry is not drawn again.
         state: Counter and drawn values; empty where nothing is random.
 
     Args:

@@ -42,6 +42,8 @@ FREQUENCIES_RAD_S = np.geomspace(1.0, 300.0, 20)
 """Natural frequencies of a position loop that are tried first: from 0.16 Hz to a loop that is at its target at once."""
 DAMPINGS = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
 """Damping ratios that are tried first."""
+STARTS = [(w, z) for w in np.log(FREQUENCIES_RAD_S) for z in np.log(DAMPINGS)]
+"""Logarithms of frequency and damping of each of them."""
 LOOP_BOUNDS = np.log([[0.3, 0.05], [400.0, 5.0]])
 """Logarithms of the bounds of frequency and damping."""
 MOST_ROWS = 3000
@@ -104,7 +106,7 @@ def _estimate_servo_delay(
                 runs.append(name)
     if sum(int((np.diff(target) != 0).sum()) for target, _ in pairs) < MIN_CHANGES:
         return None
-    loops = _ServoLoops(pairs, machine.period_s, grid_s)
+    loops = ServoLoops(pairs, machine.period_s, grid_s)
     left = loops.search()
     names = list(dict.fromkeys(runs))
     by_run = np.stack([left[[run == name for run in runs]].sum(0) for name in names])
@@ -134,7 +136,7 @@ def _bound_delay(
     return DeadTimeEstimate(value_s, interval_s, 1.0 - left, is_found=best < len(grid_s) - 1)
 
 
-class _ServoLoops:
+class ServoLoops:
     """Free-run simulations of second-order loops behind a delay, each with the best gain and offset.
 
     Args:
@@ -153,21 +155,33 @@ class _ServoLoops:
 
     def search(self) -> np.ndarray:
         """Return the sums of squares that the best loop leaves of each recording at each delay, `(R, D)`."""
-        starts = [(w, z) for w in np.log(FREQUENCIES_RAD_S) for z in np.log(DAMPINGS)]
-        everywhere = np.arange(len(self._shifts))
-        tried = np.stack([self._simulate(start, everywhere) for start in starts])
-        first = tried.sum(1).argmin(0)
-        left = tried[first, :, everywhere].T
+        first, left = self._try_all()
         best = int(left.sum(0).argmin())
         low, high = max(0, best - NUM_REFINED), min(len(self._shifts), best + NUM_REFINED + 1)
         for delay in range(low, high):
             one = np.array([delay])
             found = minimize(
-                lambda x, one=one: float(self._simulate(x, one).sum()), starts[first[delay]], method="Nelder-Mead",
+                lambda x, one=one: float(self._simulate(x, one).sum()), STARTS[first[delay]], method="Nelder-Mead",
                 options={"xatol": 0.01, "fatol": 1e-9, "maxiter": 60},
             )  # fmt: skip
             left[:, delay] = self._simulate(found.x, one)[:, 0]
         return left
+
+    def list_loops(self) -> list[tuple[int, float, float]]:
+        """Return numbers of delays with frequency, rad/s, and damping ratio of their best loop, the best first."""
+        first, left = self._try_all()
+        found = []
+        for delay in np.argsort(left.sum(0), kind="stable"):
+            w, damping = np.exp(STARTS[first[delay]])
+            found.append((int(delay), float(w), float(damping)))
+        return found
+
+    def _try_all(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the number of the best start at each delay, `(D,)`, and what it leaves, `(R, D)`."""
+        everywhere = np.arange(len(self._shifts))
+        tried = np.stack([self._simulate(start, everywhere) for start in STARTS])
+        first = tried.sum(1).argmin(0)
+        return first, tried[first, :, everywhere].T
 
     def _simulate(self, loop: Sequence[float], delays: np.ndarray) -> np.ndarray:
         """Return what a loop, logarithms of frequency and damping, leaves at some delays, `(R, D)`."""

@@ -46,8 +46,7 @@ class ParametricModel:
         STATES: Names of the state of each joint, `(N, J)`.
         DELAY: Name of the number that is the dead time.
         parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
-            candidates side by side; gradients flow to an entry that wants them until the next
-            `reset`.
+            candidates side by side.
         plant: Constants of the machine.
     """
 
@@ -81,12 +80,9 @@ class ParametricModel:
         return self.parameters[self.DELAY]
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Let the environments of `mask`, `(N,)` bool, start from their history; cuts gradients."""
+        """Let the environments of `mask`, `(N,)` bool, start from their history."""
         for name in self.STATES:
-            value = self._state[name]
-            if value.requires_grad:
-                value.detach_()
-            value.masked_fill_(mask[:, None], 0.0)
+            self._state[name].masked_fill_(mask[:, None], 0.0)
         self._fresh.logical_or_(mask)
 
     def recall(self, begun: JointMemory) -> JointMemory:

@@ -67,5 +67,4 @@ class JointWeight:
 @lru_cache(maxsize=32)
 def build_joint_weight(machine: Machine, device: torch.device) -> JointWeight:
     """Return the weight on the joints of a machine, made once."""
-    with torch.inference_mode(False):  # tensors of inference would serve no later gradient
-        return JointWeight(machine, device)
+    return JointWeight(machine, device)

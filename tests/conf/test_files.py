@@ -72,16 +72,11 @@ def test_a_file_may_hold_several_effects_and_stand_in_a_list(
 def test_a_file_replaces_a_part_of_another_option(
     brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
-    (tmp_path / "lag.yaml").write_text(LAG)
-    fit = composed(
-        brokk,
-        "mode=identify",
-        "fit=lag",
-        "actuator@fit.actuator=@lag.yaml",
-        "identify.recordings=x",
-        "session.out=x",
-    )
-    assert fit["fit"]["actuator"]["dead_time_s"] == {"q1": 0.5, "other": 0.45}
+    shipped = yaml.safe_load((Path(conf.__file__).parent / "actuator" / "servo.yaml").read_text())
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(shipped | {"top_speed": 2.0}))
+    words = ("fit=servo", "actuator@fit.actuator=@own.yaml", "identify.recordings=x")
+    fit = composed(brokk, "mode=identify", *words, "session.out=x")
+    assert fit["fit"]["actuator"]["top_speed"] == 2.0
 
 
 def test_an_experiment_may_be_a_file(brokk: Callable[..., Any], tmp_path: Path) -> None:

@@ -309,3 +309,19 @@ def test_a_plant_that_makes_no_sense_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         hydraulic(**changes).build(machine, 1, CPU)
+
+
+@pytest.mark.parametrize("name", ["lag", "hydraulic"])
+def test_a_free_run_that_begins_in_motion_goes_on_with_it(name: str, machine: Machine) -> None:
+    actuator = option("actuator", name)
+    levels = np.random.default_rng(0).uniform(-0.5, 0.5, (13, machine.num_joints))
+    u = torch.as_tensor(np.repeat(levels, 15, 0), dtype=torch.float32)[:, None]
+    path = roll(actuator, machine, u)
+    missed, moved = 0.0, 0.0
+    for start in range(40, 190, 7):
+        rows = slice(start - machine.num_history + 1, start + 1)
+        model = actuator.build(machine, 1, CPU)
+        seen = History(q=path[rows].transpose(0, 1).clone(), u=u[rows].transpose(0, 1).clone())
+        missed += float((model.step(seen) - path[start + 1]).abs().sum())
+        moved += float((path[start + 1] - path[start]).abs().sum())
+    assert missed < 0.2 * moved

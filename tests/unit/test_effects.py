@@ -23,7 +23,6 @@ dead_time delay_jitter frame_loss dead_band flow_gain asymmetry saturation rate_
 load_dependence flow_sharing creep thermal_drift compliance quantisation sensor_noise encoder_bias encoder_scale
 link_length base_tilt clock_offset extrinsics
 """.split()  # noqa: SIM905
-SMOOTH = [name for name in FIXED if name not in ("frame_loss", "stiction", "quantisation")]
 
 
 @cache
@@ -101,7 +100,6 @@ def test_an_effect_says_what_a_diagnosis_must_know(name: str, machine: Machine) 
         assert number.none is None or number.bounds[0] <= number.none <= number.bounds[1]
         assert number.typical != number.none
         assert f"{key}:" in (type(spec).__doc__ or "")
-    assert (name in SMOOTH) == spec.smooth
     model = spec.wrap(shipped("actuator", "ideal").build(machine, 1, CPU), machine, 1, CPU)
     assert set(model.parameters) == set(spec.numbers)
 
@@ -287,60 +285,6 @@ def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine)
     # at rest and without a command; only leaks move it
     assert after[1].abs().max() < (1e-3 if name == "creep" else 1e-9)
     assert {key: value.data_ptr() for key, value in model.state.items()} == place
-
-
-@pytest.mark.parametrize("name", SMOOTH)
-def test_gradients_agree_with_candidates_side_by_side(name: str, machine: Machine) -> None:
-    """Three environments hold a number minus, at, and plus a step; the gradient at the middle one must be their slope."""
-    spec, u = effect(name), commands(machine, 30, 1).expand(-1, 3, -1)
-    for key, number in spec.numbers.items():
-        if not number.is_on(machine):
-            continue
-        step = 0.02 * abs(number.typical) or 5.0
-        # Beside grid points such as whole periods.
-        middle = number.typical + 3.0 * step * (number.none is not None)
-        model = spec.wrap(shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU)
-        if "draw" in model.state:
-            model.state["draw"].fill_(7)  # the same chances for all candidates
-        width = model.parameters[key].shape[1]
-        wanted = (
-            (middle + step * torch.tensor([-1.0, 0.0, 1.0])[:, None])
-            .expand(3, width)
-            .clone()
-            .requires_grad_()
-        )
-        model.parameters[key] = wanted
-        path = roll(model, machine, u)
-        by_side = {"measurement": model.measure(path[-1]), "kinematics": places(model, path[-1])}
-        figure = (
-            by_side.get(spec.side, path)
-            .double()
-            .square()
-            .sum(dim=(0, 2) if spec.side not in by_side else 1)
-        )
-        (gradient,) = torch.autograd.grad(figure[1], wanted)
-        slope = (figure[2] - figure[0]).item() / (2.0 * step)
-        assert gradient[1].sum().item() == pytest.approx(slope, rel=0.05, abs=2e-3)
-        assert gradient[[0, 2]].abs().max() == 0
-
-
-def test_a_number_is_found_by_gradient_over_several_runs(machine: Machine) -> None:
-    u, inner = commands(machine, 40, 1), shipped("actuator", "ideal").build
-    for spec, key, value in (
-        (effect("flow_gain", gain=0.7), "gain", 0.7),
-        (effect("backlash", gap_rad=0.03), "gap_rad", 0.03),
-    ):
-        measured = roll(spec.wrap(inner(machine, 1, CPU), machine, 1, CPU), machine, u)
-        model = spec.wrap(inner(machine, 1, CPU), machine, 1, CPU)
-        guess = torch.full((1, 5), 1.4 * value).requires_grad_()
-        model.parameters[key] = guess
-        descent = torch.optim.Adam([guess], lr=0.08 * value)
-        for _ in range(25):
-            model.reset(torch.ones(1, dtype=torch.bool))
-            descent.zero_grad()
-            (roll(model, machine, u) - measured).square().sum().backward()
-            descent.step()
-        torch.testing.assert_close(guess.detach(), torch.full((1, 5), value), rtol=0.1, atol=0)
 
 
 def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:

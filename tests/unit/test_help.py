@@ -15,9 +15,9 @@ from brokk_rl.help import MAIN_MODES, add_comments, collect_comments
 
 
 def test_a_mode_has_a_help_of_its_own(brokk: Callable[..., Any]) -> None:
-    done = brokk("mode=identify", "fit=lag", "--help")
+    done = brokk("mode=identify", "fit=servo", "--help")
     assert done.code == 0
-    assert "fit=lag" in done.out and "arx" in done.out
+    assert "fit=servo" in done.out and "arx" in done.out
     text = " ".join(done.out.split())
     assert "identify.recordings=??? glob or list of globs" in text
     assert "identify.hold_out=6 one part in so many" in text

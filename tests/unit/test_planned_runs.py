@@ -158,15 +158,6 @@ def test_the_weight_of_a_planar_arm_is_that_of_its_mechanics(machine: Machine) -
     torch.testing.assert_close(weight.weigh(q), truth, atol=2e-5, rtol=0.0)
 
 
-def test_a_weight_first_asked_for_in_a_free_run_serves_a_gradient_later(machine: Machine) -> None:
-    build_joint_weight.cache_clear()
-    with torch.inference_mode():
-        weight = build_joint_weight(machine, CPU)
-    q = torch.zeros(1, machine.num_joints, requires_grad=True)
-    weight.weigh(q).sum().backward()
-    assert q.grad is not None
-
-
 def test_effects_around_a_model_that_is_stepped_are_stepped_too(machine: Machine) -> None:
     """A servo that follows at once plans nothing, so that nothing around it asks for its delay."""
     model: Any = option("actuator", "ideal").build(machine, NUM_ENVS, CPU)

@@ -228,17 +228,6 @@ def test_a_planned_run_moves_as_its_steps_do(arm: Machine) -> None:
     assert (free - limited).abs().max() > 0.05
 
 
-def test_gradients_of_a_limited_servo_are_finite(arm: Machine) -> None:
-    model = limit_torque(make_servo(response_s=0.04, damping=0.8).build(arm, 1, CPU), arm, 3.0)
-    shortage = torch.tensor([[3.0, 0.0]], requires_grad=True)
-    model.parameters["shortage"] = shortage
-    still = torch.zeros(1, arm.num_history, 2)
-    found = model.step(History(q=still, u=still + 0.5))
-    found.sum().backward()
-    assert shortage.grad is not None and bool(shortage.grad.isfinite().all())
-    assert float(shortage.grad[0, 0]) < 0.0 == float(shortage.grad[0, 1])  # a lower limit, less way
-
-
 def test_only_joints_commanded_by_position_have_it(machine: Machine, arm: Machine) -> None:
     with pytest.raises(ConfigError, match="it is for joints commanded by position"):
         option("effect", "torque_limit").wrap(option("actuator", "lag").build(machine, 1, CPU), machine, 1, CPU)  # fmt: skip
@@ -292,17 +281,3 @@ def test_a_withheld_limit_is_named(arm: Machine, tmp_path: Any, limit_n_m: float
     # 5 % of 3 rad at 30 Nm/rad are 4.5 Nm
     shortage = answer.selected[0].parameters["shortage"]["elbow"]
     assert shortage.mean == pytest.approx(4.5 / limit_n_m, rel=0.2)
-
-
-def test_a_limit_is_fitted_where_it_is_asked_for(arm: Machine, tmp_path: Any) -> None:
-    servo = make_servo(response_s=0.04, damping=0.8, limit_rad=0.05)
-    u = np.concatenate([draw_levels(arm, seed, 20, 25) for seed in range(2)])
-    q = run_servo(servo.build(arm, 1, CPU), arm, u)
-    # A command acts on the position of the row after it.
-    log = make_motion(arm, "log", arm.period_s * np.arange(len(u) - 1), u[1:], q[:-1])
-    fit = option("fit", "servo")
-    begun = replace(servo, limit_rad=0.2)
-    few = {"windows": 12, "validation_windows": 4, "candidates": 8, "starts": 1}
-    fit = replace(fit, free={"limit_rad": (0.01, 0.5)}, actuator=begun, **few)
-    found = fit.fit(arm, [log], [], tmp_path, 0, CPU)
-    assert list(found.limit_rad.values()) == pytest.approx([0.05] * 2, rel=0.03)
