@@ -202,6 +202,7 @@ class BoreholeInsertion(ToolPoseTask):
             closeness=_measure_closeness(
                 distance, lateral, turn, below * inside / rules.strict_depth_m
             ),
+            lateral_m=lateral,
         )
 
     def describe_success(self) -> dict[str, float]:

@@ -89,7 +89,8 @@ class GoalPose(ToolPoseTask):
     ) -> PoseJudgement:
         """Judge tool poses; see `ToolPoseTask`."""
         rules = self.tolerance
-        distance = (start["target_m"] - tip_m).norm(dim=1)
+        away_m = start["target_m"] - tip_m
+        distance = away_m.norm(dim=1)
         turn = (start["target_pitch_rad"] - pitch_rad).abs()
         near = 1 / (1 + distance) >= rules.paper_alignment
         reached = (distance <= rules.strict_distance_m) & (turn <= rules.strict_pitch_rad)
@@ -98,6 +99,7 @@ class GoalPose(ToolPoseTask):
             success=reached,
             paper_success=near & (1 / (1 + turn) >= rules.paper_alignment),
             closeness=_measure_closeness(distance, turn),
+            lateral_m=away_m[:, :2].norm(dim=1),
         )
 
     def describe_success(self) -> dict[str, float]:

@@ -102,12 +102,15 @@ class PoseJudgement:
         success: The strict criterion holds: reached, upright enough and without a blow, bool.
         paper_success: The paper's criterion holds, bool.
         closeness: How near the task is to done, 0 to about 1.
+        lateral_m: Distance of the tool point from the line on which the tool is to go in; in the
+            open from the vertical through the target.
     """
 
     reached: torch.Tensor
     success: torch.Tensor
     paper_success: torch.Tensor
     closeness: torch.Tensor
+    lateral_m: torch.Tensor
 
 
 @spec

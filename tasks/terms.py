@@ -108,6 +108,8 @@ class ToolState(StepState):
         paper_success: The paper's criterion holds, `(N,)` bool.
         closeness: How near the task is to done, 0 to about 1, `(N,)`.
         closeness_before: The same one step earlier.
+        lateral_m: Distance of the tool point from the hole's axis, in the open from the vertical
+            through the target, `(N,)`.
     """
 
     target_m: torch.Tensor
@@ -120,11 +122,7 @@ class ToolState(StepState):
     paper_success: torch.Tensor
     closeness: torch.Tensor
     closeness_before: torch.Tensor
-
-    @property
-    def lateral_m(self) -> torch.Tensor:
-        """Distance of the tool point from the vertical through the target, `(N,)`."""
-        return (self.target_m - self.tip_m)[:, :2].norm(dim=1)
+    lateral_m: torch.Tensor
 
     @property
     def distance_m(self) -> torch.Tensor:
@@ -210,7 +208,7 @@ def paper_success(state: ToolState) -> torch.Tensor:
 
 
 def lateral_error(state: ToolState) -> torch.Tensor:
-    """Distance of the tool point from the vertical through the target, m."""
+    """Distance of the tool point from the hole's axis, m."""
     return state.lateral_m
 
 

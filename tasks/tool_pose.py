@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import torch
@@ -22,13 +22,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET
 from tasks.control import DeployedPolicy, ToolPoseControl
 from tasks.process import START, EpisodeProcess
-from tasks.settings import CommandBase, ToolPoseTask
+from tasks.settings import CommandBase, PoseJudgement, ToolPoseTask
 from tasks.starts import DrawTally, StartSearch
 from tasks.term_task import ObservedTerm
 from tasks.terms import ToolState
 
 FORCE_SCALE_N, MAX_SCALED_FORCE = 2000.0, 5.0
 """Scale and bound of forces in the critic's group: 10 kN, where reward terms saturate too."""
+JUDGED = tuple(field.name for field in fields(PoseJudgement))
 
 
 class ToolPoseProcess(EpisodeProcess):
@@ -130,17 +131,14 @@ class ToolPoseProcess(EpisodeProcess):
         start = values["start"]
         peak_n = values["peak_force_n"].maximum(force_n)
         verdict = self.task.judge(values["tip_m"], values["pitch_rad"], peak_n, start)
+        values |= {name: getattr(verdict, name) for name in JUDGED}
         values |= {
-            "success": verdict.success,
-            "reached": verdict.reached,
             "inserted": verdict.reached,
             "target_m": self.control.aim(start["target_m"], start["target_pitch_rad"]),
             "target_pitch_rad": start["target_pitch_rad"],
             "reach_m": state["reach_m"],
             "reach_range_m": self.task.switch.reach_m,
             "positioning": state["positioning"].bool(),
-            "paper_success": verdict.paper_success,
-            "closeness": verdict.closeness,
             "closeness_before": state["closeness"],
         }
         return ToolState(**values)

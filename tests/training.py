@@ -21,6 +21,11 @@ CPU = torch.device("cpu")
 STEPS = 4
 TIMES = ("seconds", "rate/env_steps_per_s", "rate/collect_s", "rate/learn_s")
 """Columns of `progress.csv` that differ from run to run."""
+SILENT: dict[str, Any] = dict.fromkeys(
+    ("target_sample_m", "target_bias_m", "target_relative", "q_scale", "u_scale"), 0.0
+)
+SILENT["filter"] = "none"
+"""Errors of an observation that has none."""
 
 
 def plant(

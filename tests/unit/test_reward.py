@@ -51,6 +51,7 @@ def state() -> ToolState:
         failed=NO,
         closeness=torch.tensor([0.5]),
         closeness_before=torch.tensor([0.375]),
+        lateral_m=torch.tensor([0.2]),
     )
 
 

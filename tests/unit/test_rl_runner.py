@@ -33,9 +33,8 @@ def test_the_budget_of_steps_ends_training(machine: Machine, tmp_path: Path) -> 
     runner = runs.train(machine, tmp_path, runs.small(max_env_steps=5 * ITERATION))
     rows = runs.progress(tmp_path)
     assert [int(float(row["env_steps"])) for row in rows] == [ITERATION * (i + 1) for i in range(5)]
-    assert [int(row["iteration"]) for row in rows] == list(
-        range(5)
-    ) and runner.current_learning_iteration == 5
+    assert [int(row["iteration"]) for row in rows] == list(range(5))
+    assert runner.current_learning_iteration == 5
 
 
 def test_a_budget_that_is_no_multiple_of_an_iteration_is_filled_up(
@@ -67,11 +66,8 @@ def test_the_budget_of_seconds_ends_training(machine: Machine, tmp_path: Path) -
 
 def test_the_first_budget_that_is_spent_counts() -> None:
     budget = TrainingBudget(max_env_steps=100, max_seconds=10.0)
-    assert (
-        budget.share_spent(50, 2.0) == 0.5
-        and budget.share_spent(20, 9.0) == 0.9
-        and budget.share_spent(100, 0.0) == 1.0
-    )
+    spent = [budget.share_spent(*now) for now in ((50, 2.0), (20, 9.0), (100, 0.0))]
+    assert spent == [0.5, 0.9, 1.0]
     assert TrainingBudget(max_env_steps=None, max_seconds=10.0).share_spent(10**9, 5.0) == 0.5
 
 
@@ -83,11 +79,8 @@ def test_training_without_an_end_is_refused() -> None:
 def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(
     machine: Machine, tmp_path: Path
 ) -> None:
-    runs.train(
-        machine,
-        tmp_path,
-        runs.small(max_env_steps=7 * ITERATION, save_interval=2, keep_checkpoints=2),
-    )
+    often = {"save_interval": 2, "keep_checkpoints": 2}
+    runs.train(machine, tmp_path, runs.small(max_env_steps=7 * ITERATION, **often))
     assert [path.name for path in list_checkpoints(tmp_path)] == ["model_6.pt", "model_7.pt"]
     assert not list(tmp_path.glob("*.part"))
 
@@ -95,11 +88,8 @@ def test_a_checkpoint_every_save_interval_and_only_the_newest_kept(
 def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None:
     for iteration in (100, 9, 20):
         zipfile.ZipFile(tmp_path / f"model_{iteration}.pt", "w").close()
-    assert [path.name for path in list_checkpoints(tmp_path)] == [
-        "model_9.pt",
-        "model_20.pt",
-        "model_100.pt",
-    ]
+    found = [path.name for path in list_checkpoints(tmp_path)]
+    assert found == ["model_9.pt", "model_20.pt", "model_100.pt"]
     assert find_checkpoint(str(tmp_path)).name == "model_100.pt"
 
 

@@ -11,7 +11,7 @@ import torch
 from composed import option
 from kinematic import KinematicWorld
 from scipy import optimize
-from training import plant
+from training import SILENT, plant
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -246,6 +246,7 @@ def test_an_insertion_is_measured_along_the_axis_and_by_the_radius_of_its_own_ho
     tip_m = target_m + 0.11 * axis + aside_m * across
     verdict = task.judge(tip_m, start["target_pitch_rad"], torch.zeros(3), start)
     assert verdict.success.tolist() == [True, False, False]
+    torch.testing.assert_close(verdict.lateral_m, aside_m[:, 0], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -268,17 +269,9 @@ def test_a_tilted_or_forced_insertion_is_inserted_but_no_strict_success(
     ("at_m", "turn_rad", "paper"),
     [
         ((0.0, 0.0, -0.14), 0.0, True),
-        (
-            (0.0, 0.0, -0.051),
-            0.0,
-            True,
-        ),  # 5 cm below the rim is the height limit, and 8.9 cm from the target point
+        ((0.0, 0.0, -0.051), 0.0, True),  # the height limit; 8.9 cm from the target point
         ((0.0, 0.0, -0.049), 0.0, False),
-        (
-            (0.11, 0.0, -0.14),
-            0.0,
-            True,
-        ),  # 1 / 1.11 = 0.901; the paper does not ask to be inside the hole
+        ((0.11, 0.0, -0.14), 0.0, True),  # 1 / 1.11 = 0.901; it need not be inside the hole
         ((0.112, 0.0, -0.14), 0.0, False),  # 1 / 1.112 = 0.899
         ((0.0, 0.0, -0.14), 0.110, True),
         ((0.0, 0.0, -0.14), -0.112, False),
@@ -318,11 +311,8 @@ def test_closeness_grows_on_the_way_from_none_to_one(name: str) -> None:
     down = torch.full((50,), torch.pi / 2)
     start = {"target_m": target, "target_pitch_rad": down, "scene": make_nominal_scenes(50)}
     closeness = option("task", name).judge(tip, down, 0 * down, start).closeness
-    assert (
-        (closeness.diff() > 0).all()
-        and closeness[0] > 0
-        and closeness[-1] == pytest.approx(1.0, abs=1e-5)
-    )
+    assert (closeness.diff() > 0).all() and closeness[0] > 0
+    assert closeness[-1] == pytest.approx(1.0, abs=1e-5)
 
 
 def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> None:
@@ -338,11 +328,8 @@ def test_contact_later_in_the_episode_goes_on(machine: Machine) -> None:
     assert not stage.step().terminated.item()
     stage.world.contact_force_n.fill_(500.0)
     touched = stage.step()
-    assert (
-        not touched.terminated.item()
-        and touched.reason.item() == -1
-        and touched.reward.item() != 0.0
-    )
+    assert not touched.terminated.item() and touched.reason.item() == -1
+    assert touched.reward.item() != 0.0
 
 
 @pytest.mark.parametrize("joint", range(5))
@@ -353,11 +340,8 @@ def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine:
     assert not stage.step().terminated.item(), "11 mrad from the end of the travel is still inside"
     stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.009
     end = stage.step()
-    assert (
-        end.terminated.item()
-        and not end.timed_out.item()
-        and stage.process.reasons[int(end.reason)] == "joint_limit"
-    )
+    assert stage.process.reasons[int(end.reason)] == "joint_limit"
+    assert end.terminated.item() and not end.timed_out.item()
     assert end.reward.item() < -5.0, "5 (1 + closeness) is lost"
 
 
@@ -365,21 +349,16 @@ def test_the_time_limit_is_a_time_out_and_no_failure(machine: Machine) -> None:
     stage = Stage(machine, episode_s=0.2)
     ends = [stage.step() for _ in range(4)]
     assert [bool(end.timed_out) for end in ends] == [False, False, False, True]
-    assert (
-        not any(bool(end.terminated) for end in ends)
-        and stage.process.reasons[int(ends[3].reason)] == "time_limit"
-    )
+    assert not any(bool(end.terminated) for end in ends)
+    assert stage.process.reasons[int(ends[3].reason)] == "time_limit"
 
 
 def test_an_episode_that_fails_in_its_last_step_is_no_time_out(machine: Machine) -> None:
     stage = Stage(machine, episode_s=0.05)
     stage.history.q[0, -1, 0] = float(machine.upper[0])
     end = stage.step()
-    assert (
-        end.terminated.item()
-        and not end.timed_out.item()
-        and stage.process.reasons[int(end.reason)] == "joint_limit"
-    )
+    assert stage.process.reasons[int(end.reason)] == "joint_limit"
+    assert end.terminated.item() and not end.timed_out.item()
 
 
 def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine: Machine) -> None:
@@ -396,11 +375,8 @@ def test_a_fault_ends_the_episode_without_reward_or_success(machine: Machine) ->
     stage.target_below_tip(z_m=-0.12)
     stage.world.faults.fill_(True)
     end = stage.step()
-    assert (
-        end.terminated.item()
-        and end.reward.item() == 0.0
-        and stage.process.reasons[int(end.reason)] == "fault"
-    )
+    assert stage.process.reasons[int(end.reason)] == "fault"
+    assert end.terminated.item() and end.reward.item() == 0.0
     assert stage.process.episode["success_strict"].item() == 0.0
 
 
@@ -509,15 +485,7 @@ def estimates(stage: Stage, count: int) -> torch.Tensor:
 
 
 def noise(**changes: Any) -> Any:
-    silent = {
-        "target_sample_m": 0.0,
-        "target_bias_m": 0.0,
-        "target_relative": 0.0,
-        "filter": "none",
-        "q_scale": 0.0,
-        "u_scale": 0.0,
-    }
-    return replace(option("task", "borehole_insertion").noise, **(silent | changes))
+    return replace(option("task", "borehole_insertion").noise, **(SILENT | changes))
 
 
 def test_the_mean_filter_gives_the_mean_of_all_samples_so_far(machine: Machine) -> None:
@@ -528,10 +496,8 @@ def test_the_mean_filter_gives_the_mean_of_all_samples_so_far(machine: Machine) 
         errors[kind] = estimates(stage, 20)
     running = errors["none"].cumsum(0) / torch.arange(1, 21)[:, None, None]
     torch.testing.assert_close(errors["mean"], running, rtol=0, atol=2e-6)
-    assert (
-        errors["none"].abs().max() <= 0.01 + 1e-6
-        and errors["mean"][-1].std() < errors["none"][-1].std() / 3
-    )
+    assert errors["none"].abs().max() <= 0.01 + 1e-6
+    assert errors["mean"][-1].std() < errors["none"][-1].std() / 3
 
 
 def test_the_bias_is_constant_within_an_episode_and_bounded(machine: Machine) -> None:

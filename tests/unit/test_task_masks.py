@@ -31,33 +31,15 @@ def seen(reach_m: float, reach_3d_m: float, tip_z_m: float) -> Any:
 @pytest.mark.parametrize(
     ("reach_m", "reach_3d_m", "tip_z_m", "planar", "text", "equation"),
     [
-        (
-            2.0,
-            2.0,
-            1.0,
-            False,
-            False,
-            True,
-        ),  # in range, tool high: the equation goes on positioning, the text does not
+        # in range, tool high: the equation goes on positioning, the text does not
+        (2.0, 2.0, 1.0, False, False, True),
         (2.0, 2.0, 0.1, False, False, False),  # in range, tool low
         (3.0, 3.0, 1.0, True, True, True),  # too far, tool high
-        (
-            3.0,
-            3.0,
-            0.1,
-            False,
-            False,
-            True,
-        ),  # too far, tool low: the text rests q2 to keep the tool off the ground
+        # too far, tool low: the text rests q2 to keep the tool off the ground
+        (3.0, 3.0, 0.1, False, False, True),
         (1.0, 1.0, 1.0, True, True, True),  # too near
-        (
-            2.0,
-            3.5,
-            1.0,
-            False,
-            True,
-            True,
-        ),  # q1 points elsewhere: in the plane in range, in space not
+        # q1 points elsewhere: in the plane in range, in space not
+        (2.0, 3.5, 1.0, False, True, True),
         (1.7, 1.7, 0.1, False, False, False),  # the edges belong to the range
         (2.4, 2.4, 0.1, False, False, False),
     ],
@@ -110,11 +92,8 @@ def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> 
         flag = torch.tensor([positioning])
         base = CommandBase(torch.zeros(1, 5), -FREE, FREE, flag)
         u = action.command(torch.ones(1, 5), base, torch.as_tensor(machine.is_exclusive))
-        assert (
-            u[0].tolist()
-            == paper
-            == mask_exclusive_joints(machine.is_exclusive, positioning).astype(int).tolist()
-        )
+        machines = mask_exclusive_joints(machine.is_exclusive, positioning)
+        assert u[0].tolist() == paper == machines.astype(int).tolist()
 
 
 def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
@@ -162,8 +141,6 @@ def test_in_space_q2_alone_cannot_bring_a_target_behind_the_shoulder_into_range(
     q[:, 1] = torch.linspace(float(machine.lower[1]), float(machine.upper[1]), 100)
     found = guided(machine, q, torch.tensor([[3.0, 0.0, 0.7]]).repeat(100, 1))
     high = found.tip_z_m >= 0.2
-    assert (
-        switch("text").positioning(found)[high].all()
-        and switch("equation").positioning(found).all()
-    )
+    assert switch("text").positioning(found)[high].all()
+    assert switch("equation").positioning(found).all()
     assert not switch("planar").positioning(found).all()

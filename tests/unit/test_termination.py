@@ -34,11 +34,8 @@ def ends(name: str, outcome: Any = "failure", **params: Any) -> TerminationTerm:
     return TerminationTerm(function=f"tasks.terms:{name}", params=params, outcome=outcome)
 
 
-SUCCESS, START, TIME = (
-    ends("success", "success"),
-    ends("start_in_contact", "void"),
-    ends("time_limit", "time"),
-)
+SUCCESS, START = ends("success", "success"), ends("start_in_contact", "void")
+TIME = ends("time_limit", "time")
 
 
 @pytest.mark.parametrize(
@@ -73,11 +70,8 @@ def test_the_first_term_counts_and_time_counts_last() -> None:
         contact_force_n=torch.tensor([200.0, 0.0, 0.0]),
     )
     endings = terms.judge(here, torch.tensor([False, False, True]))
-    assert [terms.reasons[int(index)] for index in endings.reason] == [
-        "blow",
-        "time_limit",
-        "limit",
-    ]
+    counted = [terms.reasons[int(index)] for index in endings.reason]
+    assert counted == ["blow", "time_limit", "limit"]
     assert endings.terminated.tolist() == [True, False, True]
     assert endings.timed_out.tolist() == [False, True, False]
     assert here.failed.tolist() == [True, False, True]
