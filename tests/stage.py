@@ -437,6 +437,7 @@ class Stage:
     def _time(self) -> Iterator[None]:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(time, "monotonic", lambda: self.now_s)
+            patch.setattr(time, "clock_gettime", lambda clock: self.now_s)
             patch.setattr(
                 time,
                 "sleep",

@@ -146,9 +146,11 @@ class BusLogic:
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
 
-    def take(self, frame: CanFrame, now_s: float) -> tuple[MessageFault | None, bool]:
+    def take(
+        self, frame: CanFrame, now_s: float, steady_s: float | None = None
+    ) -> tuple[MessageFault | None, bool]:
         """Take in a frame; return its fault, if any, and whether to decide at once."""
-        fault = self.receiver.take(frame, now_s)
+        fault = self.receiver.take(frame, now_s, steady_s)
         # Only while commanding: otherwise there is no motion to end, and the cycle keeps its time.
         if self.decision is None or self.decision.state is not GuardState.ACTIVE:
             return fault, False

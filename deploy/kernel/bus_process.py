@@ -25,7 +25,7 @@ from deploy.kernel.guard import GuardDecision
 from deploy.kernel.limits import GuardLimits
 from deploy.kernel.target_check import SeenTarget
 from deploy.runtime.operator_state import PageSignal
-from deploy.runtime.process import CycleTimer, Stop
+from deploy.runtime.process import CycleTimer, Stop, read_steady_s
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import read_holes
 
@@ -120,7 +120,7 @@ class BusProcess:
 
     def _take(self, frame: CanFrame, now_s: float) -> None:
         """Take in a frame; one that ends a motion takes effect at once."""
-        fault, is_urgent = self._logic.take(frame, now_s)
+        fault, is_urgent = self._logic.take(frame, now_s, read_steady_s())
         self._log_frame(frame, now_s, sent=False)
         if fault is not None:
             self._log_text("fault", now_s, {"frame_id": frame.frame_id, "fault": fault.value})

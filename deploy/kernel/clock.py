@@ -4,14 +4,15 @@ All stamps of the bus are readings of one clock, the gateway's. The gateway stam
 remote and the PC put the newest stamp that they have heard into theirs. The gateway therefore sees
 the whole way of a command or a lever, there and back, and reports that of commands as `RoundTrip`.
 
-The PC does not share the gateway's clock. It takes the shortest transit that it has seen as none,
-and lets that grow by `DRIFT` at most: the two crystals cannot differ by more. A delay that grows is
-seen and stays seen; a delay that was there from the beginning shows in `RoundTrip`.
+The PC does not share the gateway's clock, and reads its own crystal, which no NTP slews. It takes
+the shortest transit that it has seen as none, and lets that grow by `DRIFT` at most: the two crystals
+cannot differ by more. A delay that grows is seen and stays seen; a delay that was there from the
+beginning shows in `RoundTrip`.
 
 A stamp from the future is one wrong message, and teaches nothing. Stamps that get ahead step by step
-are from the future as soon as the steps come to as much: no crystal goes so fast. Where many in a row
-agree, the gateway's clock was set ahead, and is learned anew. A clock that was set back looks like a delay of
-all messages: only a person lets it be learned anew (`accept_delay`).
+are from the future as soon as the steps come to as much: no crystal goes so fast. Where many in a
+row agree, the gateway's clock was set ahead, and is learned anew. A clock that was set back looks
+like a delay of all messages: only a person lets it be learned anew (`accept_delay`).
 """
 
 from __future__ import annotations

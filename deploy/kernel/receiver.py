@@ -117,8 +117,18 @@ class BusReceiver:
         u = tuple(values[f"Command_{joint}"] for joint in self.machine.joint_names)
         self.flow_check.note_command(now_s, u)
 
-    def take(self, frame: CanFrame, now_s: float) -> MessageFault | None:
-        """Decode a frame and use its values; return its fault, if any."""
+    def take(
+        self, frame: CanFrame, now_s: float, steady_s: float | None = None
+    ) -> MessageFault | None:
+        """Decode a frame and use its values; return its fault, if any.
+
+        Args:
+            frame: The frame.
+            now_s: When it came.
+            steady_s: The same by a clock that nobody slews, to compare with the gateway's; `None`:
+                `now_s` is one.
+        """
+        steady_s = now_s if steady_s is None else steady_s
         layout = self._layouts.get(frame.frame_id)
         if layout is None:
             # A command that this process did not send comes from a second commander.
@@ -132,7 +142,7 @@ class BusReceiver:
             # A refused frame still moves the channel towards "invalid".
             fault = channel.refuse(values) if channel else values
         else:
-            fault = self._check_stamp(layout, values.get(STAMP, 0.0), now_s)
+            fault = self._check_stamp(layout, values.get(STAMP, 0.0), steady_s)
             if fault is not None and channel is not None:
                 channel.refuse(fault)
             elif channel is not None:
@@ -142,7 +152,8 @@ class BusReceiver:
             return fault
         sent_s = now_s
         if layout.stamp_wrap_s:
-            sent_s = self._clock.find_sent_s(values[STAMP], layout.stamp_wrap_s, now_s)
+            sent_s = self._clock.find_sent_s(values[STAMP], layout.stamp_wrap_s, steady_s)
+            sent_s += now_s - steady_s
         if math.isfinite(sent_s):
             self._delay_s[layout.name] = now_s - sent_s
         self._use(values, sent_s, now_s)
@@ -270,17 +281,17 @@ class BusReceiver:
         return now_s - self._stranger_s > STRANGER_S
 
     def _check_stamp(
-        self, layout: MessageLayout, stamp_s: float, now_s: float
+        self, layout: MessageLayout, stamp_s: float, steady_s: float
     ) -> MessageFault | None:
         """Learn from a stamp; return the fault of one from the future."""
         wrap_s = layout.stamp_wrap_s
         if not wrap_s:
             return None
         if layout.sender == GATEWAY and wrap_s == self._longest_wrap_s:
-            is_early = self._clock.learn(stamp_s, wrap_s, now_s)
+            is_early = self._clock.learn(stamp_s, wrap_s, steady_s)
             self._stamp_s = stamp_s
         else:
-            is_early = self._clock.is_early(stamp_s, wrap_s, now_s)
+            is_early = self._clock.is_early(stamp_s, wrap_s, steady_s)
         return MessageFault.EARLY if is_early else None
 
     def _use(self, values: dict[str, float], sent_s: float, now_s: float) -> None:

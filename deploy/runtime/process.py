@@ -167,6 +167,11 @@ def give_up_priority() -> None:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
+def read_steady_s() -> float:
+    """Return the time of this computer's crystal, in s: NTP slews the monotonic clock, but not this."""
+    return time.clock_gettime(time.CLOCK_MONOTONIC_RAW)
+
+
 class CycleTimer:
     """Absolute deadlines on the monotonic clock; a missed one is skipped, not made up for.
 

@@ -198,8 +198,8 @@ class FaultPort:
             self._socket.bind(("127.0.0.1", port))
             self._socket.setblocking(False)
 
-    def poll(self, faults: ActiveFaults) -> str | None:
-        """Answer a request that has come in, if any; return its text."""
+    def poll(self, faults: ActiveFaults, now_s: float) -> str | None:
+        """Answer a request that has come in by `now_s`, if any; return its text."""
         if self._socket is None:
             return None
         try:
@@ -208,7 +208,7 @@ class FaultPort:
             # No request is the usual case in a cycle.
             return None
         try:
-            faults.request(text, time.monotonic())
+            faults.request(text, now_s)
             answer = f"ok {time.monotonic()!r}"
         except ConfigError as error:
             answer = str(error)

@@ -23,7 +23,7 @@ from brokk_rl.spec import Positive, spec
 from deploy.bus.c_header import generate_c_header
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import GATEWAY, STAMP, BusDescription
-from deploy.runtime.process import CycleTimer, Stop, ask_for_priority
+from deploy.runtime.process import CycleTimer, Stop, ask_for_priority, read_steady_s
 from deploy.twin.faults import ActiveFaults, FaultPort
 from deploy.twin.gateway import NOBODY, PC, REMOTE_S, ROUND_TRIP_S, TIMEOUT_S, Gateway
 from deploy.twin.remote import RadioRemote
@@ -179,9 +179,9 @@ class RunningTwin:
                 while (left_s := self._timer.next_s - time.monotonic()) > 0:
                     frame = self._bus.recv(left_s)
                     if frame is not None:
-                        self.hear(frame, time.monotonic())
+                        self.hear(frame, read_steady_s())
                 self._timer.begin()
-                self.cycle(time.monotonic())
+                self.cycle(read_steady_s())
             # A bus that goes down is no reason to end: a real machine goes on too.
             except LinkError as error:
                 log.warning("%s", error)
@@ -195,7 +195,7 @@ class RunningTwin:
 
     def cycle(self, now_s: float) -> None:
         """Let `CYCLE_S` go by: valves, motion, messages."""
-        if (text := self._port.poll(self._faults)) is not None:
+        if (text := self._port.poll(self._faults, now_s)) is not None:
             log.debug("fault: %s", text)
         # A study puts the machine elsewhere between two cycles, never within one.
         if (place := self._faults.take_place()) is not None:

@@ -27,7 +27,7 @@ from deploy.runtime.shm_layout import LoopMemory
 
 MACHINE, LIMITS = option("machine", "brokk170"), option("guard", "default")
 STILL = GuardDecision(GuardState.READY, (0.0,) * 5, GuardTrip.DEADMAN, GuardTrip.NONE)
-BEGIN_S, CYCLE_S = 5000.0, 0.01
+BEGIN_S, CYCLE_S, SLEWED_S = 5000.0, 0.01, 0.5
 FRAMES = [CanFrame(0x100 + number, bytes([number])) for number in range(4)]
 
 
@@ -91,7 +91,10 @@ class Logic:
         self.fault: MessageFault | None = None
         self.is_urgent, self.ended = False, list[tuple[float, int]]()
 
-    def take(self, frame: CanFrame, now_s: float) -> tuple[MessageFault | None, bool]:
+    def take(
+        self, frame: CanFrame, now_s: float, steady_s: float
+    ) -> tuple[MessageFault | None, bool]:
+        assert steady_s == now_s - SLEWED_S
         self.taken.append((now_s, frame))
         return self.fault, self.is_urgent
 
@@ -147,6 +150,7 @@ class Rig:
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     clock: list[Clock] = []
     monkeypatch.setattr(time, "monotonic", lambda: clock[0].now_s if clock else BEGIN_S)
+    monkeypatch.setattr(time, "clock_gettime", lambda clock_id: clock[0].now_s - SLEWED_S)
     monkeypatch.setattr(time, "sleep", lambda seconds: clock[0].sleep(seconds))
     made = Rig()
     clock.append(made.clock)

@@ -317,3 +317,15 @@ def test_channels_that_are_not_needed_cost_no_trust(sender: Sender, tmp_path: An
     assert set(receiver.channels) == set(PERIODS_S)
     assert all(one.trust is ChannelTrust.VALID for one in receiver.channels.values())
     assert np.isfinite(receiver.q).all()
+
+
+def test_a_clock_that_is_slewed_makes_no_message_late() -> None:
+    sender = Sender()
+    # Three minutes of the fastest slew that the kernel allows, 500 ppm.
+    for number in range(1800):
+        sender.now_s += 0.1
+        slewed_s = sender.now_s + 5e-4 * 0.1 * number
+        frame = sender.build("MachineStatus")
+        assert sender.receiver.take(frame, slewed_s, sender.now_s) is None
+    assert sender.receiver.held_up_s < 0.01
+    assert sender.receiver.status_t_s == pytest.approx(slewed_s, abs=0.01)
