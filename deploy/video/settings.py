@@ -88,25 +88,15 @@ class VideoSettings:
 
     Attributes:
         cameras: Cameras by their names on the page.
-        host: Address that sends the pictures. 127.0.0.1: to browsers of this computer only.
-        min_bitrate: Bits a second of one camera, below which no bad link brings it.
-        max_bitrate: Bits a second of one camera over a good link.
         viewers: Pages that can watch at once; each one is encoded for by itself.
     """
 
     cameras: dict[str, VideoCamera]
-    host: str
-    min_bitrate: Count
-    max_bitrate: int
     viewers: Count
 
     def check(self) -> None:
         if not self.cameras:
             raise ConfigError("cameras: expected one or more")
-        if self.min_bitrate > self.max_bitrate:
-            raise ConfigError(
-                f"min_bitrate: expected max_bitrate={self.max_bitrate} or less, got {self.min_bitrate}"
-            )
 
     def require_packages(self) -> None:
         """Check before any process starts that the video process can.

@@ -6,7 +6,7 @@ The process has a low priority and touches nothing of the loop but the newest fr
 If it hangs or dies, the page greys the pictures, and the loop feels nothing.
 
 aiortc carries the pictures: lost packets are sent again on request, and the receiver's estimate of
-the link sets the bit rate of the encoder.
+the link sets the bit rate of its encoder. The page asks for H.264.
 """
 
 from __future__ import annotations
@@ -17,17 +17,13 @@ import json
 import logging
 import os
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import aioice.ice  # pyright: ignore[reportMissingImports]
-import aiortc.codecs  # pyright: ignore[reportMissingImports]
 from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCSessionDescription  # pyright: ignore[reportMissingImports]
 
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.video.encoder import LinkEncoder
 from deploy.video.settings import SOCKET, VideoProcessConfig, VideoSettings
 from deploy.video.sources import CameraReader
 
@@ -39,9 +35,6 @@ POLL_S, STOP_POLL_S = 0.003, 0.05
 """Between looks for a new picture, a fifth of a screen's frame; and between looks whether to stop."""
 LONGEST_OFFER = 1 << 16
 """Bytes of an offer; a browser's has 10 kB for two cameras."""
-ANY_ADDRESS = ("0.0.0.0", "::")
-RTP_TIMES = 1 << 32
-"""Times of RTP have 32 bits."""
 
 
 class CameraTrack(MediaStreamTrack):
@@ -49,16 +42,15 @@ class CameraTrack(MediaStreamTrack):
 
     Args:
         reader: The camera.
-        report: Called with the RTP time of a picture and the time at which it was taken.
+        report: Called with the number of a picture, in units of its RTP time, and the time at which
+            it was taken.
     """
 
     kind = "video"
 
     def __init__(self, reader: CameraReader, report: Any) -> None:
         super().__init__()
-        self._reader, self._report = reader, report
-        self._number, self._pts = reader.number, 0
-        self.sender: Any = None
+        self._reader, self._report, self._number = reader, report, reader.number
 
     async def recv(self) -> Any:
         """Wait for the next picture and return it."""
@@ -66,13 +58,8 @@ class CameraTrack(MediaStreamTrack):
             await asyncio.sleep(POLL_S)
         self._number = self._reader.number
         frame, t_s = self._reader.read_newest()
-        # The sender asks for a picture when the one before is sent. So its last RTP time is that
-        # picture's, and tells the offset that aiortc has drawn. aiortc shows it nowhere else.
-        sent = getattr(self.sender, "_RTCRtpSender__rtp_timestamp", 0)
-        if self._pts and sent:
-            offset = sent - self._pts
-            self._report((frame.pts + offset) % RTP_TIMES, t_s)
-        self._pts = frame.pts
+        # Its RTP time is that and an offset, which the page finds out.
+        self._report(frame.pts, t_s)
         return frame
 
 
@@ -96,9 +83,7 @@ class VideoPeer:
         )
         waiting = [one for one in self._connection.getTransceivers() if one.kind == "video"]
         for index, (transceiver, reader) in enumerate(zip(waiting, self._readers, strict=False)):
-            track = CameraTrack(reader, self._make_report(index))
-            track.sender = transceiver.sender
-            transceiver.sender.replaceTrack(track)
+            transceiver.sender.replaceTrack(CameraTrack(reader, self._make_report(index)))
             transceiver.direction = "sendonly"
         await self._connection.setLocalDescription(await self._connection.createAnswer())
         return self._connection.localDescription.sdp
@@ -118,11 +103,11 @@ class VideoPeer:
                 channel.send(json.dumps({"at_ms": at_ms, "now_s": time.monotonic()}))
 
     def _make_report(self, index: int) -> Any:
-        def report(rtp: int, taken_s: float) -> None:
+        def report(pts: int, taken_s: float) -> None:
             channel = self._channel
             # A channel that is behind would only report on pictures of the past.
             if channel is not None and channel.readyState == "open" and not channel.bufferedAmount:
-                channel.send(json.dumps({"camera": index, "rtp": rtp, "taken_s": taken_s}))
+                channel.send(json.dumps({"camera": index, "pts": pts, "taken_s": taken_s}))
 
         return report
 
@@ -137,34 +122,11 @@ def hide_local_names(offer: str) -> str:
     return "".join(one for one in lines if not (one.startswith("a=candidate") and ".local " in one))
 
 
-def offer_h264_only(video: VideoSettings) -> None:
-    """Let aiortc offer H.264 alone, by our encoder.
-
-    aiortc fixes the codecs when it reads an offer, before preferences can be stated, and would
-    choose VP8.
-    """
-    kept, mime = [], ""
-    for one in aiortc.codecs.CODECS["video"]:
-        # An entry for repeated packets follows the codec whose packets it repeats.
-        mime = one.mimeType if one.mimeType != "video/rtx" else mime
-        if mime == "video/H264":
-            kept.append(one)
-    aiortc.codecs.CODECS["video"] = kept
-    aiortc.codecs.H264Encoder = partial(
-        LinkEncoder, video.min_bitrate, video.max_bitrate, len(video.cameras)
-    )
-
-
 def run(stop: Stop, config: VideoProcessConfig, memory: LoopMemory | None = None) -> None:
     """Send pictures until asked to stop."""
     os.nice(NICENESS)
     logging.getLogger("aioice").setLevel(logging.WARNING)
-    video = config.video
-    offer_h264_only(video)
-    if video.host not in ANY_ADDRESS:
-        # aioice offers every address but the loopback; this process offers the one it is told.
-        aioice.ice.get_host_addresses = lambda use_ipv4, use_ipv6: [video.host]
-    asyncio.run(_serve(stop, video, Path(config.folder) / SOCKET, memory))
+    asyncio.run(_serve(stop, config.video, Path(config.folder) / SOCKET, memory))
 
 
 def _tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -197,7 +159,7 @@ async def _serve(stop: Stop, video: VideoSettings, path: Path, memory: LoopMemor
             writer.close()
 
     async with await asyncio.start_unix_server(talk, path, limit=LONGEST_OFFER):
-        log.info("%s by WebRTC on %s", ", ".join(video.cameras), video.host)
+        log.info("%s by WebRTC", ", ".join(video.cameras))
         while not stop():
             await asyncio.sleep(STOP_POLL_S)
         await asyncio.gather(*(peer.close() for peer in watching))

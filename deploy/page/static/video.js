@@ -7,7 +7,8 @@ const OVER = 4;          // looks over which losses and delays are taken: 2 s
 const STALE_MS = 500;    // a picture that is not replaced for so long stands still
 const PATIENCE_MS = 4000; // for the first picture, before its lack is an alarm
 const GIVE_UP_MS = 8000; // without any picture: begin again
-const KEPT = 256;        // times of pictures that are remembered
+const KEPT = 32;         // times of pictures that are remembered
+const RTP_TIMES = 2 ** 32; // RTP times have 32 bits
 
 export class Video {
   constructor(view, token, say) {
@@ -42,10 +43,10 @@ export class Video {
       figure.append(video, caption);
       figure.onclick = () => this.enlarge(figure.classList.contains("large") ? null : camera);
       this.box.append(figure);
-      const camera = { name, figure, video, numbers, taken: new Map(), delays: [], counts: [], shown: 0, share: 0, delay_ms: null };
+      const camera = { name, figure, video, numbers, taken: new Map(), votes: new Map(), offset: null, delays: [], counts: [], shown: 0, share: 0, delay_ms: null };
       const drawn = (now, { rtpTimestamp, expectedDisplayTime }) => {
         camera.shown = now;
-        const taken_s = camera.taken.get(rtpTimestamp);
+        const taken_s = this.findTime(camera, rtpTimestamp);
         if (taken_s !== undefined && this.ahead_ms !== null) camera.delays.push([now, expectedDisplayTime - (1e3 * taken_s + this.ahead_ms)]);
         video.requestVideoFrameCallback(drawn);
       };
@@ -58,7 +59,8 @@ export class Video {
     };
     const channel = this.channel = peer.createDataChannel("times", { ordered: false, maxRetransmits: 0 });
     channel.onmessage = ({ data }) => this.told(JSON.parse(data));
-    for (const _ of names) peer.addTransceiver("video", { direction: "recvonly" });
+    const codecs = RTCRtpReceiver.getCapabilities("video").codecs.filter(one => /H264|rtx/.test(one.mimeType));
+    for (const _ of names) peer.addTransceiver("video", { direction: "recvonly" }).setCodecPreferences(codecs);
     await peer.setLocalDescription(await peer.createOffer());
     const offer = peer.localDescription.sdp;
     for (let at = 0; at < offer.length; at += PIECE) this.socket.send(offer.slice(at, at + PIECE));
@@ -69,7 +71,7 @@ export class Video {
   told(said) {
     if ("taken_s" in said) {
       const { taken } = this.cameras[said.camera];
-      taken.set(said.rtp, said.taken_s);
+      taken.set(said.pts, said.taken_s);
       if (taken.size > KEPT) taken.delete(taken.keys().next().value);
       return;
     }
@@ -77,6 +79,20 @@ export class Video {
     if (way_ms >= this.shortest_ms) return;
     this.shortest_ms = way_ms;
     this.ahead_ms = said.at_ms + way_ms / 2 - 1e3 * said.now_s;
+  }
+
+  // When a picture was taken. Its RTP time is the number of the report and an offset that the sender has drawn: the one on which most pairs agree.
+  findTime(camera, rtp) {
+    const { taken, votes } = camera;
+    if (camera.offset === null) {
+      for (const pts of taken.keys()) {
+        const offset = ((rtp - pts) % RTP_TIMES + RTP_TIMES) % RTP_TIMES;
+        votes.set(offset, (votes.get(offset) ?? 0) + 1);
+        if (votes.get(offset) > KEPT / 2) camera.offset = offset;
+      }
+    }
+    const first = [...taken.keys()].find(pts => (pts + camera.offset) % RTP_TIMES === rtp);
+    return camera.offset === null ? undefined : taken.get(first);
   }
 
   async look() {
