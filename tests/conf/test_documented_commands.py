@@ -7,13 +7,11 @@ import re
 import shlex
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import hydra
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 from packages import EXAMPLE, install_example
 
@@ -82,7 +80,7 @@ def read_arguments(command: str) -> list[str]:
     return found
 
 
-def list_jobs(arguments: list[str]) -> list[list[Override]]:
+def list_jobs(arguments: list[str]) -> list[list[str]]:
     """Returns the overrides of a command; of a sweep those of the first and the last job."""
     words = [word for word in arguments if not word.startswith("-")]
     write_option_files(words)
@@ -90,66 +88,16 @@ def list_jobs(arguments: list[str]) -> list[list[Override]]:
     known = {f"{one.group}={one.name}" for one in registry.list_options()}
     # As the command does: a group without an option `none` is left out by it.
     words = [w if w in known else re.sub(r"^(\w+)=none$", r"~\1", w) for w in words]
-    parser = OverridesParser.create()
     first, last = [], []
-    for override in parser.parse_overrides(words):
-        if not override.is_sweep_override():
-            first.append(override)
-            last.append(override)
-            continue
-        values = list(override.sweep_string_iterator())
-        name = str(override.input_line).partition("=")[0]
-        first += parser.parse_overrides([f"{name}={values[0]}"])
-        last += parser.parse_overrides([f"{name}={values[-1]}"])
-    same = [one.input_line for one in first] == [one.input_line for one in last]
-    return [first] if same else [first, last]
-
-
-@dataclass
-class Bundle:
-    """Commands with the same options that set no value differently: they compose together.
-
-    Attributes:
-        options: Their options of groups.
-        whole: All values that must be given are given.
-        values: The values of all of them, by key.
-        jobs: The overrides of each of them, by command.
-    """
-
-    options: frozenset[str]
-    whole: bool
-    values: dict[str, str]
-    jobs: dict[str, list[str]]
-
-    def take(self, command: str, job: list[Override], groups: set[str], whole: bool) -> bool:
-        """Add a command and return true, if it fits."""
-        options, values = split_overrides(job, groups)
-        if (options, whole) != (self.options, self.whole):
-            return False
-        if any(self.values.get(key, value) != value for key, value in values.items()):
-            return False
-        self.values |= values
-        self.jobs[command] = [str(one.input_line) for one in job]
-        return True
-
-    def find_faults(self) -> Iterator[str]:
-        """Yields the commands that do not compose, with the message."""
-        if explain_fault([*self.options, *self.values.values()], self.whole):
-            for command, job in self.jobs.items():
-                if fault := explain_fault(job, self.whole):
-                    yield f"{command}\n    {fault}"
-
-
-def split_overrides(job: list[Override], groups: set[str]) -> tuple[frozenset[str], dict[str, str]]:
-    """Returns the options of groups, and the values by key; each has folders of its own."""
-    options, values = set(), {}
-    for override in job:
-        line, key = str(override.input_line), str(override.key_or_group)
-        if key in groups:
-            options.add(line)
-        else:
-            values[key] = "session.out=folder" if key == "session.out" else line
-    return frozenset(options), values
+    for override in OverridesParser.create().parse_overrides(words):
+        line = str(override.input_line)
+        values = [line.partition("=")[2]]
+        if override.is_sweep_override():
+            values = list(override.sweep_string_iterator())
+        name, equals, _ = line.partition("=")
+        first.append(f"{name}{equals}{values[0]}")
+        last.append(f"{name}{equals}{values[-1]}")
+    return [first] if first == last else [first, last]
 
 
 def explain_fault(overrides: list[str], whole: bool) -> str | None:
@@ -174,19 +122,18 @@ def explain_fault(overrides: list[str], whole: bool) -> str | None:
 
 def find_faults(pages: Sequence[Path]) -> list[str]:
     """Returns the commands of these pages that do not compose, with the message."""
-    bundles: list[Bundle] = []
-    groups = {option.group for option in registry.list_options()}
-    commands = dict.fromkeys(found for page in pages for found in find_commands(page))
-    for command, in_block in commands:
+    faults = {}
+    for command, in_block in dict.fromkeys(
+        found for page in pages for found in find_commands(page)
+    ):
         if any(part in command for part in NOT_COMPOSED):
             continue
         whole = in_block and not any(part in command for part in WITHOUT_VALUES)
         for job in list_jobs(read_arguments(command)):
-            if not any(bundle.take(command, job, groups, whole) for bundle in bundles):
-                options, _ = split_overrides(job, groups)
-                bundles.append(Bundle(options, whole, {}, {}))
-                assert bundles[-1].take(command, job, groups, whole)
-    return [fault for bundle in bundles for fault in bundle.find_faults()]
+            key = (*sorted(job), whole)
+            if key not in faults:
+                faults[key] = (command, explain_fault(job, whole))
+    return [f"{command}\n    {fault}" for command, fault in faults.values() if fault]
 
 
 def write_option_files(overrides: list[str]) -> None:

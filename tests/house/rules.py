@@ -65,27 +65,19 @@ DOORS = {
     "can": ("deploy", "actuators.recordings.can_log"),
     "cantools": ("deploy", "actuators.recordings.can_log"),
 }
+INPUT_AND_OUTPUT = ("torch", "os", "pathlib", "socket", "io", "time")
 CLOSED = {
     "deploy": ("brokk_rl.sim", "brokk_rl.rl", "mujoco", "warp", "rsl_rl"),
-    "deploy.kernel.guard": (
-        "torch",
-        "os",
-        "pathlib",
-        "socket",
-        "io",
-        "time",
-        "numpy",
-        "deploy.checks",
-    ),
-    "deploy.kernel.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.kernel.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.kernel.under_way": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.kernel.flow_check": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.kernel.target_check": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.kernel.receiver": ("torch", "os", "pathlib", "socket", "io", "time", "deploy.checks"),
-    "deploy.kernel.bus_logic": ("torch", "os", "pathlib", "socket", "io", "time", "deploy.checks"),
-    "deploy.checks.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.checks.observer": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.kernel.guard": (*INPUT_AND_OUTPUT, "numpy", "deploy.checks"),
+    "deploy.kernel.limits": (*INPUT_AND_OUTPUT, "numpy"),
+    "deploy.kernel.plausibility": (*INPUT_AND_OUTPUT, "numpy"),
+    "deploy.kernel.under_way": (*INPUT_AND_OUTPUT, "numpy"),
+    "deploy.kernel.flow_check": (*INPUT_AND_OUTPUT, "numpy"),
+    "deploy.kernel.target_check": INPUT_AND_OUTPUT,
+    "deploy.kernel.receiver": (*INPUT_AND_OUTPUT, "deploy.checks"),
+    "deploy.kernel.bus_logic": (*INPUT_AND_OUTPUT, "deploy.checks"),
+    "deploy.checks.envelope": INPUT_AND_OUTPUT,
+    "deploy.checks.observer": INPUT_AND_OUTPUT,
 }
 """What a package must not import, whatever its floor: the machine's own computer has neither
 simulator nor trainer."""
@@ -175,19 +167,6 @@ def doors(sources: Mapping[str, str]) -> list[str]:
                         f"{module}:{entry.line} imports {entry.name}, which {package} must do without"
                     )
     return found
-
-
-def prints(sources: Mapping[str, str]) -> list[str]:
-    """`logging`, never `print`, outside what a mode shows the person."""
-    return [
-        f"{module}:{node.lineno} prints"
-        for module, tree in read_trees(sources)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id == "print"
-        and floor(module) != MODE
-    ]
 
 
 def vague_names(sources: Mapping[str, str]) -> list[str]:

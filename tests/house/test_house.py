@@ -35,7 +35,6 @@ SOURCES = {
     [
         rules.floors,
         rules.doors,
-        rules.prints,
         rules.vague_names,
         rules.docstrings,
         rules.units,
@@ -102,7 +101,6 @@ def test_numbers_of_the_configuration_are_explained() -> None:
         (rules.doors, "brokk_rl.modes.list", "from omegaconf import OmegaConf"),
         (rules.doors, "deploy.runtime", "from brokk_rl.sim import scene"),
         (rules.doors, "deploy.kernel.guard", "import torch"),
-        (rules.prints, "brokk_rl.session", "print('hello')"),
         (rules.vague_names, "brokk_rl.rl.utils", ""),
         (rules.docstrings, "brokk_rl.a", '"""A."""\nclass B:\n    """B."""\n    def c(self): pass'),
         (rules.docstrings, "brokk_rl.a", "x = 1"),

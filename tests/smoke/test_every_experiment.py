@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
+from conftest import Done
 from hydra.utils import instantiate
 
 from brokk_rl import cli, registry
@@ -30,7 +32,7 @@ TRAINED = (
 
 CHANGES_OF_BEHAVIOUR = ("follower=person", "task.memory=1", "task.action.mask=false")
 """Words that change what a policy learns with, and so the fingerprint of its task."""
-QUICK = ("experiment=direct", "experiment=paper", "task.memory=1")
+QUICK = ("experiment=paper", "task.memory=1")
 """Experiments of `make test`, beside the other task: each runs code that no other one does."""
 
 
@@ -78,21 +80,17 @@ def describe_words(words: tuple[str, ...]) -> str:
     return describe_task(instantiate(cfg.task, _convert_="all")).fingerprint()
 
 
-def command(*arguments: str) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["brokk", *arguments])
-        assert cli.main() == 0
-
-
 def read(path: Path) -> Any:
     return json.loads(path.read_text())
 
 
 @pytest.mark.parametrize(("words", "shared"), list_cases())
 def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
-    words: tuple[str, ...], shared: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...], shared: tuple[str, ...], tmp_path: Path, brokk: Callable[..., Done]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
+    def command(*arguments: str) -> None:
+        assert (done := brokk(*arguments)).code == 0, done.err
+
     command(*words, *TRAINED, *SHORT, "session.out=run")
     made = read(tmp_path / "run" / "policy.json")
     assert made["task"]["fingerprint"] == describe_words(words)
@@ -111,26 +109,21 @@ def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
     assert exported["task"] == made["task"] and exported["parity"]["largest_difference"] < 1e-3
     golden = read(tmp_path / "run" / "golden.json")
     assert read(tmp_path / "export" / "golden.json") == golden
+    weights = [tmp_path / name / "policy.safetensors" for name in ("run", "export")]
+    assert weights[0].read_bytes() == weights[1].read_bytes()
     session = onnxruntime.InferenceSession(str(tmp_path / "export" / "policy.onnx"))
     answers = session.run(None, {"observation": np.array(golden["observation"], np.float32)})[0]
     assert np.abs(answers - np.array(golden["command"])).max() < 1e-3
 
 
 def test_training_that_begins_with_a_policy_keeps_the_task_of_that_policy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, brokk: Callable[..., Done]
 ) -> None:
     """The shipped policy corrects the classical controller of its time, not the one of today."""
-    monkeypatch.chdir(tmp_path)
     begin = [*TRAINED, *SHORT, "actuator=lag", f"policy={SHIPPED}"]
-    monkeypatch.setattr("sys.argv", ["brokk", *begin, "session.out=run"])
-    assert cli.main() == 0
+    assert brokk(*begin, "session.out=run").code == 0
     shipped = Path(cli.__file__).parents[1] / SHIPPED.replace(":", "/")
-    there, here = (
-        json.loads((one / "policy.json").read_text())["task"] for one in (shipped, tmp_path / "run")
-    )
-    assert here == there
-
-    monkeypatch.setattr("sys.argv", ["brokk", *begin, "task.memory=5", "session.out=other"])
-    assert cli.main() == 2
-    message = capsys.readouterr().err
-    assert "task.memory=5 was asked for, the policy has 13" in message
+    assert read(tmp_path / "run/policy.json")["task"] == read(shipped / "policy.json")["task"]
+    refused = brokk(*begin, "task.memory=5", "session.out=other")
+    assert refused.code == 2
+    assert "task.memory=5 was asked for, the policy has 13" in refused.err

@@ -1,4 +1,4 @@
-"""The command, end to end and small: train, evaluate, export, bench, resume, and the same again from `resolved.yaml`."""
+"""The command, end to end and small: train, bench, resume, and the same again from `resolved.yaml`."""
 
 from __future__ import annotations
 
@@ -39,24 +39,15 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def check_evaluation(found: dict[str, Any], policy: str, episodes: int) -> None:
-    assert (
-        found.keys() >= FIELDS
-        and found["policy"] == policy
-        and found["actuator"] == "lag"
-        and found["episodes"] == episodes
-    )
-    for name in ("success_strict", "success_paper"):
-        low, high = found[name]["ci95"]
-        assert 0 <= low <= found[name]["mean"] <= high <= 1
-    assert (
-        found["time_to_insert_s"].keys() == {"median", "p95"}
-        and sum(found["terminations"].values()) == episodes
-    )
-    assert all(
-        isinstance(found[name], float)
-        for name in ("lateral_error_m", "peak_force_n", "valve_travel")
-    )
+def read_actor(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / "model_3.pt", weights_only=True)["actor_state_dict"]
+
+
+def check_same(run: Path, other: Path) -> None:
+    """Checks that two runs ended with the same weights and the same figures."""
+    weights, others = read_actor(run), read_actor(other)
+    assert all(torch.equal(value, others[name]) for name, value in weights.items())
+    assert read(run / "evaluation.json") == read(other / "evaluation.json")
 
 
 @pytest.fixture(scope="module")
@@ -80,96 +71,38 @@ def test_training_leaves_all_that_is_needed_to_judge_and_use_the_policy(run: Pat
 
 def test_the_trained_policy_is_evaluated_beside_the_classical_one(run: Path) -> None:
     found = read(run / "evaluation.json")
-    check_evaluation(found, "trained", 8)
+    assert found.keys() >= FIELDS
+    assert (found["policy"], found["actuator"], found["episodes"]) == ("trained", "lag", 8)
+    for name in ("success_strict", "success_paper"):
+        low, high = found[name]["ci95"]
+        assert 0 <= low <= found[name]["mean"] <= high <= 1
+    assert sum(found["terminations"].values()) == 8
     assert list(found["policies"]) == ["trained", "classical"]
     assert found["policies"]["classical"]["success_strict"]["mean"] >= 0.5
     record = read(run / "session.json")
-    assert (
-        record["outcome"] == "finished"
-        and record["objective"] == found["success_strict"]["mean"]
-        and record["seed"] == 0
-    )
-    assert record["machine"] == "brokk170" and record["choices"]["actuator"] == "lag"
+    assert record["outcome"] == "finished" and record["seed"] == 0
+    assert record["objective"] == found["success_strict"]["mean"]
 
 
 def test_the_resolved_config_runs_again_to_the_same_result(run: Path) -> None:
     command(run.parent, "--config-dir", str(run), "--config-name", "resolved", "session.out=again")
-    first, again = (read(folder / "evaluation.json") for folder in (run, run.parent / "again"))
-    assert first == again
-    weights = [
-        torch.load(folder / "model_3.pt", weights_only=True)["actor_state_dict"]
-        for folder in (run, run.parent / "again")
-    ]
-    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
+    check_same(run, run.parent / "again")
 
 
 def test_a_resumed_command_ends_where_an_uninterrupted_one_does(run: Path) -> None:
     arguments = ("mode=train", "session.out=parts", *SMALL, *FEW)
     command(run.parent, *arguments, "rl.budget.max_env_steps=768")
     command(run.parent, *arguments, "policy=parts")
-    parts = run.parent / "parts"
-    weights = [
-        torch.load(folder / "model_3.pt", weights_only=True)["actor_state_dict"]
-        for folder in (run, parts)
-    ]
-    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
-    assert (
-        read(parts / "evaluation.json") == read(run / "evaluation.json")
-        and len(read(parts / "session.json")["resumed"]) == 1
-    )
+    check_same(run, run.parent / "parts")
+    assert len(read(run.parent / "parts" / "session.json")["resumed"]) == 1
 
 
-def test_evaluating_the_policy_again_gives_the_same_figures(run: Path) -> None:
-    command(
-        run.parent,
-        "mode=evaluate",
-        f"policy={run}",
-        "session.out=evaluation",
-        "actuator=lag",
-        "session.device=cpu",
-        *FEW,
-    )
-    found = read(run.parent / "evaluation" / "evaluation.json")
-    check_evaluation(found, "trained", 8)
-    first = read(run / "evaluation.json")["policies"]
-    assert found["policies"] == {name: first[name] for name in ("trained", "classical")}
-
-
-def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
-    command(run.parent, "mode=export", f"policy={run}", "session.out=export")
-    made = run.parent / "export"
-    assert {path.name for path in made.iterdir()} == {
-        "golden.json", "policy.json", "policy.onnx", "policy.safetensors", "resolved.yaml",
-        "session.json", "shapes.json",
-    }  # fmt: skip
-    assert (made / "policy.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
-    assert read(made / "policy.json")["observation"] == read(run / "policy.json")["observation"]
-    assert read(made / "policy.json")["parity"]["largest_difference"] < 1e-3
-
-
-def test_bench_measures_physics_control_step_and_training(run: Path) -> None:
+def test_bench_measures_physics_control_step_and_training(tmp_path: Path) -> None:
     sizes = ("bench.num_envs=[8,16]", "bench.seconds=0.05", "bench.iterations=1")
-    command(
-        run.parent,
-        "mode=bench",
-        "session.out=bench",
-        "actuator=lag",
-        "session.device=cpu",
-        "rl.num_starts=32",
-        *sizes,
-    )
-    found = read(run.parent / "bench" / "benchmark.json")
-    rates = ("physics_env_steps_per_s", "env_steps_per_s", "train_env_steps_per_s")
-    assert (
-        found["num_envs"] == 16
-        and found["graph"] is False
-        and found["device"].startswith("cpu")
-        and "torch" in found["versions"]
-    )
+    few = ("actuator=lag", "session.device=cpu", "rl.num_starts=32")
+    command(tmp_path, "mode=bench", "session.out=bench", *few, *sizes)
+    found = read(tmp_path / "bench" / "benchmark.json")
+    rates = [found[f"{name}env_steps_per_s"] for name in ("physics_", "", "train_")]
+    assert rates == sorted(rates, reverse=True) and rates[-1] > 0
     assert [row["num_envs"] for row in found["rows"]] == [8, 16]
-    assert all(row[name] > 0 for row in found["rows"] for name in rates) and all(
-        found[name] == found["rows"][-1][name] for name in rates
-    )
-    assert (
-        found["physics_env_steps_per_s"] > found["env_steps_per_s"] > found["train_env_steps_per_s"]
-    )
+    assert found["num_envs"] == 16 and found["device"].startswith("cpu")

@@ -1,10 +1,11 @@
-"""The wheel in an empty environment, without the checkout: it evaluates, plays, and takes a package."""
+"""What `make dist` builds in empty environments, without the checkout: it evaluates, plays, and takes a package."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,50 +24,78 @@ SHORT = (
 )  # fmt: skip
 """A training of some seconds."""
 LONGEST_S = 300
+OUTSIDE = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
 pytestmark = pytest.mark.slow
 
 
 def run_in(home: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Runs a program of the environment, away from the checkout."""
-    env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     return subprocess.run(
         [home / "env/bin" / words[0], *words[1:]],
         cwd=home / "desk",
-        env=env,
+        env=OUTSIDE,
         capture_output=True,
         text=True,
         timeout=LONGEST_S,
     )
 
 
-def install(home: Path, source: Path) -> None:
-    """Builds a wheel of `source` and installs it without its dependencies."""
+def run_pip(*words: str) -> None:
     pip = [sys.executable, "-m", "pip", "--no-input", "--disable-pip-version-check", "-q"]
-    built = home / "wheels" / source.name
-    done = subprocess.run(
-        [*pip, "wheel", "--no-deps", "-w", str(built), str(source)], capture_output=True, text=True
-    )
+    done = subprocess.run([*pip, *words], capture_output=True, text=True)
     if "Could not find a version" in done.stderr:
         pytest.skip("the build backend is not installed and cannot be downloaded")
     assert done.returncode == 0, done.stderr
-    (wheel,) = built.glob("*.whl")
-    python = str(home / "env/bin/python")
-    subprocess.run([*pip, "--python", python, "install", "--no-deps", str(wheel)], check=True)
 
 
-@pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the environment `env`, and the empty folder `desk` to work in."""
-    home = tmp_path_factory.mktemp("home")
+def install(home: Path, source: Path) -> None:
+    """Installs a wheel, a source distribution or a project without its dependencies."""
+    run_pip("--python", str(home / "env/bin/python"), "install", "--no-deps", str(source))
+
+
+def make_home(home: Path) -> Path:
+    """Makes the environment `env`, and the empty folder `desk` to work in."""
     (home / "desk").mkdir()
     venv.create(home / "env", symlinks=True)
     (site,) = (home / "env/lib").glob("python*/site-packages")
     # The dependencies are those of this environment. Its own .pth files, which add the checkout,
     # are not read there.
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    install(home, ROOT)
     return home
+
+
+@pytest.fixture(scope="module")
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the source distribution, and the wheel that is built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    uv = shutil.which("uv") or str(Path(sys.executable).with_name("uv"))
+    done = subprocess.run([uv, "build", "-o", folder], cwd=ROOT, capture_output=True, text=True)
+    if "Failed to resolve requirements" in done.stderr:
+        pytest.skip("the build backend is not installed and cannot be downloaded")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an environment that holds the wheel."""
+    home = make_home(tmp_path_factory.mktemp("home"))
+    (wheel,) = dist.glob("*.whl")
+    install(home, wheel)
+    return home
+
+
+def test_the_source_distribution_installs_and_lists_the_same(
+    dist: Path, home: Path, tmp_path: Path
+) -> None:
+    other = make_home(tmp_path)
+    (archive,) = dist.glob("*.tar.gz")
+    install(other, archive)
+    listed = run_in(other, "brokk", "mode=list")
+    assert listed.returncode == 0, listed.stderr
+    assert listed.stdout == run_in(home, "brokk", "mode=list").stdout
+    assert str(tmp_path) in run_in(other, "python", "-c", "import conf; print(conf)").stdout
 
 
 def test_nothing_comes_from_the_checkout(home: Path) -> None:
@@ -93,8 +122,7 @@ def test_its_page_opens_and_closes(home: Path) -> None:
         cwd=home / "desk",
         stderr=subprocess.PIPE,
         text=True,
-        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        | {"COLUMNS": "200"},
+        env=OUTSIDE | {"COLUMNS": "200"},
     )
     told = ""
     try:
