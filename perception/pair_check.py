@@ -15,7 +15,7 @@ import numpy as np
 from brokk_rl.contracts.vision import Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, Positive, Share, spec
-from perception.robust_fit import estimate_spread, fit_linear
+from perception.robust_fit import compute_biweight, estimate_spread, fit_linear
 
 FEW = "matched features of the pair"
 ORDER = "part of the features that lie farther right in the left picture"
@@ -75,13 +75,6 @@ class PairMatches:
     right: np.ndarray
     texture: np.ndarray
 
-    def select_common_shift(self, reach_px: float) -> PairMatches:
-        """Return the matches whose vertical shift is near the commonest one."""
-        shift_px = (self.right - self.left)[:, 1]
-        near = np.abs(shift_px[:, None] - shift_px[None, :]) < reach_px
-        chosen = near[np.argmax(np.count_nonzero(near, axis=1))]
-        return PairMatches(self.left[chosen], self.right[chosen], self.texture[chosen])
-
 
 @dataclass(frozen=True)
 class PairAlignment:
@@ -116,8 +109,10 @@ class PairCheck:
         corner: Least step of brightness of a corner, grey levels.
         cell_px: Side of the squares of the small picture of which one feature counts.
         return_px: Largest error of a match on the way there and back, in the small picture.
-        common_px: Departure from the commonest vertical shift within which matches are no gross
-            errors: a repeated pattern has as many wrong partners as right ones.
+        common_px: Departure from the commonest vertical shift within which partners are searched,
+            in the small picture.
+        alike: Side of the squares of the picture, as a part of its width, within which features
+            share the error of the lens.
         least_matches: Matches below which nothing can be told; such a frame is refused unless the
             pair was found good before.
         least_ahead: Least part of the features that lie farther right in the left picture.
@@ -138,6 +133,7 @@ class PairCheck:
     cell_px: Positive
     return_px: Positive
     common_px: Positive
+    alike: Share
     least_matches: Count
     least_ahead: Share
     most_turn: Positive
@@ -167,10 +163,7 @@ class PairCheck:
         share = float(np.mean(ahead_px[:, 0] > 0))
         if share < self.least_ahead:
             return Rejection("frame", ORDER, share, self.least_ahead)
-        matches = matches.select_common_shift(self.common_px)
-        found = fit_alignment(matches, frame)
-        if len(matches.left) < self.least_matches:
-            return Rejection("frame", FEW, float(len(matches.left)), float(self.least_matches))
+        found = fit_alignment(matches, frame, self.alike)
         if found.rms_px - self.num_sigma * found.std_px > self.limit_px:
             return Rejection("frame", ROWS, found.rms_px, self.limit_px)
         if found.std_px > self.most_std_px:
@@ -187,8 +180,9 @@ class PairCheck:
     def match_features(self, left: np.ndarray, right: np.ndarray) -> PairMatches:
         """Return the features that both pictures, RGB `(h, w, 3)`, show.
 
-        ORB finds partners anywhere; Lucas and Kanade's registration places them. Both work in
-        smaller pictures of equalised contrast, in which dust and dark hide least.
+        ORB finds partners anywhere, and again near the commonest vertical shift: of a repeated
+        pattern most of the first ones are wrong. Lucas and Kanade's registration places them. Both
+        work in smaller pictures of equalised contrast, in which dust and dark hide least.
         """
         shrink = max(1, round(left.shape[1] / self.width_px))
         equalizer = cv2.createCLAHE(self.contrast, (8, 8))
@@ -204,15 +198,18 @@ class PairCheck:
         nothing = PairMatches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
         if not mine or not theirs:
             return nothing
-        pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(my_words, their_words)
-        if not pairs:
-            return nothing
-        start = np.array([mine[one.queryIdx].pt for one in pairs], np.float32)
-        end = np.array([theirs[one.trainIdx].pt for one in pairs], np.float32)
+        my_px, their_px = cv2.KeyPoint.convert(mine), cv2.KeyPoint.convert(theirs)
+        apart_px = their_px[None, :, 1] - my_px[:, None, 1]
+        first, second = _match_words(my_words, their_words, np.ones(apart_px.shape, bool))
+        shift_px = apart_px[first, second]
+        votes = compute_biweight(shift_px[:, None] - shift_px, self.common_px).sum(1)
+        near = np.abs(apart_px - shift_px[np.argmax(votes)]) < self.common_px
+        first, second = _match_words(my_words, their_words, near)
+        start, end = my_px[first], their_px[second]
         # Features of several scales at one place share their error: one of each cell counts.
         cell = np.floor(start / self.cell_px)
-        first = np.unique(cell[:, 0] * 10_000 + cell[:, 1], return_index=True)[1]
-        start, end = start[first], end[first]
+        alone = np.unique(cell[:, 0] * 10_000 + cell[:, 1], return_index=True)[1]
+        start, end = start[alone], end[alone]
         there, texture = self._register(pictures[0], pictures[1], start, end)
         back, _ = self._register(pictures[1], pictures[0], there, start)
         good = np.linalg.norm(back - start, axis=1) < self.return_px
@@ -264,16 +261,37 @@ class PairWatch:
         return fault
 
 
-def fit_alignment(matches: PairMatches, frame: Frame) -> PairAlignment:
-    """Return the vertical disparity of a pair: three numbers, fitted robustly."""
+def _match_words(
+    mine: np.ndarray, theirs: np.ndarray, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of descriptors that are each other's best partner among `allowed`, `(n, m)`."""
+    matcher, mask = cv2.BFMatcher(cv2.NORM_HAMMING), allowed.astype(np.uint8)
+    back = {}
+    for one in matcher.match(theirs, mine, np.ascontiguousarray(mask.T)):
+        back[one.queryIdx] = one.trainIdx
+    pairs = []
+    for one in matcher.match(mine, theirs, mask):
+        if back.get(one.trainIdx) == one.queryIdx:
+            pairs.append((one.queryIdx, one.trainIdx))
+    first, second = np.array(pairs, int).reshape(-1, 2).T
+    return first, second
+
+
+def fit_alignment(matches: PairMatches, frame: Frame, alike: float) -> PairAlignment:
+    """Return the vertical disparity of a pair: three numbers, fitted robustly.
+
+    What a calibration leaves of the lenses is alike within squares of a part `alike` of the width.
+    """
     shift_px = (matches.right - matches.left)[:, 1]
     design = _build_design(frame, matches.right[:, 0], matches.right[:, 1])
     # A hundredth of a pixel: pictures drawn without noise would leave no scale.
     precision = np.sqrt(matches.texture / np.median(matches.texture))
-    solution, cov = fit_linear(design * precision[:, None], shift_px * precision, 0.01)
+    row, column = np.floor(matches.left / (alike * frame.color.shape[1])).T
+    weighted = design * precision[:, None], shift_px * precision
+    solution, cov = fit_linear(*weighted, 0.01, cell=row * 1000 + column)
     # Where something was matched: beyond, three numbers of few features say anything.
     gram = design.T @ design / len(design)
-    noise = float(np.trace(gram @ cov))
+    noise = float(np.trace(gram @ cov)) if np.isfinite(cov).all() else np.inf
     rms_px = float(np.sqrt(max(float(solution @ gram @ solution) - noise, 0.0)))
     pitch, roll, focal = (float(value) for value in solution)
     return PairAlignment(pitch, roll, focal, rms_px, float(np.sqrt(noise)))

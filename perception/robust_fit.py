@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 TUKEY = 4.685
 """Residual in standard deviations from which a value counts nothing: 95 % efficient with Gaussian
 noise (Holland and Welsch 1977)."""
+FEWEST = 8
+"""Cells from which a covariance is estimated, below which bands of rows take their place."""
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -27,6 +31,7 @@ def fit_linear(
     floor: float,
     start: np.ndarray | None = None,
     num_rounds: int = 6,
+    cell: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit `values = design @ solution`; gross errors count nothing.
 
@@ -36,9 +41,12 @@ def fit_linear(
         floor: Least standard deviation of the values, in their unit.
         start: First solution, `(k,)`; `None`: the median of the values, as if all were alike.
         num_rounds: Rounds of reweighting.
+        cell: Number of each value's cell, within which errors are alike, `(n,)`; `None`: each
+            value has an error of its own.
 
     Returns:
-        The solution, `(k,)`, and its covariance, `(k, k)`.
+        The solution, `(k,)`, and its covariance, `(k, k)`; infinite where one cell alone determines
+        a number.
     """
     weight = np.ones(len(values))
     # The first scale is that about a guess: gross errors would tilt a first fit.
@@ -51,12 +59,62 @@ def fit_linear(
         root = np.sqrt(weight)
         solution = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
         away = values - design @ solution
-    # Residuals of unlike spread: the sandwich of White (1980) with leverages (HC3).
-    normal = np.linalg.pinv(design.T @ (design * weight[:, None]))
-    heavy = design * weight[:, None]
-    leverage = np.einsum("ni,ij,nj->n", design, normal, heavy)
-    moved = heavy * (away / np.maximum(1.0 - leverage, 0.1))[:, None]
-    return solution, normal @ (moved.T @ moved) @ normal
+    slopes = design * compute_psi_slope(away / (TUKEY * scale))[:, None]
+    cell = np.arange(len(values)) if cell is None else number_cells(cell)
+    cov = estimate_sandwich_covariance(slopes, design * weight[:, None], away, cell)
+    return solution, np.full((len(solution),) * 2, np.inf) if cov is None else cov
+
+
+def number_cells(cell: np.ndarray) -> np.ndarray:
+    """Return consecutive numbers of cells, `(P,)`; of too few cells, bands of rows in their place."""
+    cell = np.unique(cell, return_inverse=True)[1]
+    return (
+        cell
+        if cell.max(initial=0) >= FEWEST
+        else np.arange(len(cell)) * FEWEST // max(len(cell), 1)
+    )
+
+
+def compute_psi_slope(off: np.ndarray) -> np.ndarray:
+    """Return the derivative of Tukey's influence function over its weight, `(P,)`; 0 beyond its reach.
+
+    `off` is in units of the biweight's reach. The influence of a growing residual falls, so that a
+    fit varies more than its weights alone tell: by a fifth with a reach of 4.7 standard
+    deviations, by a half with one of 3.
+    """
+    square = off**2
+    within = square < 1.0
+    # The quotient has a pole at the reach, where the weight is 0.
+    return np.where(within, (1.0 - 5.0 * square) / np.where(within, 1.0 - square, 1.0), 0.0)
+
+
+def estimate_sandwich_covariance(
+    slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray
+) -> np.ndarray | None:
+    """Return the cluster-robust covariance of a fit, `(k, k)`.
+
+    The jackknife over cells, within which noise may be correlated: the sandwich estimate CR3 (Bell
+    and McCaffrey 2002). Return `None` where the fit is singular without one of the cells.
+
+    Args:
+        slopes: Derivatives of the residuals times `compute_psi_slope`, `(P, k)`.
+        heavy: Weighted derivatives, or instruments in their place, `(P, k)`.
+        residual: `(P,)`.
+        cell: Number of each point's cell, from 0 on, `(P,)`.
+    """
+    size = heavy.shape[1]
+    sums = np.stack([np.bincount(cell, one * residual) for one in heavy.T], -1)
+    parts = []
+    for one, other in itertools.product(heavy.T, slopes.T):
+        parts.append(np.bincount(cell, one * other))
+    squares = np.stack(parts, -1).reshape(-1, size, size)
+    # The sums without each cell, all at once.
+    without = squares.sum(0) - squares
+    try:
+        moved = np.linalg.solve(without, sums[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        return None
+    return moved.T @ moved * (1.0 - 1.0 / len(moved))
 
 
 def guess_plane(

@@ -1,15 +1,13 @@
-"""Camera poses of real footage: from a board in view, or from given poses."""
+"""Camera poses of real footage from a board in view."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 import cv2
 import numpy as np
-import yaml
 from annotated_types import Ge
 
 from brokk_rl.errors import ConfigError, FrameError
@@ -17,7 +15,6 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception.calibrate import transforms
 from perception.pose.plane_conic import convert_to_gray, linearize
-from perception.sources.validation import check_pose
 
 MIN_CORNERS = 4
 """Corners that determine a pose."""
@@ -31,11 +28,11 @@ NUM_CANDIDATES = 2
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Pose of a camera in the world: the board's frame or that of the given poses.
+    """Pose of a camera in the world: the board's frame.
 
     Attributes:
         world_from_camera: `(4, 4)`, optical convention.
-        error_px: Root mean square reprojection error of the board's corners; 0 for a given pose.
+        error_px: Root mean square reprojection error of the board's corners.
     """
 
     world_from_camera: np.ndarray
@@ -213,24 +210,6 @@ def _count_corners(found: Sequence[np.ndarray], numbers: np.ndarray | None) -> i
     return 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
 
 
-class GivenPoseTracker:
-    """Looks poses up by the frame's stem."""
-
-    def __init__(self, poses: dict[str, np.ndarray]) -> None:
-        self._poses = poses
-
-    def locate(self, frame: Frame) -> CameraPose:
-        """Return the camera's pose.
-
-        Raises:
-            FrameError: none is given for this frame.
-        """
-        stem = Path(frame.name).name
-        if stem not in self._poses:
-            raise FrameError(f"{frame.name}: no pose of the camera is given for '{stem}'")
-        return CameraPose(self._poses[stem], 0.0)
-
-
 @spec
 class Charuco:
     """The camera's pose from a ChArUco board beside the block.
@@ -268,33 +247,6 @@ class Charuco:
         )
         detect = cv2.aruco.CharucoDetector(board).detectBoard
         return BoardTracker(board, detect, self.min_corners, self.max_error_px)
-
-
-@spec
-class GivenPoses:
-    """Camera poses from a file.
-
-    Attributes:
-        poses: YAML file: stem of a frame to its pose `T_world_cam`, 4 x 4.
-    """
-
-    poses: str
-
-    def build(self) -> CameraTracker:
-        """Return a tracker.
-
-        Raises:
-            ConfigError: the file cannot be read.
-        """
-        try:
-            table = yaml.safe_load(Path(self.poses).read_text())
-            poses = {str(stem): check_pose(pose, str(stem)) for stem, pose in table.items()}
-        except (OSError, yaml.YAMLError, AttributeError, FrameError) as error:
-            raise ConfigError(
-                f"camera_pose.poses={self.poses}: expected YAML of '<stem>: 4 x 4 numbers' "
-                f"({error})"
-            ) from error
-        return GivenPoseTracker(poses)
 
 
 def _check_dictionary(dictionary: str) -> None:

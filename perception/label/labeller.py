@@ -1,14 +1,12 @@
-"""Masks for real footage: a block, placed once by clicks, is projected into each frame.
+"""Masks for real footage: a block measured in the frame of a board is projected into each frame.
 
-LabelFusion (Marion et al., 2018) does the same with reconstructed and aligned meshes; a cuboid
-needs neither. Depth cuts away what stands before the block, and what lies behind it where the
-clicks were a few pixels off.
+LabelFusion (Marion et al., 2018) does the same with reconstructed and aligned meshes; a box beside a
+board needs neither. Depth cuts away what stands before the block.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,24 +18,11 @@ from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.signals import Frame
-from brokk_rl.spec import Index, Positive, spec
+from brokk_rl.spec import Positive, spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
-from perception.label.camera_pose import CameraPose, CameraTracker, CameraTrackerSpec
-from perception.label.cuboid import (
-    Cuboid,
-    compute_pixel_rays,
-    place_cuboid,
-    place_mouths,
-    read_placing,
-    trace_rays,
-)
-from perception.label.refinement import (
-    RefinementView,
-    measure_misfit_px,
-    prepare_view,
-    refine_cuboid,
-)
+from perception.label.camera_pose import CameraTrackerSpec
+from perception.label.measured import MeasuredHole, MeasuredScene, read_measured
 
 FRAMES, OVERLAYS = "frames", "overlays"
 LEAST_STEP_M = 0.02
@@ -48,23 +33,6 @@ GREEN, ORANGE, RED = (0, 158, 115), (230, 159, 0), (213, 94, 0)
 """Of the colour-blind-safe palette (Okabe and Ito)."""
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class _Footage:
-    """Cameras of all frames.
-
-    Attributes:
-        poses: Camera of each frame that can be used, by the frame's name.
-        entries: Entry of `labels.json` for each frame, by its stem.
-        clicked: The frame that was clicked in.
-        clicked_pose: Its camera in the world, `(4, 4)`.
-    """
-
-    poses: dict[str, CameraPose]
-    entries: dict[str, dict[str, Any]]
-    clicked: Frame
-    clicked_pose: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -84,142 +52,71 @@ class _LabelledView:
 
 @spec
 class BlockLabelling:
-    """Label a folder of frames of one block that does not move.
+    """Label a folder of frames of one block that does not move, with a board in view.
 
     Attributes:
         source: The frames.
-        camera: Source of the camera's poses.
-        placing: YAML file: corners of the drilled face, thickness, mouths; see
-            `perception.label.cuboid`.
+        board: The board, in whose frame block and holes were measured.
+        measured: YAML file of the measured block and holes; see `perception.label.measured`.
         noise_per_m: Standard deviation of inverse depth, 1/m.
         num_sigma: Depth this many standard deviations off says that something else is there.
-        num_refined: Frames, evenly spread, by which the block is refined; 0 takes it as placed.
-        reach_px: How far from the placed outline the picture's edges are looked for.
-        max_outline_px: Largest distance of three quarters of the outline from edges of the picture;
-            a frame with more is left out.
         min_depth_share: Least part of the block's known depth that must agree with it.
     """
 
     source: FrameSourceSpec
-    camera: CameraTrackerSpec
-    placing: str
+    board: CameraTrackerSpec
+    measured: str
     noise_per_m: Positive
     num_sigma: Positive
-    num_refined: Index
-    reach_px: Positive
-    max_outline_px: Positive
     min_depth_share: float
 
     def label(self, folder: Path) -> dict[str, Any]:
         """Write frames with masks, and overlays, into `folder`.
 
         Returns:
-            The content of `labels.json`: the block, figures of each frame, and why frames were left
-                out.
+            The content of `labels.json`: figures of each frame, and why frames were left out.
 
         Raises:
-            ConfigError: the placing cannot be read, or names a frame that is not there.
+            ConfigError: what was measured cannot be read, or has no block.
             FrameError: no frame can be labelled.
         """
-        placing = read_placing(Path(self.placing))
-        footage = self._locate_cameras(self.camera.build(), placing.frame)
-        clicked = footage.clicked, footage.clicked_pose
-        cuboid = place_mouths(place_cuboid(placing, *clicked), placing, *clicked)
-        if self.num_refined:
-            names = sorted(footage.poses)
-            chosen = np.linspace(0, len(names) - 1, min(self.num_refined, len(names)))
-            wanted = {names[number] for number in chosen.round().astype(int)}
-            views = []
-            for frame in self._read_frames():
-                if frame.name in wanted:
-                    views.append(self._prepare(frame, footage.poses[frame.name]))
-            cuboid = refine_cuboid(cuboid, views, self.reach_px)
-        self._write(cuboid, footage, folder)
-        entries = footage.entries
+        scene = read_measured(Path(self.measured), "label.measured")
+        if scene.block_m is None:
+            raise ConfigError(f"label.measured={self.measured}: expected a block; add `block`")
+        tracker, entries = self.board.build(), {}
+        with self.source.build() as source, ItemProgress("masks", source.num_frames) as progress:
+            while True:
+                progress.advance()
+                try:
+                    frame = source.read_latest()
+                    if frame is None:
+                        break
+                    pose = tracker.locate(frame)
+                except FrameError as error:
+                    # The message begins with the path of the frame.
+                    name = str(error).split(":")[0].split("/")[-1]
+                    entries[name] = _describe_entry(str(error))
+                    continue
+                name = Path(frame.name).name
+                view = self._build_view(scene, scene.block_m, frame, pose.world_from_camera)
+                reason = self._find_fault(view)
+                entries[name] = _describe_entry(reason, pose.error_px, view.depth_share)
+                picture = _draw_overlay(frame, view.label, reason is None)
+                dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
+                if reason is None:
+                    truth = _build_truth(scene, frame, pose.world_from_camera, view.hidden)
+                    stem = folder / FRAMES / name
+                    dataset.write_frame(stem, frame.color, None, label=view.label, truth=truth)
         num_labelled = sum(entry["left_out"] is None for entry in entries.values())
         if not num_labelled:
             reasons = sorted({str(entry["left_out"]) for entry in entries.values()})
             raise FrameError(f"no frame could be labelled: {'; '.join(reasons[:3])}")
-        block = {
-            "rotation": cuboid.rotation.tolist(),
-            "origin_m": cuboid.origin_m.tolist(),
-            "size_m": cuboid.size_m.tolist(),
-        }
-        return {"schema": 2, "block": block, "num_labelled": num_labelled, "frames": entries}
+        return {"schema": 3, "num_labelled": num_labelled, "frames": entries}
 
-    def _prepare(self, frame: Frame, pose: CameraPose) -> RefinementView:
-        return prepare_view(frame, pose.world_from_camera, self.noise_per_m)
-
-    def _read_frames(self) -> Iterator[Frame]:
-        with self.source.build() as source:
-            while True:
-                try:
-                    frame = source.read_latest()
-                except FrameError as error:
-                    log.warning("%s", error)
-                    continue
-                if frame is None:
-                    return
-                yield frame
-
-    def _locate_cameras(self, tracker: CameraTracker, clicked_in: str) -> _Footage:
-        """Return the cameras of all frames, and the frame that was clicked in."""
-        poses: dict[str, CameraPose] = {}
-        entries: dict[str, dict[str, Any]] = {}
-        clicked = None
-        for frame in self._read_frames():
-            stem = Path(frame.name).name
-            entry: dict[str, Any] = dict.fromkeys(
-                ("left_out", "board_px", "outline_px", "depth_share")
-            )
-            entries[stem] = entry
-            try:
-                pose = tracker.locate(frame)
-            except FrameError as error:
-                entry["left_out"] = str(error)
-                continue
-            poses[frame.name], entry["board_px"] = pose, pose.error_px
-            if stem == clicked_in:
-                clicked = frame, pose.world_from_camera
-        if clicked is None:
-            why = entries.get(clicked_in, {}).get("left_out")
-            if not why:
-                why = f"there is none; frames: {', '.join(list(entries)[:5]) or 'none'}, …"
-            raise ConfigError(f"label.placing: frame '{clicked_in}' cannot be used: {why}")
-        return _Footage(poses, entries, *clicked)
-
-    def _write(self, cuboid: Cuboid, footage: _Footage, folder: Path) -> None:
-        with ItemProgress("masks", len(footage.poses)) as progress:
-            for frame in self._read_frames():
-                if frame.name not in footage.poses:
-                    continue
-                name, pose = Path(frame.name).name, footage.poses[frame.name].world_from_camera
-                view = self._build_view(cuboid, frame, pose)
-                prepared = self._prepare(frame, footage.poses[frame.name])
-                outline_px = measure_misfit_px(cuboid, prepared, self.reach_px)
-                reason = self._find_fault(view, outline_px)
-                footage.entries[name] |= {
-                    "outline_px": outline_px,
-                    "depth_share": view.depth_share,
-                    "left_out": reason,
-                }
-                picture = _draw_overlay(frame, view.label, reason is None)
-                dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
-                if reason is None:
-                    truth = _build_truth(cuboid, frame, pose, view.hidden)
-                    stem = folder / FRAMES / name
-                    dataset.write_frame(stem, frame.color, None, label=view.label, truth=truth)
-                progress.advance()
-
-    def _find_fault(self, view: _LabelledView, outline_px: float | None) -> str | None:
+    def _find_fault(self, view: _LabelledView) -> str | None:
         """Return why a frame is left out, `None` where it is not."""
-        if outline_px is None:
-            return "too little of the block's outline is in view"
-        if outline_px > self.max_outline_px:
-            return (
-                f"edges of the picture lie {outline_px:.1f} px beside the outline, "
-                f"{self.max_outline_px:g} are allowed"
-            )
+        if not view.label.block.any():
+            return "the block is not in view"
         share = view.depth_share
         if share is not None and share < self.min_depth_share:
             return (
@@ -228,12 +125,17 @@ class BlockLabelling:
             )
         return None
 
-    def _build_view(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> _LabelledView:
-        view = trace_rays(cuboid, compute_pixel_rays(frame), pose)
-        block, mouth = np.isfinite(view.depth_m), view.mouth >= 0
+    def _build_view(
+        self, scene: MeasuredScene, block_m: np.ndarray, frame: Frame, pose: np.ndarray
+    ) -> _LabelledView:
+        rays = _compute_pixel_rays(frame) @ pose[:3, :3].T
+        block_depth_m = _trace_box(block_m - pose[:3, 3], rays)
+        block = np.isfinite(block_depth_m)
+        mouths = [block & _trace_mouth(hole, pose[:3, 3], rays) for hole in scene.holes]
+        mouth = np.any(mouths, axis=0)
         with np.errstate(invalid="ignore"):
-            away = frame.depth_m - np.where(block, view.depth_m, np.nan)
-            depth_m = np.where(block, view.depth_m, 0.0)
+            away = frame.depth_m - np.where(block, block_depth_m, np.nan)
+            depth_m = np.where(block, block_depth_m, 0.0)
             step = np.maximum(self.num_sigma * self.noise_per_m * depth_m**2, LEAST_STEP_M)
             near, far = away < -step, (away > step) & ~mouth
         known = block & ~mouth & np.isfinite(frame.depth_m)
@@ -241,10 +143,41 @@ class BlockLabelling:
         near, far = _remove_specks(near), _remove_specks(far)
         shown = block & ~near & ~far
         hidden = []
-        for number in range(len(cuboid.mouths)):
-            there = view.mouth == number
+        for there in mouths:
             hidden.append(1.0 - float(shown[there].mean()) if there.any() else 1.0)
         return _LabelledView(FrameLabel(shown, shown & mouth, block & near), share, tuple(hidden))
+
+
+def _describe_entry(
+    left_out: str | None, board_px: float | None = None, depth_share: float | None = None
+) -> dict[str, Any]:
+    return {"left_out": left_out, "board_px": board_px, "depth_share": depth_share}
+
+
+def _compute_pixel_rays(frame: Frame) -> np.ndarray:
+    """Return the undistorted rays of all pixels at depth 1, `(h, w, 3)`."""
+    height, width = frame.color.shape[:2]
+    columns, rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+    flat = np.asarray(cv2.undistortPoints(pixels, frame.camera_matrix, frame.distortion))
+    return np.concatenate([flat.reshape(height, width, 2), np.ones((height, width, 1))], axis=-1)
+
+
+def _trace_box(bounds_m: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Return the depth at which rays `(h, w, 3)` enter a box, `(2, 3)` from the eye; infinite beside."""
+    along = np.where(np.abs(rays) < 1e-9, 1e-9, rays)
+    low, high = bounds_m[0] / along, bounds_m[1] / along
+    enters, leaves = np.minimum(low, high).max(-1), np.maximum(low, high).min(-1)
+    return np.where((enters > 0) & (enters < leaves), enters, np.inf)
+
+
+def _trace_mouth(hole: MeasuredHole, eye_m: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Find rays `(h, w, 3)` that enter a hole through its rim."""
+    toward = rays @ hole.axis
+    facing = toward < 0
+    depth_m = (hole.center_m - eye_m) @ hole.axis / np.where(facing, toward, -1.0)
+    away_m = eye_m + rays * depth_m[..., None] - hole.center_m
+    return facing & (depth_m > 0) & (np.linalg.norm(away_m, axis=-1) < hole.radius_m)
 
 
 def _remove_specks(mask: np.ndarray) -> np.ndarray:
@@ -257,38 +190,27 @@ def _remove_specks(mask: np.ndarray) -> np.ndarray:
 
 
 def _build_truth(
-    cuboid: Cuboid, frame: Frame, pose: np.ndarray, hidden: tuple[float, ...]
+    scene: MeasuredScene, frame: Frame, pose: np.ndarray, hidden: tuple[float, ...]
 ) -> SceneTruth:
-    """Return the block and its holes as a truth file has them.
-
-    Without a known base the world's frame stands in for it.
-    """
-    camera_from_world = np.linalg.inv(pose)
+    """Return the holes as a truth file has them; without a known base the board stands in for it."""
+    camera_from_board = np.linalg.inv(pose)
     base = pose if frame.base_from_camera is None else frame.base_from_camera
-    rotation = camera_from_world[:3, :3] @ cuboid.rotation
-    middle = cuboid.world((cuboid.low_m + cuboid.high_m) / 2.0)
-    axis = rotation[:, 2]
     circles = []
-    for mouth, part in zip(cuboid.mouths, hidden, strict=True):
-        center_in_world = cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0]))
-        center = camera_from_world[:3, :3] @ center_in_world + camera_from_world[:3, 3]
+    for hole, part in zip(scene.holes, hidden, strict=True):
+        center = camera_from_board[:3, :3] @ hole.center_m + camera_from_board[:3, 3]
+        axis = camera_from_board[:3, :3] @ hole.axis
         circle = TrueCircle(
             center_m=tuple(center.tolist()),
             axis=tuple(axis.tolist()),
             center_in_base_m=tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
             axis_in_base=tuple((base[:3, :3] @ axis).tolist()),
-            radius_m=mouth.radius_m,
+            radius_m=hole.radius_m,
             depth_m=0.0,
             hidden=part,
             in_view=part < 1.0,
         )
         circles.append(circle)
-    place = {
-        "center_m": (camera_from_world[:3, :3] @ middle + camera_from_world[:3, 3]).tolist(),
-        "rotation": rotation.tolist(),
-        "half_m": (cuboid.size_m / 2.0).tolist(),
-    }
-    return SceneTruth("real", {}, tuple(circles), (), place)
+    return SceneTruth("real", {}, tuple(circles), (), {})
 
 
 def _draw_overlay(frame: Frame, found: FrameLabel, good: bool) -> np.ndarray:

@@ -19,7 +19,7 @@ class Label:
 
     Attributes:
         session: Folder to write into.
-        label: Frames, camera poses, placing of the block, and settings.
+        label: Frames, board, measured block and holes, and settings.
     """
 
     session: Session
@@ -42,10 +42,9 @@ def _show(result: dict[str, Any]) -> None:
     for name, entry in result["frames"].items():
         board = None if entry["board_px"] is None else f"{entry['board_px']:.2f}"
         share = None if entry["depth_share"] is None else f"{entry['depth_share']:.0%}"
-        outline = None if entry["outline_px"] is None else f"{entry['outline_px']:.2f}"
-        rows.append((name, board, outline, share, entry["left_out"] or ""))
+        rows.append((name, board, share, entry["left_out"] or ""))
     print_table(
-        ("frame", "board [px]", "outline [px]", "depth agrees", "left out because"),
+        ("frame", "board [px]", "depth agrees", "left out because"),
         rows,
         f"{result['num_labelled']} of {len(result['frames'])} frames labelled",
     )

@@ -7,40 +7,27 @@ measured holes have a place in each frame. Real sessions and rendered ones are d
 from __future__ import annotations
 
 import logging
-import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from annotated_types import MinLen
 
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.vision import FinderSpec, FrameSourceSpec
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from perception.benchmark.session_score import HoleError, match_found_holes
 from perception.label.camera_pose import CameraTrackerSpec
+from perception.label.measured import MeasuredHole, read_measured
 
 log = logging.getLogger(__name__)
 
 FILE = "score.json"
-EXAMPLE = """expected YAML such as
-  std_m: 0.0005   # of the measured centres
-  holes:          # in the board's frame: from its corner, x along the top, y down, z into the face
-    - {name: A, center_m: [1.120, 0.310, 0.004], axis: [0, 0, -1], radius_m: 0.05}"""
-
-
-@dataclass(frozen=True)
-class MeasuredHole:
-    """A hole in the board's frame: centre, axis out of the hole, m."""
-
-    name: str
-    center_m: np.ndarray
-    axis: np.ndarray
 
 
 @spec
@@ -86,8 +73,8 @@ class ScoreCamera:
             ConfigError: the truth cannot be read.
             FrameError: no frame shows the board.
         """
-        holes, std_m = read_measured(Path(self.score.truth))
-        frames, refused = self._score_frames(holes)
+        scene = read_measured(Path(self.score.truth), "score.truth")
+        frames, refused = self._score_frames(scene.holes)
         if not frames:
             raise FrameError(
                 f"score_camera: no frame can be judged; the first: {next(iter(refused.values()), 'none')}"
@@ -102,7 +89,7 @@ class ScoreCamera:
             "name": self.score.name,
             "frames": len(frames),
             "refused_frames": len(refused),
-            "holes": len(frames) * len(holes),
+            "holes": len(frames) * len(scene.holes),
             "found": len(errors),
             "false": sum(num_false for _, num_false in frames),
             "position_m_median": median_m,
@@ -111,7 +98,7 @@ class ScoreCamera:
             if errors
             else None,
             "inside_3_sigma": sum(one.sigmas <= 3.0 for one in errors),
-            "truth_std_m": std_m,
+            "truth_std_m": scene.std_m,
         }
         content = {"schema": 1, **row, "refused": refused, "errors": [vars(one) for one in errors]}
         write_json(self.session.folder / FILE, content)
@@ -119,7 +106,7 @@ class ScoreCamera:
         return median_m
 
     def _score_frames(
-        self, holes: list[MeasuredHole]
+        self, holes: Sequence[MeasuredHole]
     ) -> tuple[list[tuple[list[HoleError], int]], dict[str, str]]:
         """Return errors and false holes of each frame, and why others were left out."""
         finder, tracker = self.perception.build(), self.board.build()
@@ -143,33 +130,6 @@ class ScoreCamera:
                 turn, shift_m = camera_from_board[:3, :3], camera_from_board[:3, 3]
                 true = [(turn @ hole.center_m + shift_m, turn @ hole.axis) for hole in holes]
                 frames.append(match_found_holes(Path(frame.name).name, found.holes, true))
-
-
-def read_measured(path: Path) -> tuple[list[MeasuredHole], float]:
-    """Return measured holes, and the standard deviation of their centres, m.
-
-    Raises:
-        ConfigError: the file cannot be read; the message shows the expected form.
-    """
-    try:
-        told = yaml.safe_load(path.read_text())
-        holes = []
-        for number, one in enumerate(told["holes"], 1):
-            center = np.asarray(one["center_m"], float)
-            axis = np.asarray(one.get("axis", (0.0, 0.0, -1.0)), float)
-            if center.shape != (3,) or axis.shape != (3,) or not np.linalg.norm(axis) > 0:
-                raise ValueError(f"hole {number}: center_m and axis need three numbers each")
-            holes.append(
-                MeasuredHole(str(one.get("name", number)), center, axis / np.linalg.norm(axis))
-            )
-        std_m = float(told["std_m"])
-        if not holes or not math.isfinite(std_m):
-            raise ValueError("no holes")
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(
-            f"score.truth={path}: {type(error).__name__} {error}; {EXAMPLE}"
-        ) from error
-    return holes, std_m
 
 
 def _show(row: dict[str, Any]) -> None:

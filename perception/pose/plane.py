@@ -13,7 +13,14 @@ import numpy as np
 
 from brokk_rl.signals import Frame
 from perception.ellipse import conic
-from perception.robust_fit import TUKEY, compute_biweight, guess_plane
+from perception.robust_fit import (
+    TUKEY,
+    compute_biweight,
+    compute_psi_slope,
+    estimate_sandwich_covariance,
+    guess_plane,
+    number_cells,
+)
 
 # Each of these times 0.8 or 1.25 left every count of holes and discs in 8 rendered frames as it was,
 # and changed their median error by 0.4 mm at most. DEGENERATE and USUAL_PULL_PX_M were not varied.
@@ -25,9 +32,8 @@ NEARNESS, LEAN = 0.3, 0.4
 addition to the slope that its shape allows: occluders differ by more."""
 DEGENERATE = 1e12
 """Condition number of a plane's normal equations from which its points lie on a line."""
-LEAST, FEWEST = 60, 8
-"""Least number of points of a plane; cells from which its covariance is estimated, below which
-bands of rows take their place."""
+LEAST = 60
+"""Least number of points of a plane."""
 USUAL_PULL_PX_M = 126.72
 """Focal length times baseline of the pair for which noise is configured: a ZED 2i at 1080p, 1056 px
 and 0.12 m."""
@@ -263,53 +269,3 @@ def compute_upper_median(values: np.ndarray) -> float:
     """Return the median of values `(P,)`, the upper one of an even number; faster than `np.median`."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
-
-
-def number_cells(cell: np.ndarray) -> np.ndarray:
-    """Return consecutive numbers of cells, `(P,)`; of too few cells, bands of rows in their place."""
-    cell = np.unique(cell, return_inverse=True)[1]
-    return (
-        cell
-        if cell.max(initial=0) >= FEWEST
-        else np.arange(len(cell)) * FEWEST // max(len(cell), 1)
-    )
-
-
-def compute_psi_slope(off: np.ndarray) -> np.ndarray:
-    """Return the derivative of Tukey's influence function over its weight, `(P,)`; 0 beyond its reach.
-
-    `off` is in units of the biweight's reach. The influence of a growing residual falls, so that a
-    fit varies more than its weights alone tell: by a fifth with a reach of 4.7 standard
-    deviations, by a half with one of 3.
-    """
-    square = off**2
-    within = square < 1.0
-    # The quotient has a pole at the reach, where the weight is 0.
-    return np.where(within, (1.0 - 5.0 * square) / np.where(within, 1.0 - square, 1.0), 0.0)
-
-
-def estimate_sandwich_covariance(
-    slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray
-) -> np.ndarray | None:
-    """Return the cluster-robust covariance of a fit of three parameters, `(3, 3)`.
-
-    The jackknife over cells, within which noise may be correlated: the sandwich estimate CR3 (Bell
-    and McCaffrey 2002). Return `None` where the fit is singular without one of the cells.
-
-    Args:
-        slopes: Derivatives of the residuals times `compute_psi_slope`, `(P, 3)`.
-        heavy: Weighted derivatives, or instruments in their place, `(P, 3)`.
-        residual: `(P,)`.
-        cell: Number of each point's cell, from 0 on, `(P,)`.
-    """
-    sums = np.stack([np.bincount(cell, heavy[:, k] * residual) for k in range(3)], -1)
-    parts = np.stack(
-        [np.bincount(cell, heavy[:, j] * slopes[:, k]) for j in range(3) for k in range(3)], -1
-    )
-    # The sums without each cell, all at once.
-    without = (parts.sum(0) - parts).reshape(-1, 3, 3)
-    try:
-        moved = np.linalg.solve(without, sums[..., None])[..., 0]
-    except np.linalg.LinAlgError:
-        return None
-    return moved.T @ moved * (1.0 - 1.0 / len(moved))

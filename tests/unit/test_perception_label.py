@@ -1,9 +1,9 @@
-"""Labels for real footage: placed by hand, refined, projected; held against what a renderer knows."""
+"""Labels for real footage: a measured block is projected; held against what a renderer knows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cuboid
@@ -13,99 +13,76 @@ import pytest
 import yaml
 from composed import option
 
+from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
-from perception.label.camera_pose import Charuco
+from perception.label.camera_pose import CameraPose, Charuco
+from perception.label.labeller import BlockLabelling
 
-SIZE_PX = (480, 270)
-EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-1.5, 0.9, 1.2), (-2.4, -0.3, 0.7))
+EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-2.4, -0.3, 0.7))
 BALL_M = (-0.5, 0.15, 0.55)
-CORNERS_M = np.array([[0.0, -0.4, 0.0], [0.0, 0.4, 0.0], [0.0, -0.4, 0.6]])
+WORLD_FROM_BOARD = np.eye(4)[[2, 0, 1, 3]]
+"""A board in the drilled face: its z axis is the world's x."""
 
 
 @pytest.fixture(scope="module")
-def footage(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[cuboid.View]]:
-    """A folder of frames around one block, something hanging before it, the camera's poses beside them, and what is true."""
-    folder = tmp_path_factory.mktemp("footage")
-    views, poses = [], {}
+def views() -> list[cuboid.View]:
+    """Frames around one block, something hanging before it, with what is true."""
+    found = []
     for number, eye in enumerate(EYES_M):
-        view = cuboid.seen(
-            cuboid.looking(eye, (0.1, 0.0, 0.3)), SIZE_PX, 0.003, BALL_M, seed=number
-        )
-        dataset.write_frame(
-            folder / "frames" / f"{number:02d}", view.frame.color, view.frame.depth_m
-        )
-        poses[f"{number:02d}"] = view.world_from_camera.tolist()
-        views.append(view)
+        pose = cuboid.looking(eye, (0.1, 0.0, 0.3))
+        found.append(cuboid.seen(pose, (480, 270), 0.003, BALL_M, seed=number))
+    return found
+
+
+def write_labels(views: list[cuboid.View], folder: Path, **block: list[float]) -> dict[str, Any]:
+    board_from_world = np.linalg.inv(WORLD_FROM_BOARD)
+    hole_m = (board_from_world[:3, :3] @ cuboid.HOLE_M).tolist()
+    measured = {
+        "std_m": 0.001, "block": block, "holes": [{"center_m": hole_m, "radius_m": cuboid.RADIUS_M}],
+    }  # fmt: skip
+    (folder / "measured.yaml").write_text(yaml.safe_dump(measured))
+    for number, view in enumerate(views):
+        stem = folder / "in" / f"{number:02d}"
+        dataset.write_frame(stem, view.frame.color, view.frame.depth_m)
     first = views[0].frame
     size_px = first.color.shape[1::-1]
-    dataset.write_camera(folder / "frames", first.camera_matrix, size_px, None, None)
-    (folder / "poses.yaml").write_text(yaml.safe_dump(poses))
-    return folder, views
+    dataset.write_camera(folder / "in", first.camera_matrix, size_px, None, None)
 
+    def locate(frame: Frame) -> CameraPose:
+        return CameraPose(board_from_world @ views[int(frame.name[-2:])].world_from_camera, 0.1)
 
-def clicked(view: cuboid.View, points_m: np.ndarray, miss_px: float) -> list[list[float]]:
-    """Returns where a person clicks who misses by so much."""
-    local = (points_m - view.world_from_camera[:3, 3]) @ view.world_from_camera[:3, :3]
-    pixels = (local @ view.frame.camera_matrix.T)[:, :2] / local[:, 2:]
-    return (pixels + np.random.default_rng(3).choice([-miss_px, miss_px], pixels.shape)).tolist()
-
-
-def labelled(
-    brokk: Callable[..., Any], folder: Path, placing: dict[str, Any], *overrides: str
-) -> tuple[Any, Path]:
-    out = folder / f"out{len(list(folder.glob('out*')))}"
-    (folder / "placing.yaml").write_text(yaml.safe_dump(placing))
-    done = brokk(
-        "mode=label", f"label.source.folder={folder / 'frames'}", "perception/camera_pose@label.camera=given",
-        f"label.camera.poses={folder / 'poses.yaml'}", f"label.placing={folder / 'placing.yaml'}", f"session.out={out}",
-        "label.noise_per_m=0.003", "label.reach_px=10", "label.num_refined=4", *overrides,
+    source = option("perception/source", "folder", folder=str(folder / "in"))
+    board = SimpleNamespace(build=lambda: SimpleNamespace(locate=locate))
+    labelling = BlockLabelling(
+        source=source, board=board, measured=str(folder / "measured.yaml"), noise_per_m=0.003,
+        num_sigma=3.0, min_depth_share=0.5,
     )  # fmt: skip
-    return done, out
+    return labelling.label(folder)
 
 
-def test_labels_from_three_sloppy_clicks_are_those_of_the_renderer(
-    brokk: Callable[..., Any], footage: tuple[Path, list[cuboid.View]]
+def test_labels_of_a_measured_block_are_those_of_the_renderer(
+    views: list[cuboid.View], tmp_path: Path
 ) -> None:
-    folder, views = footage
-    placing = {
-        "frame": "01",
-        "corners_px": clicked(views[1], CORNERS_M, 2.5),
-        "thickness_m": 1.2,
-        "mouths": [
-            {
-                "center_px": clicked(views[1], cuboid.HOLE_M[None], 2.0)[0],
-                "radius_m": cuboid.RADIUS_M,
-            }
-        ],
-    }
-    done, out = labelled(brokk, folder, placing)
-    assert done.code == 0, done.err
+    result = write_labels(views, tmp_path, corner_m=[-0.4, 0.0, 0.0], size_m=[0.8, 0.6, 1.2])
+    assert result["num_labelled"] == len(views)
     for number, view in enumerate(views):
-        label = dataset.read_label(out / "frames" / f"{number:02d}")
+        label = dataset.read_label(tmp_path / "frames" / f"{number:02d}")
         assert cuboid.overlap(label.block, view.block) > 0.95
-        assert cuboid.overlap(label.hole_mask, view.mouth) > 0.8
+        assert cuboid.overlap(label.hole_mask, view.mouth) > 0.9
         assert (label.arm & ~view.occluder).sum() < 0.01 * view.block.sum()
         assert (label.block & view.occluder).sum() < 0.01 * view.block.sum()
-    truth = dataset.read_truth(out / "frames" / "00")
+    truth = dataset.read_truth(tmp_path / "frames" / "00")
     local = (cuboid.HOLE_M - views[0].world_from_camera[:3, 3]) @ views[0].world_from_camera[:3, :3]
-    assert np.linalg.norm(np.array(truth.holes[0].center_m) - local) < 0.004
-    assert len(list((out / "overlays").glob("*.png"))) == len(views)
+    np.testing.assert_allclose(truth.holes[0].center_m, local, atol=1e-9)
+    assert len(list((tmp_path / "overlays").glob("*.png"))) == len(views)
 
 
 def test_a_block_in_the_wrong_place_is_left_out_and_said(
-    brokk: Callable[..., Any], footage: tuple[Path, list[cuboid.View]]
+    views: list[cuboid.View], tmp_path: Path
 ) -> None:
-    folder, views = footage
-    # 5 cm at 1.9 m and a focal length of 264 px: 7 px
-    shifted_m = CORNERS_M + np.array([0.0, 0.05, 0.0])
-    placing = {
-        "frame": "01", "corners_px": clicked(views[1], shifted_m, 0.0), "thickness_m": 1.2,
-    }  # fmt: skip
-    done, out = labelled(brokk, folder, placing, "label.num_refined=0")
-    assert done.code == 2
-    assert "no frame could be labelled: edges of the picture lie" in done.err
-    assert not list(out.glob("frames/*"))
+    with pytest.raises(FrameError, match="of the depth agrees with the block"):
+        write_labels(views, tmp_path, corner_m=[-0.4, 0.0, -0.1], size_m=[0.8, 0.6, 1.2])
 
 
 def test_a_board_tells_where_the_camera_was() -> None:

@@ -87,7 +87,7 @@ def test_pitch_and_roll_of_a_pair_are_measured() -> None:
     def measure(frame: Frame) -> pair_check.PairAlignment:
         assert frame.right is not None
         matches = check.match_features(frame.color, frame.right)
-        return pair_check.fit_alignment(matches.select_common_shift(check.common_px), frame)
+        return pair_check.fit_alignment(matches, frame, check.alike)
 
     found = measure(pair(0.4, roll_rad))
     # 0.4 px in the middle and at the border: 1 + y² is 1.09 on average
@@ -96,6 +96,25 @@ def test_pitch_and_roll_of_a_pair_are_measured() -> None:
     assert found.roll_px == pytest.approx(528.0 * roll_rad, rel=0.125)
     assert found.focal_px == pytest.approx(0.0, abs=0.04)
     assert measure(pair(0.0, 0.0)).rms_px < 0.02
+
+
+def test_a_good_pair_of_a_repeated_pattern_is_not_refused() -> None:
+    rows, columns = np.mgrid[0:540, 0:960].astype(float)
+
+    def draw_chessboard(shift_px: float, seed: int) -> np.ndarray:
+        x, y = (columns + shift_px - 250.0) / 40.0, (rows - 80.0) / 40.0
+        x, y = x + 0.05 * y, y - 0.05 * x
+        on = (x > 0) & (x < 12) & (y > 0) & (y < 9)
+        gray = np.where(on, 60 + 140 * ((np.floor(x) + np.floor(y)) % 2), 130.0)
+        noise = np.random.default_rng(seed).normal(0, 4.0, gray.shape)
+        gray = cv2.GaussianBlur(gray, (0, 0), 1.0) + noise
+        return np.repeat(gray.clip(0, 255).astype(np.uint8)[..., None], 3, 2)
+
+    disparity_px = 528.0 * BASELINE_M / DEPTH_M
+    board = replace(
+        pair(0.0, 0.0), color=draw_chessboard(0.0, 1), right=draw_chessboard(disparity_px, 2)
+    )
+    assert fault(board) is None
 
 
 def turn(frame: Frame, quarters: int) -> Frame:

@@ -18,7 +18,8 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception.label.camera_pose import CameraPose
-from perception.modes.score_camera import ScoreCamera, ScoreOptions, read_measured
+from perception.label.measured import read_measured
+from perception.modes.score_camera import ScoreCamera, ScoreOptions
 from perception.segment.network import NetworkSegmenter
 from perception.sources.lens_file import read_pair_lens
 
@@ -143,7 +144,7 @@ def test_a_session_is_scored_by_holes_measured_in_the_frame_of_the_board(tmp_pat
         assert (row["kind"], row["inside_3_sigma"]) == (kind, inside)
     (tmp_path / "wrong.yaml").write_text("holes: [{center_m: [1, 2]}]\nstd_m: 0.1\n")
     with pytest.raises(ConfigError, match=r"hole 1.*expected YAML such as"):
-        read_measured(tmp_path / "wrong.yaml")
+        read_measured(tmp_path / "wrong.yaml", "score.truth")
 
 
 @pytest.mark.parametrize(("side", "named"), [(2, False), (12, True)])
