@@ -55,7 +55,6 @@ MEASURES = (
     Measure("several_joints", "time with two or more joints moving", "share", 1),
     Measure("lever_movements", "lever movements", "", -1),
     Measure("joint_switches", "changes from one joint to another", "", -1),
-    Measure("smoothness", "smoothness of the tool's speed (SPARC)", "", 1),
     Measure("control_effort", "lever travel a second", "1/s", -1),
     Measure("peak_force_n", "largest contact force", "N", -1),
     Measure("advice_error", "distance from the advice", "1", -1),
@@ -88,7 +87,6 @@ def measure_trial(
     q, u = recording.q[:num].astype(float), recording.u[:num].astype(float)
     onsets = detect_lever_movements(u)
     moving = np.abs(differentiate(q, period_s)) > MOVING * machine.max_speed
-    tip_speed = np.linalg.norm(differentiate(tip[:num], period_s), axis=1)
     found = {
         "time_s": float(t_s[num - 1]) if inserted else limit_s,
         "success": float(inserted),
@@ -96,7 +94,6 @@ def measure_trial(
         "several_joints": float((moving.sum(1) >= 2).mean()),
         "lever_movements": float(len(onsets)),
         "joint_switches": float(np.count_nonzero(np.diff(onsets[:, 1]))),
-        "smoothness": compute_sparc(tip_speed, recording.rate_hz),
         "control_effort": float(np.abs(np.diff(u, axis=0)).sum() / (period_s * max(1, num - 1))),
         "peak_force_n": math.nan,
         "advice_error": math.nan,
@@ -149,39 +146,3 @@ def detect_lever_movements(u: np.ndarray) -> np.ndarray:
     newest = np.maximum.accumulate(rows, axis=0)
     held = np.where(newest >= 0, np.take_along_axis(crossed, np.maximum(newest, 0), 0), 0)
     return np.argwhere(np.diff(held.astype(int), axis=0, prepend=0) > 0)
-
-
-# Defaults of SPARC (Balasubramanian et al., J. NeuroEng. Rehabil. 12 (2015) 112): cut-off, share
-# of the peak below which the spectrum is left out, and powers of two of zero padding.
-CUT_OFF_HZ = 10.0
-THRESHOLD = 0.05
-PADDING = 4
-
-
-def compute_sparc(speed: np.ndarray, rate_hz: float) -> float:
-    """Return minus the length of the spectrum's outline: near -1.4 for one smooth stroke, lower with every stop and start.
-
-    Args:
-        speed: Speed over time, `(T,)`, any unit.
-        rate_hz: Samples a second.
-
-    Returns:
-        NaN where nothing moved.
-    """
-    if len(speed) < 2 or not np.any(speed):
-        return math.nan
-    # Zero padding refines the spectrum.
-    size = 2 ** (math.ceil(math.log2(len(speed))) + PADDING)
-    frequency = np.arange(size) * rate_hz / size
-    spectrum = np.abs(np.fft.fft(speed, size))
-    spectrum = spectrum / spectrum.max()
-    # Above the cut-off there is no voluntary motion.
-    within = frequency <= CUT_OFF_HZ
-    frequency, spectrum = frequency[within], spectrum[within]
-    above = np.flatnonzero(spectrum >= THRESHOLD)
-    frequency, spectrum = frequency[above[0] : above[-1] + 1], spectrum[above[0] : above[-1] + 1]
-    if len(frequency) < 2:
-        return math.nan
-    # Both axes of the outline are scaled to 1, so that duration and size drop out.
-    across = np.diff(frequency) / (frequency[-1] - frequency[0])
-    return -float(np.hypot(across, np.diff(spectrum)).sum())

@@ -1,11 +1,10 @@
-"""The pictures of a study: the paper's two (tool paths, radar), and each person.
+"""The pictures of a study: the tool's paths, as in the paper, and each person.
 
 Guided is always blue and solid, unguided orange and dotted.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,11 +12,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, make_figure, remove_frame
+from brokk_rl.plot import BLUE, GREEN, ORANGE, RED, add_legend, make_figure, remove_frame
 from brokk_rl.statistics import compute_student_interval
-from study import tlx
 from study.analysis import TITLES, Analysis
-from study.design import CONDITIONS
 
 LOOK = {"guided": (BLUE, "-"), "unguided": (ORANGE, ":")}
 VIEWS = {
@@ -56,33 +53,6 @@ def draw_paths(found: Analysis) -> Figure:
 def _project(tip_in_base_m: np.ndarray, view: str) -> tuple[np.ndarray, np.ndarray]:
     x, y, z = tip_in_base_m.T
     return (x, y) if view == "from above" else (np.hypot(x, y), z)
-
-
-def draw_radar(found: Analysis) -> Figure:
-    """Draw the mean of each NASA-TLX scale, with and without guidance, with Student's intervals."""
-    figure = make_figure(6.2, 5.6)
-    axis = figure.add_subplot(projection="polar")
-    angles = np.linspace(0, 2 * math.pi, len(tlx.SCALES), endpoint=False)
-    # The two conditions are drawn slightly apart, so that their intervals do not hide each other.
-    for shift, condition in zip((-0.02, 0.02), CONDITIONS, strict=True):
-        mine = found.means[found.means.condition == condition]
-        colour, line = LOOK[condition]
-        means = [mine[f"tlx_{scale}"].mean() for scale in tlx.SCALES]
-        # Closed by repeating the first point.
-        axis.plot(
-            np.append(angles, angles[0]) + shift, [*means, means[0]], line, color=colour,
-            label=condition, linewidth=2,
-        )  # fmt: skip
-        for angle, scale in zip(angles, tlx.SCALES, strict=True):
-            _draw_mean(axis, angle + shift, mine[f"tlx_{scale}"], colour)
-    titles = [title.replace(" (", "\n(") for title in tlx.SCALES.values()]
-    axis.set_xticks(angles, titles, fontsize=9)
-    axis.tick_params(axis="x", pad=16)
-    # The full scale, so that small differences look small.
-    axis.set_ylim(0, 100)
-    axis.set_yticks([20, 40, 60, 80], ["20", "40", "60", "80"], fontsize=7, color=GREY)
-    add_legend(figure, axis)
-    return figure
 
 
 def draw_pairs(found: Analysis, names: Sequence[str]) -> Figure:

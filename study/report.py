@@ -29,7 +29,14 @@ SIZES = (8, 12, 16, 20, 24)
 """Numbers of participants in the table of a plan."""
 EFFECTS_DZ = (0.5, LARGE_DZ, 1.2)
 """A medium, a large and a very large effect, in standard deviations of a person's difference."""
-SHOWN = ("time_s", "path_m", "several_joints", "joint_switches", "smoothness", "control_effort")
+SHOWN = (
+    "time_s",
+    "path_m",
+    "several_joints",
+    "joint_switches",
+    "lever_movements",
+    "control_effort",
+)
 """Measures of which each participant's line is drawn."""
 
 
@@ -80,7 +87,6 @@ def write_report(folder: Path, found: Analysis) -> Path:
     drawn = {
         "paths": pictures.draw_paths(found),
         "pairs": pictures.draw_pairs(found, (*SHOWN, "tlx_raw")),
-        "tlx": pictures.draw_radar(found),
     }
     embedded = {}
     for name, figure in drawn.items():

@@ -10,8 +10,6 @@ Axes: `J` joints.
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from queue import SimpleQueue
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,6 +27,7 @@ from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
 from deploy.runtime.operator_state import OperatorState
 from deploy.runtime.shared_memory import RecordLayout
+from deploy.runtime.shm_layout import LoopMemory
 from study import study_folder as folders
 from study.design import Design, Trial
 from study.measures import find_insertion, measure_trial
@@ -43,7 +42,6 @@ MOST_SEED = 10**9
 """Largest seed of a session."""
 NEVER_S = 1e9
 """Age at which positions and borehole are too old for an advice: never, as the study gives them."""
-TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,))])
 
 
 @spec
@@ -123,23 +121,10 @@ class TwinGround:
             left -= find_insertion(tip_m[None], hole, design.success) is not None
             if left <= 0:
                 break
-        return desk.recording()
+        return desk.end()
 
     def _choose_operator(self, trial: Trial) -> Operator:
         return self.guided if trial.condition == "guided" else self.unguided
-
-
-class _Newest:
-    """The newest record, for one process; see `deploy.runtime.shared_memory.RecordSlot`."""
-
-    def __init__(self, record: Any = None) -> None:
-        self._record = record
-
-    def write(self, record: Any) -> None:
-        self._record = record
-
-    def read(self) -> Any:
-        return self._record
 
 
 class TwinDesk:
@@ -169,23 +154,16 @@ class TwinDesk:
         # A plant that cannot be placed has no such fields; `link=site` has.
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
         self._link = placed.build(machine, 1, session)
-        target = np.zeros((), TARGET)
+        self._memory = LoopMemory.new(machine.num_joints, commands=False)
+        target = self._memory.target.new()
         target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
+        self._memory.target.write(target)
         self._state = RecordLayout(OperatorState, machine.num_joints).new()
-        self._advice = _Newest()
-        memory: Any = SimpleNamespace(
-            state=_Newest(),
-            advice=self._advice,
-            target=_Newest(target),
-            request=None,
-            policy_log=SimpleQueue(),
-        )
-        self._memory = memory
         settings = PolicyProcessConfig(
             machine, ground.policy, ground.guidance, NEVER_S, NEVER_S, pitch_rad=None
         )
         bundle = PolicyBundle(ground.policy, machine)
-        self._adviser = PolicyAdviser(settings, bundle, memory)
+        self._adviser = PolicyAdviser(settings, bundle, self._memory)
         self._display = LeverMap(ground.guidance.levers or machine.levers, machine)
         self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
         self._shown = np.zeros(machine.num_joints)
@@ -202,7 +180,7 @@ class TwinDesk:
         """Let one control period go by with the levers at `given`, `(J,)`."""
         q, now_s = self.seen()[0], self._now_s + self._machine.period_s
         force = getattr(self._link, "extra", dict)().get("force_n", np.zeros(1))
-        advised, advice = self._advice.read(), np.full(len(given), np.nan)
+        advised, advice = self._memory.advice.read(), np.full(len(given), np.nan)
         if advised is not None and advised.valid:
             advice = np.array(advised.u)
         u = self._link.send(Command(given)).u
@@ -223,11 +201,13 @@ class TwinDesk:
         )
         self._memory.state.write(self._state)
         self._adviser.run_cycle(0, now_s)
-        shown = self._advice.read()
+        shown = self._memory.advice.read()
+        assert shown is not None
         self._shown = self._display.command(shown.lever_rad, shown.button_right)
 
-    def recording(self) -> Recording:
+    def end(self) -> Recording:
         """Return the trial at the control rate, commands as the valves got them."""
+        self._memory.close()
         q, u, advice, force_n = map(np.array, zip(*self._rows, strict=True))
         t_s = np.arange(len(q)) * self._machine.period_s
         extra = {"force_n": force_n.astype(np.float32)}

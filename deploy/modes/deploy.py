@@ -18,7 +18,7 @@ class DeployMode:
     bench: BenchSpec | None
 
     def run(self) -> None:
-        """Write `capture.mcap` and `frames.blf` (recorded), `timing.json` and `processes.json`.
+        """Write `capture.mcap` (recorded), `timing.json` and `processes.json`.
 
         Raises:
             CheckpointError: the policy was made for another machine, or is damaged.

@@ -44,14 +44,10 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.004
 """Between looks for a new advice. Chosen by hand: a quarter of a screen's frame."""
-EXPECTED_POLL_S = 0.001
-"""The same where an advice is expected."""
 FRAME_POLL_S = 0.02
 """Between looks for a frame of the camera."""
 STOP_POLL_S = 0.05
 """Between looks whether to stop."""
-DRAW_S = 0.018
-"""Time of a frame on a screen of 60 Hz (17 ms), and of a message on its way to it."""
 HEARTBEAT_S = 0.1
 """Between messages when nothing changes, so that a page knows that it is connected."""
 EARLY = 0.9
@@ -240,38 +236,26 @@ class PageServer:
                 task.cancel()
 
     async def _watch(self) -> None:
-        """Watch the feed: a new advice goes out at once, other changes no faster than the rate.
-
-        A browser draws one frame in `DRAW_S`: a change that would take the frame of an expected
-        advice waits and goes with it.
-        """
-        sent_s = looked_s = advised_s = apart_s = 0.0
+        """Watch the feed: a new advice goes out at once, other changes no faster than the rate."""
+        sent_s = looked_s = 0.0
         before = advised = None
         while True:
             now_s, number = time.monotonic(), self._feed.read_advice_number()
-            # Advices come at the control rate: the interval of the last two predicts the next
-            # one.
-            until_s = advised_s + apart_s - now_s
-            expected = -POLL_S < until_s < DRAW_S
             # A page that hears nothing for long cannot tell a calm machine from a dead
             # connection.
             silent = now_s - sent_s >= HEARTBEAT_S
-            is_due = now_s - looked_s >= 1.0 / self._page.rate_hz and not expected
+            is_due = now_s - looked_s >= 1.0 / self._page.rate_hz
             if number != advised or silent or is_due:
-                looked_s, state = now_s, self._feed.read_state()
+                looked_s, advised, state = now_s, number, self._feed.read_state()
                 facts = _list_facts(state)
-                number = state.advice.number if state.advice else None
-                if number != advised:
-                    apart_s, advised_s = now_s - advised_s, now_s
                 if silent or facts != before:
-                    sent_s, before, advised = now_s, facts, number
+                    sent_s, before = now_s, facts
                     alarms = [asdict(one) for one in list_alarms(state)]
                     shown = state.to_plain() | {"alarms": alarms}
                     message = {"number": self._state.number + 1, "shown": shown}
                     text = json.dumps(message, separators=(",", ":"))
                     await self._state.put(text)
-            # Short sleeps only around the expected moment: polling costs processor time.
-            await asyncio.sleep(EXPECTED_POLL_S if abs(until_s) < POLL_S else POLL_S)
+            await asyncio.sleep(POLL_S)
 
     async def _watch_frames(self) -> None:
         """Take frames while somebody looks; encode them in a thread, once for all pages."""

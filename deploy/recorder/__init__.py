@@ -1,1 +1,1 @@
-"""Recording: decoded signals and decisions as MCAP, raw frames as BLF, and their conversion."""
+"""Recording: decoded signals and decisions as MCAP, and their conversion."""

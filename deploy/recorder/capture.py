@@ -2,9 +2,8 @@
 
 MCAP holds every decoded message of the bus as a topic of its name, and the decisions of all
 processes, as protobuf messages with complete schemas (`topics`). Beside them stand Foxglove's own
-messages (`scene_topics`), from which Foxglove and Rerun show the session. BLF holds the raw frames,
-for any tool that reads it. Times are monotonic ones plus one constant, so that a step of the wall
-clock shows nowhere.
+messages (`scene_topics`), from which Foxglove and Rerun show the session. Times are monotonic ones
+plus one constant, so that a step of the wall clock shows nowhere.
 """
 
 from __future__ import annotations
@@ -19,8 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import can
-from can.io.blf import BLFWriter
 from mcap.writer import CompressionType, Writer
 
 from brokk_rl.errors import StorageError
@@ -48,7 +45,7 @@ POLL_S = 0.05
 """Between looks into the pipes, which hold minutes. Chosen by hand."""
 FLUSH_S = 0.5
 """Time between two flushes: the longest piece that a power failure costs. Chosen by hand."""
-MCAP, BLF = "capture.mcap", "frames.blf"
+MCAP = "capture.mcap"
 EARLY = 0.9
 """Part of the time between pictures from which one is due: a camera's period is not exact."""
 FACTS, NUM_FACTS = "brokk", 3
@@ -103,21 +100,8 @@ def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
         ) from error
 
 
-class DurableBlfWriter(BLFWriter):
-    """A BLF writer whose header is right after every flush, not only after closing."""
-
-    def flush(self) -> None:
-        """Write the buffer and the header."""
-        self._flush()
-        end = self.file.tell()
-        self.file.seek(0)
-        self._write_header(end)
-        self.file.seek(end)
-        self.file.flush()
-
-
 class CaptureWriter:
-    """Writes both files; a context manager."""
+    """Writes the file; a context manager."""
 
     def __init__(self, capture: CaptureConfig) -> None:
         self._description = BusDescription(capture.dbc, capture.machine)
@@ -143,7 +127,6 @@ class CaptureWriter:
             "text/plain",
             resolve_package_path(capture.dbc).read_bytes(),
         )
-        self._blf = DurableBlfWriter(capture.folder / BLF)
         self._schemas: dict[str, TopicSchema] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
@@ -180,9 +163,7 @@ class CaptureWriter:
     def flush(self) -> None:
         """Write everything to the disk."""
         self._mcap.flush()
-        self._blf.flush()
         os.fsync(self._mcap_file.fileno())
-        os.fsync(self._blf.file.fileno())
 
     def __enter__(self) -> CaptureWriter:
         return self
@@ -192,33 +173,17 @@ class CaptureWriter:
             # Again at the end: the beginning may be lost whole.
             self._mcap.add_metadata(FACTS, self._facts)
             self._mcap.finish()
-            self._blf.stop()
         with contextlib.suppress(OSError):
             self._mcap_file.close()
 
     def _add_frame(self, t_s: float, frame_id: int, sent: bool, payload: bytes) -> None:
-        wall_s = (int(t_s * 1e9) + self._offset_ns) / 1e9
         layout = self._description.by_id.get(frame_id)
-        extended = layout.extended if layout else frame_id > 0x7FF
-        self._blf.on_message_received(
-            can.Message(
-                timestamp=wall_s,
-                arbitration_id=frame_id,
-                data=payload,
-                is_extended_id=extended,
-                is_rx=not sent,
-                check=False,
-            )
-        )
         if layout is None:
             return
         values = self._description.decode(layout, payload)
         if isinstance(values, MessageFault):
-            self._write(
-                "refused",
-                t_s,
-                {"message": layout.name, "fault": values.value, "data": payload.hex()},
-            )
+            refused = {"message": layout.name, "fault": values.value, "data": payload.hex()}
+            self._write("refused", t_s, refused)
         else:
             self._write(layout.name, t_s, values | {"sent": sent}, layout)
             if self._scene is not None:

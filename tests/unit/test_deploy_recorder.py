@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import random
@@ -12,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import can
 import numpy as np
 import pytest
 import zstandard
@@ -26,7 +24,7 @@ from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
 from deploy.kernel.bus_process import FRAME, FRAMES, TEXT
 from deploy.recorder import capture_reader
-from deploy.recorder.capture import BLF, MCAP, CaptureConfig, CaptureWriter
+from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.conversion import CaptureLogReader
 
 READER = CaptureLogReader(longest_gap_s=0.15, shortest_s=1.0)
@@ -145,13 +143,6 @@ def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(
     positions = contents.messages["JointPos1"]
     # Flushed last at 2.5 s.
     assert not contents.whole and positions[-1][0] - positions[0][0] >= 2.49
-    frames = []
-    with contextlib.suppress(Exception), can.BLFReader(tmp_path / BLF) as reader:
-        frames.extend(reader)  # the last container is cut off
-    assert (
-        frames[-1].timestamp - frames[0].timestamp >= 2.49
-        and abs(frames[0].timestamp - time.time()) < 60
-    )
     log.__exit__(None)
 
 
@@ -259,12 +250,8 @@ def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: 
         log.add(
             FRAMES + FRAME.pack(time.monotonic(), bus.layouts["JointPos1"].frame_id, 0, 8) + payload
         )
-    assert (
-        capture_reader.read_capture(tmp_path / MCAP).messages["refused"][0][1]["fault"]
-        == "wrong CRC"
-    )
-    with can.BLFReader(str(tmp_path / BLF)) as frames:
-        assert bytes(next(iter(frames)).data) == bytes(payload)
+    refused = capture_reader.read_capture(tmp_path / MCAP).messages["refused"][0][1]
+    assert (refused["fault"], refused["data"]) == ("wrong CRC", payload.hex())
 
 
 def test_a_step_of_the_wall_clock_shows_nowhere(

@@ -69,7 +69,7 @@ def test_a_whole_study_says_what_was_put_in(tmp_path: Path) -> None:
     page = report.write_report(tmp_path / "out", found).read_text()
     assert "Guidance helps" in page and "imulated" not in page
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "report.html", "effects.csv", "trials.csv", "means.csv", "paths.png", "tlx.png", "pairs.png",
+        "report.html", "effects.csv", "trials.csv", "means.csv", "paths.png", "pairs.png",
     }  # fmt: skip
     means = pd.read_csv(tmp_path / "out" / "means.csv")
     assert means[means.condition == "guided"].tlx_raw.tolist() == [30.0] * 12

@@ -12,7 +12,7 @@ from sitting import MACHINE, recorded
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from study import measures, tlx
 from study.design import Hole, Success
-from study.measures import compute_sparc, measure_trial
+from study.measures import measure_trial
 
 SUCCESS = Success(depth_m=0.1, clearance_m=0.013)
 
@@ -27,16 +27,6 @@ def test_the_tool_is_where_the_projects_kinematics_has_it() -> None:
     step = 1e-6 * np.eye(5)[3]
     slope = (compute_tool_kinematics(MACHINE, q + step).axis_in_base - here.axis_in_base) / 1e-6
     assert np.allclose(here.turn[..., 3], slope, atol=1e-4)
-
-
-def test_sparc_is_that_of_the_published_algorithm() -> None:
-    t = np.arange(-1, 1, 0.01)
-    # The example of the authors' own code.
-    assert compute_sparc(np.exp(-5 * t**2), 100.0) == pytest.approx(-1.41403, abs=1e-5)
-    two = np.exp(-40 * (t + 0.5) ** 2) + np.exp(-40 * (t - 0.5) ** 2)
-    assert compute_sparc(two, 100.0) < -1.6
-    assert compute_sparc(7 * two, 100.0) == pytest.approx(compute_sparc(two, 100.0))
-    assert math.isnan(compute_sparc(np.zeros(50), 20.0))
 
 
 def test_a_straight_path_has_its_length_and_noise_hardly_adds_to_it() -> None:
