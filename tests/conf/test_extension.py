@@ -192,7 +192,7 @@ def test_a_sweep_has_one_folder_for_each_job_and_no_others(
 
 
 def test_the_name_of_a_job_can_be_typed() -> None:
-    overrides = ["effect=[@found/effects.yaml,lag]", "fit@baselines.valve=valve", "mode=train"]
+    overrides = ["effect=[@found/effects.yaml,lag]", "fit@baselines.lag=lag", "mode=train"]
     assert name_job(7, overrides, ["mode"]) == "7_effect-effects-lag_lag-lag"
     assert len(name_job(0, [f"a.b={'x' * 300}"], [])) == 120
 
