@@ -1,8 +1,4 @@
-"""Fits of actuator networks to recordings, all joints in one batch.
-
-A free run of 60 steps is some thousand tiny kernels forth and back; launched one by one they take
-far longer than they run.
-"""
+"""Fits of actuator networks to recordings, all joints in one batch."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -27,119 +23,7 @@ from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
-from brokk_rl.rl.execution import capture_graph
 from brokk_rl.spec import Count, Share, spec
-
-
-class FreeRunOptimizer:
-    """Adam on free runs, with a running average of the weights.
-
-    The windows of an update are named by a counter (`Windows.draw`), so that there is no generator
-    with a state to keep. Rates are tensors that the host fills before an update, so that a captured
-    update can be steered.
-
-    Args:
-        networks: The fitted networks, on their device.
-        machine: Gives the ends of travel.
-        seed: Of the draws.
-
-    Attributes:
-        networks: The networks at work.
-        averaged: The running average of their weights, which is validated and kept.
-    """
-
-    def __init__(self, networks: JointNetworks, machine: Machine, seed: int) -> None:
-        self.networks, self.averaged = networks, copy.deepcopy(networks).requires_grad_(False)
-        self._device = networks.quiet.device
-        self._plant = MachineTensors(machine, self._device)
-        self._seed = seed % 2**31
-        self._key = torch.zeros((), dtype=torch.int64, device=self._device)
-        self._rate = torch.zeros((), device=self._device)
-        self._share_of_new = torch.zeros((), device=self._device)
-        self._parameters = list(networks.parameters())
-        self._adam = torch.optim.Adam(
-            self._parameters, lr=self._rate, fused=True, capturable=self._device.type == "cuda"
-        )
-        # Adam's state at fixed addresses before capture: a step with zero rate.
-        for parameter in self._parameters:
-            parameter.grad = torch.zeros_like(parameter)
-        self._adam.step()
-        for parameter in self._parameters:
-            for value in self._adam.state[parameter].values():
-                value.zero_()
-
-    def state(self) -> dict[str, torch.Tensor]:
-        """Return the tensors that an update changes, by name, to be copied from and into."""
-        found = {}
-        for name, value in self.networks.named_parameters():
-            found[f"networks.{name}"] = value.detach()
-        found |= {f"averaged.{name}": value for name, value in self.averaged.named_parameters()}
-        for number, parameter in enumerate(self._parameters):
-            for name, value in self._adam.state[parameter].items():
-                found[f"adam.{number}.{name}"] = value
-        return found
-
-    def updater(
-        self, windows: TrainingWindows, batch: int, still_share: float
-    ) -> Callable[[], None]:
-        """Return one update on `batch` windows a joint as a function.
-
-        On a GPU it is captured, which leaves the state unchanged.
-        """
-
-        def update() -> None:
-            self._update(*windows.draw(batch, still_share, self._key))
-
-        if self._device.type != "cuda":
-            return update
-        before = {name: value.clone() for name, value in self.state().items()}
-        graph = capture_graph(update, self._device, gradients=True)
-        for name, value in self.state().items():
-            value.copy_(before[name])
-        return graph.replay
-
-    def steer(self, number: int, rate: float, average: float) -> None:
-        """Set number, learning rate and averaging decay of the coming update.
-
-        Does not wait for the device.
-        """
-        self._key.fill_(self._seed * 2**20 + number)
-        self._rate.fill_(rate)
-        self._share_of_new.fill_(1.0 - average)
-
-    @torch.no_grad()
-    def run(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Return free runs of the averaged networks through windows, `(J, B, K)`."""
-        return self.averaged.roll_out(
-            u[..., :-1], q[..., : self.averaged.num_history], self._plant.lower, self._plant.upper
-        )
-
-    def _update(self, u: torch.Tensor, q: torch.Tensor) -> None:
-        networks, size = self.networks, self.networks.num_history
-        scale = networks.increment_scale[:, None, None]
-        horizon = q.shape[2] - size
-        if horizon == 1:
-            # before the dead zone, whose gradient is zero where it acts
-            output = networks(networks.inputs(u[..., :size], q[..., :size]))
-            moved = (q[..., size] - q[..., size - 1]) / scale[..., 0]
-            loss = (output - moved).square().mean(1).sum()
-        else:
-            path = networks.roll_out(
-                u[..., :-1], q[..., :size], self._plant.lower, self._plant.upper
-            )
-            ahead = torch.arange(1, horizon + 1, device=q.device)
-            # an error that grows with the square root of time counts the same early and late
-            loss = (((path - q[..., size:]) / scale).square() / ahead).mean((1, 2)).sum()
-        gradients = torch.autograd.grad(loss, self._parameters)
-        for parameter, gradient in zip(self._parameters, gradients, strict=True):
-            # joints are fitted independently: each has its own bound
-            norm = gradient.flatten(1).norm(dim=1).clamp(min=1.0)
-            parameter.grad = gradient / norm.view(-1, 1, 1)
-        self._adam.step()
-        with torch.no_grad():
-            for mean, value in zip(self.averaged.parameters(), self._parameters, strict=True):
-                mean.lerp_(value, self._share_of_new)
-
 
 log = logging.getLogger(__name__)
 
@@ -248,7 +132,7 @@ class _HorizonStage(NamedTuple):
 
 
 class _NetworkFitting:
-    """One fit at work."""
+    """One fit at work: Adam on free runs, with a running average of the weights, which is validated and kept."""
 
     def __init__(
         self,
@@ -260,18 +144,19 @@ class _NetworkFitting:
         device: torch.device,
     ) -> None:
         self._config, self._machine, self._train, self._device = config, machine, train, device
-        generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator().manual_seed(seed)
         joints = machine.num_joints
-        networks = JointNetworks(joints, machine.num_history, config.width, generator)
+        networks = JointNetworks(joints, machine.num_history, config.width, self._generator)
         self._normalise(networks)
-        self._descent = FreeRunOptimizer(networks.to(device), machine, seed)
-        averaged = self._descent.averaged.named_parameters()
-        self._kept = {name: value.clone() for name, value in averaged}
+        self._networks = networks.to(device)
+        self._averaged = copy.deepcopy(self._networks).requires_grad_(False)
+        self._plant = MachineTensors(machine, device)
+        self._adam = torch.optim.Adam(networks.parameters(), lr=config.learning_rate, fused=True)
+        self._kept = {name: value.clone() for name, value in self._averaged.named_parameters()}
         self._best = torch.full((joints,), math.inf, device=device)
         steps, purpose = self._steps(config.validation_s), "held out to stop the fit by"
         held = TrainingWindows(validation, machine, steps, device, purpose)
-        key = torch.zeros((), dtype=torch.int64, device=device)
-        self._held = held.draw(VALIDATED, 0.2, key)
+        self._held = held.draw(VALIDATED, 0.2, self._generator)
         self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
         for horizon_s in config.horizons_s if config.loss == "rollout" else ():
             self._stages.append(_HorizonStage(horizon_s, config.updates, config.batch))
@@ -287,7 +172,7 @@ class _NetworkFitting:
     @property
     def result(self) -> tuple[dict[str, torch.Tensor], list[float]]:
         """The best averaged networks, with normalisation, and each joint's validation error."""
-        return {**self._descent.averaged.state_dict(), **self._kept}, self._best.tolist()
+        return {**self._averaged.state_dict(), **self._kept}, self._best.tolist()
 
     def _run_stage(
         self, stage: _HorizonStage, before: int, total: int, progress: ItemProgress
@@ -296,13 +181,17 @@ class _NetworkFitting:
         config, stale = self._config, 0
         steps = max(1, self._steps(stage.horizon_s))
         windows = TrainingWindows(self._train, self._machine, steps, self._device)
-        update = self._descent.updater(windows, stage.batch, config.still_share)
         for done in range(1, stage.updates + 1):
             number = before + done - 1
             fall = 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total))
-            average = min(config.average, (number + 1.0) / (number + 11.0))
-            self._descent.steer(number, config.learning_rate * fall, average)
-            update()
+            self._adam.param_groups[0]["lr"] = config.learning_rate * fall
+            self._update(*windows.draw(stage.batch, config.still_share, self._generator))
+            kept = min(config.average, (number + 1.0) / (number + 11.0))
+            with torch.no_grad():
+                for mean, value in zip(
+                    self._averaged.parameters(), self._networks.parameters(), strict=True
+                ):
+                    mean.lerp_(value, 1.0 - kept)
             if done % config.validate_every == 0 or done == stage.updates:
                 stale = 0 if self._validate() else stale + 1
                 error = self._best.mean().item()
@@ -312,11 +201,41 @@ class _NetworkFitting:
             if stale >= config.patience:
                 break
 
+    def _update(self, u: torch.Tensor, q: torch.Tensor) -> None:
+        """Descend on windows `(J, B, H + K)`."""
+        networks, size = self._networks, self._networks.num_history
+        scale = networks.increment_scale[:, None, None]
+        horizon = q.shape[2] - size
+        if horizon == 1:
+            # before the dead zone, whose gradient is zero where it acts
+            output = networks(networks.inputs(u[..., :size], q[..., :size]))
+            moved = (q[..., size] - q[..., size - 1]) / scale[..., 0]
+            loss = (output - moved).square().mean(1).sum()
+        else:
+            ahead = torch.arange(1, horizon + 1, device=q.device)
+            # an error that grows with the square root of time counts the same early and late
+            error = (self._roll_out(networks, u, q) - q[..., size:]) / scale
+            loss = (error.square() / ahead).mean((1, 2)).sum()
+        self._adam.zero_grad()
+        loss.backward()
+        for parameter in networks.parameters():
+            # joints are fitted independently: each has its own bound
+            assert parameter.grad is not None, "all weights act"
+            norm = parameter.grad.flatten(1).norm(dim=1).clamp(min=1.0)
+            parameter.grad.div_(norm.view(-1, 1, 1))
+        self._adam.step()
+
+    def _roll_out(self, networks: JointNetworks, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+        """Return free runs through windows, `(J, B, K)`."""
+        begin = q[..., : networks.num_history]
+        return networks.roll_out(u[..., :-1], begin, self._plant.lower, self._plant.upper)
+
     @torch.no_grad()
     def _validate(self) -> bool:
         """Validate the averaged weights by free runs; keep the best of each joint."""
         u, q = self._held
-        averaged, path = self._descent.averaged, self._descent.run(u, q)
+        averaged = self._averaged
+        path = self._roll_out(averaged, u, q)
         error = (path - q[..., averaged.num_history :]).square().mean((1, 2)).sqrt()
         if not bool(error.isfinite().all()):
             raise BrokkError("the fit diverged (NaN in the validation); lower fit.learning_rate")

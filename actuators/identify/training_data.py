@@ -6,9 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from torch import nn
-from torch.nn.utils.rnn import pad_sequence
 
-from actuators.models.parameters import hash_uniform
 from actuators.recordings.inspection import estimate_step
 from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import RecordingError
@@ -63,48 +61,37 @@ class TrainingWindows:
                 f"too little data: the longest of {len(recordings)} recordings {purpose} has {longest} samples, one window needs "
                 f"{self._length} ({machine.num_history} of history and {horizon} to predict)"
             )
-        moving = [self._within(u.abs() > COMMANDED) for u in self.u]
-        for joint, found in zip(machine.joint_names, moving, strict=True):
+        self._moving = [self._within(u.abs() > COMMANDED) for u in self.u]
+        for joint, found in zip(machine.joint_names, self._moving, strict=True):
             if not len(found):
                 raise RecordingError(
                     f"too little data: joint {joint} is never commanded in the {len(recordings)} recordings {purpose}"
                 )
-        self._moving = pad_sequence(moving, batch_first=True)  # (J, most)
-        self._num_moving = torch.tensor([[len(found)] for found in moving], device=device)
-        self._joint = torch.arange(len(self.u), device=device)[:, None]
 
     def draw(
-        self, batch: int, still_share: float, key: torch.Tensor
+        self, batch: int, still_share: float, generator: torch.Generator
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw windows for each joint, mostly of times at which it is commanded.
-
-        Shapes are fixed and no host is involved: a CUDA graph may hold it.
 
         Args:
             batch: Number of windows drawn a joint.
             still_share: Part drawn from all times instead.
-            key: Names the draw, int64 of shape `()`: the same key gives the same windows.
+            generator: Draws them.
 
         Returns:
             Commands and positions, each `(J, B, H + K)`.
         """
-        index = self._index(batch, still_share, key)
-        u, q = (one.unfold(1, self._length, 1)[self._joint, index] for one in (self.u, self.q))
-        return u, q
-
-    def _index(self, batch: int, still_share: float, key: torch.Tensor) -> torch.Tensor:
         still = round(batch * still_share)
-        place = torch.arange(len(self.u) * batch, device=key.device)
-        chance = hash_uniform(key * 1_048_576 + place).view(-1, batch)
-
-        def pick(chance: torch.Tensor, count: torch.Tensor | int) -> torch.Tensor:
-            return (chance.double() * count).long()
-
-        rows = (
-            self.starts[pick(chance[:, :still], len(self.starts))],
-            self._moving.gather(1, pick(chance[:, still:], self._num_moving)),
-        )
-        return torch.cat(rows, 1)
+        u, q = [], []
+        for joint, moving in enumerate(self._moving):
+            index = []
+            for places, count in ((self.starts, still), (moving, batch - still)):
+                drawn = torch.randint(len(places), (count,), generator=generator)
+                index.append(places[drawn.to(places.device)])
+            rows = torch.cat(index)
+            u.append(self.u[joint].unfold(0, self._length, 1)[rows])
+            q.append(self.q[joint].unfold(0, self._length, 1)[rows])
+        return torch.stack(u), torch.stack(q)
 
     def _within(self, condition: torch.Tensor) -> torch.Tensor:
         """Return the starts of windows in which `condition`, `(T,)` bool, holds at some time."""

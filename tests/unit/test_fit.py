@@ -74,14 +74,14 @@ def test_a_fit_repeats_with_its_seed(machine: Machine, runs: Runs, tmp_path: Pat
     assert not torch.equal(a["weight.0"], c["weight.0"])
 
 
-def test_the_same_key_draws_the_same_windows_and_none_crosses_recordings(machine: Machine) -> None:
+def test_the_same_seed_draws_the_same_windows_and_none_crosses_recordings(machine: Machine) -> None:
     parts = [recording(machine, seed, minutes=0.2) for seed in range(3)]
     marked = [
         dataclasses.replace(part, q=np.full_like(part.q, number))
         for number, part in enumerate(parts)
     ]
     windows = TrainingWindows(marked, machine, 7, CPU)
-    draws = [windows.draw(64, 0.25, torch.tensor(key)) for key in (5, 5, 6)]
+    draws = [windows.draw(64, 0.25, torch.Generator().manual_seed(seed)) for seed in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)
     assert torch.equal(draws[0][0], draws[1][0])
     assert not torch.equal(draws[0][0], draws[2][0])
