@@ -8,12 +8,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from scipy import stats
 
 from brokk_rl.report import Tone, render_page
 from brokk_rl.session import write_text
@@ -28,17 +25,15 @@ SuccessRate = dict[str, Any]
 
 
 def compare_policies(evaluations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return success by policy and plant, its loss and recovery, and the agreement of simulators.
+    """Return success by policy and plant, its loss and recovery.
 
     Args:
         evaluations: `evaluation.json` of each plant, all of the same policies.
 
     Returns:
         Plain JSON data. `fall`: success of the old policy in the simulator less that on the
-            machine; `return`: of the new policy on
-        the machine less that of the old one; `predicted` and `achieved`: the new policy in the
-        repaired simulator and on the machine; `agreement`: of each simulator with the machine about
-        the policies.
+            machine; `return`: of the new policy on the machine less that of the old one; `predicted` and
+            `achieved`: the new policy in the repaired simulator and on the machine.
     """
     rows = {plant: evaluations[plant]["policies"] for plant in PLANTS}
     policies = list(rows["machine"])
@@ -60,7 +55,6 @@ def compare_policies(evaluations: Mapping[str, Mapping[str, Any]]) -> dict[str, 
         "left": subtract_rates(success[BEFORE]["simulator"], success[AFTER]["machine"]),
         "predicted": success[AFTER]["repaired"],
         "achieved": success[AFTER]["machine"],
-        "agreement": {plant: measure_rank_agreement(success, plant) for plant in PLANTS[:2]},
     }
 
 
@@ -83,38 +77,6 @@ def subtract_rates(first: SuccessRate, second: SuccessRate) -> SuccessRate:
     below = math.hypot(first["mean"] - low, higher - second["mean"])
     above = math.hypot(high - first["mean"], second["mean"] - lower)
     return {"mean": mean, "ci95": [max(-1.0, mean - below), min(1.0, mean + above)]}
-
-
-def measure_rank_agreement(
-    success: Mapping[str, Mapping[str, SuccessRate]], plant: str
-) -> dict[str, float | None]:
-    """Return how well the ranking of policies on `plant` agrees with that on the machine.
-
-    Returns:
-        `kendall`: Kendall's tau-b of the two orders, 1 when they are the same, `None` when one of
-        them knows no order; `rank_violation`: loss of success on the machine by a wrong order,
-        mean over policies of the worst pair (mean maximum rank violation; Li et al. 2024, SIMPLER),
-        0 at best; `error`: mean absolute difference of success.
-    """
-    simulated = np.array([rates[plant]["mean"] for rates in success.values()])
-    real = np.array([rates["machine"]["mean"] for rates in success.values()])
-    # Tau divides by the number of pairs that differ: it has no value where all are equal.
-    known = np.ptp(simulated) > 0 and np.ptp(real) > 0
-    tau: Any = stats.kendalltau(simulated, real) if known else None
-    return {
-        "kendall": float(tau.statistic) if known else None,
-        "rank_violation": compute_rank_violation(simulated, real),
-        "error": float(np.abs(simulated - real).mean()),
-    }
-
-
-def compute_rank_violation(
-    simulated: Sequence[float] | np.ndarray, real: Sequence[float] | np.ndarray
-) -> float:
-    """Return the mean over policies of the largest real difference that is ranked wrongly."""
-    simulated, real = np.asarray(simulated, dtype=float), np.asarray(real, dtype=float)
-    swapped = (simulated[:, None] < simulated[None]) != (real[:, None] < real[None])
-    return float((swapped * np.abs(real[:, None] - real[None])).max(1).mean())
 
 
 def write_headline(found: Mapping[str, Any]) -> tuple[str, Tone]:

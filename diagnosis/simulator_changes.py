@@ -1,20 +1,14 @@
-"""Findings of a diagnosis as ranges for domain randomisation and as priors for sysid of MuJoCo.
-
-Ranges are ranked by the success that each effect costs, where that was measured, else by its part of the
-gap.
-"""
+"""Findings of a diagnosis as ranges for domain randomisation, the effect that closes most of the gap first."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from brokk_rl.errors import RecordingError
 from brokk_rl.session import write_text
 from diagnosis.answer import Answer
 from diagnosis.effect_library import EffectType
@@ -37,7 +31,6 @@ class RandomisationRange:
         number: The number, with its unit in its name.
         low: Lower end.
         high: Upper end.
-        success_cost: Strict success that the effect takes from the policy; `None` where not measured.
         gap_closed: Its part of the gap; `None` where free runs do not show it.
     """
 
@@ -46,39 +39,11 @@ class RandomisationRange:
     number: str
     low: float
     high: float
-    success_cost: float | None
     gap_closed: float | None
 
 
-def read_success_costs(path: Path) -> dict[str, float]:
-    """Return the success that each effect costs, from `why.json`.
-
-    Raises:
-        RecordingError: The file cannot be read.
-    """
-    try:
-        told = json.loads(path.read_text())
-        success = {name: float(rate["mean"]) for name, rate in told["success"].items()}
-        effects = [one["effect"] for one in told["effects"]]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RecordingError(f"{path}: expected a why.json with success rates ({error})") from error
-    if "as_trained" not in success:
-        return {}
-    costs = {}
-    for name in effects:
-        # One effect alone is evaluated as the set of all.
-        after = success.get(
-            f"with_{name}", success.get("with_effects") if len(effects) == 1 else None
-        )
-        if after is not None:
-            costs[name] = success["as_trained"] - after
-    return costs
-
-
-def list_ranges(
-    answer: Answer, kinds: Sequence[EffectType], costs: Mapping[str, float]
-) -> list[RandomisationRange]:
-    """Return the ranges, the effect that costs most success first."""
+def list_ranges(answer: Answer, kinds: Sequence[EffectType]) -> list[RandomisationRange]:
+    """Return the ranges, the effect that closes most of the gap first."""
     by_name = {kind.name: kind for kind in kinds}
     found = []
     for one in answer.selected:
@@ -86,14 +51,8 @@ def list_ranges(
         for number, values in one.parameters.items():
             for joint, value in values.items():
                 low, high = _widen(by_name[one.effect], number, joint, value)
-                cost = costs.get(one.effect)
-                found.append(RandomisationRange(one.effect, joint, number, low, high, cost, closed))
-    return sorted(found, key=_rank)
-
-
-def _rank(one: RandomisationRange) -> tuple[bool, float, float]:
-    cost, closed = one.success_cost, one.gap_closed
-    return cost is None, -(cost or 0.0), -(closed or 0.0)
+                found.append(RandomisationRange(one.effect, joint, number, low, high, closed))
+    return sorted(found, key=lambda one: -(one.gap_closed or 0.0))
 
 
 def _widen(kind: EffectType, number: str, joint: str, value: Any) -> tuple[float, float]:
@@ -126,12 +85,12 @@ def write_randomisation(
     nodes = {}
     lines = [
         "# @package effect",
-        "# Ranges for domain randomisation, the effect that costs most first.",
+        "# Ranges for domain randomisation, the effect that closes most of the gap first.",
     ]
     for name in order:
         own = [one for one in ranges if one.effect == name]
         selected = next(one for one in answer.selected if one.effect == name)
-        lines.append(f"# {name}: {describe_cost(own[0])}")
+        lines.append(f"# {name}: {describe_part(own[0])}")
         if by_name[name].target.side == "simulator":
             lines.append("#   a number of the MJCF file: its range is in randomisation.json")
         else:
@@ -143,86 +102,8 @@ def write_randomisation(
     write_text(path, "\n".join(lines) + "\n" + text)
 
 
-def describe_cost(one: RandomisationRange) -> str:
+def describe_part(one: RandomisationRange) -> str:
     """Return in words by what an effect is ranked."""
-    if one.success_cost is not None:
-        return f"costs {one.success_cost:.2f} of success"
-    if one.gap_closed is not None:
-        return f"success not measured; closes {one.gap_closed:.2f} of the gap"
-    return "success not measured; free runs do not show it"
-
-
-SYSID_HEAD = '''"""Priors for mujoco.sysid from a diagnosis: nominal value and bounds of each changed number.
-
-    from sysid_parameters import build_parameters
-    parameters = build_parameters()
-
-It needs `pip install 'mujoco[sysid]'`. The nominal value is that of the diagnosis; bounds are twice its
-95 % interval, at least a fifth of the change.
-"""
-
-import math
-
-from mujoco import sysid
-
-
-def _write(element, joint, attribute, index):
-    def modify(spec, parameter):
-        if element == "joint":
-            owner = spec.joint(joint)
-        else:
-            owner = next(one for one in spec.actuators if one.target == joint)
-        value = float(parameter.value[0])
-        if attribute == "delay":  # its buffer holds the longest delay of the bounds
-            owner.nsample = math.ceil(float(parameter.max_value[0]) / spec.option.timestep) + 2
-            owner.interp = 1  # between time steps
-        if index is None:
-            setattr(owner, attribute, value)
-        else:
-            row = getattr(owner, attribute).copy()
-            row[index] = value
-            setattr(owner, attribute, row)
-
-    return modify
-
-
-def build_parameters():
-    """Return a `mujoco.sysid.ParameterDict`; each parameter writes itself into an MjSpec."""
-    parameters = sysid.ParameterDict()
-'''
-PRIOR = """    # {comment}
-    parameters.add(
-        sysid.Parameter(
-            "{name}", {nominal!r}, {low!r}, {high!r},
-            modifier=_write("{element}", "{joint}", "{attribute}", {index!r}),
-        )
-    )
-"""
-
-
-def write_sysid_priors(changes: Sequence[Any], path: Path) -> None:
-    """Write `sysid_parameters.py` from changes of an MJCF file (`diagnosis.mjcf.changes.MjcfChange`).
-
-    Raises:
-        StorageError: The file could not be written.
-    """
-    text = SYSID_HEAD
-    for one in changes:
-        attribute, _, index = one.attribute.rstrip("]").partition("[")
-        ends = one.interval or (one.after, one.after)
-        half = max(WIDER * 0.5 * (ends[1] - ends[0]), LEAST_SPREAD * abs(one.after - one.before))
-        low, high = one.after - half, one.after + half
-        if one.before >= 0.0 and one.after >= 0.0:
-            low = max(0.0, low)
-        text += PRIOR.format(
-            comment=f"{one.effect} on {one.joint}: {one.before:.6g} in the file",
-            name=f"{one.joint}.{one.attribute}",
-            nominal=float(f"{one.after:.6g}"),
-            low=float(f"{low:.6g}"),
-            high=float(f"{high:.6g}"),
-            element=one.element,
-            joint=one.joint,
-            attribute=attribute,
-            index=int(index) if index else None,
-        )
-    write_text(path, text + "    return parameters\n")
+    if one.gap_closed is None:
+        return "free runs do not show it"
+    return f"closes {one.gap_closed:.2f} of the gap"

@@ -179,7 +179,7 @@ def list_changes(result: WhyResult) -> list[NextStep]:
         text = "Put the effects into your simulator, and train in it again. This writes them as ranges and changes:"
         command = (
             f"brokk mode=change_simulator {machine} simulator={simulator} changes.diagnosis={result.folder / DIAGNOSIS} "
-            f"changes.why={result.folder / WHY_FILE} session.out={result.folder / 'changes'}"
+            f"session.out={result.folder / 'changes'}"
         )
         return [*changes, (text, command)]
     text = "Train on with the effects that were found, then run this command again with the new policy:"

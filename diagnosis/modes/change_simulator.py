@@ -23,7 +23,7 @@ from diagnosis.answer import Answer
 from diagnosis.own_simulator import OwnSimulator
 from diagnosis.simulator_runs import cut_simulator_runs
 
-MJCF_FILE, SYSID_FILE = "changed.xml", "sysid_parameters.py"
+MJCF_FILE = "changed.xml"
 RANGES_FILE, TABLE_FILE = "randomisation.yaml", "randomisation.json"
 CHANGES_FILE = "changes.json"
 
@@ -35,12 +35,10 @@ class ChangeRequest:
     Attributes:
         diagnosis: Run folder of `mode=diagnose`.
         recordings: Glob or globs of recordings that the changed file is replayed on.
-        why: `why.json`, with the success that each effect costs.
     """
 
     diagnosis: str
     recordings: str | tuple[str, ...] | None
-    why: str | None
 
 
 @spec
@@ -68,7 +66,7 @@ class ChangeSimulator:
         """Write the files.
 
         Raises:
-            RecordingError: The diagnosis, the recordings or `why.json` cannot be read.
+            RecordingError: The diagnosis or the recordings cannot be read.
             ConfigError: The MJCF file does not have the machine's joints, or nothing was found.
             StorageError: A file could not be written.
         """
@@ -82,12 +80,9 @@ class ChangeSimulator:
             )
         own = replace(self.own, source=self.simulator)
         kinds = effect_library.load_effects(self.machine, None, own)
-        costs = {}
-        if self.changes.why is not None:
-            costs = simulator_changes.read_success_costs(Path(self.changes.why))
         recordings = self._read_recordings()
         folder.mkdir(parents=True, exist_ok=True)
-        ranges = simulator_changes.list_ranges(given, kinds, costs)
+        ranges = simulator_changes.list_ranges(given, kinds)
         simulator_changes.write_randomisation(given, kinds, ranges, folder / RANGES_FILE)
         write_json(folder / TABLE_FILE, [asdict(one) for one in ranges])
         told: dict[str, Any] = {"changes": [], "not_in_the_file": {}, "replay": {}}
@@ -104,7 +99,7 @@ class ChangeSimulator:
     def _change_file(
         self, own: OwnSimulator, path: Path, given: Answer, recordings: Sequence[Recording]
     ) -> dict[str, Any]:
-        """Write the changed MJCF and the priors; return what was done."""
+        """Write the changed MJCF; return what was done."""
         from diagnosis.mjcf import changes as mjcf_changes  # MuJoCo is not in every installation
 
         folder = self.session.folder
@@ -126,7 +121,6 @@ class ChangeSimulator:
                 )
         changed = folder / MJCF_FILE
         changes, left = mjcf_changes.write_changed_mjcf(path, self.machine, findings, changed)
-        simulator_changes.write_sysid_priors(changes, folder / SYSID_FILE)
         told: dict[str, Any] = {
             "changes": [asdict(one) for one in changes],
             "not_in_the_file": left,
@@ -164,5 +158,5 @@ def _print(
         print_text(f"{joint}: error {before:.4g}, with the changes {after:.4g}")
     for name in dict.fromkeys(one.effect for one in ranges):
         first = next(one for one in ranges if one.effect == name)
-        print_text(f"{name}: {simulator_changes.describe_cost(first)}")
+        print_text(f"{name}: {simulator_changes.describe_part(first)}")
     print_text(f"written: {folder}")

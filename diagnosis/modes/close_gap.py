@@ -61,8 +61,7 @@ class CloseGap:
         stand_in: The machine.
         follower: Who stands between policy and machine.
         policy: The policy as it was.
-        panel: Policies beside it, by name, to see whether simulator and machine put them in the
-            same order.
+        panel: Policies beside it, by name, to compare with.
         warm: Retrain from the network of `policy`; false: from a fresh one.
         rl: How to train.
         tracking: Where figures of the training go beside the run folder.

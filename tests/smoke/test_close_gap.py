@@ -40,7 +40,6 @@ def test_a_policy_is_retrained_and_judged_on_three_plants(
     for policy in found["success"].values():
         # the stand-in is just the repaired simulator, and all meet the same starts and noise
         assert policy["repaired"] == policy["machine"]
-    assert found["agreement"]["repaired"]["error"] == 0.0
     assert (run / "close_gap.html").exists() and (run / "retrained" / "policy.onnx").exists()
 
     before = (run / "retrained" / "policy.safetensors").read_bytes()

@@ -1,11 +1,8 @@
-"""Findings of a diagnosis as changes of an MJCF file, priors and ranges."""
+"""Findings of a diagnosis as changes of an MJCF file, and as ranges."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +21,6 @@ from diagnosis.closure import Estimate
 from diagnosis.mjcf.changes import JointFinding, write_changed_mjcf
 from diagnosis.mjcf.plant import MjcfPlant
 from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
-from diagnosis.simulator_changes import write_sysid_priors
 from diagnosis.simulator_runs import cut_simulator_runs
 
 DELAY_S, FRICTION_NM = 0.06, 0.5
@@ -80,25 +76,12 @@ def change_arm(folder: Path) -> dict[str, Any]:
         )
     (folder / "arm.xml").write_text(ARM)
     name_effects().write(folder / ANSWER_FILE)
-    why = {
-        "success": {
-            "as_trained": {"mean": 0.9},
-            "with_dead_time": {"mean": 0.7},
-            "with_joint_friction": {"mean": 0.3},
-        },
-        "effects": [{"effect": name} for name in ("dead_time", "joint_friction", "backlash")],
-    }
-    (folder / "why.json").write_text(json.dumps(why))
     ChangeSimulator(
         session=Session(out=str(folder / "out"), seed=0, device="cpu"),
         machine=machine,
         simulator=str(folder / "arm.xml"),
         own=api._load_option("actuator", "own"),
-        changes=ChangeRequest(
-            diagnosis=str(folder),
-            recordings=str(folder / "*.parquet"),
-            why=str(folder / "why.json"),
-        ),
+        changes=ChangeRequest(diagnosis=str(folder), recordings=str(folder / "*.parquet")),
     ).run()
     return json.loads((folder / "out" / "changes.json").read_text())
 
@@ -116,7 +99,7 @@ def test_the_changed_file_is_the_faulty_machine(tmp_path: Path) -> None:
     assert max(told["replay"]["after"].values()) < 8 * NOISE_RAD
     ranges = json.loads((tmp_path / "out" / "randomisation.json").read_text())
     ranked = list(dict.fromkeys(one["effect"] for one in ranges))
-    assert ranked == ["joint_friction", "dead_time", "backlash"]  # by success, then by the gap
+    assert ranked == ["dead_time", "joint_friction", "backlash"]  # by the gap
     nodes = yaml.safe_load((tmp_path / "out" / "randomisation.yaml").read_text())
     assert nodes["dead_time"]["dead_time_s"]["elbow"] == [0.048, 0.072]
     assert "joint_friction" not in nodes
@@ -164,32 +147,6 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
         assert np.square(left).mean() < 0.01 * np.square(with_effect - plain).mean(), kind.name
 
 
-def test_priors_write_themselves_into_a_spec(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sysid = pytest.importorskip("mujoco.sysid")
-    if not hasattr(sysid, "Parameter"):
-        pytest.skip("needs mujoco[sysid]")
-    change_arm(tmp_path)
-    found = importlib.util.spec_from_file_location(
-        "sysid_parameters", tmp_path / "out" / "sysid_parameters.py"
-    )
-    assert found and found.loader
-    module = importlib.util.module_from_spec(found)
-    monkeypatch.setitem(sys.modules, "sysid_parameters", module)
-    found.loader.exec_module(module)
-    parameters = module.build_parameters()
-    spec = mujoco.MjSpec.from_string(ARM)
-    for one in parameters.parameters.values():
-        one.apply_modifier(spec)
-    model = spec.compile()
-    changed = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "changed.xml"))
-    assert model.dof_frictionloss.tolist() == pytest.approx(changed.dof_frictionloss.tolist())
-    assert model.actuator_delay.tolist() == pytest.approx(changed.actuator_delay.tolist())
-    lower, upper = parameters.get_bounds()
-    assert (np.asarray(lower) < np.asarray(upper)).all()
-
-
 def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
     none = Answer(
         verdict="none",
@@ -208,7 +165,7 @@ def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
         machine=make_machine("shoulder", "elbow"),
         simulator=str(tmp_path / "arm.xml"),
         own=api._load_option("actuator", "own"),
-        changes=ChangeRequest(diagnosis=str(tmp_path), recordings=None, why=None),
+        changes=ChangeRequest(diagnosis=str(tmp_path), recordings=None),
     )
     with pytest.raises(ConfigError, match="its verdict is 'none', so there is nothing to change"):
         mode.run()
@@ -225,11 +182,6 @@ def test_a_lower_range_of_the_file_stays(tmp_path: Path) -> None:
     assert left == {} and model.actuator_forcerange.tolist() == [[-3.0, 4.5], [0.0, 0.0]]
     assert model.actuator_forcelimited.tolist() == [1, 0]
     assert [one.interval for one in changes] == [(3.0, 6.0)]  # the other side keeps its range
-    free = replace(
-        changes[0], attribute="forcerange[0]", before=0.0, after=-4.5, interval=(-6.0, -3.0)
-    )
-    write_sysid_priors([free], tmp_path / "priors.py")
-    assert '"shoulder.forcerange[0]", -4.5, -7.5, -1.5,' in (tmp_path / "priors.py").read_text()
     plant = MjcfPlant(source, machine).change_model({"limit": np.array([2.0, 0.0])})
     assert plant.actuator_forcerange.tolist() == model.actuator_forcerange.tolist()
     assert plant.actuator_forcelimited.tolist() == [1, 0]

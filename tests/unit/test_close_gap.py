@@ -1,4 +1,4 @@
-"""What a diagnosis is worth to a policy: intervals, orders and sentences; and the mode's refusals."""
+"""What a diagnosis is worth to a policy: intervals and sentences; and the mode's refusals."""
 
 from __future__ import annotations
 
@@ -83,24 +83,6 @@ def test_the_interval_of_a_difference_is_newcombe_s() -> None:
     assert retraining.subtract_rates(first, second)["ci95"] == pytest.approx(
         [0.0524, 0.3339], abs=5e-5
     )
-
-
-def test_a_wrong_order_costs_what_it_would_lose_on_the_machine() -> None:
-    # the simulator swaps the first two; choosing by it loses 0.3 for each of them, nothing for the
-    # third
-    assert retraining.compute_rank_violation([0.8, 0.9, 0.1], [0.9, 0.6, 0.2]) == pytest.approx(
-        (0.3 + 0.3 + 0.0) / 3
-    )
-    assert retraining.compute_rank_violation([0.5, 0.6, 0.7], [0.1, 0.2, 0.9]) == 0.0
-
-
-def test_a_simulator_without_an_order_claims_none() -> None:
-    found = retraining.compare_policies(
-        evaluations(before=(0.9, 0.2, 0.2), after=(0.9, 0.8, 0.7), classical=(0.9, 0.1, 0.1))
-    )
-    assert found["agreement"]["simulator"]["kendall"] is None and found["agreement"]["repaired"][
-        "kendall"
-    ] == pytest.approx(1.0)
 
 
 def test_training_that_begins_with_a_policy_has_its_network_and_its_own_exploration(
