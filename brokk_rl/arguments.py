@@ -27,6 +27,8 @@ SWEEP = {"--multirun", "-m"}
 ROBOT_FILES = (".urdf", ".xml", ".mjcf", ".xacro")
 NOTHING = ("none", "null")
 """Options that no group needs: they leave it out."""
+PLACES = ("hydra.run", "hydra.sweep.", "hydra.output_subdir", "hydra.job.chdir")
+"""Keys of Hydra's own folders, of which none is made."""
 KEY = r"\+{0,2}[\w/]+(?:[.@:][\w:]+)*"
 """A key as Hydra takes it: `+group@package`, `task.hole.radius_m`."""
 MEANINGFUL = frozenset(",[](){}'\"$\\")
@@ -135,6 +137,8 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     if not re.fullmatch(KEY, key):
         hint = "it is written without spaces" if " " in key else "it is names with dots between"
         raise ConfigError(f"'{key}' in '{word}' is no key; {hint}, as in session.seed=3")
+    if key.startswith(PLACES):
+        raise ConfigError(f"{word}: folders are made by the command; give session.out=<folder>")
     if not value.strip():
         offered = groups.get(key)
         end = list_choices("", offered) if offered else f"{key}=<value>, or {key}=null for none"

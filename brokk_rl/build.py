@@ -13,11 +13,13 @@ import traceback
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import MISSING, fields, is_dataclass
-from importlib.abc import MetaPathFinder
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from brokk_rl import extras, registry
+from brokk_rl import registry
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import SpecError
 
@@ -26,6 +28,8 @@ RUN = "run"
 """Key of the class of the mode; no mode has such a field, since `run` is its method."""
 BESIDE = {"machine", "sim"}
 """Nodes that others are compared with."""
+SUBJECT = "subject"
+"""Node of a mode that tells what does not fit together, in place of a refusal."""
 SLOW = "torch"
 """Package whose import takes seconds."""
 
@@ -85,19 +89,17 @@ def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -
         ConfigError: Classes cannot be found or refuse their values; all of them are named.
     """
     built, refusals = {}, []
-    with _refuse_slow_import():
-        for key, value in values.items():
-            if key == RUN or key in shared:
-                continue
-            try:
-                with suppress(_SlowImport, _LackingPackageError):  # the mode says what it lacks
-                    built[key] = build_node(value, key)
-            except ConfigError as error:
-                refusals.append(error)
-    if "machine" in built:
-        refusals += _list_foreign_joints(values.get("effect"), built["machine"])
-    for other in built.keys() & BESIDE:
-        for part in built.values():
+    for key, value in values.items():
+        if key == RUN or key in shared:
+            continue
+        try:
+            # the mode itself says which package it lacks
+            with defer_slow_import(), suppress(_SlowImport, _LackingPackageError):
+                built[key] = build_node(value, key)
+        except ConfigError as error:
+            refusals.append(error)
+    for other in () if SUBJECT in values else built.keys() & BESIDE:
+        for part in _list_parts(built):
             try:
                 if check := getattr(part, f"check_{other}", None):
                     check(built[other])
@@ -108,17 +110,13 @@ def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -
     return built
 
 
-def _list_foreign_joints(effects: Any, machine: Any) -> Iterator[ConfigError]:
-    """Yield an error for each joint that an effect names and the machine does not have.
-
-    Effects compute with torch, so they are not built yet.
-    """
-    for place, name in registry.iterate_leaves(effects):
-        if "joints" in place and name not in ("all", *machine.joint_names):
-            yield ConfigError(
-                f"{'.'.join(('effect', *place))}: '{name}' is no joint of machine '{machine.name}'; "
-                f"{list_choices(str(name), machine.joint_names)}"
-            )
+def _list_parts(nodes: Mapping[str, Any]) -> Iterator[Any]:
+    """Yield each node, of those that hold several parts by name the parts."""
+    for node in nodes.values():
+        if isinstance(node, Mapping):
+            yield from _list_parts(node)
+        else:
+            yield node
 
 
 def build_node(node: Any, place: str = "") -> Any:
@@ -188,6 +186,8 @@ def load_class(target: object, place: str) -> Any:
         return getattr(importlib.import_module(module), name)
     except Exception as error:
         if isinstance(error, ModuleNotFoundError):
+            from brokk_rl import extras  # its parts take a while to import
+
             text = extras.explain_missing_module(str(error.name), str(target))
             if text:
                 raise _LackingPackageError(text) from error
@@ -259,23 +259,63 @@ class _LackingPackageError(ConfigError):
 
 
 class _SlowImport(BaseException):
-    """A module imports torch; no `Exception`, so that nothing takes it for a missing package."""
+    """Code uses torch; no `Exception`, so that nothing takes it for a missing package."""
 
 
-class _SlowFinder(MetaPathFinder):
-    """Refuses the import of torch."""
+class _LateModule(ModuleType):
+    """A module that its import does not execute, but the first use of a member."""
 
-    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
-        if fullname == SLOW:
-            raise _SlowImport
+    def __getattr__(self, name: str) -> Any:
+        if _LateImport.is_refusing:
+            raise _SlowImport(name)
+        return getattr(importlib.import_module(self.__name__), name)
+
+
+class _LateImport(MetaPathFinder, Loader):
+    """Imports torch, within the block of `defer_slow_import` without executing it.
+
+    All imports give one object, so that a module which has torch unexecuted has it executed later.
+    """
+
+    is_refusing = False
+
+    def __init__(self) -> None:
+        self._module = ModuleType(SLOW)
+        self._loader: Loader | None = None
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
+        """Return where the module lies, and that it is loaded here."""
+        found = PathFinder.find_spec(fullname, path, target) if fullname == SLOW else None
+        if found is not None:
+            self._loader = found.loader
+            found.loader = self
+        return found
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Return the module that earlier imports have given."""
+        self._module.__class__ = ModuleType
+        return self._module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Execute the module, or leave that for later."""
+        if self.is_refusing:
+            del module.__path__  # the import of a part asks for it
+            module.__class__ = _LateModule
+        elif self._loader is not None:
+            self._loader.exec_module(module)
 
 
 @contextmanager
-def _refuse_slow_import() -> Iterator[None]:
-    """Make a module that imports torch raise `_SlowImport`; Python imports it anew later."""
-    finder = _SlowFinder()
-    sys.meta_path.insert(0, finder)
+def defer_slow_import() -> Iterator[None]:
+    """Make the use of torch raise `_SlowImport`, but not its import."""
+    if SLOW in sys.modules:
+        yield
+        return
+    if not any(isinstance(finder, _LateImport) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _LateImport())
+    _LateImport.is_refusing = True
     try:
         yield
     finally:
-        sys.meta_path.remove(finder)
+        _LateImport.is_refusing = False
+        sys.modules.pop(SLOW, None)

@@ -145,7 +145,7 @@ def _locate_values(text: str) -> Iterator[tuple[str, int, int, int]]:
 
     A table or list in lines of its own ends with its key.
     """
-    root = yaml.compose(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
     waiting = [("", root)]
     while waiting:
         above, table = waiting.pop()

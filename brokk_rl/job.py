@@ -17,23 +17,31 @@ from omegaconf import DictConfig, OmegaConf
 from brokk_rl import distributed, extensions, registry
 from brokk_rl.build import build_mode
 from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.policy_choice import insert_policy, is_going_on
 from brokk_rl.session import read_earlier_job, remove_empty_folders, require_new_folder
 from brokk_rl.sweep import name_job
 
 log = logging.getLogger(__name__)
+
+WITH_POLICIES = {"policy", "rivals", "panel"}
+"""Nodes that may hold a policy."""
 
 
 def run(cfg: DictConfig) -> float | None:
     """Build the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
     extensions.refuse_ambiguous(HydraConfig.get().runtime.choices)
-    cfg, built = insert_policy(cfg)
+    built: dict[str, Any] = {}
+    if not WITH_POLICIES.isdisjoint(cfg):
+        from brokk_rl.policy_choice import insert_policy  # its imports take 0.2 s
+
+        cfg, built = insert_policy(cfg)
     values, shared = extensions.read_values(cfg)
     if "session" not in values:
         mode = build_mode(values | built, shared)
         distributed.check_together(type(mode), sweep)
         return mode.run()
+    from brokk_rl.policy_choice import is_going_on
+
     folder = choose_run_folder(values)
     goes_on = is_going_on(cfg, folder)
     try:

@@ -183,9 +183,10 @@ class Machine:
             )
 
     def check_sim(self, sim: object) -> None:
-        """Refuse an MJCF that there is not, before a simulator looks for it."""
-        if self.mjcf is not None:
-            find_mjcf(self)
+        """Refuse a machine that cannot be simulated."""
+        if not self.has_bodies:
+            _ = self.bodies, self.tip_m  # they say what is missing
+        find_mjcf(self)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

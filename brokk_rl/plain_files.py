@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from brokk_rl.errors import ConfigError
 
 MOST_NODES, MOST_DEPTH = 20_000, 40
 """Values of a YAML file with its aliases written out, and levels of nesting, beyond which it is no
@@ -93,3 +96,28 @@ def check_yaml_size(text: str) -> None:
         is_open[-1] = outer, total + size
         if total + size > MOST_NODES:
             raise ValueError(f"expected at most {MOST_NODES} values with all aliases written out")
+
+
+def parse_model(path: Path) -> ElementTree.Element:
+    """Return the root of a URDF or MJCF.
+
+    Raises:
+        ConfigError: there is no such file, or it is neither.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except OSError as error:
+        raise ConfigError(
+            f"model: cannot read {path}: {error.strerror} (seen from {Path.cwd()})"
+        ) from error
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        hint = "; run xacro first" if "xacro" in path.name or "prefix" in str(error) else ""
+        raise ConfigError(
+            f"model: {path} is no XML, cannot read it as URDF or MJCF ({error}){hint}"
+        ) from error
+    if root.tag not in ("robot", "mujoco"):
+        raise ConfigError(
+            f"model: expected a URDF (<robot>) or an MJCF (<mujoco>), got <{root.tag}> in {path}; "
+            "export it as one of these"
+        )
+    return root

@@ -16,13 +16,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from brokk_rl import distributed
 from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
 from brokk_rl.spec import Seed, spec
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
 RECORD = "session.json"
@@ -117,10 +116,14 @@ class Session:
 
     def generator(self, name: str) -> np.random.Generator:
         """Return a numpy generator for the stream `name`, independent of all other streams."""
+        import numpy as np
+
         return np.random.default_rng(self.stream(name))
 
     def seed_all(self) -> None:
         """Seed the global generators of Python, numpy and torch (all devices)."""
+        import numpy as np
+
         random.seed(self.stream("python"))
         np.random.seed(self.stream("numpy"))
         try:

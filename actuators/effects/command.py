@@ -1,5 +1,7 @@
 """Effects on how much of a command the valve sees."""
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 import torch

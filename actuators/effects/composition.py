@@ -1,5 +1,7 @@
 """Several effects at once: drawn per episode, or around an actuator with its sensors."""
 
+from __future__ import annotations
+
 import zlib
 
 import torch
@@ -58,6 +60,12 @@ class Library:
                 place = f"behind {on_commands[-1]}: it delays what is sent"
                 raise ConfigError(f"{where}: '{name}' must come {place}")
 
+    def check_machine(self, machine: Machine) -> None:
+        """Refuse numbers that a machine cannot have; effects that do not occur on it are left out."""
+        for effect in self.effects.values():
+            if effect.find_variant(machine):
+                effect.check_machine(machine, "effect.library.effects")
+
     def _get_shares(self) -> dict[str, float]:
         share: PerJoint = self.share
         if not isinstance(share, dict):
@@ -102,9 +110,7 @@ class ActuatorWithEffects:
     actuator: Actuator
     effects: dict[str, Effect]
 
-    def build(
-        self, machine: Machine, num_envs: int, device: torch.device
-    ) -> "MeasuredActuatorModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> MeasuredActuatorModel:
         """Return a model for `num_envs` environments on `device`."""
         model = self.actuator.build(machine, num_envs, device)
         return MeasuredActuatorModel(model, self.effects, machine, num_envs, device)

@@ -18,7 +18,7 @@ import torch
 
 from actuators.contracts import PlannedRun
 from actuators.effects.planned_run import ChainRun, change_run_commands
-from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
+from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value, check_numbers
 from actuators.effects.step_inputs import Memory, RunMemory, StepInputs, StepMemory, join_name
 from actuators.models.force_drive import change_drive
 from actuators.models.machine_tensors import MachineTensors
@@ -101,7 +101,24 @@ class EffectSpec:
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
     ) -> EffectChain:
-        """Return `model` with the effect around it.
+        """Return `model` with the effect around it."""
+        self.check_machine(machine)
+        return EffectChain(
+            {"": self},
+            model,
+            machine,
+            num_envs,
+            device,
+            salt=zlib.crc32(self.name().encode()),
+            where=f"effect.{self.name()}",
+        )
+
+    def check_machine(self, machine: Machine, above: str = "effect") -> None:
+        """Refuse an effect that does not occur on a machine; needs no torch.
+
+        Args:
+            machine: The machine.
+            above: Config node that holds the effect, for messages.
 
         Raises:
             ConfigError: A number is out of bounds, or a joint is unknown.
@@ -113,15 +130,7 @@ class EffectSpec:
                 f"effect={name}: joints of machine '{machine.name}' are commanded by {machine.interface}, where it does not "
                 f"occur; it is for joints commanded by {', '.join(sorted({*self.interfaces, *self.variants}))}"
             )
-        return EffectChain(
-            {"": self},
-            model,
-            machine,
-            num_envs,
-            device,
-            salt=zlib.crc32(name.encode()),
-            where=f"effect.{name}",
-        )
+        check_numbers(vars(self), variant.numbers, machine, f"{above}.{name}")
 
     def begin(self, now: StepInputs) -> Memory:
         """Return the initial memory at `now`, at rest or in the middle of a recording."""

@@ -1,5 +1,7 @@
 """Effects on geometry: link lengths, base tilt and camera pose that differ from the drawings."""
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 import torch

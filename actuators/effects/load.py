@@ -1,5 +1,7 @@
 """Effects of load: the arm's weight, and the other joints on the same pump."""
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 import torch

@@ -1,5 +1,7 @@
 """Effects on the measured positions that controller and recording receive."""
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 import torch

@@ -1,9 +1,11 @@
 """Numbers of effects: values or ranges, per joint, as tensors over environments."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -181,6 +183,15 @@ class ParameterRanges:
     def advance(self) -> torch.Tensor | None:
         """Advance to the next draws and return the counter, `(N,)`; `None` without draws."""
         return None if self._draw is None else self._draw.add_(1)
+
+
+def check_numbers(
+    values: Mapping[str, Any], numbers: Mapping[str, EffectNumber], machine: Machine, where: str
+) -> None:
+    """Refuse numbers and joints that a machine cannot have; see `ParameterRanges`."""
+    chosen = _select_joints(values.get("joints", "all"), machine, f"{where}.joints")
+    for name, number in numbers.items():
+        _resolve_range(values[name], number, chosen, machine, f"{where}.{name}")
 
 
 def _select_joints(joints: Joints, machine: Machine, where: str) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Effects on the speed that a joint reaches for a valve opening, joint by joint."""
 
+from __future__ import annotations
+
 import math
 from types import MappingProxyType
 from typing import ClassVar

@@ -12,7 +12,7 @@ from actuators.models.machine_tensors import MachineTensors
 from actuators.models.parameters import draw_uniform
 from brokk_rl.history import History
 
-Memory = dict[str, torch.Tensor]
+Memory = dict[str, "torch.Tensor"]
 
 
 @dataclass(frozen=True)

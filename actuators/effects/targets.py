@@ -5,6 +5,8 @@ that an error of that encoder shows in no recording of the two; `encoder_bias` a
 not among the effects here.
 """
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 import torch

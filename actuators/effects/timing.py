@@ -1,5 +1,7 @@
 """Effects on when a command arrives."""
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 import torch

@@ -9,6 +9,8 @@ A command acts for a whole control period. The speed is solved implicitly over t
 friction of any size is stable and dry friction brings a joint exactly to rest.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -83,7 +85,7 @@ class ForceDrive:
     motor_load_square: PerJoint = 0.0
     outside_load_square: PerJoint = 0.0
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ForceDriveModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ForceDriveModel:
         """Return a model for `num_envs` environments on `device`.
 
         Raises:

@@ -16,6 +16,8 @@ than the weight, `motor_load_square f^2 / full` where the weight does, and 0 whe
     M5  M4 with loads that differ M6  M5 and squares
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import torch

@@ -21,6 +21,8 @@ by flow. Contact reaches the plant through the measured position only: a blocked
 pushing, and the simulator's drive yields.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, get_type_hints
@@ -108,7 +110,7 @@ class Hydraulic:
     thermal_gain: float
     substep_s: Annotated[float, Interval(gt=0, le=0.01)]
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HydraulicModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> HydraulicModel:
         """Return a model for `num_envs` environments on `device`.
 
         Raises:

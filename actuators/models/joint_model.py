@@ -17,7 +17,7 @@ from actuators.models.parameters import split_run_commands
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
-JointMemory = dict[str, torch.Tensor]
+JointMemory = dict[str, "torch.Tensor"]
 """State of the joints by name, `(N, J)` each."""
 
 

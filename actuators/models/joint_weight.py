@@ -1,5 +1,7 @@
 """Weight on the joints of a machine, in the linear form of a planar arm where that is exact."""
 
+from __future__ import annotations
+
 from functools import lru_cache
 
 import numpy as np

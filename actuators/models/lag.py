@@ -1,5 +1,7 @@
 """Simple actuator models: ideal, and dead time with dead band and first-order lag."""
 
+from __future__ import annotations
+
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -23,7 +25,7 @@ class Ideal:
 
     speed_scale: float
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "IdealModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> IdealModel:
         """Return a model for `num_envs` environments on `device`.
 
         Raises:
@@ -67,7 +69,7 @@ class FirstOrderLag:
     gain: PerJoint
     time_constant_s: PerJoint
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "FirstOrderLagModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> FirstOrderLagModel:
         """Return a model for `num_envs` environments on `device`.
 
         Raises:

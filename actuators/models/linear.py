@@ -1,5 +1,7 @@
 """Baselines that a learned actuator must beat: a machine that stands still, and a linear model."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from brokk_rl.spec import NonNegative, spec
 class Hold(MemorylessModel):
     """Never moves, `q' = q`: the error that any model must beat."""
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "Hold":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> Hold:
         """Return itself: there is nothing to build."""
         return self
 
@@ -63,7 +65,7 @@ class Arx:
 
     checkpoint: str
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ArxModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ArxModel:
         """Return the model.
 
         Raises:

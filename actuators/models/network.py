@@ -8,6 +8,8 @@ learned in one place holds in another unless the data say otherwise.
 Axes: `J` joints, `B` batch, `H` history, `K` steps.
 """
 
+from __future__ import annotations
+
 from itertools import pairwise
 
 import torch
@@ -149,7 +151,7 @@ class Mlp:
 
     checkpoint: str
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "NetworkModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NetworkModel:
         """Return a model for any number of environments on `device`.
 
         Raises:

@@ -5,6 +5,8 @@ graph may hold the draws, and a run that is restored from its state goes on exac
 be memory outside the state, which the contract of an actuator model forbids.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType

@@ -20,6 +20,7 @@ from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Dimension, Machine
+from brokk_rl.plain_files import parse_model
 from brokk_rl.session import Session, write_bytes, write_json, write_text
 from brokk_rl.spec import WorldCount, name_spec, spec
 
@@ -73,8 +74,8 @@ class CheckSubject:
     num_starts: WorldCount
 
     def check(self) -> None:
-        if self.model is not None and not Path(self.model).is_file():
-            raise ConfigError(f"model: there is no file {self.model} (seen from {Path.cwd()})")
+        if self.model is not None:
+            parse_model(Path(self.model))
         if self.model is None and (self.chain or self.tip or self.name):
             raise ConfigError("model: expected the file of a robot beside name, chain and tip")
         if self.name is not None and not re.fullmatch(r"\w+", self.name):

@@ -22,6 +22,7 @@ import numpy as np
 import trimesh
 
 from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.plain_files import parse_model
 
 KINDS: dict[int, Literal["hinge", "slide"]] = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
@@ -121,9 +122,7 @@ def read_source(path: Path, packages: Sequence[str] = ()) -> ModelSource:
         ConfigError: The file is missing, is neither, or holds something that cannot be mended.
     """
     source = ModelSource(path)
-    if not path.is_file():
-        raise source.refuse(f"there is no such file (seen from {Path.cwd()})")
-    root = _parse_xml(source)
+    root = parse_model(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what MuJoCo will no longer read in a later version
@@ -141,22 +140,6 @@ def read_source(path: Path, packages: Sequence[str] = ()) -> ModelSource:
         raise source.refuse(f"MuJoCo cannot read it as URDF or MJCF: {error}") from error
     _read_limits(source)
     return source
-
-
-def _parse_xml(source: ModelSource) -> ElementTree.Element:
-    try:
-        root = ElementTree.parse(source.path).getroot()
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        is_xacro = "xacro" in source.path.name or "prefix" in str(error)
-        hint = "; run xacro first" if is_xacro else ""
-        raise source.refuse(
-            f"it is no XML, cannot read it as URDF or MJCF ({error}){hint}"
-        ) from error
-    if root.tag not in ("robot", "mujoco"):
-        raise source.refuse(
-            f"expected a URDF (<robot>) or an MJCF (<mujoco>), got <{root.tag}>; export it as one of these"
-        )
-    return root
 
 
 # the text of a URDF

