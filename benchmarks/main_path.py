@@ -24,8 +24,6 @@ WORDS = (
     "rl.num_starts=64",
     "rl.budget.max_env_steps=384",
     "evaluation.video=false",
-    "hydra.run.dir=.",
-    "hydra.output_subdir=null",
 )
 
 

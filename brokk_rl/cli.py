@@ -67,7 +67,6 @@ def main() -> int:
     if not sys.argv[1:] or (asks_help and not any("mode=" in word for word in sys.argv[1:])):
         sys.stdout.write(describe_command())
         return 0
-    trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
     # The launcher options keep the names that submitit gave them; Hydra warns of that three times.
     warnings.filterwarnings(
@@ -83,17 +82,18 @@ def main() -> int:
     probe.keep_renderer_for_drawing()
     # A run that a scheduler stops ends like one that is stopped by hand.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # Hydra raises its errors instead of printing them and leaving.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        with _make_hydra_raise():
-            sys.argv[1:] = _prepare_policy(read_arguments(sys.argv[1:]))
-            extensions.register_options(sys.argv[1:])
-            if {"--help", "-h"} & set(sys.argv[1:]):
-                sys.stdout.write(_describe_chosen_mode())
-                return 0
-            command = hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")
-            with _add_comments() if "--cfg" in sys.argv[1:] else contextlib.nullcontext():
-                command(run_job)()
-            sys.stdout.flush()
+        sys.argv[1:] = _prepare_policy(read_arguments(sys.argv[1:]))
+        extensions.register_options(sys.argv[1:])
+        if {"--help", "-h"} & set(sys.argv[1:]):
+            sys.stdout.write(_describe_chosen_mode())
+            return 0
+        command = hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")
+        with _add_comments() if "--cfg" in sys.argv[1:] else contextlib.nullcontext():
+            command(run_job)()
+        sys.stdout.flush()
     except BrokenPipeError:
         # Python flushes stdout once more when it ends; that must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -110,7 +110,7 @@ def main() -> int:
         message = explain(cause)
         if isinstance(cause, SweepError) and cause.args[1] == os.getpid():
             message = "jobs of the sweep failed, for the reasons above"
-        if trace or message is None:
+        if message is None or os.environ.get("BROKK_TRACE") == "1":
             traceback.print_exception(cause)
         # Of several processes the first one reports an error of the configuration for all.
         if message is not None and (_is_first_process() or not isinstance(cause, ConfigError)):
@@ -198,18 +198,3 @@ def _add_comments() -> Iterator[None]:
     if "--config-name" not in sys.argv and "-cn" not in sys.argv:
         text = add_comments(text, collect_comments(list_sources()))
     sys.stdout.write(text)
-
-
-@contextlib.contextmanager
-def _make_hydra_raise() -> Iterator[None]:
-    """Make Hydra raise its errors instead of printing them and leaving."""
-    name = "HYDRA_FULL_ERROR"
-    before = os.environ.get(name)
-    os.environ[name] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before

@@ -56,8 +56,11 @@ def explain(error: BaseException) -> str | None:
     if missing:
         return explain_missing_value(str(missing.full_key or missing))
     lacking = next((e for e in chain if isinstance(e, ModuleNotFoundError) and e.name), None)
-    if lacking and (text := _explain_missing_module(lacking, chain)):
-        return text
+    if lacking:
+        from brokk_rl import extras  # its parts take a while to import
+
+        if text := extras.explain_missing_module(str(lacking.name), "this run"):
+            return text
     if isinstance(error, MissingConfigException):
         return _explain_missing_option(error)
     if isinstance(error, ConfigCompositionException):
@@ -83,18 +86,6 @@ def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__
-
-
-def _explain_missing_module(lacking: ModuleNotFoundError, chain: list[BaseException]) -> str | None:
-    """Explain a package that is not installed; `None` where no extra brings it."""
-    from brokk_rl import extras  # its parts take a while to import
-
-    for error in chain:
-        # Hydra names the target that it could not load, in one of two ways.
-        target = re.search(r"(?:target|loading) '([\w.]+)'", str(error))
-        if target:
-            return extras.explain_missing_module(str(lacking.name), target[1])
-    return extras.explain_missing_module(str(lacking.name), "this run")
 
 
 def _explain_missing_option(error: MissingConfigException) -> str:

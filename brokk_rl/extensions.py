@@ -108,11 +108,8 @@ def load_option(group: str, name: str, **fields: object) -> Any:
     if not name.startswith("@") and name not in known:
         raise ConfigError(f"there is no {group}={name}; {list_choices(name, known)}")
     changes = [f"subject.{field}={value}" for field, value in fields.items()]
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject='{name}'", *changes])
-    from brokk_rl.build import build_node  # the command composes without it
-
-    return build_node(OmegaConf.to_container(cfg.subject, resolve=True), group)
+    words = ["~mode", f"+{group}@subject='{name}'", *changes]
+    return _build(_compose("config", words).subject, group)
 
 
 def load_part(name: str) -> Any:
@@ -121,10 +118,7 @@ def load_part(name: str) -> Any:
     Raises:
         ConfigError: A value is refused.
     """
-    from brokk_rl.build import build_node
-
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        return build_node(OmegaConf.to_container(hydra.compose(name), resolve=True), name)
+    return _build(_compose(name, ()), name)
 
 
 def load_mode(*words: str) -> Any:
@@ -139,8 +133,18 @@ def load_mode(*words: str) -> Any:
     from brokk_rl.build import build_mode
 
     register_options(words)
+    return build_mode(*read_values(_compose("config", words)))
+
+
+def _compose(name: str, words: Sequence[str]) -> DictConfig:
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        return build_mode(*read_values(hydra.compose("config", overrides=list(words))))
+        return hydra.compose(name, overrides=list(words))
+
+
+def _build(node: DictConfig, place: str) -> Any:
+    from brokk_rl.build import build_node  # the command composes without it
+
+    return build_node(OmegaConf.to_container(node, resolve=True), place)
 
 
 def read_values(cfg: DictConfig) -> tuple[dict[str, Any], set[str]]:

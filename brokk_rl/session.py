@@ -327,16 +327,8 @@ def describe_commit() -> str | None:
     if not (root / ".git").exists():  # A wheel may be installed inside another checkout.
         return None
     try:
-        git = [
-            "git",
-            "-C",
-            str(root),
-            "describe",
-            "--always",
-            "--abbrev=40",
-            "--dirty",
-            "--exclude=*",
-        ]
+        git = ["git", "-C", str(root)]
+        git += ["describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
         return subprocess.run(
             git, capture_output=True, text=True, check=True, timeout=10
         ).stdout.strip()

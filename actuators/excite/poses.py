@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from brokk_rl.contracts.actuator import Segment
-from brokk_rl.gravity import Gravity
+from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 
 NUM_CANDIDATES = 128

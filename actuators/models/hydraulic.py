@@ -40,8 +40,8 @@ from actuators.models.parameters import (
     select_commands_in_force,
 )
 from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
+from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
 

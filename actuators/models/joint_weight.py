@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from brokk_rl.gravity import Gravity
+from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 
 NUM_POSES = 256

@@ -17,8 +17,7 @@ from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import BrokkError, ConfigError
-from brokk_rl.gravity import Gravity
-from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.kinematics import Gravity, compute_tool_kinematics
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.plain_files import parse_model
 from brokk_rl.session import Session, write_bytes, write_json, write_text

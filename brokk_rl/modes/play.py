@@ -9,14 +9,19 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from brokk_rl.errors import CheckpointError
 from brokk_rl.gamepad import Gamepad
-from brokk_rl.play.checkpoint_watch import CheckpointWatch
-from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.policy_folder import find_policy
-from brokk_rl.rl.loop import SimulatedPlant
-from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
+from brokk_rl.rl.policy import (
+    ClassicalPolicy,
+    NetworkPolicy,
+    PolicySpec,
+    TrainedPolicy,
+    load_policy,
+)
 from brokk_rl.session import Session
 from brokk_rl.spec import name_spec, spec
 
@@ -33,6 +38,10 @@ FRAME_S = 1 / 30
 """Time between two pictures, s. Chosen by hand for the eye."""
 RATE_S = 30.0
 """Time between two lines about the rate, s; the first comes after a tenth of it. By hand."""
+
+
+POLL_S = 2.0
+"""Seconds between two looks for a newer checkpoint. Chosen by hand."""
 
 
 @spec
@@ -66,12 +75,11 @@ class Play(SimulatedPlant):
 
         gamepad = None
         if self.play.gamepad is not None:
-            pad = Gamepad(Path(self.play.gamepad), "play.gamepad")
-            gamepad = GamepadLevers(pad, self.play.gamepad_axes)
+            gamepad = Gamepad(Path(self.play.gamepad), "play.gamepad")
         port = self.play.port
         require_free_port(port)
         session, watch = self._build_session()
-        page = PlayPage(session, port, gamepad)
+        page = PlayPage(session, port, gamepad, self.play.gamepad_axes)
         log.info("open http://localhost:%d in a browser; end with Ctrl-C", port)
         log.info("over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", port, port)
         try:
@@ -104,6 +112,47 @@ class Play(SimulatedPlant):
         name = f"{name_spec(self.policy)} {getattr(self.policy, 'path', '')}".rstrip()
         log.info("%s drives; policy=%s", played.driver, watch.note if watch else name)
         return played, watch
+
+
+class CheckpointWatch:
+    """A policy on disk, loaded anew whenever a training has written another one.
+
+    Args:
+        path: Run folder, policy folder or checkpoint.
+        loop: Control loop in which the policy acts.
+    """
+
+    def __init__(self, path: str, loop: ControlLoop) -> None:
+        self._path, self._loop = path, loop
+        self._next_s = 0.0
+        self._loaded: Path | None = None
+        self.note = ""
+        """Run and file of the checkpoint that was loaded last."""
+
+    def load(self) -> NetworkPolicy:
+        """Return the newest policy; errors as in `TrainedPolicy.build`."""
+        stored = find_policy(self._path)
+        policy = load_policy(stored, self._loop)
+        self._loaded = stored.file
+        self.note = f"{stored.file.parent.name}/{stored.file.name}"
+        return policy
+
+    def poll(self) -> NetworkPolicy | None:
+        """Return a policy that is newer than the last one, else `None`.
+
+        A checkpoint that cannot be read, because the training has just replaced it, is tried again.
+        """
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return None
+        self._next_s = now_s + POLL_S
+        try:
+            if find_policy(self._path).file == self._loaded:
+                return None
+            return self.load()
+        except CheckpointError as error:
+            log.warning("the newest checkpoint is left out: %s", error)
+            return None
 
 
 def _drive(

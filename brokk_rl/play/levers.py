@@ -1,11 +1,10 @@
-"""A person at the levers of one simulated machine: keys or a gamepad."""
+"""A person at the levers of one simulated machine."""
 
 from __future__ import annotations
 
 import torch
 
 from brokk_rl.contracts.actuator import FollowerModel
-from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine, mask_exclusive_joints
 
 KEY_STEP = 0.25
@@ -57,23 +56,3 @@ class PersonAtLevers(FollowerModel):
         """Return the person's command, `(J,)`: a lever of an exclusive joint rules out the others."""
         positioning = bool(self.levers[self._is_exclusive].any())
         return self.levers * mask_exclusive_joints(self._is_exclusive, positioning)
-
-
-class GamepadLevers:
-    """Levers of all joints on a gamepad.
-
-    Args:
-        gamepad: The gamepad; this closes it.
-        axes: Axis of the gamepad for each joint, in machine order, as in `Gamepad.read_axes`.
-    """
-
-    def __init__(self, gamepad: Gamepad, axes: tuple[int, ...]) -> None:
-        self._gamepad, self._axes = gamepad, axes
-
-    def read(self) -> torch.Tensor | None:
-        """Return positions of the levers, `(J,)`; `None` where no axis has moved since."""
-        return torch.tensor(self._gamepad.read_axes(self._axes)) if self._gamepad.poll() else None
-
-    def close(self) -> None:
-        """Close the device."""
-        self._gamepad.close()

@@ -19,7 +19,8 @@ import viser.uplot as uplot
 
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.errors import BrokkError, ConfigError
-from brokk_rl.play.levers import KEY_STEP, GamepadLevers
+from brokk_rl.gamepad import Gamepad
+from brokk_rl.play.levers import KEY_STEP
 from brokk_rl.play.scene_view import SceneView
 from brokk_rl.play.session import DISTANCE_M, HEIGHT_M, PERSON, PlaySession, PlayState
 from brokk_rl.play.settings import SPEEDS
@@ -68,10 +69,13 @@ class PlayPage:
         session: The session.
         port: Port on this computer.
         gamepad: Gamepad of this computer; `None` for none.
+        axes: Axis of the gamepad for each joint, as in `Gamepad.read_axes`.
     """
 
-    def __init__(self, session: PlaySession, port: int, gamepad: GamepadLevers | None) -> None:
-        self._session, self._gamepad = session, gamepad
+    def __init__(
+        self, session: PlaySession, port: int, gamepad: Gamepad | None, axes: Sequence[int]
+    ) -> None:
+        self._session, self._gamepad, self._axes = session, gamepad, axes
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         logging.getLogger("websockets").setLevel(logging.WARNING)
         with contextlib.redirect_stdout(io.StringIO()):  # it prints a table of its own
@@ -89,8 +93,8 @@ class PlayPage:
     def update(self) -> None:
         """Carry out the requests of browsers and show the present state."""
         is_touched = self._follow_requests()
-        if self._gamepad is not None and (levers := self._gamepad.read()) is not None:
-            self._session.set_levers(levers)
+        if self._gamepad is not None and self._gamepad.poll():
+            self._session.set_levers(self._gamepad.read_axes(self._axes))
         state, now_s = self._session.read(), time.monotonic()
         with self._server.atomic():
             self._scene.draw(state)

@@ -6,6 +6,7 @@ It knows no browser and runs in one thread; the page hands its commands over.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -200,9 +201,9 @@ class PlaySession:
         """Put the person's lever of a joint to a position in [-1, 1]."""
         self._person.levers[joint] = min(max(position, -1.0), 1.0)
 
-    def set_levers(self, levers: torch.Tensor) -> None:
-        """Put the person's levers to positions, `(J,)` in [-1, 1]."""
-        self._person.levers.copy_(levers.clamp(-1.0, 1.0))
+    def set_levers(self, levers: Sequence[float]) -> None:
+        """Put the person's levers to positions, `J` of them in [-1, 1]."""
+        self._person.levers.copy_(torch.tensor(levers).clamp(-1.0, 1.0))
 
     def release_levers(self) -> None:
         """Let all levers spring back to neutral."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.gravity import GRAVITY_M_S2
+from brokk_rl.kinematics import GRAVITY_M_S2
 from brokk_rl.machine import Machine
 from diagnosis.closure import Estimate
 from diagnosis.effect_library import EffectType

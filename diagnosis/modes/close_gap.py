@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from brokk_rl.comparison import EVALUATION
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.modes.compare import EVALUATION
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.train import Train
 from brokk_rl.policy_folder import CONTRACT

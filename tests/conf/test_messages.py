@@ -59,7 +59,6 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("effect=backlash,lag",): ("a list: 'effect=[backlash,lag]'",),
     ("effect=[backlash,backlash]",): ("'backlash' stands in it twice",),
     ("policy=[shipped,classical]",): ("one option: policy=shipped;", "brokk -m"),
-    ("mode=import", "import.x=1"): ("'import' is a group",),
     ("mode=evaluate", "policy=shipped", "task=goal_pose"): ("was trained for task=",),
     ("tracking=wandb,",): ("Write tracking=wandb",),
     ("wandb=true",): ("tracking=wandb",),

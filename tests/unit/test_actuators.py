@@ -15,8 +15,8 @@ from actuators.models.hydraulic import Hydraulic
 from actuators.models.lag import FirstOrderLag
 from actuators.models.parameters import open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import GRAVITY_M_S2, Gravity
 from brokk_rl.history import History
+from brokk_rl.kinematics import GRAVITY_M_S2, Gravity
 from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")

@@ -20,8 +20,8 @@ from actuators.models.circuit import (
     compute_cylinder_length,
 )
 from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import GRAVITY_M_S2, Gravity
 from brokk_rl.history import History
+from brokk_rl.kinematics import GRAVITY_M_S2, Gravity
 from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")

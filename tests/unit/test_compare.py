@@ -13,7 +13,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from brokk_rl.comparison import (
+from brokk_rl.errors import ConfigError
+from brokk_rl.modes.compare import (
     average_seeds,
     compare_to_baseline,
     find_differences,
@@ -22,7 +23,6 @@ from brokk_rl.comparison import (
     load_run,
     tabulate_runs,
 )
-from brokk_rl.errors import ConfigError
 from brokk_rl.statistics import compute_student_interval, compute_wilson_interval
 
 

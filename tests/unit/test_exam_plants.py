@@ -7,8 +7,7 @@ import pytest
 import torch
 from composed import option
 
-from brokk_rl.gravity import Gravity
-from brokk_rl.kinematics import Kinematics
+from brokk_rl.kinematics import Gravity, Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from exam.plants import valve_causes, valve_parameters

@@ -11,7 +11,7 @@ from composed import option
 from actuators.excite.poses import draw_start_poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import Gravity
+from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from brokk_rl.gravity import Gravity
-from brokk_rl.kinematics import Kinematics, compute_tool_kinematics, solve_joint_step
+from brokk_rl.kinematics import Gravity, Kinematics, compute_tool_kinematics, solve_joint_step
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.sim.model import compile_model
 

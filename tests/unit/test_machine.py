@@ -8,8 +8,7 @@ import torch
 from actuators.models.lag import FirstOrderLag
 from brokk_rl.checks import check_actuator
 from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import Gravity
-from brokk_rl.kinematics import Kinematics
+from brokk_rl.kinematics import Gravity, Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import compile_model
 

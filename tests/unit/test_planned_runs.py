@@ -13,8 +13,8 @@ from composed import option
 
 from actuators.effects.effect import EffectSpec
 from actuators.models.joint_weight import build_joint_weight
-from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
+from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")
