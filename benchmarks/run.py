@@ -34,14 +34,13 @@ HEAD = """# Results
 
 <!-- rendered by `python benchmarks/run.py page`; edit benchmarks/rooms instead -->
 
-Each table says what was simulated, the baseline, the commands, the machine and the commit. All machines are
-simulated, but for the logs that are said to be real. *Older* means that code which the figure depends on has
-changed since, so that today's may give another figure. The file of a result names this code.
+All machines are simulated, but for logs that are said to be real. *Older* means that code which the figure
+depends on, listed in its file, has changed since: today's may give another figure.
 
 * **Strict success:** the tip is 0.10 m or more below the rim, inside the hole with 1 cm of clearance, tilted
   by 0.11 rad at most, and no contact force of the episode was above 10 kN.
 * **Inserted:** the same without force and tilt. Older tables without this column call it strict success.
-* **Paper's criterion:** the weaker criterion of the paper, shown beside it.
+* **Paper's criterion:** the weaker one of the paper.
 * **Plant:** a simulated machine that judges a policy. `mlp` is the network through which policies are
   trained, `hydraulic` the plant to which it was fitted; nothing was fitted to the others.
 

@@ -97,6 +97,7 @@ def say(words: str) -> Callable[[Table], str]:
 
 STRICT, INSERTED = "strict success", "inserted"
 ONE, SETS = "one effect: named first", "several effects: exact set"
+EQUIVALENT = "… or an equivalent"
 NONE = "unchanged machines: an effect or `unknown`"
 NO_FINDER, NO_GUARD = say("none was run"), say("the last command stays in force")
 HEADLINES = (
@@ -127,6 +128,7 @@ HEADLINES = (
         )
         for meaning, baseline in (
             (ONE, singles),
+            (EQUIVALENT, singles),
             (SETS, "0, one name always"),
             (NONE, "none or all"),
         )
