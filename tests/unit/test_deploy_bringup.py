@@ -26,8 +26,8 @@ from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
 from deploy.runtime.process import ChildProcess
-from deploy.twin.faults import ActiveFaults, request_fault
-from deploy.twin.rehearsal import CHECKS, SENSORS, RehearsalBench, ScriptedPerson
+from deploy.twin.faults import request_fault
+from deploy.twin.rehearsal import RehearsalBench, ScriptedPerson
 from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import Twin
 
@@ -250,23 +250,6 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     assert remote.button_right and sum(one != 0 for one in remote.levers) == 1
     person.move(remote, 0.5)
     assert remote.deadman and not any(remote.levers)
-
-
-@pytest.mark.parametrize("fails", [*CHECKS, *SENSORS])
-def test_a_scripted_person_fails_the_chosen_check_alone(fails: str) -> None:
-    sound, chosen = sample_person(None), sample_person(fails)
-    person = ScriptedPerson(option("machine", "brokk170"), fails)
-    late_s = 4 * person.round_s
-    assert chosen[1].any() == (fails != "dead-man") and chosen[2].any() == (fails != "e-stop")
-    same = np.array_equal(sound[0], chosen[0])
-    assert same == (fails != "joints") and np.array_equal(sound[0][:, :4], chosen[0][:, :4])
-    early, late = person.spoil(0.0, 8.0), person.spoil(late_s, 8.0)
-    early_faults = ("bus", "positions", *SENSORS)
-    assert (early is not None) == (fails in early_faults)
-    assert (late is not None) == (fails in (*early_faults, "shadow"))
-    for fault in (early, late):
-        if fault is not None:
-            ActiveFaults().request(json.dumps(fault).encode(), 0.0)
 
 
 def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:

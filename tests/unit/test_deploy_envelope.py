@@ -17,7 +17,6 @@ from composed import option
 
 import brokk_rl.sim
 from brokk_rl.errors import ConfigError
-from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.sim import shapes
@@ -190,20 +189,6 @@ def test_distances_beyond_interest_may_be_left_out_but_no_near_one_is_missed() -
     assert np.isinf(measure_clearance(nothing, poses[:3])).all()
 
 
-def test_links_are_placed_as_the_kinematics_place_them_slides_and_slanted_axes_too() -> None:
-    joints = list(MACHINE.joints)
-    slanted = (0.6, 0.64, 0.48)
-    for number, kind in ((1, "hinge"), (2, "slide"), (4, "hinge")):
-        body = joints[number].body
-        assert body is not None
-        joints[number] = replace(joints[number], kind=kind, body=replace(body, axis=slanted))
-    machine = replace(MACHINE, joints=tuple(joints))
-    assert SHAPES is not None
-    envelope, poses = make_envelope(LIMITS, SHAPES, machine), draw_poses(5)
-    expected = compute_tool_kinematics(machine, poses).tip_in_base_m
-    assert envelope.locate_tip(poses) == pytest.approx(expected, abs=1e-9)
-
-
 def test_a_fast_arm_that_would_pass_the_surface_is_slowed() -> None:
     envelope = build_envelope(ground_m=None)
     q = np.array([0.0, -0.9, 0.2, 0.9, 0.77])
@@ -367,51 +352,6 @@ def test_capsules_enclose_boxes_and_balls(end_m: tuple[float, float, float]) -> 
             off = np.linalg.norm(corners_m - one["begin_m"] - t[:, None] * along, axis=1)
             inside.append((off + box["radius_m"] <= one["radius_m"] + 1e-9).all())
         assert any(inside)
-
-
-def test_capsules_are_no_larger_than_needed() -> None:
-    # One ball alone: the capsule is the ball.
-    ball = make_box(2, np.array([0.3, 0.1, -0.2]), np.eye(3), np.zeros(3), 0.25)
-    (one,) = shapes.fit_capsules([ball], np.array([1.0, 0.0, 0.0]))
-    assert one["radius_m"] == pytest.approx(0.25) and one["link"] == 2
-    for end_m in (one["begin_m"], one["end_m"]):
-        assert end_m == pytest.approx(ball["center_m"])
-    # A breaker with a chisel: two capsules, the thin one over the chisel.
-    housing = make_box(2, np.array([0.3, 0, 0]), np.eye(3), np.array([0.3, 0.1, 0.1]), 0.0)
-    chisel = make_box(2, np.array([1.0, 0, 0]), np.eye(3), np.array([0.4, 0, 0]), 0.04)
-    thick, thin = shapes.fit_capsules([chisel, housing], np.array([1.4, 0.0, 0.0]))
-    assert thin["radius_m"] == pytest.approx(0.04) and thick["radius_m"] == pytest.approx(
-        math.hypot(0.1, 0.1)
-    )
-    assert sorted([thin["begin_m"][0], thin["end_m"][0]]) == pytest.approx([0.6, 1.4])
-
-    # Two balls along the link: the capsule ends where the smaller one ends.
-    ends_m = np.array([[0.1, 0.0, 0.0], [0.5, 0.0, 0.0]])
-    balls = [
-        make_box(2, at_m, np.eye(3), np.zeros(3), radius_m)
-        for at_m, radius_m in zip(ends_m, (0.2, 0.1), strict=True)
-    ]
-    both = shapes._fit_capsule(balls, np.array([1.0, 0.0, 0.0]))
-    assert (both["radius_m"], both["begin_m"][0], both["end_m"][0]) == pytest.approx(
-        (0.2, 0.1, 0.4)
-    )
-    # One on top of the other: two capsules would take more room than one.
-    same = [make_box(2, np.zeros(3), np.eye(3), np.full(3, 0.1), 0.0)] * 3
-    assert len(shapes.fit_capsules(same, np.array([1.0, 0.0, 0.0]))) == 1
-
-
-def test_the_volume_of_a_capsule_worked_by_hand() -> None:
-    ends = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 5.0])
-    capsule = {"begin_m": ends[0], "end_m": ends[1], "radius_m": 0.5}
-    # A cylinder of 2 m and two half balls.
-    expected = math.pi * 0.25 * 2.0 + 4.0 / 3.0 * math.pi * 0.125
-    assert shapes._compute_volume(capsule) == pytest.approx(expected)
-
-
-def test_the_first_link_is_an_obstacle_to_the_others() -> None:
-    assert SHAPES is not None
-    assert {box.link for box in SHAPES.body} == {-1, 0}
-    assert {one.link for one in SHAPES.arm} == {1, 2, 3, 4}
 
 
 class Arm:
@@ -700,18 +640,6 @@ def test_a_longer_link_has_longer_capsules() -> None:
             ends.append(max(own))
         # Radii stay; the ends of the boxes move with the link.
         assert ends[1] == pytest.approx(factor * ends[0], rel=0.12)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"margin_m": 0.0}, {"release_m": 0.0}, {"face_near_m": -1.0},
-        {"face_radius_m": 0.0}, {"face_speed_m_s": 0.0}, {"face_normal": (0.0, 0.0, 2.0)},
-    ],
-)  # fmt: skip
-def test_limits_that_make_no_sense_are_refused(change: dict[str, object]) -> None:
-    with pytest.raises(ConfigError, match="|".join(change)):
-        replace(LIMITS, **change)
 
 
 def test_a_stay_out_box_upside_down_is_refused() -> None:

@@ -29,12 +29,9 @@ from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanBus
 from deploy.guidance import AXES, LeverDisplay, LeverMap
 from deploy.policy.bundle import PolicyBundle
-from deploy.policy.policy_process import PolicyAdviser, PolicyHistory, PolicyProcessConfig
-from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.process import CycleTimer
 from deploy.runtime.process_group import BusAndPolicySettings
-from deploy.runtime.shared_memory import Pipe, RecordLayout, Slot
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.shared_memory import Pipe, Slot
 from deploy.runtime.target import FileTarget
 
 SHIPPED = "tasks:policies/borehole_insertion"
@@ -94,64 +91,6 @@ def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.M
         and report["missed"] == 2
         and report["late_max_s"] == pytest.approx(0.12)
     )
-
-
-def state(
-    machine: Machine, number: int, flow: float, q: float, now_s: float = 0.0, **changes: Any
-) -> OperatorState:
-    each = np.ones(machine.num_joints)
-    blank = RecordLayout(OperatorState, machine.num_joints).new()
-    found = replace(
-        blank,
-        t_s=now_s,
-        q_t_s=now_s,
-        flow_t_s=now_s,
-        q=q * each,
-        flow_number=number,
-        flow_sum=flow * number * each,
-        flow=flow * each,
-        q_plausible=True,
-        trusted=True,
-    )
-    return replace(found, **changes)
-
-
-def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does(
-    machine: Machine,
-) -> None:
-    ring = PolicyHistory(machine)
-    for k in range(machine.num_history):
-        assert not ring.full
-        ring.sample(state(machine, 10 + 2 * k, 0.0, float(k)), missed=0)
-    assert ring.full and ring.q[:, 0].tolist() == list(range(13))
-    # since number 34 six messages, 0.9 in all
-    ring.sample(state(machine, 40, 0.0, 13.0, flow_sum=np.full(5, 0.9)), missed=0)
-    assert ring.u[-1].tolist() == pytest.approx([0.15] * 5) and ring.q[-1, 0] == 13.0
-
-
-def test_one_missed_period_is_filled_in_and_two_empty_the_ring(machine: Machine) -> None:
-    ring = PolicyHistory(machine)
-    for k in range(13):
-        ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
-    ring.sample(state(machine, 20, 0.0, 2.0), missed=1)
-    assert ring.full and ring.q[-2:, 0].tolist() == [1.5, 2.0]
-    ring.sample(state(machine, 30, 0.0, 3.0), missed=2)
-    assert ring.filled == 1
-
-
-def test_valves_that_say_nothing_more_empty_the_ring(machine: Machine) -> None:
-    ring = PolicyHistory(machine)
-    for k in range(13):
-        ring.sample(state(machine, k + 1, 0.0, 1.0), missed=0)
-    late = state(machine, 13, 0.4, 1.0)
-    ring.sample(late, missed=0)
-    assert ring.full and ring.u[-1].tolist() == [0.4] * 5, (
-        "one period without a message: they still get what they got"
-    )
-    ring.sample(late, missed=0)
-    assert ring.filled == 1
-    ring.sample(late, missed=0)
-    assert ring.filled == 1
 
 
 def test_levers_are_those_of_the_paper(machine: Machine) -> None:
@@ -448,77 +387,6 @@ def test_a_target_file_that_is_none_is_refused_at_once(tmp_path: Path, kind: str
         path.write_text(f'{{"center_in_base_m": [1{"0" * 400}, 0, 0]}}')
     with pytest.raises(ConfigError, match="expected JSON with center_in_base_m"):
         FileTarget(path=str(path)).build().news([])
-
-
-@pytest.fixture
-def adviser(machine: Machine) -> PolicyAdviser:
-    memory = LoopMemory.new(machine.num_joints, commands=False)
-    counsel = PolicyProcessConfig(
-        machine, SHIPPED, option("guidance", "machine"), stale_s=0.15, target_s=60.0, pitch_rad=None
-    )
-    return PolicyAdviser(counsel, PolicyBundle(SHIPPED, machine), memory)
-
-
-def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(
-    adviser: PolicyAdviser, machine: Machine
-) -> None:
-    memory, now_s, found = adviser._memory, 1000.0, []
-    assert adviser.run_cycle(0, now_s) is AdviceStatus.NO_STATE
-    for k in range(30):
-        now_s += machine.period_s
-        home = state(machine, 10 + k, 0.0, 0.0, now_s)
-        memory.state.write(replace(home, q=machine.home))
-        if k == 15:
-            target = memory.target.new()
-            target["t_s"], target["center_in_base_m"] = now_s, (2.6, 0.0, 0.75)
-            memory.target.write(target)
-        found.append(adviser.run_cycle(0, now_s))
-    assert (
-        found[:12] == [AdviceStatus.WARMING_UP] * 12
-        and found[12:15] == [AdviceStatus.NO_TARGET] * 3
-        and set(found[15:]) == {AdviceStatus.VALID}
-    )
-    shown = memory.read_snapshot()
-    assert shown.advice is not None and shown.advice.valid and any(shown.advice.u)
-    assert adviser.run_cycle(0, now_s + 0.16) is AdviceStatus.STALE
-    advice = memory.advice.read()
-    assert advice is not None and not advice.u.any() and memory.request is None
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"q_plausible": False}, AdviceStatus.IMPLAUSIBLE),
-        ({"trusted": False}, AdviceStatus.IMPLAUSIBLE),
-    ],
-)
-def test_positions_that_are_not_to_be_believed_give_no_advice(
-    adviser: PolicyAdviser, machine: Machine, change: dict[str, bool], reason: AdviceStatus
-) -> None:
-    adviser._memory.state.write(state(machine, 1, 0.0, 0.0, 1000.0, **change))
-    assert adviser.run_cycle(0, 1000.0) is reason
-
-
-def test_an_answer_that_makes_no_sense_is_not_shown(
-    adviser: PolicyAdviser, machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory, now_s = adviser._memory, 1000.0
-    target = memory.target.new()
-    target["t_s"], target["center_in_base_m"] = now_s, (2.5, 0.0, 0.75)
-    memory.target.write(target)
-    for answer in (
-        np.array([np.nan, 0, 0, 0, 0]),
-        np.array([1.1, 0, 0, 0, 0]),
-        np.array([0.1, 0.1, 0, 0, 0]),
-    ):
-        monkeypatch.setattr(adviser._bundle, "command", lambda _, answer=answer: answer[None])
-        for _ in range(14):
-            now_s += machine.period_s
-            memory.state.write(state(machine, int(now_s * 100), 0.0, 0.0, now_s))
-            reason = adviser.run_cycle(0, now_s)
-        assert reason is AdviceStatus.REJECTED
-        advice = memory.advice.read()
-        assert advice is not None and not advice.u.any()
 
 
 def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_path: Path) -> None:

@@ -105,35 +105,6 @@ def test_levers_are_drawn_where_they_are_and_should_be(
     assert found["right advised"] == pytest.approx((-0.6, 0.1), abs=1e-3)
 
 
-def test_pixels_are_green_where_the_lever_should_be_and_blue_where_it_is(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
-    own, advised = (0.8, -0.5), (-0.4, 0.6)  # psi, theta
-    feed.now = change_state(feed.now, lever=lever(left_psi=own[0], left_theta=own[1]))
-    feed.advise(2, left_psi=advised[0], left_theta=advised[1])
-    eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
-    box = page.locator("#left").bounding_box()
-    picture = np.asarray(
-        Image.open(io.BytesIO(page.locator("#left").screenshot())).convert("RGB")
-    ).astype(int)
-    scale = min(box["width"], box["height"]) / 260
-    middle = np.array([picture.shape[1] / 2, picture.shape[0] / 2])
-
-    def center(color: np.ndarray, radius: float, about: tuple[float, float]) -> np.ndarray:
-        """Returns the middle of what has that colour near a position, of full travel."""
-        y, x = np.nonzero((np.abs(picture - color) < 12).all(-1))
-        at = (np.stack([x + 0.5, y + 0.5], 1) - middle) / (scale * TRAVEL) * [1, -1]
-        near = at[(np.abs(at - about) < radius).all(1)]
-        assert len(near) > 30
-        return (near.min(0) + near.max(0)) / 2
-
-    # The diamond, without what leads to it.
-    np.testing.assert_allclose(center(GREEN, 0.31, advised), advised, atol=0.02)
-    blue = center(BLUE, 0.155, own)
-    np.testing.assert_allclose(blue, own, atol=0.03)
-
-
 def test_the_button_is_announced_and_then_green(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:
@@ -500,13 +471,6 @@ def test_the_token_leaves_the_address_bar(port: int, opened: Callable[..., Any])
     until(page, "() => window.measured?.allowed === true")
     page.keyboard.press("Escape")
     until(page, "document.getElementById('answer').textContent === ''")
-
-
-def test_two_pages_show_the_same(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
-    pages = [opened(port), opened(port)]
-    feed.advise(41, left_psi=0.3)
-    for page in pages:
-        eventually(lambda page=page: drawn(page)["left advised"][0] == pytest.approx(0.3, abs=1e-3))
 
 
 def test_the_scene_shows_machine_points_and_picture(

@@ -153,15 +153,6 @@ def test_every_hole_and_start_stands_everywhere_equally_often() -> None:
         assert set(mine.condition) == {"guided", "unguided"}
 
 
-@pytest.mark.parametrize("size", [2, 3, 4, 5, 6, 7, 9])
-def test_squares_are_latin(size: int) -> None:
-    holes, starts = design.make_latin_squares(size)
-    for line in (*holes, *holes.T, *starts, *starts.T):
-        assert sorted(line) == list(range(size))
-    if size % 2:
-        assert len(set(zip(holes.ravel(), starts.ravel(), strict=True))) == size**2
-
-
 def test_orders_are_drawn_in_pairs_and_differ_from_seed_to_seed() -> None:
     drawn = set()
     for seed in range(3):

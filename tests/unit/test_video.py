@@ -21,7 +21,6 @@ from deploy.page.video_relay import VideoRelay
 from deploy.runtime.process import ChildProcess
 from deploy.video import sources
 from deploy.video.settings import SOCKET, VideoProcessConfig
-from deploy.video.sources import draw_time_code
 
 READ_CODE = """name => {
     const camera = window.measured.video.cameras.find(one => one.name === name), { video } = camera;
@@ -54,23 +53,6 @@ def read_time_code(picture: np.ndarray) -> float | None:
     num_ticks = value >> sources.CODE_CHECK
     bits = sources.list_code_bits(num_ticks)
     return num_ticks * sources.TICK_S if value == int("".join(map(str, bits)), 2) else None
-
-
-@pytest.mark.parametrize("t_s", [0.0, 0.001, 86400.5, 4294967.295])
-def test_a_time_code_survives_blur_and_noise_and_a_wrong_block_is_noticed(t_s: float) -> None:
-    picture = np.full((360, 640), 128, np.uint8)
-    draw_time_code(picture, t_s)
-    for axis in (0, 1):  # a blur over five pixels, as a coder of few bits leaves it
-        picture = np.mean([np.roll(picture, by, axis) for by in range(-2, 3)], 0)
-    noisy = picture + np.random.default_rng(1).normal(0.0, 20.0, picture.shape)
-    assert read_time_code(noisy) == pytest.approx(t_s)
-    side = 360 // 16
-    noisy[:side, 7 * side : 8 * side] = 255.0 - noisy[:side, 7 * side : 8 * side]
-    assert read_time_code(noisy) is None
-
-
-def test_a_picture_without_a_code_is_not_read() -> None:
-    assert read_time_code(np.full((360, 640), 128, np.uint8)) is None
 
 
 def test_who_has_no_token_does_not_reach_the_video_process(tmp_path: Path) -> None:
