@@ -107,6 +107,7 @@ class Stiction(EffectSpec):
     stop: Value
     side = "command"
     recent = 2
+    smooth = False
     numbers: ClassVar = {
         "start": EffectNumber("1", none=0.0, typical=0.14, bounds=(0.0, 0.6)),
         "stop": EffectNumber("1", none=0.0, typical=0.06, bounds=(0.0, 0.6)),

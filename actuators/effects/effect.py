@@ -47,6 +47,7 @@ class EffectSpec:
             `diagnosis.json`).
         numbers: Unit, neutral value, typical size and bounds of each number.
         stochastic: Whether it draws random numbers in every step.
+        smooth: Whether small changes of its numbers change the motion a little.
         delays: Whether it shifts all commands that the inner model sees, not only the newest; its
             number is then the shift, s.
         pointwise: Whether each command that it returns depends on the same command only, so that
@@ -73,6 +74,7 @@ class EffectSpec:
     )
     numbers: ClassVar[dict[str, EffectNumber]]
     stochastic: ClassVar[bool] = False
+    smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None

@@ -30,6 +30,7 @@ class Quantisation(SensorEffect):
 
     joints: Joints
     step_rad: Value
+    smooth = False
     interfaces = ANY_INTERFACE
     numbers: ClassVar = {
         "step_rad": EffectNumber("rad", none=0.0, typical=0.003, bounds=(0.0, 0.1), scale="travel")

@@ -137,6 +137,7 @@ class FrameLoss(EffectSpec):
     stage = "timing"
     recent = 2
     stochastic = True
+    smooth = False
     shared = True
     interfaces = ANY_INTERFACE
     numbers: ClassVar = {
