@@ -25,7 +25,7 @@ play: setup             ## install, and watch the shipped policy in a browser
 test: setup             ## the tests that need no GPU, without the slow ones
 	@[ -n "$$CHROMIUM" ] || command -v chromium chromium-headless-shell >/dev/null || \
 	    echo "the tests in a browser are skipped: apt-get install chromium-headless-shell, or CHROMIUM=<path>"
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -m "not gpu and not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -m "not gpu and not slow"
 
 test-all: setup         ## the slow tests too
 	$(BIN)/python -m pytest -q -m "not gpu"

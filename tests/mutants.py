@@ -57,7 +57,7 @@ SCIENCE = {
     "brokk_rl.observation": ["test_observation.py"],
     "brokk_rl.statistics": ["test_compare.py"],
     "tasks.control": ["test_classical.py", "test_task_masks.py", "test_advice.py"],
-    "tasks.terms": ["test_reward.py", "test_term_task.py"],
+    "tasks.terms": ["test_reward.py", "test_term_task.py", "test_termination.py"],
     "diagnosis.engine.decide": ["test_diagnosis_simulated.py", "test_servo_engine.py"],
     "diagnosis.engine.measure": ["test_diagnosis_simulated.py", "test_servo_engine.py"],
     "diagnosis.engine.rows": ["test_diagnosis_simulated.py", "test_servo_engine.py"],
@@ -75,7 +75,9 @@ OURS = ("brokk_rl", "tasks", "actuators", "diagnosis", "deploy", "exam", "percep
 PYTEST = ["-x", "-q", "--no-header", "--assert=plain"]
 PYTEST += ["-p", "no:cacheprovider", "-p", "no:unraisableexception", "-p", "no:threadexception"]
 LONGEST_S = 120
-"""Time for the tests of one mutant."""
+"""CPU time for the tests of one mutant."""
+WAITING = 10
+"""Time for them, in multiples of that."""
 COMPARED = {
     ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.Lt), ast.Eq:
     (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
@@ -224,7 +226,9 @@ def survivors(module: str, tests: Sequence[str], only: set[str] | None) -> tuple
         count += 1
         child = os.fork()
         if child == 0:
-            signal.alarm(LONGEST_S)  # a mutant that loops for ever is noticed
+            # a mutant that loops or waits for ever is noticed, also where the cores are busy
+            signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
+            signal.alarm(WAITING * LONGEST_S)
             os._exit(_killed(module, tree, tests, pytest))
         _, status = os.waitpid(child, 0)
         if os.waitstatus_to_exitcode(status) == 0:

@@ -223,8 +223,6 @@ def lengths(sources: Mapping[str, str], limit: int, reasons: Mapping[str, str]) 
 
 PREDICATES = ("is", "has", "can", "does", "may", "needs", "as", "to", "from", "main")
 """First words of names that need no verb: predicates, conversions and the entry of a script."""
-FIRST_WORDS = ("what", "how", "whether", "is told", "says", "of ", "so much")
-"""Beginnings of a docstring that a reader has to read twice."""
 VERBS = frozenset(Path(__file__).with_name("verbs.txt").read_text().split())
 
 
@@ -253,18 +251,6 @@ def unique_classes(sources: Mapping[str, str]) -> list[str]:
         for name, modules in owners.items()
         if len(modules) > 1
     ]
-
-
-def first_lines(sources: Mapping[str, str]) -> list[str]:
-    """A docstring begins with an imperative or a noun phrase."""
-    found = []
-    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    for module, tree in read_trees(sources):
-        for node in ast.walk(tree):
-            text = ast.get_docstring(node) if isinstance(node, documented) else None
-            if text and text.lower().startswith(FIRST_WORDS):
-                found.append(f"{module}:{getattr(node, 'lineno', 1)} '{text.splitlines()[0]}'")
-    return found
 
 
 def circles(sources: Mapping[str, str]) -> list[str]:

@@ -39,7 +39,6 @@ SOURCES = {
         rules.docstrings,
         rules.units,
         rules.unique_classes,
-        rules.first_lines,
         rules.circles,
     ],
 )
@@ -107,7 +106,6 @@ def test_numbers_of_the_configuration_are_explained() -> None:
         (rules.units, "brokk_rl.a", "tilt_deg: float = 1.0"),
         (rules.units, "brokk_rl.a", "def f(n_envs): pass"),
         (rules.verb_names, "brokk_rl.a", "def distance(a): pass"),
-        (rules.first_lines, "brokk_rl.a", '"""What it is."""'),
         (rules.uncommented_numbers, "a.yaml", "# A file.\ngain: 1.0"),
         (rules.uncommented_numbers, "a.yaml", "a:  # m\n  b: 1\nc: [0, 1]"),
     ],

@@ -26,32 +26,16 @@ TOKEN = "correct horse battery staple"
 @pytest.mark.slow
 def test_the_loop_is_shown_recorded_again_on_a_wish_and_outlives_its_page(tmp_path: Path) -> None:
     _photograph(tmp_path / "camera")
-    # a simulated operator, who holds the dead-man
-    command = [
-        sys.executable,
-        "-c",
-        "from brokk_rl.cli import main; main()",
-        "preset=bench",
-        "bench=guided",
-    ]
-    command += [
-        f"session.out={tmp_path / 'run'}",
-        "page.port=0",
-        f"page.token='{TOKEN}'",
-        "deploy.seconds=300",
-    ]
-    command += [f"bus.port={free_port()}"]
-    command += [
-        "camera=pictures",
-        "perception/source@source=folder",
-        f"source.folder={tmp_path / 'camera'}",
-    ]
-    command += ["deploy.camera.record_hz=5"]
+    words = (
+        "preset=bench", "bench=guided", "page.port=0", f"page.token='{TOKEN}'", "deploy.seconds=300", f"bus.port={free_port()}",
+        "camera=pictures", "perception/source@source=folder", f"source.folder={tmp_path / 'camera'}",
+        "deploy.camera.record_hz=5", f"session.out={tmp_path / 'run'}",
+    )  # fmt: skip
+    command = [sys.executable, "-m", "brokk_rl", *words]
     loop = subprocess.Popen(command, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "1"})
     try:
-        address = _patiently(
-            lambda: (tmp_path / "run" / "page.url").read_text().strip(), 90
-        ).partition("/#")[0]
+        link = _patiently(lambda: (tmp_path / "run" / "page.url").read_text().strip(), 90)
+        address = link.partition("/#")[0]
         pids = json.loads((tmp_path / "run" / "processes.json").read_text())
         asyncio.run(_use(address.removeprefix("http://"), tmp_path / "run"))
         os.kill(pids["page"], signal.SIGKILL)
@@ -71,40 +55,34 @@ async def _use(host: str, run: Path) -> None:
     ):
         await control.send(json.dumps({"token": TOKEN}))
         assert json.loads(await control.recv()) == {"ready": True}
-        await _shown(
-            state,
-            lambda shown: (
-                shown["alive"]
-                and shown["advice"]
-                and shown["advice"]["valid"]
-                and shown["safety"]["deadman"]
-            ),
-        )
+        await _shown(state, is_led)
         assert (await _shown(state, lambda shown: shown["recording"]["on"]))["path_in_base_m"]
         for value, on in (("off", False), ("on", True)):
             await control.send(json.dumps({"kind": "record", "value": value}))
             assert json.loads(await control.recv()) == {"done": "record", "kind": "record"}
             await _shown(state, lambda shown, on=on: shown["recording"]["on"] == on)
         # The picture that is touched has to be there; the camera's process starts last.
-        await _shown(
-            state,
-            lambda shown: any(
-                one["name"] == "camera" and one["age_s"] is not None for one in shown["streams"]
-            ),
-        )
+        await _shown(state, has_picture)
         x, y = seen_at(FRAME, np.array(TARGETS[1].center_in_base_m))
         await control.send(json.dumps({"kind": "point", "value": f"{x:.4f},{y:.4f}"}))
         assert json.loads(await control.recv()) == {"done": "point", "kind": "point"}
-        touched = (await _shown(state, lambda shown: shown["targets"][0]["std_m"] is not None))[
-            "targets"
-        ][0]
-        assert (
-            np.linalg.norm(np.array(touched["center_in_base_m"]) - TARGETS[1].center_in_base_m)
-            < 0.02
-            and touched["chosen"]
-        )
+        shown = await _shown(state, lambda shown: shown["targets"][0]["std_m"] is not None)
+        touched = shown["targets"][0]
+        away_m = np.array(touched["center_in_base_m"]) - TARGETS[1].center_in_base_m
+        assert np.linalg.norm(away_m) < 0.02 and touched["chosen"]
         assert (run / "capture.mcap").stat().st_size > 0
         _patiently(lambda: (run / "recording_2" / "capture.mcap").stat(), 20)
+
+
+def is_led(shown: dict[str, Any]) -> bool:
+    """Whether somebody who holds the dead-man is shown a valid advice."""
+    advice = shown["advice"]
+    return bool(shown["alive"] and advice and advice["valid"] and shown["safety"]["deadman"])
+
+
+def has_picture(shown: dict[str, Any]) -> bool:
+    seen = [one["name"] for one in shown["streams"] if one["age_s"] is not None]
+    return "camera" in seen
 
 
 def _photograph(folder: Path) -> None:

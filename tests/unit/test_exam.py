@@ -209,6 +209,7 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
             "it"
         ]
         assert found["sat"] == expected and found["failed"] == missed
+        assert ("1 of 2 cases were not begun" in done.err) is (missed == 0)
         shutil.rmtree(answers / first.name, ignore_errors=True)  # from then on nobody has begun it
 
 

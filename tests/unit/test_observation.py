@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, TargetScaling, list_pose_parts, restore_encoder
+from brokk_rl.observation import (
+    TARGET_DISTANCE,
+    ObservationEncoder,
+    ObservationPart,
+    TargetScaling,
+    list_pose_parts,
+    measure_ranges,
+    restore_encoder,
+)
 
 SCALING = TargetScaling(
     target_mean_m=(2.5, 0.0, 0.75), target_std_m=(0.5, 1.0, 0.1), pitch_rad=None
@@ -82,3 +90,22 @@ def test_the_contract_tells_size_order_and_scale_and_gives_the_encoder_back(
     assert paper["q"]["mean"][1] == pytest.approx(-0.675)
     assert paper["q"]["std"][1] == pytest.approx(0.3625)
     assert restore_encoder(machine, pitch).describe() == pitch
+
+
+def test_parts_of_another_task_are_told_one_by_one_and_give_the_encoder_back(
+    machine: Machine,
+) -> None:
+    described = ObservationEncoder([ObservationPart("speed", (2, 3), 0.5, 2.0)]).describe()
+    assert described["size"] == 6 and described["order"] == ["speed (2 x 3)"]
+    assert restore_encoder(machine, described).describe() == described
+
+
+def test_ranges_are_those_of_the_values_in_their_units(machine: Machine) -> None:
+    values, encoder = make_values(machine), make_encoder(machine, SCALING)
+    found = measure_ranges(encoder, encoder.encode(values), machine.joint_names)
+    q1, x, y = values["q"][:, :, 0], *values["target_in_base_m"][:, :2].T
+    assert found["q.q1"] == pytest.approx((q1.min(), q1.max()), abs=1e-6)
+    assert found["target.x"] == pytest.approx((x.min(), x.max()), abs=1e-6)
+    distance_m = np.hypot(x, y)
+    expected = pytest.approx((distance_m.min(), distance_m.max()), abs=1e-6)
+    assert found[TARGET_DISTANCE] == expected
