@@ -265,7 +265,6 @@ class ToolPoseControl:
         self.encoder = ObservationEncoder(parts, to_constant, torch.cat)
         self._down = to_constant([0.0, 0.0, task.aim_below_m])
         self.exclusive = to_constant(machine.is_exclusive).bool()
-        self.num_forgotten = max(0, machine.num_history - task.memory)
 
     def process(self, values: Mapping[str, torch.Tensor]) -> ControlInput:
         """Return the observation vector and all that the controller makes of it.
@@ -275,15 +274,14 @@ class ToolPoseControl:
                 `(N,)`, and `proposals` `(N, H, J)` where there is an adviser.
         """
         target_m, pitch_rad = values[TARGET], values[PITCH]
-        seen = dict(values) | {"q": self._forget(values["q"]), "u": self._forget(values["u"], 0.0)}
+        q, u = values["q"], values["u"]
         coming = None
         if self.adviser is not None:
-            seen[PROPOSALS] = self._forget(values[PROPOSALS], 0.0)
-            coming = self.adviser.coming(seen[PROPOSALS], seen["u"][:, -1])
-        guidance, base = self._guide(seen["q"], seen["u"], target_m, pitch_rad, coming)
+            coming = self.adviser.coming(values[PROPOSALS], u[:, -1])
+        guidance, base = self._guide(q, u, target_m, pitch_rad, coming)
         return ControlInput(
-            vector=self.encoder.encode(seen),
-            features=compute_features(guidance, base.positioning, seen["u"][:, -1]),
+            vector=self.encoder.encode(values),
+            features=compute_features(guidance, base.positioning, u[:, -1]),
             base=base,
             reach_m=self.task.switch.reach(guidance),
         )
@@ -353,16 +351,7 @@ class ToolPoseControl:
         u = self.task.action.command(output, base, self.exclusive)
         if self.adviser is None or proposed is None:
             return u
-        return self.adviser.proposal(u, self._forget(proposed, 0.0))
-
-    def _forget(self, history: torch.Tensor, rest: float | None = None) -> torch.Tensor:
-        """Return a history `(N, H, J)` with `rest` before the memory; `None`: at rest there."""
-        count = self.num_forgotten
-        if count == 0:
-            return history
-        first = history[:, count : count + 1].expand(-1, count, -1)
-        before = first if rest is None else torch.full_like(first, rest)
-        return torch.cat((before, history[:, count:]), 1)
+        return self.adviser.proposal(u, proposed)
 
 
 def compute_features(
@@ -416,9 +405,8 @@ class DeployedPolicy(torch.nn.Module):
         if PITCH not in values:
             values[PITCH] = torch.full_like(observation[:, 0], self._pitch_rad)
         seen = control.process(values)
-        # encoding again is not exact to the last bit: only where history was forgotten
-        vector = seen.vector if control.num_forgotten else observation
-        output = self.network({"policy": vector, "guide": seen.features})
+        # encoding again is not exact to the last bit
+        output = self.network({"policy": observation, "guide": seen.features})
         return control.command(output, seen.base, values.get(PROPOSALS))
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from annotated_types import Interval
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.machine import mask_exclusive_joints
 from brokk_rl.observation import TargetScaling
 from brokk_rl.spec import Count, Finite, NonNegative, NonNegativeRange, Positive, spec
 from tasks.term_task import EpisodeTask
@@ -328,8 +328,6 @@ class ToolPoseTask(EpisodeTask):
 
     Attributes:
         arms: Where the arm may begin.
-        memory: Newest samples of history that the policy sees; the machine's `num_history` for all
-            of them.
         advice: How to propose to a person who moves the levers; `null` where the policy's commands
             are given as they are.
         noise: Errors of the observation.
@@ -340,7 +338,6 @@ class ToolPoseTask(EpisodeTask):
     """
 
     arms: ArmStarts
-    memory: Count
     advice: AdviceConfig | None
     noise: ObservationNoise
     switch: PhaseSwitch
@@ -350,7 +347,6 @@ class ToolPoseTask(EpisodeTask):
 
     process: ClassVar[str] = "tasks.tool_pose:ToolPoseProcess"
     behaviour: ClassVar[tuple[str, ...]] = (
-        "memory",
         "advice",
         "noise.filter",
         "switch",
@@ -359,15 +355,6 @@ class ToolPoseTask(EpisodeTask):
         "classical",
     )
     """Fields that a policy has learned with; see `brokk_rl.policy_folder`."""
-
-    def check_machine(self, machine: Machine) -> None:
-        """Refuse a memory that is longer than the machine's history, and an episode of no step."""
-        super().check_machine(machine)
-        if self.memory > machine.num_history:
-            raise ConfigError(
-                f"task.memory: expected at most the {machine.num_history} samples of the history of "
-                f"machine '{machine.name}' (num_history), got {self.memory}; change one of them"
-            )
 
     @property
     def aim_below_m(self) -> float:

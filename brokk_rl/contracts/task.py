@@ -261,7 +261,7 @@ class Task(Protocol):
     """A spec in `conf/task`: builds a task process.
 
     A class attribute `behaviour` names the fields that a policy has learned with, such as
-    `("memory", "noise.filter")`. Checkpoints and policies carry them, and a policy is evaluated and
+    `("depth_m", "noise.filter")`. Checkpoints and policies carry them, and a policy is evaluated and
     exported with its own (`brokk_rl.policy_folder`). Without it only the task's name is known.
     """
 

@@ -69,7 +69,7 @@ BEGINNING = (
 )
 """Values that count only when a training begins: a checkpoint holds what has become of them."""
 REFUSED_CLASSES = {
-    "RNNModel": "recurrent networks are neither exported nor deployed; task.memory gives a history",
+    "RNNModel": "recurrent networks are neither exported nor deployed; a policy sees a history",
     "CNNModel": "observations are vectors, not pictures",
     "BetaDistribution": "actions are drawn from Gaussians",
     "Distillation": "train with PPO",

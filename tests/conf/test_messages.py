@@ -71,7 +71,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=import", "logs=x"): ("mode=import --help",),
     ("mode=inspect", "recording=x"): ("did you mean inspect.recordings=x?",),
     ("mode=play", "session.seed=3"): ("play.seed=3",),
-    ("task..memory=3",): ("'task..memory'", "is no key"),
+    ("task..depth_m=3",): ("'task..depth_m'", "is no key"),
     ("policy=empty", "session.out=empty"): ("empty holds no policy",),
     ("mode=check", "subject.chain=[a,b]"): ("subject.model: expected the file of a robot",),
     ("mode=collect", "collect.run_minutes=-1"): ("collect.run_minutes", "above 0"),

@@ -30,9 +30,9 @@ TRAINED = (
 """Two iterations of 8 environments."""
 
 
-CHANGES_OF_BEHAVIOUR = ("follower=person", "task.memory=1", "task.action.mask=false")
+CHANGES_OF_BEHAVIOUR = ("follower=person", "task.action.mask=false")
 """Words that change what a policy learns with, and so the fingerprint of its task."""
-QUICK = ("experiment=paper", "task.memory=1")
+QUICK = ("experiment=paper",)
 """Experiments of `make test`, beside the other task: each runs code that no other one does."""
 
 
@@ -124,6 +124,6 @@ def test_training_that_begins_with_a_policy_keeps_the_task_of_that_policy(
     assert brokk(*begin, "session.out=run").code == 0
     shipped = Path(cli.__file__).parents[1] / SHIPPED.replace(":", "/")
     assert read(tmp_path / "run/policy.json")["task"] == read(shipped / "policy.json")["task"]
-    refused = brokk(*begin, "task.memory=5", "session.out=other")
+    refused = brokk(*begin, "task.depth_m=0.1", "session.out=other")
     assert refused.code == 2
-    assert "task.memory=5 was asked for, the policy has 13" in refused.err
+    assert "task.depth_m=0.1 was asked for, the policy has 0.14" in refused.err

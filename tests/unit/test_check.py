@@ -327,7 +327,6 @@ def test_a_check_makes_the_files_of_a_machine_that_other_modes_take(
     done = brokk("mode=check", f"subject.model={urdf}", *few, "session.out=made")
     assert done.code == 0, done.err
     assert "It can be simulated and trained" in done.out and "machine=@made/arm.yaml" in done.out
-    few = (*few, "task.memory=5")
     again = brokk("mode=check", "machine=@made/arm.yaml", *few, "session.out=again")
     assert again.code == 0, again.err
     assert "nearly no start" in again.out, "the task is one of a Brokk"

@@ -51,12 +51,12 @@ def direct(task: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def newest(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run folder of a short training with the newest sample alone."""
-    folder = tmp_path_factory.mktemp("newest")
+def shallow(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run folder of a short training that aims less deep."""
+    folder = tmp_path_factory.mktemp("shallow")
     torch.manual_seed(0)
     training = runs.small(max_env_steps=2 * ITERATION)
-    loop = runs.plant(machine, insertion(memory=1)).build(CPU, 16, 64, 0)
+    loop = runs.plant(machine, insertion(depth_m=0.1)).build(CPU, 16, 64, 0)
     runner = runs.make(machine, folder, training, loop)
     runner.run()
     actor, process = runner.alg.get_policy(), loop.task
@@ -72,9 +72,9 @@ def newest(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_policy_restores_the_behaviour_and_leaves_the_conditions(newest: Path) -> None:
-    found = own_task(insertion(episode_s=40.0), str(newest))
-    assert found == insertion(episode_s=40.0, memory=1)
+def test_a_policy_restores_the_behaviour_and_leaves_the_conditions(shallow: Path) -> None:
+    found = own_task(insertion(episode_s=40.0), str(shallow))
+    assert found == insertion(episode_s=40.0, depth_m=0.1)
 
 
 def test_advice_is_restored(machine: Machine) -> None:
@@ -86,7 +86,6 @@ def test_advice_is_restored(machine: Machine) -> None:
 def test_each_field_of_the_behaviour_counts() -> None:
     task = insertion()
     changed = {
-        "memory": insertion(memory=2),
         "depth_m": insertion(depth_m=0.1),
         "action.mask": insertion(action=replace(task.action, mask=False)),
         "noise.filter": insertion(noise=replace(task.noise, filter="none")),
@@ -107,7 +106,7 @@ def test_each_field_of_the_behaviour_counts() -> None:
 
 def test_a_changed_or_foreign_description_is_refused() -> None:
     data = describe_task(insertion()).to_json()
-    data["behaviour"]["memory"] = 1
+    data["behaviour"]["depth_m"] = 1.0
     with pytest.raises(CheckpointError, match="changed after it was written"):
         TaskDescription.from_json(data, "policy.json")
     with pytest.raises(CheckpointError, match="incomplete"):
@@ -115,49 +114,52 @@ def test_a_changed_or_foreign_description_is_refused() -> None:
 
 
 def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
-    newest: Path, machine: Machine, tmp_path: Path
+    shallow: Path, machine: Machine, tmp_path: Path
 ) -> None:
     """The figures of a policy do not depend on the words of the caller, nor on its neighbours."""
     how = Evaluation(episodes=8, seed=3, num_recorded=1, video=False)
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     short = 4.0
     default = insertion(episode_s=short)
-    mine = TrainedPolicy(path=str(newest), task=replace(default, memory=1))
+    mine = TrainedPolicy(path=str(shallow), task=replace(default, depth_m=0.1))
     shipped = TrainedPolicy(path=str(SHIPPED), task=own_task(default, str(SHIPPED)))
     by_default = evaluate_policies(
         runs.plant(machine, default),
         how,
         session,
-        {"newest": mine, "shipped": shipped, "classical": ClassicalPolicy(task=mine.task)},
+        {"shallow": mine, "shipped": shipped, "classical": ClassicalPolicy(task=mine.task)},
     )
     alone = evaluate_policies(
-        runs.plant(machine, insertion(episode_s=short, memory=1)), how, session, {"newest": mine}
+        runs.plant(machine, insertion(episode_s=short, depth_m=0.1)),
+        how,
+        session,
+        {"shallow": mine},
     )
     other = evaluate_policies(runs.plant(machine, default), how, session, {"shipped": shipped})
-    assert by_default["policies"]["newest"] == alone["policies"]["newest"]
+    assert by_default["policies"]["shallow"] == alone["policies"]["shallow"]
     assert by_default["policies"]["shipped"] == other["policies"]["shipped"]
-    assert by_default["task"]["behaviour"]["memory"] == 1
+    assert by_default["task"]["behaviour"]["depth_m"] == 0.1
     stamps = by_default["tasks"]
-    assert stamps["newest"] == stamps["classical"] != stamps["shipped"]
+    assert stamps["shallow"] == stamps["classical"] != stamps["shipped"]
 
 
 def test_a_checkpoint_is_exported_by_what_it_says(
-    newest: Path, machine: Machine, tmp_path: Path
+    shallow: Path, machine: Machine, tmp_path: Path
 ) -> None:
     """Its file answers as the training run recorded; another network or task is noticed."""
     session = Session(out=str(tmp_path), seed=0, device="cpu")
-    policy = TrainedPolicy(path=str(newest), task=None)
-    export = Export(session=session, machine=machine, task=insertion(memory=1), policy=policy)
+    policy = TrainedPolicy(path=str(shallow), task=None)
+    export = Export(session=session, machine=machine, task=insertion(depth_m=0.1), policy=policy)
     export.run()
     made = json.loads((tmp_path / "policy.json").read_text())
-    assert made["task"]["behaviour"]["memory"] == 1 and made["parity"]["observations"] == 16
-    assert made["plant"] == json.loads((newest / "policy.json").read_text())["plant"]
-    golden = [json.loads((folder / "golden.json").read_text()) for folder in (tmp_path, newest)]
+    assert made["task"]["behaviour"]["depth_m"] == 0.1 and made["parity"]["observations"] == 16
+    assert made["plant"] == json.loads((shallow / "policy.json").read_text())["plant"]
+    golden = [json.loads((folder / "golden.json").read_text()) for folder in (tmp_path, shallow)]
     assert golden[0] == golden[1]
-    with pytest.raises(CheckpointError, match=r"task\.memory is 1 there, 13 here"):
+    with pytest.raises(CheckpointError, match=r"task\.depth_m is 0\.1 there, 0\.14 here"):
         replace(export, task=insertion()).run()
 
-    content = read_checkpoint(newest / "model_2.pt", CPU)
+    content = read_checkpoint(shallow / "model_2.pt", CPU)
     content["answers"] = (content["answers"][0], content["answers"][1] + 0.01)
     torch.save(content, tmp_path / "model_2.pt")
     other = replace(policy, path=str(tmp_path / "model_2.pt"))
@@ -186,22 +188,22 @@ def test_recorded_answers_are_those_of_the_network_in_the_loop(machine: Machine)
     assert torch.equal(commands, loop.end_u[:5])
 
 
-def test_resuming_in_another_task_is_refused_by_name(newest: Path, machine: Machine) -> None:
+def test_resuming_in_another_task_is_refused_by_name(shallow: Path, machine: Machine) -> None:
     training = runs.small(max_env_steps=4 * ITERATION)
-    runner = runs.make(machine, newest, training)
-    with pytest.raises(CheckpointError, match=r"task\.memory is 1 there, 13 here.*resolved"):
-        runner.load(str(newest / "model_2.pt"))
+    runner = runs.make(machine, shallow, training)
+    with pytest.raises(CheckpointError, match=r"task\.depth_m is 0\.1 there, 0\.14 here.*resolved"):
+        runner.load(str(shallow / "model_2.pt"))
 
 
 def test_weights_of_another_policy_are_noticed(
-    newest: Path, machine: Machine, tmp_path: Path
+    shallow: Path, machine: Machine, tmp_path: Path
 ) -> None:
     for name in ("policy.json", "golden.json", "policy.onnx"):
         shutil.copy(SHIPPED / name, tmp_path / name)
-    shutil.copy(newest / "policy.safetensors", tmp_path / "policy.safetensors")
+    shutil.copy(shallow / "policy.safetensors", tmp_path / "policy.safetensors")
     with pytest.raises(CheckpointError, match=r"policy\.safetensors and policy\.json are of diff"):
         find_policy(str(tmp_path)).read()
-    shutil.copy(newest / "policy.onnx", tmp_path / "policy.onnx")
+    shutil.copy(shallow / "policy.onnx", tmp_path / "policy.onnx")
     with pytest.raises(CheckpointError, match=r"policy\.json and policy\.onnx do not belong"):
         PolicyBundle(str(tmp_path), machine)
 
@@ -229,7 +231,7 @@ FEW = ("evaluation.num_recorded=1", "evaluation.video=false", "actuator=lag", "s
             "task.action.kind=residual was asked for, the policy has dir",
         ),
         (("task.action={kind: residual}",), "task.action.kind=residual was asked for"),
-        (("task.memory=1",), "task.memory=1 was asked for, the policy has 13"),
+        (("task.depth_m=0.1",), "task.depth_m=0.1 was asked for, the policy has 0.14"),
         (("task=goal_pose",), "for task=borehole_insertion, but task=goal_pose was asked for"),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else None,
@@ -255,21 +257,21 @@ def test_values_of_an_experiment_yield_to_the_policy(
 
 
 def test_the_command_finds_the_task_of_its_policy(
-    newest: Path, brokk: Callable[..., Done], tmp_path: Path
+    shallow: Path, brokk: Callable[..., Done], tmp_path: Path
 ) -> None:
     """A follower is of the plant: what it brings to the task is no request."""
-    words = ("task.episode_s=1.0", "task.memory=1", "follower=person")
-    done = brokk(*EVALUATE, *FEW, f"policy={newest}", *words)
+    words = ("task.episode_s=1.0", "task.depth_m=0.1", "follower=person")
+    done = brokk(*EVALUATE, *FEW, f"policy={shallow}", *words)
     assert done.code == 0, done.err
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert found["task"]["behaviour"]["advice"] is None and found["follower"] == "person"
 
 
 @pytest.fixture
-def foreign(newest: Path, tmp_path: Path) -> Path:
+def foreign(shallow: Path, tmp_path: Path) -> Path:
     """The policy as one of a machine whose file nobody has any more."""
     folder = tmp_path / "policies" / "foreign"
-    shutil.copytree(newest, folder)
+    shutil.copytree(shallow, folder)
     contract = json.loads((folder / "policy.json").read_text())
     contract["plant"]["machine"] |= {"name": "foreign", "title": "of somebody else"}
     contract["fingerprint"] = option("machine", "brokk170").fingerprint()

@@ -54,7 +54,7 @@ def test_a_network_with_a_memory_is_refused_before_the_first_step_whatever_its_n
     training = runs.small(max_env_steps=ITERATION)
     actor = training.runner["actor"] | {"class_name": f"{__name__}:Remembering"}
     training = replace(training, runner=training.runner | {"actor": actor})
-    with pytest.raises(ConfigError, match=r"without memory.*task\.memory gives a history"):
+    with pytest.raises(ConfigError, match=r"without memory.*a policy sees a history"):
         runs.make(machine, tmp_path, training)
 
 
