@@ -43,10 +43,10 @@ def try_draft(*options: str) -> Done:
 
 def import_log(*options: str) -> tuple[Done, list[dict[str, np.ndarray]]]:
     """Returns the draft as text, and the columns of the recordings that it makes."""
-    done = try_draft(*options)
-    if done.code:
-        return done, []
-    draft = make_draft(*options)
+    try:
+        draft = make_draft(*options)
+    except BrokkError as error:
+        return Done(2, "", str(error)), []
     made = []
     for group, template in (
         ("machine", log_draft.MACHINE_TEMPLATE),
@@ -63,4 +63,4 @@ def import_log(*options: str) -> tuple[Done, list[dict[str, np.ndarray]]]:
             for j, (name, unit) in enumerate(zip(one.joints, one.units, strict=True)):
                 columns[f"q_{name}_{unit}"] = one.q[:, j]
             found.append(columns)
-    return done, found
+    return Done(0, describe_draft(draft), ""), found

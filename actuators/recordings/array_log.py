@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.dataset as ds
 from scipy import io as matlab
 
+from actuators.recordings.column_names import TIME_UNITS
 from actuators.recordings.log_tables import LogFile, LogRun, Table, Wanted
 from brokk_rl.errors import RecordingError
 
@@ -28,6 +28,8 @@ EPISODE = "episode_index"
 """Column of a LeRobotDataset that says which episode a row belongs to."""
 MOST_COLUMNS = 256
 """Widest matrix that is taken for joints; wider ones are pictures."""
+INDEX = "__index_level_"
+"""Begin of the names under which pandas writes an index without a name."""
 FORMATS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json"}
 """Formats of pyarrow by the ending of their files."""
 TABLE_ERRORS = (OSError, pa.ArrowException, ValueError)
@@ -59,19 +61,18 @@ class TableLog(LogFile):
         return {"": Table(self.read_columns(wanted.get("", ()), max_rows))}
 
     def read_columns(self, names: Collection[str], max_rows: int | None) -> dict[str, np.ndarray]:
-        """Return the named columns, each `(T,)`; NaN for an empty cell, s since 1970 for a time."""
+        """Return the named columns, each `(T,)`; NaN for an empty cell, s for a time."""
         places = {name: place for name, place in self._list_places().items() if name in names}
-        fields = {way: pc.field(*way) for way, *_ in places.values()}
+        columns = sorted({field for field, *_ in places.values()})
         found = {}
         try:
             source = self._open()
-            columns = {".".join(way): field for way, field in fields.items()}
             if max_rows is None:
-                table = source.to_table(columns=columns)
+                table = flatten_table(source.to_table(columns))
             else:
-                table = source.head(max_rows, columns=columns)
-            for name, (way, item, length) in places.items():
-                found[name] = _convert_column(table[".".join(way)], length)[:, item]
+                table = flatten_table(source.head(max_rows, columns=columns))
+            for name, (_, inner, item, length) in places.items():
+                found[name] = _convert_column(table[inner], length)[:, item]
         except TABLE_ERRORS as error:
             raise RecordingError(f"{self.path}: damaged ({error})") from error
         return found
@@ -79,27 +80,29 @@ class TableLog(LogFile):
     def _open(self) -> ds.Dataset:
         return ds.dataset(self.path, format=FORMATS[self.path.suffix.lower()])
 
-    def _list_places(self) -> dict[str, tuple[tuple[str, ...], int, int]]:
-        """Return field, item and number of items of each name; a field within another one is a way to it."""
+    def _list_places(self) -> dict[str, tuple[str, str, int, int]]:
+        """Return field, field within it, item and number of items of each name."""
         try:
-            (head,) = self._open().head(1).to_pylist() or [{}]
-            schema = self._open().schema
+            head = self._open().head(1)
         except FileNotFoundError as error:
             raise RecordingError(f"{self.path}: no such log") from error
         except TABLE_ERRORS as error:
             kind = FORMATS[self.path.suffix.lower()]
             raise RecordingError(f"{self.path}: cannot be read as {kind} ({error})") from error
         places = {}
-        for way, kind, value in _walk_fields(schema, head):
-            name = ".".join(way)
-            if _is_number(kind):
-                places[name] = (way, 0, 1)
-            elif _is_list(kind) and _is_number(kind.value_type) and value:
-                names = self._labels.get(name, [])
-                if len({*names}) != len(value):
-                    names = [str(item) for item in range(len(value))]
-                for item, label in enumerate(names):
-                    places[f"{name}[{label}]"] = (way, item, len(value))
+        for field in head.column_names if head.num_rows else ():
+            part = flatten_table(head.select([field]))
+            for name, column in zip(part.column_names, part.columns, strict=True):
+                value = column[0].as_py()
+                if _is_number(column.type):
+                    is_index = name.startswith(INDEX) and pa.types.is_timestamp(column.type)
+                    places["timestamp" if is_index else name] = (field, name, 0, 1)
+                elif _is_list(column.type) and _is_number(column.type.value_type) and value:
+                    labels = self._labels.get(name, [])
+                    if len({*labels}) != len(value):
+                        labels = [str(item) for item in range(len(value))]
+                    for item, label in enumerate(labels):
+                        places[f"{name}[{label}]"] = (field, name, item, len(value))
         return places
 
 
@@ -265,16 +268,11 @@ def _read_labels(features: Mapping[str, Any]) -> dict[str, list[str]]:
     return labels
 
 
-def _walk_fields(
-    fields: Any, values: Any, outer: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], pa.DataType, Any]]:
-    """Yield way, type and first value of each field, of those inside of others too."""
-    for field in fields:
-        value = (values or {}).get(field.name)
-        if pa.types.is_struct(field.type):
-            yield from _walk_fields(field.type, value, (*outer, field.name))
-        else:
-            yield (*outer, field.name), field.type, value
+def flatten_table(table: pa.Table) -> pa.Table:
+    """Return a table with the fields within others as columns of their own, `pose.x`."""
+    while any(pa.types.is_struct(kind) for kind in table.schema.types):
+        table = table.flatten()
+    return table
 
 
 def _is_real(values: np.ndarray) -> bool:
@@ -283,8 +281,12 @@ def _is_real(values: np.ndarray) -> bool:
 
 def _is_number(kind: pa.DataType) -> bool:
     types = pa.types
-    tests = (types.is_floating, types.is_integer, types.is_boolean, types.is_timestamp)
-    return any(test(kind) for test in tests)
+    tests = (types.is_floating, types.is_integer, types.is_boolean, types.is_decimal)
+    return _is_time(kind) or any(test(kind) for test in tests)
+
+
+def _is_time(kind: pa.DataType) -> bool:
+    return pa.types.is_timestamp(kind) or pa.types.is_duration(kind)
 
 
 def _is_list(kind: pa.DataType) -> bool:
@@ -302,6 +304,8 @@ def _convert_column(column: pa.ChunkedArray, length: int) -> np.ndarray:
     if len(flat) != length * len(column):
         raise ValueError(f"a list of another length than {length}")
     unit = 1.0
-    if pa.types.is_timestamp(flat.type):
-        flat, unit = flat.cast(pa.timestamp("ns")).cast(pa.int64()), 1e-9
-    return unit * np.asarray(flat.to_numpy(zero_copy_only=False), dtype=float).reshape(-1, length)
+    if _is_time(flat.type):
+        unit = TIME_UNITS[flat.type.unit]
+        flat = flat.cast(pa.int64())
+    numbers = flat.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+    return unit * numbers.reshape(-1, length)

@@ -24,6 +24,8 @@ CLOCK_POINTS = 200
 points of the fastest messages fix a drift of 1 ppm within minutes."""
 COARSE_SHARE = 0.1
 """Share of rows at the time of the row before from which a clock is coarse; lost rows repeat less often."""
+MOST_UNORDERED = 0.1
+"""Share of rows out of their order from which a clock is broken: its other times may be wrong too."""
 SETBACK_PERIODS = 10
 """A longer step back is a clock that was set; shorter ones are rows out of their order."""
 
@@ -95,7 +97,7 @@ class ClockFault:
     """Rows of a clock that do not come later than all before.
 
     Attributes:
-        kind: `repeated` rows, a `coarse` clock, one that was set `back`, or rows out of `order`.
+        kind: `repeated` rows, a `coarse` or a `broken` clock, one that was set `back`, or rows out of `order`.
         rows: Rows concerned.
         text: Description.
         advice: How the log is read all the same.
@@ -105,6 +107,11 @@ class ClockFault:
     rows: np.ndarray
     text: str
     advice: str
+
+    @property
+    def is_damage(self) -> bool:
+        """True where the other rows can be used."""
+        return self.kind not in ("coarse", "broken")
 
 
 def unwrap(values: np.ndarray, modulus: float | None) -> np.ndarray:
@@ -153,12 +160,8 @@ def find_fault(t_s: np.ndarray, table: Table, clock: str) -> ClockFault | None:
         same &= (now == before) | (np.isnan(now) & np.isnan(before))
     count = f"{len(bad)} of {len(t_s)} rows"
     if (is_equal & ~same).sum() > COARSE_SHARE * len(t_s):
-        stamps_s, counts = np.unique(t_s[np.isfinite(t_s)], return_counts=True)
-        # the first and the last stamp may have only a part of their rows
-        span_s = stamps_s[-1] - stamps_s[1] if len(stamps_s) > 2 else 1.0
-        rate_hz = float(counts[1:-1].sum() / span_s) or len(t_s)
         text = f"the clock is coarser than the rows: {count} repeat the time of the row before, with other values"
-        return ClockFault("coarse", bad, text, advise("rate", rate_hz=float(f"{rate_hz:.3g}")))
+        return ClockFault("coarse", bad, text, _advise_rate(t_s))
     period_s = float(np.median(steps[later][1:])) if later.sum() > 1 else 0.0
     back = np.flatnonzero(steps < -SETBACK_PERIODS * period_s)
     if 0 < len(back) <= max(3, 0.01 * len(t_s)):
@@ -167,7 +170,21 @@ def find_fault(t_s: np.ndarray, table: Table, clock: str) -> ClockFault | None:
     if (is_equal & same).sum() > 0.5 * len(bad):
         text = f"the time does not increase in {count}, which repeat the row before"
         return ClockFault("repeated", bad, text, advise("damaged"))
-    return ClockFault("order", bad, f"the time does not increase in {count}", advise("damaged"))
+    text = f"the time does not increase in {count}"
+    if len(bad) > MOST_UNORDERED * len(t_s):
+        return ClockFault(
+            "broken", bad, f"{text}: its digits may be wrong", _advise_rate(np.floor(t_s))
+        )
+    return ClockFault("order", bad, text, advise("damaged"))
+
+
+def _advise_rate(t_s: np.ndarray) -> str:
+    """Return the advice to take rows as equally spaced, at their mean rate."""
+    stamps_s, counts = np.unique(t_s[np.isfinite(t_s)], return_counts=True)
+    # the first and the last stamp may have only a part of their rows
+    span_s = stamps_s[-1] - stamps_s[1] if len(stamps_s) > 2 else 1.0
+    rate_hz = float(counts[1:-1].sum() / span_s) or len(t_s)
+    return advise("rate", rate_hz=float(f"{rate_hz:.3g}"))
 
 
 def read_clock(
@@ -210,7 +227,7 @@ def read_clock(
     if fault is not None:
         row = int(fault.rows[0])
         place = f"{run.where}: {table.locate(row)}, column '{time.column}'"
-        if not skip or fault.kind == "coarse":
+        if not (skip and fault.is_damage):
             before_s = t_s[max(row - 1, 0)]
             raise RecordingError(
                 f"{place}: time does not increase ({before_s:g} s, then {t_s[row]:g} s): {fault.text}; {fault.advice}"

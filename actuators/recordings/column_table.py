@@ -50,6 +50,8 @@ TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
 DOUBLED_SHARE = 0.2
 """Share of equal stamps with other values from which two programs send to one topic."""
+MOST_TURNS = 2.0
+"""Turns beyond which a target in rad is in doubt: joints of arms and legs stop before, winches do not."""
 SPIKE_SHARE = 0.01
 """Share of spikes from which a column holds two sources."""
 
@@ -247,6 +249,10 @@ class _JointJudge:
             f"correlation of {FOLLOWED[joint.kind]} with command {r:.2f}, {joint.lag_s:.2f} s later"
         )
         joint.evidence.append((text, _weigh_correlation(r, joint.kind)))
+        if joint.lag_s > 0.95 * LONGEST_LAG_S:
+            joint.evidence.append(
+                ("no longer lag is tried: its delay is longer, or it is no pair", -5.0)
+            )
         size = np.abs(self._matrix.get(joint.kind)[:, self._at])
         others = np.delete(size, self._at)
         if size[self._at] < CLEAR_CORRELATION and others.max(initial=0.0) > size[self._at] + MARGIN:
@@ -302,6 +308,9 @@ class _JointJudge:
             value, evidence = given, [("as given by log.position_unit", 5.0)]
         elif name.unit is not None:
             value, evidence = name.unit, [("unit in its name", 5.0)]
+            if name.unit == "rad" and joint.kind == "position" and largest > MOST_TURNS * math.tau:
+                text = f"but {largest:.4g} rad is {largest / math.tau:.2g} turns: degrees? {advise('unit')}"
+                evidence.append((text, -5.0))
         elif is_target and 0.8 <= self._slope <= 1.2:
             text = f"unit in the name of its target, which it follows 1 : {self._slope:.2f}"
             value, evidence = str(target.unit), [(text, 4.0)]

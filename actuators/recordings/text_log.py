@@ -43,9 +43,10 @@ DAY_TIME = re.compile(
     r"\d\d?[./-](\d\d?|[A-Za-z]{3})[./-]\d{4}[T ]+\d\d?:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?"
 )
 """Day, month, year and time of day."""
-CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
-NUMBER_SIGNS = str.maketrans({"D": "E", "d": "e", "'": None, "’": None, "\u00a0": None})
-"""Exponents of Fortran, and signs between thousands."""
+CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?|\d\d?:\d\d[.,]\d+|\d+([.,]\d+)? (sec|min|hr)")
+"""Time of day, minutes and seconds, or a time with its unit, as MATLAB writes it."""
+NUMBER_SIGNS = str.maketrans({"D": "E", "d": "e"} | dict.fromkeys("'’\u00a0=\""))
+"""Exponents of Fortran, signs between thousands, and those of a formula of Excel, `="0.5"`."""
 FIRST_ROWS = 3
 """Rows on end from which data begin; a block of describing lines may hold some numbers too."""
 
@@ -217,8 +218,7 @@ def convert_cells(cells: Any, kind: CellKind, length: int, decimal: str) -> np.n
     if kind == "number":
         if cells.dtype.kind in "fiu":
             return cells.to_numpy(dtype=float)
-        texts = cells.astype(str).str.strip().str.replace(decimal, ".", regex=False)
-        texts = texts.str.translate(NUMBER_SIGNS)
+        texts = cells.astype(str).map(lambda text: simplify_number(text, decimal))
         numbers: Any = pd.to_numeric(texts, errors="coerce")
         return numbers.to_numpy(dtype=float)
     texts = cells.fillna("").str.strip()
@@ -239,7 +239,8 @@ def convert_times(texts: Any) -> np.ndarray:
     first = next((text for text in texts if text), "")
     texts = texts.str.replace(",", ".", regex=False)
     if CLOCK_TIME.fullmatch(first):
-        elapsed: Any = pd.to_timedelta(texts, errors="coerce")
+        whole = "00:" + texts if first.count(":") == 1 else texts
+        elapsed: Any = pd.to_timedelta(whole, errors="coerce")
         return elapsed.dt.total_seconds().to_numpy(dtype=float)
     is_iso = ISO_TIME.fullmatch(first) is not None
     form: Any = (
@@ -404,6 +405,15 @@ def split_line(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
+def simplify_number(text: str, decimal: str) -> str:
+    """Return a number as Python writes it; signs between thousands are told where a decimal sign follows."""
+    plain = text.strip().translate(NUMBER_SIGNS)
+    other = "," if decimal == "." else "."
+    if re.fullmatch(rf"[-+]?\d{{1,3}}(\{other}\d{{3}})+\{decimal}\d+", plain):
+        plain = plain.replace(other, "")
+    return plain.replace(decimal, ".")
+
+
 def tell_kind(text: str, decimal: str) -> CellKind:
     """Return the kind of a cell; an empty cell counts as a number that is missing."""
     if text.startswith("[") and text.endswith("]"):
@@ -412,7 +422,7 @@ def tell_kind(text: str, decimal: str) -> CellKind:
         return "time"
     if text.lower() in FLAGS:
         return "flag"
-    plain = text.replace(decimal, ".").translate(NUMBER_SIGNS)
+    plain = simplify_number(text, decimal)
     is_number = text in MISSING or ("_" not in text and _is_number(plain))
     return "number" if is_number else "text"
 

@@ -92,7 +92,7 @@ def _guess_own_clock(subject: str, table: Table) -> TimeGuess:
     """Return the clock that the reader of the log made, or that of the sensor tied to it."""
     clock, stamp = table.clock or "", "header.stamp"
     num_doubled = 0
-    if stamp in table.columns:
+    if stamp in table.columns and np.ptp(table.columns[stamp]) > 0:  # a driver may leave it at 0
         stamp_s, anchor_s = table.columns[stamp], table.columns[clock]
         num_doubled = int((np.diff(stamp_s) == 0).sum())
         if len(stamp_s) > 2 and (np.diff(stamp_s) > 0).all():
@@ -153,24 +153,23 @@ def _judge_clock(
         return None
     wraps = _find_time_wrap(values) if is_named else None
     values = unwrap(values, wraps)
-    later = is_later(values)
+    unit = 1.0 if text not in table.columns else TIME_UNITS.get(stated or "")
+    if unit is None:
+        named = [TIME_UNITS[word] for word in split_words(plain) if word in TIME_UNITS]
+        unit = named[-1] if named else None
+    later, fault = is_later(values), find_fault((unit or 1.0) * values, table, text)
     if is_named and is_later(-values).all():
         return f"'{text}' only decreases: the newest row comes first; sort the rows, oldest first"
     if not later.all():
         if later.mean() < (0.02 if is_named else 0.9) or not (skip or np.isfinite(values).all()):
             return None
-        fault = find_fault(values, table, text)
         assert fault is not None
         if not words.isdisjoint(("dt", "delta", "diff", "period")):
             rate_hz = 1.0 / max(float(np.mean(values)), 1e-9)
             return f"'{text}' holds the time since the row before; {advise('rate', rate_hz=float(f'{rate_hz:.3g}'))}"
-        if not skip or fault.kind == "coarse":
+        if not (skip and fault.is_damage):
             place = table.locate(int(fault.rows[0]))
             return f"'{text}': {fault.text}, first in {place}; {fault.advice}"
-    unit = 1.0 if text not in table.columns else TIME_UNITS.get(stated or "")
-    if unit is None:
-        named = [TIME_UNITS[word] for word in split_words(plain) if word in TIME_UNITS]
-        unit = named[-1] if named else None
     judged = _judge_unit(values[later], unit if is_named else None, is_named)
     if judged is None:
         return None
@@ -178,8 +177,7 @@ def _judge_clock(
     steps = np.diff(values[later])
     period = float(np.median(steps))
     is_regular = float(np.quantile(np.abs(steps / period - 1.0), 0.9)) < 0.2
-    bad = f"increases but for {int((~later).sum())} of {len(later)} rows"
-    evidence = [("only increases" if later.all() else bad, 0.0), reason]
+    evidence = [("only increases" if fault is None else f"but {fault.text}", 0.0), reason]
     evidence.append((f"{1.0 / (period * scale):.4g} Hz", 0.5 if is_regular else -0.5))
     evidence.append(("", 1.5) if is_named else ("its name does not say it", 0.0))
     if wraps is not None:

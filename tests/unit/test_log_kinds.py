@@ -9,12 +9,14 @@ import shlex
 import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
 import can
 import cantools
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.io
 from conftest import Done
@@ -92,6 +94,10 @@ FORTRAN = [" ".join(f"{v:.8e}".replace("e", "D") for v in row) for row in make_r
 GROUPED = [";".join(f"{1e3 * v:,.3f}".replace(",", "'") for v in row) for row in make_rows()]
 GROUPED_NAMES = ["time [ms]", *(f"{name.removesuffix('_rad')} [mrad]" for name in NAMES[1:])]
 LABVIEW = ["LabVIEW Measurement", "***End_of_Header***", "Samples\t600\t600\t600\t600"]
+THOUSANDS = [",".join(f'"{1e3 * v:,.3f}"' for v in row) for row in make_rows()]
+FORMULAS = [",".join(f'"=""{v:.6f}"""' for v in row) for row in make_rows()]
+DURATIONS = [line.replace(",", " sec,", 1) for line in COMMAS]
+MINUTES = [f"50:{line.partition(',')[0]:>09.9},{line.partition(',')[2]}" for line in COMMAS]
 TABBED = [line.replace(" ", "\t") for line in PLAIN]
 
 
@@ -122,6 +128,10 @@ def write_dates(form: str) -> list[str]:
         ("labview.lvm", [*LABVIEW, "\t".join([*NAMES, "Comment"]), *TABBED], "utf-8"),
         ("american.csv", write_dates("%m/%d/%Y %I:%M:%S.%f %p"), "utf-8"),
         ("matlab.csv", write_dates("%d-%b-%Y %H:%M:%S.%f"), "utf-8"),
+        ("thousands.csv", [",".join(GROUPED_NAMES), *THOUSANDS], "utf-8"),
+        ("formulas.csv", [",".join(NAMES), *FORMULAS], "utf-8"),
+        ("durations.csv", [",".join(NAMES), *DURATIONS], "utf-8"),
+        ("minutes.csv", [",".join(NAMES), *MINUTES], "utf-8"),
         ("returns.csv", [",".join(NAMES), *COMMAS], "utf-8"),
     ],
 )  # fmt: skip
@@ -151,15 +161,47 @@ def test_units_behind_names_are_read(names: tuple[str, ...], factor: float) -> N
     check_joints(recordings, atol=5e-3)
 
 
-def test_a_unit_that_is_not_known_is_never_sure() -> None:
+@pytest.mark.parametrize(
+    ("unit", "factor", "text"),
+    [("furlong", 1.0, "its unit 'furlong' is not known"), ("rad", 57.3, "rad is 6.4 turns: degrees?")],
+)  # fmt: skip
+def test_a_unit_that_is_not_known_or_cannot_be_is_never_sure(
+    unit: str, factor: float, text: str
+) -> None:
     names = (
         "t [s]",
-        *(f"{one} [furlong]" for one in ("hip cmd", "hip pos", "knee cmd", "knee pos")),
+        *(f"{one} [{unit}]" for one in ("hip cmd", "hip pos", "knee cmd", "knee pos")),
     )
-    write_text("a.csv", make_rows(), names)
+    write_text("a.csv", make_rows() * [1.0, factor, factor, factor, factor], names)
     done = try_draft("log.input=a.csv")
-    assert "its unit 'furlong' is not known" in done.out
+    assert text in done.out
     assert "No guess is unsure" not in done.out
+
+
+def test_a_delay_beyond_the_longest_lag_is_never_sure() -> None:
+    rows = make_rows(2500)
+    rows[:, 2] = np.interp(rows[:, 0] - 2.0, rows[:, 0], rows[:, 1])
+    write_text("a.csv", rows)
+    done = try_draft("log.input=a.csv")
+    assert "no longer lag is tried" in done.out
+    assert "No guess is unsure" not in done.out
+
+
+@pytest.mark.parametrize("kind", ["index", "durations", "decimals"])
+def test_columns_of_parquet_of_every_kind_are_read(kind: str) -> None:
+    rows = make_rows()
+    stamps = pd.to_datetime(1_700_000_000_000 + rows[:, 0] * 1000.0, unit="ms")
+    frame = pd.DataFrame(rows[:, 1:], columns=NAMES[1:])
+    if kind == "index":
+        frame.index = stamps
+    else:
+        frame.insert(0, "time", stamps - stamps[0] if kind == "durations" else rows[:, 0])
+    if kind == "decimals":
+        frame["hip_pos_rad"] = frame["hip_pos_rad"].map(lambda value: Decimal(f"{value:.6f}"))
+    frame.to_parquet("a.parquet")
+    done, recordings = import_log("log.input=a.parquet")
+    assert "No guess is unsure" in done.out
+    check_joints(recordings)
 
 
 @pytest.mark.parametrize(
@@ -209,6 +251,13 @@ def coarsen_clock(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
 
 def leave_time_out(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     return rows[:, 1:], NAMES[1:]
+
+
+def leave_zeros_out(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Returns times as a program writes them that joins seconds and nanoseconds by a point."""
+    parts = [(int(t_s), round(t_s % 1.0 * 1e9)) for t_s in rows[:, 0]]
+    clock = [float(f"{second}.{nano}") for second, nano in parts]
+    return np.column_stack([clock, rows[:, 1:]]), NAMES
 
 
 def take_differences(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -453,7 +502,13 @@ def write_advised(case: str) -> list[str]:
     if case == "set back":
         rows = make_rows(1200)
         rows[600:, 0] -= 3600.0
-    elif case in ("repeat_rows", "coarsen_clock", "leave_time_out", "take_differences"):
+    elif case in (
+        "repeat_rows",
+        "coarsen_clock",
+        "leave_time_out",
+        "take_differences",
+        "leave_zeros_out",
+    ):
         rows, names = globals()[case](rows)
     elif case == "short line":
         write_text("a.csv", rows)
@@ -465,7 +520,8 @@ def write_advised(case: str) -> list[str]:
         names = ["time_s", "target", "position", "target", "position"]
     elif case == "wraps":
         rows[:, 1:] = np.mod(np.round(rows[:, 1:] * 652.0), 4096.0)
-        names = ["time_s", "hip_target_rad", "hip_pos_rad", "knee_target_rad", "knee_pos_rad"]
+        write_text("a.csv", rows, tuple(name.removesuffix("_rad") for name in NAMES))
+        return ["log.input=a.csv", "log.position_unit=0.00153 rad"]
     elif case == "unit":
         rows[:, 1:] = np.round(2000.0 + rows[:, 1:] * 652.0)
         names = ["time_s", "hip_target", "hip_pos", "knee_target", "knee_pos"]
@@ -486,6 +542,7 @@ ADVISED = {
     "short line": "damaged",
     "coarsen_clock": "rate",
     "leave_time_out": "rate",
+    "leave_zeros_out": "rate",
     "take_differences": "rate",
     "time": "time",
     "headerless": "joints",
@@ -595,18 +652,23 @@ def test_two_arms_on_topics_of_their_own_keep_all_joints() -> None:
     assert {"q_left_hip_rad", "q_right_hip_rad"} <= recordings[0].keys()
 
 
-def test_two_programs_on_one_topic_are_never_sure(brokk: Callable[..., Done]) -> None:
+@pytest.mark.parametrize("is_stamped", [True, False])
+def test_two_programs_on_one_topic_are_never_sure_and_a_stamp_of_zero_is_no_clock(
+    is_stamped: bool,
+) -> None:
     messages = []
     for row in make_rows():
-        stamp = {"stamp": {"sec": 1700 + int(row[0]), "nanosec": round(1e9 * (row[0] % 1.0))}}
-        content = {"header": stamp, "name": ["hip"]}
+        second = 1700 + int(row[0]) if is_stamped else 0
+        nano = round(1e9 * (row[0] % 1.0)) if is_stamped else 0
+        content = {"header": {"stamp": {"sec": second, "nanosec": nano}}, "name": ["hip"]}
         messages.append((row[0], "/joint_states", {**content, "position": [row[2]]}))
-        messages.append((row[0] + 0.001, "/joint_states", {**content, "position": [0.0]}))
         messages.append((row[0], "/command", {**content, "target": [row[1]]}))
+        if is_stamped:
+            messages.append((row[0] + 0.001, "/joint_states", {**content, "position": [0.0]}))
     write_messages("a.mcap", messages)
     done = try_draft("log.input=a.mcap")
-    assert "two programs send to '/joint_states'" in done.out
-    assert "No guess is unsure" not in done.out
+    assert ("two programs send to '/joint_states'" in done.out) is is_stamped
+    assert ("No guess is unsure" in done.out) is not is_stamped
 
 
 def test_the_next_log_of_a_kind_fits_into_the_draft() -> None:
