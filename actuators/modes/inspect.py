@@ -252,7 +252,10 @@ class Inspect:
             "Shares are of the time; noise and step in the unit of the joint.",
         )
         if preview:
-            self._add_preview(page, preview)
+            page.add_heading("Effects that these recordings could tell")
+            shown = preview_report.describe_preview(preview, self.machine)
+            page.add_table(shown.head, shown.rows)
+            page.add_list(shown.remarks)
         page.add_heading("Findings")
         head, rows = self._counts(result)
         page.add_table(head, rows)
@@ -279,17 +282,6 @@ class Inspect:
                 with page.add_details(f"{len(rows)} findings"):
                     page.add_table(head, rows)
         return page
-
-    def _add_preview(self, page: Report, preview: PreviewResult) -> None:
-        page.add_heading("Effects that these recordings could tell")
-        page.add_table(
-            *preview_report.describe_effects(preview, self.machine), preview_report.EXPLANATION
-        )
-        if preview.pairs:
-            page.add_table(
-                *preview_report.describe_pairs(preview), "Effects that nothing here tells apart."
-            )
-        page.add_list(preview_report.list_remarks(preview))
 
 
 def _combine(key: str, values: np.ndarray, seconds: np.ndarray) -> float | None:

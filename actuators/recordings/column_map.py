@@ -28,10 +28,11 @@ from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn
 from actuators.recordings.guess import Damaged
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import (
-    Piece,
     Places,
     RunSignals,
     Signal,
+    describe_source,
+    list_ticks,
     locate,
     refuse_missing,
     resolve_column,
@@ -307,14 +308,22 @@ class ColumnMap:
             )
         found = []
         for begin_s, end_s in spans_s:
-            piece = Piece(begin_s, end_s, machine)
-            for j, command in enumerate(commands):
+            t_s = list_ticks(begin_s, end_s, machine.period_s)
+            u = []
+            for command in commands:
                 read = command.average if machine.interface == "torque" else command.hold
-                piece.u[:, j] = read(piece.ticks_s, machine.period_s)
-                piece.q[:, j] = positions[j].interpolate(piece.ticks_s)
+                u.append(read(begin_s + t_s, machine.period_s))
+            q = [position.interpolate(begin_s + t_s) for position in positions]
+            extra = {}
             for name, signal in optional.items():
-                piece.extra[name] = signal.interpolate(piece.ticks_s).astype(np.float32)
-            found.append(piece.make_recording(signals.run, positions[0].t_s))
+                extra[name] = signal.interpolate(begin_s + t_s).astype(np.float32)
+            clock_s = positions[0].t_s
+            inside_s = clock_s[(clock_s >= begin_s) & (clock_s <= end_s)]
+            metadata = describe_source(signals.run, machine, inside_s)
+            made = record.make_motion(
+                machine, signals.run.name, t_s, np.stack(u, 1), np.stack(q, 1)
+            )
+            found.append(replace(made, extra=extra, metadata=metadata))
         return found
 
     def _read_command(

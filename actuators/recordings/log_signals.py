@@ -16,7 +16,6 @@ from actuators.recordings.log_tables import LogRun
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 
 log = logging.getLogger(__name__)
 
@@ -203,46 +202,21 @@ def locate(run: LogRun, signal: Signal, row: int, column: str) -> str:
     return f"{run.where}: {place}, {inside}column '{column}'"
 
 
-class Piece:
-    """A piece of a run without gaps, at the machine's rate.
+def list_ticks(begin_s: float, end_s: float, period_s: float) -> np.ndarray:
+    """Return the times, `(T,)` s, of a recording from its beginning on, which is 0."""
+    return np.arange(int((end_s - begin_s) / period_s + TICK_TOLERANCE) + 1) * period_s
 
-    Attributes:
-        ticks_s: Times of the rows by the clock of the log, `(T,)`.
-        u: Commands, `(T, J)`, to be filled.
-        q: Positions, `(T, J)`, to be filled.
-        extra: Optional columns, to be filled.
-    """
 
-    def __init__(self, begin_s: float, end_s: float, machine: Machine) -> None:
-        self._machine = machine
-        self._end_s = end_s
-        num_rows = int((end_s - begin_s) / machine.period_s + TICK_TOLERANCE) + 1
-        self._grid_s = np.arange(num_rows) * machine.period_s
-        self.ticks_s = begin_s + self._grid_s
-        self.u = np.empty((num_rows, machine.num_joints), dtype=np.float32)
-        self.q = np.empty((num_rows, machine.num_joints), dtype=np.float32)
-        self.extra: dict[str, np.ndarray] = {}
-
-    def make_recording(self, run: LogRun, clock_s: np.ndarray) -> Recording:
-        """Return the filled piece; `clock_s` is the clock that it was resampled from."""
-        metadata = {
-            "source": f"log: {Path(run.where).name}",
-            "run": run.name,
-            "fingerprint": record.format_fingerprint(self._machine),
-        }
-        period_s = np.diff(clock_s[(clock_s >= self.ticks_s[0]) & (clock_s <= self._end_s)])
-        if len(period_s):
-            metadata["resampled_from"] = (
-                f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"
-            )
-        return Recording(
-            machine=self._machine.name,
-            joints=self._machine.joint_names,
-            units=tuple(joint.unit for joint in self._machine.joints),
-            rate_hz=1.0 / self._machine.period_s,
-            t_s=self._grid_s,
-            u=self.u,
-            q=self.q,
-            extra=self.extra,
-            metadata=metadata,
+def describe_source(run: LogRun, machine: Machine, clock_s: np.ndarray) -> dict[str, str]:
+    """Return the metadata of a recording of a run; `clock_s` is the clock that it is resampled from."""
+    metadata = {
+        "source": f"log: {Path(run.where).name}",
+        "run": run.name,
+        "fingerprint": record.format_fingerprint(machine),
+    }
+    if len(clock_s) > 1:
+        period_s = np.diff(clock_s)
+        metadata["resampled_from"] = (
+            f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"
         )
+    return metadata

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from actuators.recordings.preview import EffectLimit, EffectPreview, PreviewResult
 from brokk_rl.console_table import print_table, print_text
@@ -14,8 +15,6 @@ from brokk_rl.record import Recording
 
 log = logging.getLogger(__name__)
 
-Rows = tuple[list[str], list[list[str]]]
-"""Heading and cells of a table."""
 EXPLANATION = (
     "Smallest size that would be told, as a distance from the value without the effect. In brackets: "
     "larger than the typical size. – : none of the sizes that were tried."
@@ -25,6 +24,21 @@ UNTOLD = {
     "frames": "the more often commands change, the smaller ones show",
 }
 """What is said of effects whose smallest size is not foretold."""
+
+
+@dataclass(frozen=True)
+class PreviewText:
+    """A preview as it is shown.
+
+    Attributes:
+        head: Heading of the table of effects.
+        rows: Its cells: a row a number of an effect, a column a joint.
+        remarks: What the table leaves out, and what it rests on.
+    """
+
+    head: list[str]
+    rows: list[list[str]]
+    remarks: list[str]
 
 
 def run_preview(
@@ -48,91 +62,54 @@ def run_preview(
         return None
 
 
-def describe_effects(result: PreviewResult, machine: Machine) -> Rows:
-    """Return the table of effects: a row a number, a column a joint."""
-    head = ["effect", *machine.joint_names, "unit", "typical"]
-    rows, names = [], _name_numbers(result)
-    for limits in _group_limits(result):
-        first = limits[0]
-        sizes: dict[str, str] = dict.fromkeys(machine.joint_names, "")
-        for one in limits:
-            first_joint, shared = one.joints[0], "all " if len(one.joints) > 1 else ""
-            sizes[first_joint] = shared + _format_size(one)
-        typical = sorted({f"{one.typical:.2g}" for one in limits}, key=float)
-        rows.append(
-            [
-                names[first.effect, first.number],
-                *sizes.values(),
-                " or ".join(sorted({one.unit.replace("1", "–") for one in limits})),
-                " to ".join([typical[0], typical[-1]] if len(typical) > 1 else typical),
-            ]
-        )
-    return head, rows
-
-
-def describe_pairs(result: PreviewResult) -> Rows:
-    """Return the table of effects that look alike."""
-    head, rows = ["look alike", "joints"], []
+def describe_preview(result: PreviewResult, machine: Machine) -> PreviewText:
+    """Return a preview as it is shown."""
+    by_number: dict[tuple[str, str], dict[str, EffectLimit]] = {}
+    untold: dict[str, set[str]] = {}
+    for one in result.limits:
+        if one.shows_in in UNTOLD:
+            untold.setdefault(one.shows_in, set()).add(one.effect)
+        else:
+            by_number.setdefault((one.effect, one.number), {})[one.joints[0]] = one
+    rows = []
+    for (effect, number), limits in by_number.items():
+        sizes = [_format_size(limits.get(joint)) for joint in machine.joint_names]
+        units = sorted({one.unit.replace("1", "–") for one in limits.values()})
+        typical = sorted({f"{one.typical:.2g}" for one in limits.values()}, key=float)
+        both = [typical[0], typical[-1]] if len(typical) > 1 else typical
+        rows.append([f"{effect} {number}", *sizes, " or ".join(units), " to ".join(both)])
+    remarks = [EXPLANATION]
     for pair in result.pairs:
-        rows.append([" and ".join(pair.effects), ", ".join(pair.joints)])
-    return head, rows
-
-
-def list_remarks(result: PreviewResult) -> list[str]:
-    """Return what the tables leave out, and what they rest on."""
-    found = []
-    for place, text in UNTOLD.items():
-        if hidden := sorted({one.effect for one in result.limits if one.shows_in == place}):
-            found.append(f"{', '.join(hidden)}: {text}")
-    source = "of these recordings" if result.assumed["noise_is_measured"] else "expected"
-    price = sum(result.assumed["price"].values())
-    found.append(
-        f"simulator: {result.assumed['simulator']}; noise of the sensors: {source}; an effect on one joint is told "
-        f"from {price:g} nats of log likelihood on, one with a cause behind all joints from "
-        f"{result.assumed['price']['name']:g}"
+        remarks.append(f"{' and '.join(pair.effects)} look alike on {', '.join(pair.joints)}")
+    for place, effects in untold.items():
+        remarks.append(f"{', '.join(sorted(effects))}: {UNTOLD[place]}")
+    price = result.assumed["price"]
+    remarks.append(
+        f"simulator: {result.assumed['simulator']}; noise of the sensors: "
+        f"{'of these recordings' if result.assumed['noise_is_measured'] else 'expected'}; an effect on one joint is told "
+        f"from {sum(price.values()):g} nats of log likelihood on, one with a cause behind all joints from {price['name']:g}"
     )
-    return found
+    return PreviewText(["effect", *machine.joint_names, "unit", "typical"], rows, remarks)
 
 
 def show_preview(result: PreviewResult, machine: Machine) -> None:
-    """Print the tables."""
+    """Print a preview."""
     untold = [one for one in result.limits if not one.is_told and one.shows_in not in UNTOLD]
     title = (
         f"effects that {result.minutes:.1f} minutes of these motions would tell "
         f"({len(untold)} of {len(result.limits)} numbers not at their typical size)"
     )
-    for name, (head, rows) in {
-        title: describe_effects(result, machine),
-        "pairs": describe_pairs(result),
-    }.items():
-        if rows:
-            print_table(head, rows, name)
-    for remark in (EXPLANATION, *list_remarks(result)):
+    shown = describe_preview(result, machine)
+    if shown.rows:
+        print_table(shown.head, shown.rows, title)
+    for remark in shown.remarks:
         print_text(remark)
 
 
-def _group_limits(result: PreviewResult) -> list[list[EffectLimit]]:
-    """Return the limits of each number that commands and positions show."""
-    found: dict[tuple[str, str], list[EffectLimit]] = {}
-    for one in result.limits:
-        if one.shows_in not in UNTOLD:
-            found.setdefault((one.effect, one.number), []).append(one)
-    return list(found.values())
-
-
-def _name_numbers(result: PreviewResult) -> dict[tuple[str, str], str]:
-    """Return the name of each number: that of the effect where it has no other."""
-    numbers: dict[str, set[str]] = {}
-    for one in result.limits:
-        numbers.setdefault(one.effect, set()).add(one.number)
-    found = {}
-    for effect, several in numbers.items():
-        for number in several:
-            found[effect, number] = effect if len(several) == 1 else f"{effect} {number}"
-    return found
-
-
-def _format_size(one: EffectLimit) -> str:
+def _format_size(one: EffectLimit | None) -> str:
+    if one is None:
+        return ""
+    shared = "all " if len(one.joints) > 1 else ""
     if one.smallest is None:
-        return "–"
-    return f"{one.smallest:.2g}" if one.is_told else f"({one.smallest:.2g})"
+        return f"{shared}–"
+    return f"{shared}{one.smallest:.2g}" if one.is_told else f"{shared}({one.smallest:.2g})"

@@ -12,6 +12,7 @@ import pytest
 from composed import option
 from conftest import Done
 
+from actuators.recordings import conversion
 from actuators.recordings.column_map import Column, ColumnMap, CommandColumn
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError
@@ -173,69 +174,29 @@ def test_optional_columns_are_read_and_may_have_empty_cells(
     assert np.isfinite(recording.extra["oil_c"][5:]).all()
 
 
-def test_convert_from_the_command(brokk: Callable[..., Done], excavator: Machine) -> None:
+def test_pieces_are_written_by_log_and_a_bad_log_leaves_none_of_the_others(
+    brokk: Callable[..., Done], excavator: Machine
+) -> None:
     Path("logs").mkdir()
     logged(Path("logs"), [*lines(8.0, 0.0), *lines(6.0, 30.0)])
     logged(Path("logs"), lines(), name="lift.csv")
-    choice = (
-        "mode=convert",
-        "machine=mini_excavator",
-        "import=mini_excavator",
-        "convert.input=logs/*.csv",
-    )
-    done = brokk(*choice, "session.out=out")
+    options = ("machine=mini_excavator", "import=mini_excavator", "convert.input=logs/*.csv")
+    done = brokk("mode=convert", *options, "session.out=out")
     assert done.code == 0, done.err
-    names = [path.name for path in sorted(Path("out/recordings").iterdir())]
-    assert names == ["dig_00.parquet", "dig_01.parquet", "lift_00.parquet"]
     recordings = record.read_recordings("out/recordings/*", excavator)
+    names = [one.path.name for one in recordings if one.path is not None]
+    assert names == ["dig_00.parquet", "dig_01.parquet", "lift_00.parquet"]
     assert [recording.run for recording in recordings] == ["dig", "dig", "lift"]
-
-
-def test_one_bad_log_leaves_no_recording_of_the_others(brokk: Callable[..., Done]) -> None:
-    logged(Path(), lines(), name="a.csv")
-    logged(Path(), put(7, 1, "off"), name="b.csv")
-    done = brokk(
-        "mode=convert",
-        "machine=mini_excavator",
-        "import=mini_excavator",
-        "convert.input=*.csv",
-        "session.out=out",
-    )
+    logged(Path("logs"), put(7, 1, "off"), name="zoom.csv")
+    done = brokk("mode=convert", *options, "session.out=none")
     assert done.code == 2
-    assert "b.csv: line 9 (row 7), column 'Boom Cmd': 'off' is not a number" in done.err
-    assert not list(Path().rglob("*.parquet"))
+    assert "zoom.csv: line 9 (row 7), column 'Boom Cmd': 'off' is not a number" in done.err
+    assert not list(Path("none").rglob("*.parquet"))
 
 
-def test_two_logs_of_one_name_are_refused(brokk: Callable[..., Done]) -> None:
+def test_two_logs_of_one_name_are_refused(tmp_path: Path) -> None:
     for folder in ("monday", "tuesday"):
-        Path(folder).mkdir()
-        logged(Path(folder), lines())
-    done = brokk(
-        "mode=convert",
-        "machine=mini_excavator",
-        "import=mini_excavator",
-        "convert.input=*/dig.csv",
-        "session.out=out",
-    )
-    assert done.code == 2
-    assert "monday/dig.csv and" in done.err or "tuesday/dig.csv and" in done.err
-    assert not list(Path().rglob("*.parquet"))
-
-
-def test_a_recording_written_as_csv_comes_back_as_it_was(tmp_path: Path, machine: Machine) -> None:
-    generator = np.random.default_rng(0)
-    t_s = np.arange(200) * machine.period_s
-    u, q = (
-        generator.uniform(-1.0, 1.0, (200, 5)).astype(np.float32),
-        generator.uniform(-0.2, 0.0, (200, 5)).astype(np.float32),
-    )
-    names = ["t_s", *(f"u_q{j}" for j in range(1, 6)), *(f"q_q{j}_rad" for j in range(1, 6))]
-    rows = [
-        ",".join(repr(float(value)) for value in (t, *a, *b))
-        for t, a, b in zip(t_s, u, q, strict=True)
-    ]
-    (recording,) = option("import", "brokk170").read(
-        logged(tmp_path, rows, ",".join(names)), machine
-    )
-    np.testing.assert_array_equal(recording.u, u)
-    np.testing.assert_allclose(recording.q, q, atol=1e-7)
+        (tmp_path / folder).mkdir()
+        logged(tmp_path / folder, lines())
+    with pytest.raises(RecordingError, match="would become the same recording"):
+        conversion.find_logs(f"{tmp_path}/*/dig.csv")

@@ -188,16 +188,12 @@ def test_arithmetic_stands_in_the_place_of_a_column(tmp_path: Path, carriage: Ma
     check(recording)
 
 
-@settings(deadline=None)
-@given(
-    a=st.floats(-1e6, 1e6), b=st.floats(-1e6, 1e6), c=st.floats(0.01, 1e6), d=st.integers(-99, 99)
-)
-def test_an_expression_is_what_python_computes(a: float, b: float, c: float, d: int) -> None:
-    text = f"-(a + 2.5*b) / c - {d} * (a - -b)"
-    columns = {"a": np.array([a]), "b": np.array([b]), "c": np.array([c])}
-    expected = -(a + 2.5 * b) / c - d * (a - -b)
-    assert parse_expression(text).evaluate(columns)[0] == pytest.approx(expected, nan_ok=True)
-    assert set(parse_expression(text).names) == {"a", "b", "c"}
+def test_an_expression_is_what_python_computes() -> None:
+    a, b, c = np.random.default_rng(0).normal(size=(3, 50))
+    parsed = parse_expression("-(a + 2.5e0*`b b`) / q[c].x - .5 * (a - -`b b`)")
+    assert parsed.names == ("a", "b b", "q[c].x")
+    found = parsed.evaluate({"a": a, "b b": b, "q[c].x": c})
+    np.testing.assert_allclose(found, -(a + 2.5 * b) / c - 0.5 * (a - -b))
 
 
 @pytest.mark.parametrize(
@@ -205,7 +201,7 @@ def test_an_expression_is_what_python_computes(a: float, b: float, c: float, d: 
     [
         "__import__('os').system('true')", "a.b()", "a if b else c", "a ** b", "lambda: a", "[a]",
         "a @ b", "'a'", "a and b", "3 + 4", "", "a[b()]", "(" * 400 + "a" + ")" * 400,
-        "a;b", "a\x00b", "1j * a", "a" * 2000,
+        "a (b)", "2 (a)", "a;b", "a\x00b", "1j * a", "a" * 2000,
     ],
 )  # fmt: skip
 def test_anything_but_arithmetic_is_refused(text: str) -> None:
@@ -213,7 +209,7 @@ def test_anything_but_arithmetic_is_refused(text: str) -> None:
         parse_expression(text)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=100)
 @given(st.text(max_size=60))
 def test_any_text_is_parsed_or_refused(text: str) -> None:
     try:
@@ -249,7 +245,7 @@ def test_commands_that_go_one_way_only_are_read(tmp_path: Path, carriage: Machin
 
 
 @pytest.mark.parametrize("name", ["a.parquet", "a.npz", "a.mat"])
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=12)
 @given(place=st.floats(0.0, 0.999))
 def test_a_cut_off_file_is_refused_by_name(
     tmp_path_factory: pytest.TempPathFactory, carriage: Machine, name: str, place: float

@@ -437,7 +437,7 @@ def list_frames(foreign: bool) -> list[can.Message]:
     return found
 
 
-@pytest.mark.parametrize("name", ["a.blf", "a.log", "printed.txt", "dated.txt"])
+@pytest.mark.parametrize("name", ["a.blf", "a.asc", "a.log", "printed.txt", "dated.txt"])
 def test_pages_and_kinds_of_identifiers_are_sources_of_their_own(name: str) -> None:
     Path("a.dbc").write_text(DBC)
     frames = list_frames(foreign=True)
@@ -476,6 +476,14 @@ def write_bus(num_channels: int) -> None:
                 frame.channel = channel
                 frame.timestamp += 0.0004 * channel
                 logger.on_message_received(frame)
+
+
+def test_a_cut_off_log_of_a_bus_and_one_without_its_dbc_are_refused() -> None:
+    write_bus(num_channels=1)
+    assert "log.dbc=<file>" in try_draft("log.input=a.blf").err
+    assert "cannot be read" in try_draft("log.input=a.blf", "log.dbc=none.dbc").err
+    Path("a.blf").write_bytes(Path("a.blf").read_bytes()[:-40])
+    assert "a.blf: cut off at byte" in try_draft("log.input=a.blf", "log.dbc=a.dbc").err
 
 
 def write_structures(rows: np.ndarray, apart_s: float) -> None:

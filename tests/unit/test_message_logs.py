@@ -9,18 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import can
-import cantools
 import numpy as np
 import pytest
 from carriage import check, make_carriage, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
-from actuators.recordings.can_log import CanLog
 from actuators.recordings.column_map import AlignedTime, Column
 from actuators.recordings.log_files import open_log
-from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -304,64 +301,3 @@ def test_items_of_lists_keep_their_order(tmp_path: Path) -> None:
     opened = open_log(path)
     (run,) = opened.read_runs(opened.list_tables(), None)
     assert list(run.tables["/state"].columns)[1:] == [f"q[{j}]" for j in range(12)]
-
-
-DBC = """VERSION ""
-NS_ :
-BS_:
-BU_: PC
-BO_ 256 Command: 8 PC
- SG_ Valve : 0|16@1- (0.0078125,0) [-1|1] "" PC
-BO_ 257 State: 8 PC
- SG_ Position : 0|16@1- (0.00390625,0) [-1|1] "m" PC
- SG_ Count : 16|8@1+ (1,0) [0|255] "" PC
-"""
-
-
-def write_can(path: Path) -> None:
-    database: Any = cantools.database.load_string(DBC)
-    with can.Logger(path) as logger:
-        for number, (time_ns, u, q) in enumerate(list_rows()):
-            t_s = (time_ns - BEGIN_NS) * 1e-9 + 100.0
-            values = {"Command": {"Valve": u}, "State": {"Position": q, "Count": number % 256}}
-            for name, content in values.items():
-                message = database.get_message_by_name(name)
-                data = message.encode(content)
-                logger.on_message_received(
-                    can.Message(
-                        timestamp=t_s,
-                        arbitration_id=message.frame_id,
-                        data=data,
-                        is_extended_id=False,
-                    )
-                )
-
-
-@pytest.mark.parametrize("ending", ["blf", "asc"])
-def test_can_logs_are_decoded_by_their_dbc(tmp_path: Path, carriage: Machine, ending: str) -> None:
-    path, dbc = tmp_path / f"a.{ending}", tmp_path / "a.dbc"
-    dbc.write_text(DBC)
-    write_can(path)
-    reader = replace(make_map("Command:Valve", "State:Position", "time"), dbc=str(dbc))
-    (recording,) = reader.read(path, carriage)
-    signals = make_signals()
-    np.testing.assert_allclose(recording.u[:, 0], signals["u"][: recording.num_samples], atol=1e-6)
-    np.testing.assert_allclose(recording.q[:, 0], signals["q"][: recording.num_samples], atol=1e-3)
-    assert recording.num_samples >= len(signals["t"]) - 1
-
-
-def test_a_cut_off_blf_is_refused_by_its_frame(tmp_path: Path, carriage: Machine) -> None:
-    path, dbc = tmp_path / "a.blf", tmp_path / "a.dbc"
-    dbc.write_text(DBC)
-    write_can(path)
-    path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(RecordingError, match=r"a\.blf"):
-        replace(make_map("Command:Valve", "State:Position", "time"), dbc=str(dbc)).read(path, carriage)  # fmt: skip
-
-
-def test_a_can_log_without_its_dbc_is_refused(tmp_path: Path) -> None:
-    write_can(tmp_path / "a.asc")
-    with pytest.raises(ConfigError, match=r"log\.dbc=<file>"):
-        open_log(tmp_path / "a.asc")
-    with pytest.raises(ConfigError, match=r"dbc=.*: cannot be read"):
-        CanLog(tmp_path / "a.asc", str(tmp_path / "none.dbc"))
