@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 
 from rich.console import Console
@@ -13,10 +12,6 @@ from brokk_rl.spec import Positive, spec
 from deploy.page.protocol import FeedSpec
 from deploy.page.server import serve_page
 from deploy.page.settings import PageSettings
-from deploy.page.video_relay import VideoRelay
-from deploy.runtime.process import ChildProcess
-from deploy.runtime.process_group import PATIENCE_S
-from deploy.video.settings import VideoProcessConfig, VideoSettings
 
 
 @spec
@@ -27,7 +22,6 @@ class PageMode:
     machine: Machine
     feed: FeedSpec
     page: PageSettings
-    video: VideoSettings | None
     seconds: Positive | None
 
     def run(self) -> None:
@@ -35,10 +29,7 @@ class PageMode:
 
         Raises:
             LinkError: the address is taken.
-            ModuleNotFoundError: the extra `video` is not installed.
         """
-        if self.video is not None:
-            self.video.require_packages()
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
         console = Console(stderr=True)
 
@@ -49,14 +40,4 @@ class PageMode:
             console.print(f"operator's page: {link}", soft_wrap=True, highlight=False)
 
         feed = self.feed.build(self.machine)
-        if self.video is None:
-            serve_page(self.page, stop, self.machine, feed, self.session, show)
-            return
-        with tempfile.TemporaryDirectory(prefix="brokk-") as folder:
-            config = VideoProcessConfig(self.video, folder)
-            child = ChildProcess("video", "deploy.video.video_process:run", (config,), ())
-            try:
-                relay = VideoRelay(folder)
-                serve_page(self.page, stop, self.machine, feed, self.session, show, relay)
-            finally:
-                child.end(PATIENCE_S)
+        serve_page(self.page, stop, self.machine, feed, self.session, show)

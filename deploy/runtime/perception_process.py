@@ -34,8 +34,8 @@ from deploy.kernel.bus_process import TEXT
 from deploy.picture import shrink_picture
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
-from deploy.runtime.shm_layout import MOST_HOLES, LoopMemory
-from deploy.runtime.target import NEAR_M
+from deploy.runtime.shm_layout import HOLE, MOST_HOLES, LoopMemory
+from deploy.runtime.target import NEAR_M, read_holes
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +101,7 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
             if finder is not None and frame.base_from_camera is not None:
                 tracked = tracker.update(_find_holes(finder, frame), now_s)
                 write_holes(memory.holes, tracked, now_s)
-                text = {"topic": "holes", "t_s": now_s, "holes": _list_holes(tracked)}
+                text = {"topic": "holes", "t_s": now_s, "holes": _list_holes(memory.holes)}
                 memory.vision_log.put(TEXT + json.dumps(text).encode())
             time.sleep(max(0.0, began_s + 1.0 / camera.rate_hz - time.monotonic()))
 
@@ -151,21 +151,12 @@ def write_holes(slot: Slot, tracked: Sequence[TrackedHole], t_s: float) -> None:
     slot.write(record)
 
 
-def _list_holes(tracked: Sequence[TrackedHole]) -> list[dict[str, Any]]:
-    """Return the known boreholes as plain data for the log."""
+def _list_holes(slot: Slot) -> list[dict[str, Any]]:
+    """Return the published boreholes as plain data for the log."""
     plain = []
-    for hole in tracked:
-        plain.append(
-            {
-                "name": hole.name,
-                "center_in_base_m": np.round(hole.pose.center_m, 4).tolist(),
-                "axis_in_base": np.round(hole.pose.axis, 5).tolist(),
-                "radius_m": round(float(hole.pose.radius_m), 4),
-                "std_m": round(hole.std_m, 5),
-                "score": round(float(hole.pose.score), 3),
-                "seen_t_s": hole.seen_s,
-            }
-        )
+    for hole in read_holes(slot):
+        found = {name: hole[name].tolist() for name in HOLE.names or ()}
+        plain.append(found | {"seen_t_s": found.pop("t_s")})
     return plain
 
 

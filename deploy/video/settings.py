@@ -8,8 +8,7 @@ from typing import Protocol
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import Count, spec
-from deploy.runtime.shm_layout import LoopMemory
-from deploy.video.sources import LoopPictures, OpenedDevice, TestPattern, VideoSource
+from deploy.video.sources import OpenedDevice, TestPattern, VideoSource
 
 SOCKET = "video"
 """Name of the socket between page and video process, in a folder that only its owner may enter."""
@@ -18,7 +17,7 @@ SOCKET = "video"
 class VideoCamera(Protocol):
     """A spec of one camera."""
 
-    def build(self, memory: LoopMemory | None) -> VideoSource:
+    def build(self) -> VideoSource:
         """Return the open camera.
 
         Raises:
@@ -41,26 +40,9 @@ class DeviceCamera:
     container: str | None
     options: dict[str, str]
 
-    def build(self, memory: LoopMemory | None) -> VideoSource:
+    def build(self) -> VideoSource:
         """See `VideoCamera`."""
         return OpenedDevice(self.device, self.container, self.options)
-
-
-@spec
-class LoopCamera:
-    """The camera beside the loop (`camera=…`): its newest picture, at its own rate.
-
-    Attributes:
-        rate_hz: Looks for a new picture a second.
-    """
-
-    rate_hz: float
-
-    def build(self, memory: LoopMemory | None) -> VideoSource:
-        """See `VideoCamera`."""
-        if memory is None or memory.frame is None:
-            raise ConfigError("video: there is no camera beside the loop; choose camera=… as well")
-        return LoopPictures(memory.frame, self.rate_hz)
 
 
 @spec
@@ -77,7 +59,7 @@ class PatternCamera:
     height_px: int
     rate_hz: float
 
-    def build(self, memory: LoopMemory | None) -> VideoSource:
+    def build(self) -> VideoSource:
         """See `VideoCamera`."""
         return TestPattern(self.width_px, self.height_px, self.rate_hz)
 

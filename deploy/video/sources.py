@@ -15,8 +15,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from brokk_rl.errors import FrameError
-from deploy.runtime.perception_process import read_frame
-from deploy.runtime.shared_memory import Slot
 
 log = logging.getLogger(__name__)
 
@@ -94,27 +92,6 @@ def list_code_bits(num_ticks: int) -> list[int]:
     check = ~sum(num_ticks.to_bytes(CODE_BITS // 8, "big")) & (1 << CODE_CHECK) - 1
     value = num_ticks << CODE_CHECK | check
     return [value >> place & 1 for place in reversed(range(CODE_BITS + CODE_CHECK))]
-
-
-class LoopPictures:
-    """Pictures of the camera beside the loop; the source of a `LoopCamera`."""
-
-    def __init__(self, slot: Slot, rate_hz: float) -> None:
-        self._slot, self._period_s, self._t_s = slot, 1.0 / rate_hz, 0.0
-
-    def read(self) -> tuple[Any, float]:
-        """See `VideoSource`."""
-        while True:
-            t_s = self._slot.peek("t_s")
-            if t_s is not None and t_s > self._t_s:
-                record = self._slot.read()
-                if record is not None:
-                    frame = read_frame(record)
-                    self._t_s = frame.t_s
-                    # H.264 halves the colours both ways: an odd row or column has no place.
-                    height, width = (2 * (length // 2) for length in frame.color.shape[:2])
-                    return _convert_to_frame(frame.color[:height, :width]), frame.t_s
-            time.sleep(self._period_s)
 
 
 class OpenedDevice:

@@ -2,7 +2,7 @@
 
 Pages reach it through the page's server only, which asks for the token: it hands on a page's offer
 by a socket of the file system, and the answer back. When that connection ends, so do the pictures.
-The process has a low priority and touches nothing of the loop but the newest frame of its camera.
+The process has a low priority and touches nothing of the loop.
 If it hangs or dies, the page greys the pictures, and the loop feels nothing.
 
 aiortc carries the pictures: lost packets are sent again on request, and the receiver's estimate of
@@ -126,7 +126,7 @@ def run(stop: Stop, config: VideoProcessConfig, memory: LoopMemory | None = None
     """Send pictures until asked to stop."""
     os.nice(NICENESS)
     logging.getLogger("aioice").setLevel(logging.WARNING)
-    asyncio.run(_serve(stop, config.video, Path(config.folder) / SOCKET, memory))
+    asyncio.run(_serve(stop, config.video, Path(config.folder) / SOCKET))
 
 
 def _tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -134,11 +134,11 @@ def _tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     log.warning("%s", context.get("exception") or context["message"])
 
 
-async def _serve(stop: Stop, video: VideoSettings, path: Path, memory: LoopMemory | None) -> None:
+async def _serve(stop: Stop, video: VideoSettings, path: Path) -> None:
     asyncio.get_running_loop().set_exception_handler(_tell)
     readers = []
     for name, camera in video.cameras.items():
-        readers.append(CameraReader(name, lambda camera=camera: camera.build(memory)))
+        readers.append(CameraReader(name, camera.build))
     watching: set[VideoPeer] = set()
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
