@@ -13,6 +13,8 @@ from brokk_rl.spec import Positive, Share, spec
 
 GRID = np.linspace(-1.5, 1.5, 601)
 """Logarithms of the factor that are told apart: up to 4.5, in steps of 0.005."""
+IMPOSSIBLE = 1e-300
+"""Density in place of 0, whose logarithm is finite."""
 SAME_RIM = 0.5
 """Distance of two ellipses over the semi-axis of one up to which they show the same rim."""
 
@@ -28,7 +30,7 @@ class FocalDoubt:
         widened: Factor on the stated deviation of a measurement.
         least_std: Standard deviation that comes on top.
         sure: Probability from which a wrong one is named; it stays named while it is likelier wrong.
-        factor: Least factor that is named.
+        factor: Least factor of a wrong one: no slip is smaller, and a calibration errs by less.
     """
 
     wrong: Share
@@ -59,6 +61,7 @@ class FocalBelief:
         self._camera, self._rims, self._is_named = camera, [], False
         doubt = self._doubt
         slip = np.exp(-0.5 * (GRID / doubt.slip_std) ** 2)
+        slip[np.abs(GRID) < np.log(doubt.factor)] = IMPOSSIBLE
         self._slip = np.log(doubt.wrong * slip / slip.sum())
         self._is_right = np.log(1.0 - doubt.wrong)
 
@@ -82,8 +85,7 @@ class FocalBelief:
     def find_slip(self) -> float | None:
         """Return the likeliest factor if the focal length is surely wrong, else `None`."""
         probability = self._weigh()
-        beyond = float(probability[np.abs(GRID) > np.log(self._doubt.factor)].sum())
-        self._is_named = beyond > (0.5 if self._is_named else self._doubt.sure)
+        self._is_named = float(probability.sum()) > (0.5 if self._is_named else self._doubt.sure)
         return float(np.exp(GRID[np.argmax(probability)])) if self._is_named else None
 
     def _weigh(self) -> np.ndarray:
