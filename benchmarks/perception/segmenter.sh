@@ -4,7 +4,7 @@
 #     FRAMES=<folder> NEGATIVES=<folder>] bash benchmarks/perception/segmenter.sh
 # FRAMES is kept: what lies there from before is learned from too (RENDER_S=0: that alone), and while the network learns the cores go
 # on rendering into it for the next call, by another SEED. Without it pictures lie in $TMPDIR meanwhile, some 0.2 MB each.
-# Leaves in $OUT: segmenter.{safetensors,onnx} (for perception/weights), training.json, samples.png, log.
+# Leaves in $OUT: segmenter.{safetensors,onnx} (for perception/weights), training.json, log.
 # NEGATIVES holds pictures without a block: they are learned from.
 # To try it: CORES=1 RENDER_S=90 TRAIN_S=40 SMALL=1 GPU= .
 set -u
@@ -75,7 +75,7 @@ say "trained, $(count train) frames there now: $(ls "$work/run" | tr '\n' ' ')"
 
 keep() {  # whatever is there by now: judging may be cut off
   local file
-  for file in segmenter.safetensors segmenter.onnx training.json samples.png; do
+  for file in segmenter.safetensors segmenter.onnx training.json; do
     [ -f "$work/run/$file" ] && cp "$work/run/$file" "$OUT/"
   done
   cp "$work/log" "$OUT/log"

@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 @spec
 class TrainPerception:
-    """Train a segmenter; leave it as ONNX and safetensors, with its learning curve and samples.
+    """Train a segmenter; leave it as ONNX and safetensors, with its learning curve.
 
     Attributes:
         session: Folder, seed, device.

@@ -342,17 +342,24 @@ def compare_depths(
     sector = np.arange(len(edge)) * SECTORS // len(edge)
     # Pixels of the patch to a sector, over those that share their error.
     area = 2 * np.pi * radius_px * (away[-1] - away[0] + 1.0) / SECTORS / both.shrink**2
-    odds = np.zeros((SECTORS, len(DEPTHS_M)))
-    for number, depth_m in enumerate(DEPTHS_M):
+    pictures = []
+    for depth_m in DEPTHS_M:
         m = chart.m / (1.0 + depth_m * float(np.linalg.norm(chart.m)))
-        seen = _sample(both.right, both.on_plane(u, v, m), row)
-        for place in range(SECTORS):
-            one, other = mine[sector == place].ravel(), seen[sector == place].ravel()
-            one, other = one - one.mean(), other - other.mean()
-            # Gain and offset are free: what remains is 1 - r² of the variance.
-            power = float(other @ other) * float(one @ one)
-            unlike = 1.0 - max(float(one @ other), 0.0) ** 2 / max(power, 1e-6)
-            odds[place, number] = -0.5 * area / ALIKE_PX2 * np.log(unlike + LEAST_UNLIKE)
+        pictures.append(_sample(both.right, both.on_plane(u, v, m), row))
+    seen = np.stack(pictures)
+    begins = np.flatnonzero(np.diff(sector, prepend=-1))
+    count = np.bincount(sector) * len(away)
+
+    def add_up(values: np.ndarray) -> np.ndarray:
+        """Return the sums of values, `(…, P, A)`, over each sector, `(…, SECTORS)`."""
+        return np.add.reduceat(values.sum(-1), begins, axis=-1)
+
+    # Gain and offset are free: what remains is 1 - r² of the variance.
+    shared = add_up(mine * seen) - add_up(mine) * add_up(seen) / count
+    power = add_up(mine**2) - add_up(mine) ** 2 / count
+    power = power * (add_up(seen**2) - add_up(seen) ** 2 / count)
+    unlike = 1.0 - np.maximum(shared, 0.0) ** 2 / np.maximum(power, 1e-6)
+    odds = -0.5 * area / ALIKE_PX2 * np.log(unlike + LEAST_UNLIKE).T
     return odds - odds.max(axis=1, keepdims=True)
 
 

@@ -14,7 +14,7 @@ from perception.ellipse import conic
 from perception.pose import plane, rim
 from perception.pose.plane import FacePlane, FaceSupport
 from perception.pose.rim import PlaneChart
-from perception.robust_fit import fit_linear
+from perception.robust_fit import TUKEY, compute_biweight, estimate_spread, fit_linear
 
 SIZE = "radius of a rim by depth over that of the holes"
 RING_KNOWN = "pixels with depth in the ring around it"
@@ -128,8 +128,14 @@ def measure_stretch(
     steepest = np.argmax(np.where(known, profiles.strength, -1.0), axis=1)
     pixels = profiles.pixels[rows, steepest[rows]]
     outline = (pixels, row, chart, face)
-    oval, std = _measure_oval(*outline, 0.0)
-    rise = (_measure_oval(*outline, NEARBY)[0][0] - oval[0]) / NEARBY
+    waves, distance_m = _expand_outline(*outline, 0.0)
+    floor_m = 1e-3 * float(np.median(distance_m))
+    solution, cov = fit_linear(waves, distance_m, floor_m)
+    away_m = distance_m - waves @ solution
+    # The waves hold any oval, so that edges of something else are the same by all focal lengths.
+    weight = compute_biweight(away_m, TUKEY * max(estimate_spread(away_m), floor_m))
+    oval, std = solution[3:5] / solution[0], float(np.sqrt(cov[3, 3]) / solution[0])
+    rise = (_measure_oval(weight, *outline, NEARBY)[0] - oval[0]) / NEARBY
     if not abs(rise) > 1e-3:
         return None
     logarithm = -oval[0] / rise
@@ -145,7 +151,7 @@ def measure_stretch(
         for reach, step in TRIALS:
             sizes = {}
             for trial in logarithm + np.arange(-reach, reach + step / 2, step):
-                sizes[float(trial)] = float(np.linalg.norm(_measure_oval(*outline, trial)[0]))
+                sizes[float(trial)] = float(np.linalg.norm(_measure_oval(weight, *outline, trial)))
             logarithm = min(sizes, key=sizes.__getitem__)
             least = sizes[logarithm]
         # Edges of something else are round with no focal length.
@@ -169,12 +175,27 @@ def measure_tilt_doubt(chart: PlaneChart, face: FacePlane) -> float:
 
 
 def _measure_oval(
-    pixels: np.ndarray, row: np.ndarray, chart: PlaneChart, face: FacePlane, logarithm: float
-) -> tuple[np.ndarray, float]:
-    """Return how oval edges are on a face, along its slope and diagonally, and the deviation.
+    weight: np.ndarray,
+    pixels: np.ndarray,
+    row: np.ndarray,
+    chart: PlaneChart,
+    face: FacePlane,
+    logarithm: float,
+) -> np.ndarray:
+    """Return how oval weighted edges are on a face, along its slope and diagonally, in radii.
 
-    Both are relative to the radius, by the focal length over the factor of this logarithm.
+    By the focal length over the factor of this logarithm.
     """
+    waves, distance_m = _expand_outline(pixels, row, chart, face, logarithm)
+    heavy = waves.T * weight
+    solution = np.linalg.solve(heavy @ waves, heavy @ distance_m)
+    return solution[3:5] / solution[0]
+
+
+def _expand_outline(
+    pixels: np.ndarray, row: np.ndarray, chart: PlaneChart, face: FacePlane, logarithm: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return waves around the middle of edges, `(n, 7)`, and the distances of those, m, `(n,)`."""
     factor = float(np.exp(logarithm))
     matrix = chart.camera_matrix.copy()
     matrix[[0, 1], [0, 1]] /= factor
@@ -187,10 +208,7 @@ def _measure_oval(
     waves = [np.ones(len(angle))]
     for number in (1, 2, 3):
         waves += [np.cos(number * angle), np.sin(number * angle)]
-    distance_m = np.linalg.norm(away, axis=1)
-    floor_m = 1e-3 * float(np.median(distance_m))
-    solution, cov = fit_linear(np.column_stack(waves), distance_m, floor_m)
-    return solution[3:5] / solution[0], float(np.sqrt(cov[3, 3]) / solution[0])
+    return np.column_stack(waves), np.linalg.norm(away, axis=1)
 
 
 def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float:

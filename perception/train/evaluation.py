@@ -1,24 +1,19 @@
-"""Evaluation of a segmenter on unseen frames, as numbers and as pictures."""
+"""Evaluation of a segmenter on unseen frames, in numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
 from perception.segment.network import THRESHOLD
-from perception.segment.unet import CHANNELS, UNet
+from perception.segment.unet import UNet
 from perception.segment.window import center_window, cover_picture
 from perception.train.samples import LOOKS, ROOM, TrainingViews
 
 BATCH = 32
-SHOWN = 12
-"""Frames in the picture of samples."""
-COLOURS = {"block": (0, 114, 178), "mouth": (213, 94, 0)}
 
 
 def crop_segmenter_views(
@@ -86,30 +81,3 @@ def compute_metrics(
 
 def _compute_iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
     return float((said & known).sum() / (said | known).sum()) if known.any() else None
-
-
-def draw_samples(
-    path: Path, pictures: torch.Tensor, probabilities: torch.Tensor, known: torch.Tensor
-) -> None:
-    """Write a PNG of some frames in both views: true masks as lines, predictions as colour."""
-    rows = []
-    for frame in np.linspace(0, len(pictures) - 1, min(SHOWN, len(pictures))).round().astype(int):
-        tiles = []
-        for look in range(len(LOOKS)):
-            picture = np.ascontiguousarray(pictures[frame, look].numpy().transpose(1, 2, 0))
-            for channel, name in enumerate(CHANNELS):
-                weight = 0.45 * probabilities[frame, look, channel].numpy()[..., None]
-                picture = (picture * (1 - weight) + np.array(COLOURS[name]) * weight).astype(
-                    np.uint8
-                )
-                there = known[frame, look, channel].numpy().astype(np.uint8)
-                outlines, _ = cv2.findContours(there, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-                cv2.drawContours(picture, outlines, -1, (255, 255, 255), 1)
-            tiles.append(picture)
-        rows.append(np.concatenate(tiles, axis=1))
-    if len(rows) % 2:
-        rows.append(np.zeros_like(rows[0]))
-    sheet = np.concatenate(
-        [np.concatenate(rows[k : k + 2], axis=1) for k in range(0, len(rows), 2)]
-    )
-    cv2.imwrite(str(path), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))

@@ -86,7 +86,7 @@ class SegmenterTraining:
             )
 
     def fit(self, session: Session) -> dict[str, Any]:
-        """Train; write network (safetensors, ONNX) and samples (PNG) into the session's folder.
+        """Train; write the network (safetensors, ONNX) into the session's folder.
 
         One that is stopped leaves the best network so far, with which `start` goes on.
 
@@ -320,7 +320,6 @@ class _Training:
         # Eight pictures show a wrong export as surely as all.
         compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
         parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
-        evaluation.draw_samples(self._folder / "samples.png", pictures, probabilities, known)
         return {
             "schema": 1,
             "conditions": conditions,

@@ -32,8 +32,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) -> None:
     done = brokk(
-        "mode=perceive", f"perceive.input={folder}", "session.out=out", "perception/segmenter=truth",
-        "perception.pose.looks.mouth=0", "tracker.confirm=1",
+        "mode=perceive", f"perceive.input={folder}", "session.out=out", "tracker.confirm=1",
     )  # fmt: skip
     assert done.code == 0, done.err
     frames = json.loads(Path("out/holes.json").read_text())["frames"]
