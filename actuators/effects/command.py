@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.effect import ANY_INTERFACE, EffectSpec, Memory, StepInputs
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber
 from actuators.effects.timing import append_command
 from actuators.models.parameters import open_valve
 from brokk_rl.spec import spec
@@ -23,9 +23,6 @@ class DeadBand(EffectSpec):
         retract: The same for the negative direction.
     """
 
-    joints: Joints
-    extend: Value
-    retract: Value
     side = "command"
     pointwise = True
     numbers: ClassVar = {
@@ -50,8 +47,6 @@ class Saturation(EffectSpec):
         level: Command beyond which the valve opens no further.
     """
 
-    joints: Joints
-    level: Value
     side = "command"
     pointwise = True
     interfaces = frozenset({"speed", "torque"})
@@ -72,8 +67,6 @@ class RateLimit(EffectSpec):
         stroke_s: Shortest time from no command to a full one.
     """
 
-    joints: Joints
-    stroke_s: Value
     side = "command"
     recent = 2
     interfaces = ANY_INTERFACE  # of a target: a lower top speed
@@ -102,9 +95,6 @@ class Stiction(EffectSpec):
         stop: Command at which a moving joint stops; taken as `start` where it is larger.
     """
 
-    joints: Joints
-    start: Value
-    stop: Value
     side = "command"
     recent = 2
     smooth = False

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import ClassVar
 
 from actuators.effects.effect import EffectSpec
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber
 from brokk_rl.spec import spec
 
 
@@ -34,8 +34,6 @@ class CoulombFriction(DriveEffect):
         coulomb_n: Friction beyond that of the simulator (Nm of a hinge).
     """
 
-    joints: Joints
-    coulomb_n: Value
     numbers: ClassVar = {
         # Gears and screws lose some percent of the largest force.
         "coulomb_n": EffectNumber("N", none=0.0, typical=0.05, bounds=(0.0, 0.5), scale="force")
@@ -51,8 +49,6 @@ class ViscousFriction(DriveEffect):
         viscous_n_s_m: Friction beyond that of the simulator (Nm s/rad of a hinge).
     """
 
-    joints: Joints
-    viscous_n_s_m: Value
     numbers: ClassVar = {
         # The same loss as dry friction, at full speed.
         "viscous_n_s_m": EffectNumber(
@@ -70,8 +66,6 @@ class Inertia(DriveEffect):
         factor: Mass over that of the simulator.
     """
 
-    joints: Joints
-    factor: Value
     drives = MappingProxyType({"factor": "mass_kg"})
     numbers: ClassVar = {"factor": EffectNumber("1", none=1.0, typical=1.3, bounds=(0.2, 5.0))}
 
@@ -85,8 +79,6 @@ class ForceOffset(DriveEffect):
         offset_n: Force beyond that of the simulator (Nm of a hinge).
     """
 
-    joints: Joints
-    offset_n: Value
     numbers: ClassVar = {
         "offset_n": EffectNumber("N", none=0.0, typical=0.02, bounds=(-0.5, 0.5), scale="force")
     }
@@ -103,8 +95,6 @@ class StribeckFriction(DriveEffect):
         stribeck_n: Friction at rest beyond that of the simulator (Nm of a hinge).
     """
 
-    joints: Joints
-    stribeck_n: Value
     numbers: ClassVar = {
         # At rest 1.2 to 2 times the friction in motion, which is 5 % of the largest force.
         "stribeck_n": EffectNumber("N", none=0.0, typical=0.03, bounds=(0.0, 0.5), scale="force")
@@ -123,9 +113,6 @@ class LoadFriction(DriveEffect):
         outside_load: The same over the weight on the joint.
     """
 
-    joints: Joints
-    motor_load: Value
-    outside_load: Value
     numbers: ClassVar = {
         # Gears of servos lose 2 to 20 % of the torque; from 1 on the motor moves nothing.
         "motor_load": EffectNumber("1", none=0.0, typical=0.1, bounds=(0.0, 0.9)),
@@ -144,9 +131,6 @@ class PoseForce(DriveEffect):
         pose_cos_n: The same with the cosine of the angle less 1; nothing on a sliding joint.
     """
 
-    joints: Joints
-    pose_sin_n: Value
-    pose_cos_n: Value
     numbers: ClassVar = {
         # A servo that bears a tenth of its largest torque in the outermost pose.
         "pose_sin_n": EffectNumber("N", none=0.0, typical=0.1, bounds=(-1.0, 1.0), scale="force"),
@@ -168,9 +152,6 @@ class TorqueLimit(DriveEffect):
         firmware_damping: Part of the servo's damping within the limit; see `actuators.models.servo`.
     """
 
-    joints: Joints
-    shortage: Value
-    firmware_damping: Value
     interfaces = frozenset({"position"})
     numbers: ClassVar = {
         # STS3215: 20 % of its 2.9 Nm over 24 to 40 Nm/rad are reached at 0.02 rad, 2.5 % of a travel

@@ -1,12 +1,13 @@
 """Effects around an actuator model: the base class of their specs, and the one model of all.
 
 An effect of a package of your own is a spec that derives from `EffectSpec`, sets `side` and
-`numbers`, and overrides the method of its side. `EffectChain` does the rest: parameters per
+`numbers`, which become its fields, and overrides the method of its side. `EffectChain` does the rest: parameters per
 environment, memory, resets and random draws.
 """
 
 from __future__ import annotations
 
+import inspect
 import re
 import zlib
 from collections.abc import Mapping
@@ -87,6 +88,17 @@ class EffectSpec:
     interfaces: ClassVar[frozenset[str]] = frozenset({"speed"})
     variants: ClassVar[Mapping[str, type[EffectSpec]]] = MappingProxyType({})
     label: ClassVar[str] = ""
+
+    def __init_subclass__(cls) -> None:
+        """Give the spec a field for each of its numbers, and `joints` where they are by joint.
+
+        A subclass states a number itself only to give it a value that older files mean.
+        """
+        numbers: dict[str, EffectNumber] = cls.__dict__.get("numbers", {})
+        fields: dict[str, Any] = dict.fromkeys(numbers, Value)
+        if any(number.per_joint for number in numbers.values()):
+            fields = {"joints": Joints} | fields
+        cls.__annotations__ = fields | inspect.get_annotations(cls)
 
     @classmethod
     def find_variant(cls, machine: Machine) -> type[EffectSpec] | None:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.effect import ANY_INTERFACE, EffectSpec
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber
 from actuators.models.machine_tensors import MachineTensors
 from brokk_rl.spec import spec
 
@@ -40,8 +40,6 @@ class LinkLength(GeometryEffect):
             joint.
     """
 
-    joints: Joints
-    extra_m: Value
     numbers: ClassVar = {
         "extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3), scale="reach")
     }
@@ -73,8 +71,6 @@ class BaseTilt(GeometryEffect):
         pitch_rad: Turn about y, to the left; positive lowers the front.
     """
 
-    roll_rad: Value
-    pitch_rad: Value
     numbers: ClassVar = {"roll_rad": _describe_angle(0.03), "pitch_rad": _describe_angle(0.03)}
 
     def tool(
@@ -108,12 +104,6 @@ class Extrinsics(GeometryEffect):
         yaw_rad: About z.
     """
 
-    x_m: Value
-    y_m: Value
-    z_m: Value
-    roll_rad: Value
-    pitch_rad: Value
-    yaw_rad: Value
     stage = "perception"
     numbers: ClassVar = {name: _describe_shift(0.02) for name in ("x_m", "y_m", "z_m")} | {
         name: _describe_angle(0.01) for name in ("roll_rad", "pitch_rad", "yaw_rad")

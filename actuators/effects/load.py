@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.effect import EffectSpec, Memory, StepInputs
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber, Value
 from brokk_rl.spec import spec
 
 LEAST_HEAD, MOST_HEAD = 0.05, 2.0
@@ -34,8 +34,6 @@ class LoadDependence(EffectSpec):
         pose_sin: The same with the sine of the angle (over half the travel for a sliding joint).
     """
 
-    joints: Joints
-    sensitivity: Value
     lowering: Value = 1.0  # a plain valve, as files from before this number mean
     pose_cos: Value = 0.0  # neutral: files from before this number lack it
     pose_sin: Value = 0.0  # neutral: files from before this number lack it
@@ -73,8 +71,6 @@ class Creep(EffectSpec):
         drift_rad_s: Speed where masses are not known, in the positive direction.
     """
 
-    joints: Joints
-    sink_rad_s: Value
     drift_rad_s: Value = 0.0  # neutral: files from before this number lack it
     side = "speed"
     weighed = True
@@ -104,8 +100,6 @@ class FlowSharing(EffectSpec):
         demand: Flow of a joint at the machine's `max_speed` over the flow of the pump.
     """
 
-    joints: Joints
-    demand: Value
     side = "joints"
     shared = True
     alike = False  # a boom asks the pump for more than a slewing gear

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.effect import ANY_INTERFACE, EffectSpec
-from actuators.effects.ranges import CHANCE, EffectNumber, Joints, Value
+from actuators.effects.ranges import CHANCE, EffectNumber
 from actuators.models.parameters import draw_normal
 from brokk_rl.spec import spec
 
@@ -28,8 +28,6 @@ class Quantisation(SensorEffect):
         step_rad: Distance between two readings (m for a sliding joint).
     """
 
-    joints: Joints
-    step_rad: Value
     smooth = False
     interfaces = ANY_INTERFACE
     numbers: ClassVar = {
@@ -53,8 +51,6 @@ class SensorNoise(SensorEffect):
         sigma_rad: Standard deviation (m for a sliding joint).
     """
 
-    joints: Joints
-    sigma_rad: Value
     stochastic = True
     interfaces = ANY_INTERFACE
     numbers: ClassVar = {
@@ -78,8 +74,6 @@ class EncoderBias(SensorEffect):
         bias_rad: Excess of the reading over the true position (m for a sliding joint).
     """
 
-    joints: Joints
-    bias_rad: Value
     interfaces = frozenset({"speed", "torque"})  # a servo has its encoder within its loop
     numbers: ClassVar = {
         "bias_rad": EffectNumber("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3), scale="travel")
@@ -105,8 +99,6 @@ class EncoderScale(SensorEffect):
         scale: Shown angle over true angle, about the zero of the joint.
     """
 
-    joints: Joints
-    scale: Value
     interfaces = frozenset({"speed", "torque"})  # a servo has its encoder within its loop
     numbers: ClassVar = {"scale": EffectNumber("1", none=1.0, typical=1.015, bounds=(0.7, 1.4))}
 

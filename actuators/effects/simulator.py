@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 
 from actuators.effects.effect import ANY_INTERFACE, EffectChain, EffectSpec
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber
 from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -52,8 +52,6 @@ class JointFriction(_InsideEffect):
             (position), at full speed (velocity) or at full command (torque).
     """
 
-    joints: Joints
-    part: Value
     quantity = "friction"
     # Chosen by hand: the drive stops 0.75 % of the travel from its target.
     numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.15, bounds=(0.0, 2.0))}
@@ -69,8 +67,6 @@ class JointDamping(_InsideEffect):
             than the robot.
     """
 
-    joints: Joints
-    part: Value
     quantity = "damping"
     # Chosen by hand: at full speed the drive lags by 1 % of the travel more.
     numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.2, bounds=(-5.0, 5.0))}
@@ -85,8 +81,6 @@ class JointArmature(_InsideEffect):
         part: Added inertia over that of the joint in the file's own pose.
     """
 
-    joints: Joints
-    part: Value
     quantity = "armature"
     # Chosen by hand: a rotor behind a gear of some hundreds doubles the inertia of a small arm.
     numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 20.0))}
@@ -101,8 +95,6 @@ class DriveGain(_InsideEffect):
         gain: Factor.
     """
 
-    joints: Joints
-    gain: Value
     quantity = "gain"
     # Chosen by hand: a battery that sags takes a fifth of the voltage.
     numbers: ClassVar = {"gain": EffectNumber("1", none=1.0, typical=0.8, bounds=(0.1, 5.0))}
@@ -118,8 +110,6 @@ class DriveLimit(_InsideEffect):
             (velocity) or at full command (torque), over its largest torque; 0 for no limit.
     """
 
-    joints: Joints
-    shortage: Value
     quantity = "limit"
     # As `torque_limit` around a servo; a drive at its full command is limited from 1 on.
     numbers: ClassVar = {"shortage": EffectNumber("1", none=0.0, typical=2.0, bounds=(0.0, 20.0))}

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.effect import EffectSpec, Memory, StepInputs
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber, Value
 from actuators.effects.targets import TargetBacklash, TargetLag
 from brokk_rl.spec import spec
 
@@ -26,8 +26,6 @@ class FlowGain(EffectSpec):
         gain: Factor on the speed.
     """
 
-    joints: Joints
-    gain: Value
     side = "speed"
     numbers: ClassVar = {"gain": EffectNumber("1", none=1.0, typical=0.85, bounds=(0.1, 3.0))}
 
@@ -46,9 +44,6 @@ class Asymmetry(EffectSpec):
         retract_gain: The same for the negative direction.
     """
 
-    joints: Joints
-    extend_gain: Value
-    retract_gain: Value
     side = "speed"
     numbers: ClassVar = {
         "extend_gain": EffectNumber("1", none=1.0, typical=0.8, bounds=(0.1, 3.0)),
@@ -70,8 +65,6 @@ class Lag(EffectSpec):
         time_constant_s: Time constant with which the speed follows that of the inner model.
     """
 
-    joints: Joints
-    time_constant_s: Value
     side = "speed"
     variants = MappingProxyType({"position": TargetLag, "torque": TargetLag})
     numbers: ClassVar = {
@@ -103,8 +96,6 @@ class Backlash(EffectSpec):
         gap_rad: Whole width of the play (m for a sliding joint).
     """
 
-    joints: Joints
-    gap_rad: Value
     side = "speed"
     variants = MappingProxyType({"position": TargetBacklash})
     numbers: ClassVar = {
@@ -133,9 +124,6 @@ class Compliance(EffectSpec):
         damping: Damping ratio.
     """
 
-    joints: Joints
-    ringing_s: Value
-    damping: Value
     side = "speed"
     numbers: ClassVar = {
         "ringing_s": EffectNumber("s", none=0.0, typical=0.3, bounds=(0.0, 2.0), scale="time"),
@@ -185,10 +173,6 @@ class ThermalDrift(EffectSpec):
             up.
     """
 
-    joints: Joints
-    change: Value
-    time_s: Value
-    elapsed_s: Value
     cold_change: Value = 0.0  # its neutral value: files from before this number lack it
     side = "speed"
     running = "elapsed_s"

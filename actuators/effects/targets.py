@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.effect import EffectSpec, Memory, StepInputs
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber
 from actuators.effects.timing import append_command
 from brokk_rl.spec import spec
 
@@ -30,8 +30,6 @@ class TargetBacklash(EffectSpec):
             stiffness of the loop.
     """
 
-    joints: Joints
-    gap_rad: Value
     label: ClassVar = "backlash"
     side = "command"
     recent = 2
@@ -69,8 +67,6 @@ class TargetLag(EffectSpec):
         time_constant_s: Time constant with which the joint follows.
     """
 
-    joints: Joints
-    time_constant_s: Value
     label: ClassVar = "lag"
     side = "command"
     layer = 1
@@ -109,10 +105,6 @@ class Sag(EffectSpec):
         sag_slope: Change of the sag over the change of the target, where masses are not known.
     """
 
-    joints: Joints
-    load_rad: Value
-    sag_rad: Value
-    sag_slope: Value
     side = "command"
     layer = 2  # of the target: play holds the joint about the target less the sag
     pointwise = True

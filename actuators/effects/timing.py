@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.effect import ANY_INTERFACE, EffectSpec, Memory, StepInputs
-from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.ranges import EffectNumber, Value
 from actuators.models.parameters import split_run_commands
 from brokk_rl.spec import spec
 
@@ -47,8 +47,6 @@ class DeadTime(_Delayed):
             model commands ahead of time: exact up to its own dead time.
     """
 
-    joints: Joints
-    dead_time_s: Value
     numbers: ClassVar = {
         "dead_time_s": EffectNumber("s", none=0.0, typical=0.1, bounds=(-0.3, 0.5), scale="time")
     }
@@ -70,8 +68,6 @@ class ClockOffset(_Delayed):
         offset_s: How much later than their commands positions are stamped.
     """
 
-    joints: Joints
-    offset_s: Value
     shared = True
     # A loop that holds a target shows it as a dead time.
     interfaces = frozenset({"speed", "torque"})
@@ -93,8 +89,6 @@ class DelayJitter(EffectSpec):
         jitter_s: Longest delay; delays are uniform from 0.
     """
 
-    joints: Joints
-    jitter_s: Value
     side = "command"
     stage = "timing"
     stochastic = True
@@ -130,8 +124,6 @@ class FrameLoss(EffectSpec):
             `1 / ((1 - persistence) (1 - probability))` frames on average.
     """
 
-    joints: Joints
-    probability: Value
     persistence: Value = 0.0  # each frame by itself, as files from before this number mean
     side = "command"
     stage = "timing"
