@@ -164,7 +164,7 @@ class Examiners:
     Attributes:
         exam: Folder of the exam.
         labels: Its opened labels.
-        machine: The machine as the candidates know it.
+        machine: The machine.
         fit: Fit of the examiner's simulator.
     """
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
@@ -168,18 +168,6 @@ class CaseDistribution:
                 )
             )
         return [found[i] for i in generator.permutation(len(found))]
-
-    def restrict(self, effects: Collection[str]) -> CaseDistribution:
-        """Return the same for machines without a measured tool, with these effects only.
-
-        Raises:
-            ConfigError: none is left.
-        """
-        kept = {}
-        for name, trouble in self.troubles.items():
-            if name in effects and not trouble.needs_tool:
-                kept[name] = trouble
-        return replace(self, tracked_share=0.0, troubles=kept)
 
     def list_shared(self) -> list[str]:
         """Return the effects that all joints have together."""

@@ -76,7 +76,7 @@ class ExaminerSimulator:
         exam: Folder of the exam.
         case: Name of the case.
         fit: Fit of the simulator.
-        machine: The machine as the candidates know it.
+        machine: The machine.
 
     Raises:
         RecordingError: there are no withheld recordings, or the simulator cannot be fitted.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -158,7 +157,6 @@ class CaseRecorder:
         roughness: Which of the family's.
         excitations: By name.
         approach: How start poses are taken up.
-        known: The machine as candidates know it; its name and fingerprint stamp the files.
     """
 
     def __init__(
@@ -168,10 +166,8 @@ class CaseRecorder:
         roughness: str,
         excitations: Mapping[str, Excitation],
         approach: Approach,
-        known: Machine,
     ) -> None:
         self._machine, self._plants, self._roughness = machine, plants, roughness
-        self._known = known
         self._excitations, self._approach = excitations, approach
         self._guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
 
@@ -281,8 +277,8 @@ class CaseRecorder:
         columns: dict[str, np.ndarray],
         folder: Path,
     ) -> None:
-        """Write a file of a job, stamped as of the machine as the candidates know it."""
-        machine = self._known
+        """Write a file of a job."""
+        machine = self._machine
         recording = record.Recording(
             machine=machine.name,
             joints=machine.joint_names,
@@ -310,17 +306,3 @@ class CaseRecorder:
                 path.append(opened.read().q)
                 opened.send(Command(command.astype(float)))
         return np.stack(path).astype(np.float32)
-
-
-def restrict_machine(machine: Machine, known: str) -> Machine:
-    """Return the machine as candidates know it: `full`, or by its `joints` only."""
-    if known == "full":
-        return machine
-    joints = tuple(dataclasses.replace(joint, body=None) for joint in machine.joints)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return dataclasses.replace(  # pyright: ignore[reportCallIssue]
-        machine,  # pyright: ignore[reportArgumentType]
-        name=f"{machine.name}_joints",
-        mjcf=None,
-        tool_m=None,
-        joints=joints,
-    )

@@ -19,7 +19,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
-from diagnosis import effect_library
 from exam import dataset, ledger, report, run_cases
 from exam.answer_scoring import (
     EXAMINED_FILE,
@@ -32,7 +31,7 @@ from exam.answer_scoring import (
 )
 from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.dataset import CaseSet
-from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
+from exam.generate import CaseRecorder, Half, HalfPlan
 from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
 
@@ -55,8 +54,6 @@ class ExamSettings:
         plants: Machines, written apart from the library.
         roughness: How much of a machine no tidy model has: a name of the family's, `mild` or
             `strong`.
-        known: How far candidates know the machine: `full`, or by its `joints` only, without
-            masses, geometry and measured tool point.
         reference: How the machine as it is believed to be is recorded.
         field: How the machine as it is is recorded.
         withheld: How it is recorded for the examiner, who simulates the repair there.
@@ -77,7 +74,6 @@ class ExamSettings:
     mix: CaseDistribution
     plants: DrawnPlants
     roughness: str
-    known: Literal["full", "joints"]
     reference: HalfPlan
     field: HalfPlan
     withheld: HalfPlan
@@ -145,14 +141,8 @@ class Exam:
                 f"{settings.first_sealed_seed} on are for exams and need exam.sealed=true, smaller ones are for development"
             )
         salt = dataset.read_partial_salt(folder) or settings.salt or secrets.token_hex(16)
-        known = restrict_machine(self.machine, settings.known)
         recorder = CaseRecorder(
-            self.machine,
-            settings.plants,
-            settings.roughness,
-            self.excitation,
-            settings.approach,
-            known,
+            self.machine, settings.plants, settings.roughness, self.excitation, settings.approach
         )
         halves: dict[Half, HalfPlan] = {
             "reference": settings.reference,
@@ -166,7 +156,6 @@ class Exam:
             "schema": 2,
             "seed": self.session.seed,
             "sealed": is_exam,
-            "known": settings.known,
             "roughness": settings.roughness,
             "num_cases": len(labels),
         }
@@ -178,12 +167,9 @@ class Exam:
 
     def questions(self, salt: str) -> list[CaseDesign]:
         """Return the cases; those of a sealed exam depend on the secret salt too."""
-        settings, mix = self.exam, self.exam.mix
+        settings = self.exam
         entropy = [self.session.seed, *(salt.encode() if settings.sealed else b"")]
-        if settings.known == "joints":
-            known = restrict_machine(self.machine, "joints")
-            mix = mix.restrict([kind.name for kind in effect_library.load_effects(known)])
-        return mix.questions(
+        return settings.mix.questions(
             self.machine,
             settings.plants.outside_faults,
             np.random.default_rng(entropy),
@@ -208,10 +194,14 @@ class Exam:
             entry = {"labels_sha256": facts["labels_sha256"], "run": run}
             ledger.append_entry(self._folder, ledger.BEGUN, entry)
         write_json(self.session.folder / RUN_FILE, run)
-        known = restrict_machine(self.machine, facts.get("known", "full"))
         with ItemProgress("cases answered", len(cases)) as progress:
             failed = run_cases.answer_cases(
-                settings.candidate, cases, self.session.folder, known, settings.workers, progress
+                settings.candidate,
+                cases,
+                self.session.folder,
+                self.machine,
+                settings.workers,
+                progress,
             )
         if failed:
             text = "%d of %d cases have no answer; why stands in their %s"
@@ -250,10 +240,8 @@ class Exam:
         if not is_published:
             hashes = {"labels_sha256": facts["labels_sha256"]}
             ledger.append_entry(self._folder, ledger.OPENED, hashes)
-        out, known = self.session.folder, facts.get("known", "full")
-        examiners = Examiners(
-            self._folder, labels, restrict_machine(self.machine, known), self.exam.fit
-        )
+        out = self.session.folder
+        examiners = Examiners(self._folder, labels, self.machine, self.exam.fit)
         examined = examiners.examine(answers, out / EXAMINED_FILE, self.exam.workers)
         scoring = AnswerScoring(labels, self.exam.mix.classes, self.exam.mix.list_shared())
         tables = {}

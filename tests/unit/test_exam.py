@@ -25,7 +25,10 @@ from diagnosis.answer import ANSWER_FILE
 from exam import dataset, run_cases
 from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
 from exam.constant_answer import ConstantAnswer
-from exam.generate import CaseRecorder
+from exam.generate import UNCHANGED_FOLDER, CaseRecorder
+from exam.ledger import BEGUN, read_ledger
+
+SEALED = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234")
 
 
 def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDesign]:
@@ -92,8 +95,9 @@ def test_parameters_lie_at_their_size_between_nothing_and_typical(
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sealed exam of two cases."""
     out = tmp_path_factory.mktemp("made") / "exam"
-    mode = load_mode(*SMALL, f"session.out={out}")
+    mode = load_mode(*SMALL, *SEALED, f"session.out={out}")
     out.mkdir()
     mode.run()
     return out
@@ -144,41 +148,70 @@ def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
         dataset.seal_labels(tmp_path, {"cases": []}, "salt")
 
 
-def test_an_exam_is_made_sat_and_scored_from_the_command_line(
+def test_an_exam_is_sat_and_scored_and_its_ledger_knows_the_engine_before_the_labels(
     exam: Path, brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
-    answers, marks = tmp_path / "answers", tmp_path / "marks"
-    about = ("mode=exam", f"exam.folder={exam}")
-    assert (
-        brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}").code
-        == 0
-    )
-    again = brokk(
-        *about,
-        "exam.do=run",
-        "exam_candidate=always_none",
-        f"session.out={answers}",
-        f"resume={answers}",
-    )
-    assert again.code == 0 and brokk(*about, "exam.do=run", f"session.out={answers}").code != 0
-    done = brokk(*about, "exam.do=score", f"+exam.answers.none={answers}", f"session.out={marks}")
-    assert done.code == 0, done.err
-    found = json.loads((marks / "marks.json").read_text())["candidates"]["none"]
-    assert (
-        found["false_alarms_none"]["value"] == 0.0
-        and found["top1"]["value"] == 0.0
-        and found["failed"] == 0
-    )
+    answers = tmp_path / "answers"
+    about = ("mode=exam", f"exam.folder={exam}", "exam_candidate=always_none")
+    run = (*about, "exam.do=run", f"session.out={answers}")
+    assert brokk(*run).code == 0
+    assert brokk(*run, f"resume={answers}").code == 0
+    assert brokk(*run).code != 0
+    (begun,) = read_ledger(exam)
+    facts = json.loads((exam / "exam.json").read_text())
+    assert begun["event"] == BEGUN and begun["run"]["labels_sha256"] == facts["labels_sha256"]
+    score = (*about, "exam.do=score", f"+exam.answers.none={answers}")
+    for count in range(2):
+        marks = tmp_path / f"marks_{count}"
+        done = brokk(*score, f"session.out={marks}")
+        assert done.code == 0, done.err
+        found = json.loads((marks / "marks.json").read_text())
+        (said,) = found["exam"]["ledger"]
+        assert "registered before" in said and f"opened {count} times" in said
+    table = found["candidates"]["none"]
+    assert table["false_alarms_none"]["value"] == table["top1"]["value"] == table["failed"] == 0
     assert "one effect: named first" in (marks / "exam.md").read_text()
     # labels and answers are published beside the score
     assert (marks / "labels.json").read_bytes() == (exam / dataset.LABELS_FILE).read_bytes()
     said = [json.loads(text) for text in (marks / "answers_none.jsonl").read_text().splitlines()]
     assert [one["answer"]["verdict"] for one in said] == ["none", "none"]
     # whoever says "none" repairs nothing, by the examiner's own simulation
-    assert all(
-        one["before"] == one["after"]
-        for one in json.loads((marks / "examined.json").read_text())["none"].values()
-    )
+    for one in json.loads((marks / "examined.json").read_text())["none"].values():
+        assert one["before"] == one["after"]
+    noted = json.loads((answers / "run.json").read_text())
+    (answers / "run.json").write_text(json.dumps(noted | {"labels_sha256": "other"}))
+    refused = brokk(*score, f"session.out={tmp_path / 'refused'}")
+    assert refused.code == 2 and "got answers to others" in refused.err
+
+
+def test_a_make_that_was_interrupted_goes_on_and_gives_the_cases_of_its_salt(
+    made: Path, brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    part, (labels, _) = tmp_path / "part", dataset.open_labels(made)
+    again = (*SMALL, *SEALED, f"exam.salt={labels['salt']}", f"session.out={part}")
+    monkeypatch.setattr(dataset, "BLOCK_CASES", 1)
+    write = dataset.CaseSet.write
+
+    def fail_on_second(self: Any, numbers: list[int]) -> Any:
+        if numbers == [1]:
+            raise RecordingError("interrupted")
+        return write(self, numbers)
+
+    fail_on_second.__name__ = "write"  # another process finds a method by its name
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset.CaseSet, "write", fail_on_second)
+        assert brokk(*again).code != 0
+    partial = part / dataset.PARTIAL_FILE
+    assert partial.stat().st_mode & 0o777 == 0o600
+    finished = [json.loads(line).get("case") for line in partial.read_text().splitlines()]
+    assert finished == [None, "0000"] and not (part / dataset.LABELS_FILE).exists()
+    done = brokk(*again, f"resume={part}")
+    assert done.code == 0, done.err
+    assert dataset.open_labels(part)[0]["cases"] == labels["cases"] and not partial.exists()
+    withheld = {path.parent.name for path in (made / dataset.WITHHELD_FOLDER).rglob("*.parquet")}
+    assert withheld == {"0000", "0001", UNCHANGED_FOLDER}
+    for path in sorted((made / "cases").rglob("*.parquet")):
+        assert path.read_bytes() == (part / path.relative_to(made)).read_bytes()
 
 
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
@@ -294,9 +327,7 @@ def test_another_hand_drives_the_field_of_half_of_the_cases_and_never_the_refere
     words = ("exam_recording=hands", "exam.field.other_hand=[[work],[work]]")
     mode = load_mode(*SMALL, *words, "exam.mix.num_cases=20", f"session.out={tmp_path}")
     exam, questions = mode.exam, mode.questions("")
-    recorder = CaseRecorder(
-        mode.machine, exam.plants, "mild", mode.excitation, exam.approach, mode.machine
-    )
+    recorder = CaseRecorder(mode.machine, exam.plants, "mild", mode.excitation, exam.approach)
     by_person = set()
     for job in recorder.planned(questions, exam.field, "field"):
         if job.plan.runs[0][0].name.startswith("work"):

@@ -1,138 +1,57 @@
-"""Interruption and scoring of an exam, and the examiner's simulation."""
+"""The examiner's simulation, and a program that is interrupted."""
 
 from __future__ import annotations
 
-import json
-import os
-import stat
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from composed import option
-from small_exam import SMALL
 
-from brokk_rl.build import describe_spec
 from brokk_rl.errors import RecordingError
-from brokk_rl.extensions import load_mode
+from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
+from brokk_rl.record import make_motion, write_recording
 from diagnosis.answer import Answer, Estimate, Gap, Where
 from exam import dataset, examiner, run_cases
 from exam.examiner import ExaminerSimulator, compute_closed, read_effects
-from exam.generate import UNCHANGED_FOLDER, restrict_machine
-from exam.ledger import BEGUN, read_ledger
+from exam.generate import UNCHANGED_FOLDER
 
 
-def test_a_sealed_exam_knows_its_engine_before_its_labels_are_opened(
-    brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    exam, answers = tmp_path / "exam", tmp_path / "answers"
-    sealed = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234")
-    made = brokk(*SMALL, *sealed, f"session.out={exam}")
-    assert made.code == 0, made.err
-    facts = json.loads((exam / "exam.json").read_text())
-    assert facts["sealed"] and facts["num_cases"] == 2
-    withheld = sorted((exam / dataset.WITHHELD_FOLDER).rglob("*.parquet"))
-    assert {path.parent.name for path in withheld} == {"0000", "0001", UNCHANGED_FOLDER}
-    about = ("mode=exam", f"exam.folder={exam}", "exam_candidate=always_none")
-    done = brokk(*about, "exam.do=run", f"session.out={answers}")
-    assert done.code == 0, done.err
-    (begun,) = read_ledger(exam)
-    assert begun["event"] == BEGUN and begun["run"]["labels_sha256"] == facts["labels_sha256"]
-    score = (*about, "exam.do=score", f"+exam.answers.none={answers}")
-    for count in range(2):
-        out = tmp_path / f"marks_{count}"
-        assert brokk(*score, f"session.out={out}").code == 0
-        (said,) = json.loads((out / "marks.json").read_text())["exam"]["ledger"]
-        assert "registered before" in said and f"opened {count} times" in said
-    run = json.loads((answers / "run.json").read_text())
-    (answers / "run.json").write_text(json.dumps(run | {"labels_sha256": "other"}))
-    refused = brokk(*score, f"session.out={tmp_path / 'refused'}")
-    assert refused.code == 2 and "got answers to others" in refused.err
-
-
-def test_a_make_that_was_interrupted_goes_on_and_gives_the_same_cases(
-    brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    whole, part = tmp_path / "whole", tmp_path / "part"
-    assert brokk(*SMALL, f"session.out={whole}").code == 0
-    monkeypatch.setattr(dataset, "BLOCK_CASES", 1)
-    write = dataset.CaseSet.write
-
-    def fail_on_second(self: Any, numbers: list[int]) -> Any:
-        if numbers == [1]:
-            raise RecordingError("interrupted")
-        return write(self, numbers)
-
-    fail_on_second.__name__ = "write"  # another process finds a method by its name
-    with monkeypatch.context() as patch:
-        patch.setattr(dataset.CaseSet, "write", fail_on_second)
-        assert brokk(*SMALL, f"session.out={part}").code != 0
-    partial = part / dataset.PARTIAL_FILE
-    assert stat.S_IMODE(os.stat(partial).st_mode) == 0o600
-    assert [json.loads(line).get("case") for line in partial.read_text().splitlines()][1:] == [
-        "0000"
-    ]
-    assert not (part / dataset.LABELS_FILE).exists()
-    again = brokk(*SMALL, f"session.out={part}", f"resume={part}")
-    assert again.code == 0, again.err
-    labels = [
-        json.loads((folder / dataset.LABELS_FILE).read_text())["cases"] for folder in (whole, part)
-    ]
-    assert labels[0] == labels[1] and not partial.exists()
-    for path in sorted((whole / "cases").rglob("*.parquet")):
-        assert path.read_bytes() == (part / path.relative_to(whole)).read_bytes()
-
-
-@pytest.mark.slow
-def test_an_exam_of_arms_known_by_their_joints_asks_nothing_that_needs_masses(
-    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
-) -> None:
-    exam = tmp_path / "exam"
-    many = (
-        "exam.mix.num_cases=4",
-        "exam.mix.shares={none: 0, faint: 0, one: 1, several: 0, outside: 0}",
-    )
-    done = brokk(*SMALL, *many, "exam.known=joints", f"session.out={exam}")
-    assert done.code == 0, done.err
-    known = restrict_machine(machine, "joints")
-    assert not known.has_bodies and known.name == "brokk170_joints"
-    labels, _ = dataset.open_labels(exam)
-    named = {one["effect"] for label in labels["cases"] for one in label["effects"]}
-    assert labels["known"] == "joints" and not any(label["tracked"] for label in labels["cases"])
-    assert named and not named & {"encoder_bias", "encoder_scale", "link_length", "base_tilt"}
-    # the files are those of the machine that a candidate knows
-    ExaminerSimulator(exam, "0000", option("fit", "valve"), known)
-    with pytest.raises(RecordingError):
-        ExaminerSimulator(exam, "0000", option("fit", "valve"), machine)
-    # a program gets the machine as an option file
-    text = json.dumps(describe_spec(known))
-    assert '"_target_": "brokk_rl.machine.Machine"' in text and '"body": null' in text
+def record_lag(machine: Machine, gain: float, seed: int, seconds: float, path: Path) -> None:
+    """Writes a recording of joints that lag behind random levels, at a part of their speed."""
+    levels = np.random.default_rng(seed).uniform(-0.7, 0.7, (round(seconds), machine.num_joints))
+    u = np.repeat(levels, 20, 0).astype(np.float32)
+    lag = replace(option("actuator", "lag"), gain=gain)
+    model = lag.build(machine, 1, torch.device("cpu"))
+    shape = (1, machine.num_history, machine.num_joints)
+    history = History(torch.zeros(shape), torch.zeros(shape))
+    home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
+    history.reset(torch.ones(1, dtype=torch.bool), home)
+    q = []
+    for command in u:
+        q.append(history.q[0, -1].numpy().copy())
+        history.push_u(torch.as_tensor(command[None]))
+        history.push_q(model.step(history))
+    t_s = machine.period_s * np.arange(len(u))
+    write_recording(make_motion(machine, f"{seed}", t_s, u, np.array(q)), path)
 
 
 @pytest.fixture(scope="module")
-def slow_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An exam of one case: all joints at 0.6 of their speed, withheld recordings of 30 s."""
-    out = tmp_path_factory.mktemp("examined") / "exam"
-    gain = (
-        "{flow_gain: {_target_: exam.case_distribution.EffectDistribution, numbers: {gain: [1.0, 0.6]}, "
-        "joints: all, needs_tool: false, only_one: false, mirrored: false, not_on: [], shape: {}}}"
-    )
-    words = [
-        "mode=exam", "exam.mix.num_cases=1", "exam.mix.shares={none: 0, faint: 0, one: 1, several: 0, outside: 0}",
-        "exam.mix.sizes=[1.0,1.0]", "~exam.mix.troubles", f"+exam.mix.troubles={gain}",
-        "exam.reference.programs=[[levels],[levels]]",
-        "exam.reference.file_s=40", "exam.field.programs=[[levels]]", "exam.field.file_s=8", "exam.withheld.programs=[[levels]]",
-        "exam.withheld.file_s=30", f"session.out={out}",
-    ]  # fmt: skip
-    mode = load_mode(*words)
-    out.mkdir()
-    mode.run()
+def slow_case(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Path:
+    """An exam of one case: all joints at 0.6 of their speed."""
+    out = tmp_path_factory.mktemp("examined")
+    case, hidden = out / dataset.CASES_FOLDER / "0000", out / dataset.WITHHELD_FOLDER / "0000"
+    for seed in (0, 1):
+        record_lag(machine, 1.0, seed, 60.0, case / "reference" / f"{seed}.parquet")
+    record_lag(machine, 0.6, 2, 20.0, case / "field" / "0.parquet")
+    record_lag(machine, 0.6, 3, 30.0, hidden / "0.parquet")
+    record_lag(machine, 1.0, 3, 30.0, hidden / UNCHANGED_FOLDER / "0.parquet")
     return out
 
 
