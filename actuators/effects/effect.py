@@ -107,6 +107,13 @@ class EffectSpec:
             return cls
         return cls.variants.get(machine.interface)
 
+    def adapt(self, machine: Machine) -> EffectSpec | None:
+        """Return the effect as it is on the machine; `None`: the machine cannot have it."""
+        variant = self.find_variant(machine)
+        if variant is None or variant is type(self):
+            return self if variant else None
+        return variant(**{field.name: getattr(self, field.name) for field in fields(self)})  # pyright: ignore[reportArgumentType]
+
     @classmethod
     def name(cls) -> str:
         """Return the name of the effect, as in `effect=[name]`."""
@@ -229,7 +236,8 @@ class EffectChain:
     ) -> None:
         self.inner: Any = inner
         self._num_recent = num_recent
-        self.effects = effects = _list_variants(effects, machine)
+        known = {name: effect.adapt(machine) for name, effect in effects.items()}
+        self.effects = effects = {name: one for name, one in known.items() if one is not None}
         given: dict[str, Value] = {}
         numbers: dict[str, EffectNumber] = {}
         joints: dict[str, Joints] = {}
@@ -299,11 +307,7 @@ class EffectChain:
     def plan_run(
         self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
     ) -> PlannedRun | None:
-        """See `actuators.contracts.PlannedModel`.
-
-        Effects on commands are applied to the whole run before its first step, so that a step computes
-        only what depends on positions.
-        """
+        """See `actuators.contracts.PlannedModel`; effects on commands are applied to the whole run first."""
         self._change_drives()
         if not self.is_plannable:
             return None
@@ -370,9 +374,8 @@ class EffectChain:
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
         """Return the error of the controller's estimate of a target near the tool, `(N, 3)` in m.
 
-        A controller that uses the drawn kinematics on a machine that differs misses by as much as
-        one with right kinematics and a displaced target. So the simulated geometry stays and the
-        estimate moves.
+        A controller with the drawn kinematics misses by as much as one with right kinematics and a
+        displaced target: the simulated geometry stays and the estimate moves.
         """
         if self._placed:
             tip_m = self.plant.kinematics.pose(q).tip_in_base_m
@@ -454,9 +457,8 @@ class EffectChain:
     ) -> torch.Tensor:
         """Return the next positions, `(N, J)`, with all effects on speed.
 
-        A learned model continues the increments that it sees, and a gain on them would compound
-        from step to step. So it sees the increments as they would be without the effects, ending
-        at the true position: `shift` is added to its history.
+        A learned model continues the increments that it sees, and a gain would compound from step to
+        step. So it sees them as they would be without the effects: `shift` is added to its history.
         """
         shift = self._memory["shift"]
         shift = torch.where(memory.fresh[:, None, None], torch.zeros_like(shift), shift)
@@ -490,20 +492,6 @@ class EffectChain:
         if counter is None or name not in self._salts:
             return None
         return counter + self._salts[name]
-
-
-def _list_variants(effects: Mapping[str, EffectSpec], machine: Machine) -> dict[str, EffectSpec]:
-    """Return the effects as they are on this machine, without those that it cannot have."""
-    found = {}
-    for name, effect in effects.items():
-        variant = effect.find_variant(machine)
-        if variant is None:
-            continue
-        if variant is not type(effect):
-            values = {field.name: getattr(effect, field.name) for field in fields(effect)}  # pyright: ignore[reportArgumentType]
-            effect = variant(**values)
-        found[name] = effect
-    return found
 
 
 def _keep_unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
