@@ -29,6 +29,7 @@ def make_plain_figure(figsize: tuple[float, float], layout: str) -> Figure:
 
 
 plot.Figure = make_plain_figure
+plot.DPI = 50
 
 
 def pytest_collection_finish() -> None:
