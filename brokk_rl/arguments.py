@@ -57,7 +57,7 @@ def read_arguments(words: Sequence[str]) -> list[str]:
         key, _, value = word.lstrip("~").partition("=")
         is_nothing = word == f"~{key}" or value in NOTHING
         if is_nothing and key in groups and value not in groups[key] and key != "mode":
-            word = f"{key}=[]" if _is_list_group(key) else f"~{key}"
+            word = f"{key}=[]" if is_list_group(key) else f"~{key}"
         if word[:1] == "~":
             read.append(word)
             continue
@@ -135,8 +135,16 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     """Return an override as Hydra can read it."""
     key, _, value = word.partition("=")
     if not re.fullmatch(KEY, key):
-        hint = "it is written without spaces" if " " in key else "it is names with dots between"
-        raise ConfigError(f"'{key}' in '{word}' is no key; {hint}, as in session.seed=3")
+        likely = re.sub(r"\[(\w+)\]", r".\1", key.replace(" ", "").replace("-", "_"))
+        if not re.fullmatch(KEY, likely):
+            likely, value = "session.seed", "3"
+        raise ConfigError(
+            f"'{key}' in '{word}' is no key; it is names with dots between, without spaces or "
+            f"dashes, as in {likely}={value.strip()}"
+        )
+    if value.startswith("~/"):  # a shell leaves it after '='
+        value = str(Path(value).expanduser())
+        word = f"{key}={value}"
     if key.startswith(PLACES):
         raise ConfigError(f"{word}: folders are made by the command; give session.out=<folder>")
     if not value.strip():
@@ -158,7 +166,7 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
         raise ConfigError(_explain_characters(key, value)) from error
     if override.is_range_sweep() and not any(override.sweep_string_iterator()):
         raise ConfigError(f"{word} holds no value: range(first, beyond the last, step)")
-    is_single = key in groups and not _is_list_group(key)
+    is_single = key in groups and not is_list_group(key)
     if override.is_sweep_override() and not sweep:
         raise ConfigError(_explain_several(key, value, key in groups, is_single))
     if is_single and value.startswith("[") and "," in value:
@@ -173,7 +181,7 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     return word
 
 
-def _is_list_group(group: str) -> bool:
+def is_list_group(group: str) -> bool:
     """Return whether several options of a group may be chosen: each has a place of its own."""
     for option in registry.list_options(group):
         if re.search(rf"^# @package {group}\.", option.path.read_text(), re.MULTILINE):
@@ -192,7 +200,7 @@ def explain_robot(path: str) -> str:
 def _explain_several(key: str, value: str, is_group: bool, is_single: bool) -> str:
     """Explain a value with commas, which is a sweep where one was meant."""
     ways = []
-    if re.fullmatch(r"-?\d+,\d+", value):
+    if re.fullmatch(r"-?\d+,\d+", value) and not is_group:
         ways.append(f"one number: {key}={value.replace(',', '.')}")
     elif is_single:
         ways.append(f"one option: {key}={value.split(',')[0]}")

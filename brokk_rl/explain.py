@@ -25,7 +25,7 @@ from omegaconf.errors import (
 )
 
 from brokk_rl import registry
-from brokk_rl.arguments import ROBOT_FILES, explain_robot
+from brokk_rl.arguments import ROBOT_FILES, explain_robot, is_list_group
 from brokk_rl.errors import BrokkError, list_choices
 
 CLOSE = 0.85
@@ -172,8 +172,17 @@ def _explain_absence(cfg: DictConfig, key: str, value: str) -> str:
         fields = [str(field) for field in table if field != "_target_"]
         return f"'{key}' is a table, whose values are given as {key}.<name>=…; {list_choices(value, fields)}"
     parent, _, leaf = key.rpartition(".")
+    group, _, rest = key.partition(".")
+    name = rest.partition(".")[0]
+    for option in registry.list_options(group):
+        if option.name == name and OmegaConf.select(cfg, f"{group}.{name}", default=None) is None:
+            chosen = f"[{option.name}]" if is_list_group(group) else option.name
+            return f"'{option.name}' is not chosen: add {group}={chosen}"
     keys = _find_keys(cfg, leaf)
     groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
+    likely = key.lower().replace("/", ".")
+    if likely in groups or likely in _find_keys(cfg, likely.rpartition(".")[2]):
+        return f"{mode} has no such key; {_suggest([likely], value)}"
     if key in {option.group for option in registry.list_options()} and not (keys and value):
         return f"{mode} does not use such a group; {list_choices(key, groups)}"
     while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:

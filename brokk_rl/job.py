@@ -115,7 +115,7 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
     session = values["session"]
     if not isinstance(session, Mapping):
         raise ConfigError(
-            f"session={session}: it is a table, whose values are given as session.<name>=…; "
+            f"session={session or 'null'}: it is a table, whose values are given as session.<name>=…; "
             f"{list_choices(str(session), ('out', 'seed', 'device'))}"
         )
     out = session.get("out")  # a preset may set others in a mode without a session

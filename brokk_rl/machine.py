@@ -9,9 +9,10 @@ import hashlib
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import MinLen
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.registry import find_packages, resolve_package_path
@@ -156,7 +157,7 @@ class Machine:
     period_s: Positive
     dead_time_s: NonNegative
     num_history: Count
-    joints: tuple[Joint, ...]
+    joints: Annotated[tuple[Joint, ...], MinLen(1)]
     tool_m: tuple[Dimension, Dimension, Dimension] | None
     exclusive: tuple[str, ...]
     levers: tuple[Lever, ...]

@@ -15,29 +15,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
-from textwrap import fill
 from typing import Annotated, Any
 
 import pandas as pd
 import yaml
 from annotated_types import MinLen
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Picture
 from scipy import stats
 
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.task import Figure
 from brokk_rl.errors import ConfigError
-from brokk_rl.plot import (
-    BLUE,
-    GREY,
-    ORANGE,
-    OTHERS,
-    add_legend,
-    draw_grid,
-    make_figure,
-    save_figure,
-)
 from brokk_rl.session import RESOLVED, Session, read_record, write_json, write_text
 from brokk_rl.spec import spec
 from brokk_rl.statistics import CONFIDENCE, compute_student_interval
@@ -47,9 +34,6 @@ log = logging.getLogger(__name__)
 MOST_COLUMNS = 4
 """Largest number of columns of differences; above it one column has the values that most rows lack.
 Chosen by hand."""
-LABEL_WIDTH = 42
-"""Characters of a row label in a picture before it wraps."""
-COLORS = (BLUE, ORANGE, *OTHERS)
 EVALUATION = "evaluation.json"
 SUCCESS_RATE = "success_strict"
 LOW, HIGH = "_low", "_high"
@@ -79,7 +63,7 @@ class RunSelection:
 
 @spec
 class Compare:
-    """Compare runs: success with 95 % intervals, as tables and a picture."""
+    """Compare runs: success with 95 % intervals, as tables."""
 
     session: Session
     compare: RunSelection
@@ -100,8 +84,6 @@ class Compare:
         write_json(folder / "comparison.json", content)
         write_text(folder / "comparison.csv", table.to_csv(index=False, lineterminator="\n"))
         words = collect_words(runs, list_figures(table))
-        picture = draw_comparison(groups, columns, words, list_rates(table))
-        save_figure(picture, folder / "comparison.png")
         _print_groups(groups, columns, words, list_rates(table))
         log.info("%d runs compared in %s", len(runs), folder)
 
@@ -150,59 +132,6 @@ def _format_difference(group: Any) -> str | None:
     if pd.notna(group[DIFFERENCE + LOW]):
         text += f" ({group[DIFFERENCE + LOW]:+.3f} to {group[DIFFERENCE + HIGH]:+.3f})"
     return text
-
-
-def label_rows(rows: Any, columns: Sequence[str]) -> list[str]:
-    """Return a short name of each row: its policy, and the values that most others lack."""
-    texts = describe_differences(rows[list(columns)])
-    return [", ".join(filter(None, pair)) for pair in zip(rows["policy"], texts, strict=True)]
-
-
-def draw_comparison(
-    groups: pd.DataFrame, columns: Sequence[str], words: Mapping[str, Figure], rates: Sequence[str]
-) -> Picture:
-    """Draw rates with intervals, and each other figure, a row for each policy and setting."""
-    others = {name: figure for name, figure in words.items() if name not in rates}
-    picture = make_figure(6.0 + 2.0 * len(others), 1.4 + 0.42 * len(groups))
-    widths = [2, *[1] * len(others)]
-    success, *axes = picture.subplots(
-        1, len(widths), sharey=True, width_ratios=widths, squeeze=False
-    )[0]
-    for index, name in enumerate(rates):
-        _draw_rows(success, groups, name, COLORS[index], words[name].title, shift=0.2 * index)
-    success.set_xlabel("success rate, 95 % interval")
-    success.set_xlim(right=1.005)
-    add_legend(picture, success)
-    for axis, (name, figure) in zip(axes, others.items(), strict=True):
-        _draw_rows(axis, groups, name, GREY, factor=figure.factor)
-        axis.set_xlabel(_name_figure(figure))
-        axis.set_xlim(left=0.0)
-    _name_rows(success, label_rows(groups, columns))
-    return picture
-
-
-def _draw_rows(
-    axis: Axes,
-    table: pd.DataFrame,
-    name: str,
-    color: str,
-    label: str | None = None,
-    shift: float = 0.0,
-    factor: float = 1.0,
-) -> None:
-    """Draw a figure as marks and its intervals as lines; what is missing is left out."""
-    places = [row + shift for row in range(len(table))]
-    values = factor * table[[name, name + LOW, name + HIGH]].astype(float)
-    axis.plot(values[name], places, "o", color=color, label=label)
-    axis.hlines(places, values[name + LOW], values[name + HIGH], color=color)
-    draw_grid(axis, "x")
-    axis.tick_params(axis="y", length=0)
-
-
-def _name_rows(axis: Axes, labels: Sequence[str]) -> None:
-    """Write labels beside rows, the first row at the top."""
-    axis.set_yticks(range(len(labels)), [fill(label, LABEL_WIDTH) for label in labels])
-    axis.set_ylim(len(labels) - 0.4, -0.6)
 
 
 @dataclass(frozen=True)

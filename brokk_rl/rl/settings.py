@@ -222,6 +222,9 @@ class TrainingConfig:
                 value = require_value(f"runner.{path}", allowed, holder[name])
                 if isinstance(value, int):  # 1e2 was given for a whole number
                     holder[name] = value
+        for name in ("algorithm", "actor", "critic", "obs_groups"):
+            if not isinstance(self.runner.get(name), dict):
+                raise ConfigError(f"runner.{name}: expected a table, got {self.runner.get(name)}")
         for name in ("algorithm", "actor", "critic", "actor.distribution_cfg"):
             class_name = str(self._read_runner(f"{name}.class_name"))
             if reason := REFUSED_CLASSES.get(class_name.replace(":", ".").rpartition(".")[2]):

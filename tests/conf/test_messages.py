@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -64,6 +65,12 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("wandb=true",): ("tracking=wandb",),
     # keys
     ("mod=train",): ("did you mean 'mode'?",),
+    ("MODE=train",): ("did you mean mode=train?",),
+    ("rl/num_envs=3",): ("did you mean rl.num_envs=3?",),
+    ("rl.num-envs=3",): ("as in rl.num_envs=3",),
+    ("machine.joints[0].home=2",): ("as in machine.joints.0.home=2",),
+    ("event.mass.factor=[1,2]",): ("add event=[mass]",),
+    ("mode=evaluate", "policy=~/none"): (f"policy={Path.home()}/none",),
     ("hidden_dims=256",): ("rl.runner.actor.hidden_dims=256",),
     ("~rl.lr",): ("'rl' has no 'lr'", "rl.runner.algorithm.learning_rate"),
     ("+machine=brokk170",): ("without the '+'",),

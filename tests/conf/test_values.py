@@ -25,6 +25,7 @@ BAD = {
         "rl.runner.algorithm.num_mini_batches=100000",
     ): "rl.runner.algorithm.num_mini_batches: expected at most 1536",
     ("rl.runner.actor.distribution_cfg.std_range=[1.0,0.1]",): "distribution_cfg.std_range",
+    ("rl.runner.algorithm=null",): "rl.runner.algorithm: expected a table, got None",
     ("rl.runner.actor.class_name=RNNModel",): "a policy sees a history",
     ("rl.runner.algorithm.class_name=Distillation",): "train with PPO",
     ("rl.runner.obs_groups.actor=[policy,privileged]",): "give it to the critic alone",
