@@ -406,7 +406,6 @@ class EpisodeProcess(TaskProcess):
             "age": state["age"],
             "period_s": self._machine.period_s,
             "start": start,
-            "kinematics": self._kinematics,
             "success": nowhere,
             "failed": nowhere,
             "held_share": state["held"],

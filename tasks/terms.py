@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     import torch
 
     from brokk_rl.history import History
-    from brokk_rl.kinematics import Kinematics
 
 
 @dataclass
@@ -41,7 +40,6 @@ class StepState:
         period_s: Control period.
         start: What was drawn for the episode, `(N, …)` each, by name: `q`, `scene`, `tip_m`, and
             what the task asks for.
-        kinematics: Kinematics of the machine.
         success: The task's criterion holds, `(N,)` bool.
         failed: The episode ends by a failure, such as a joint limit, `(N,)` bool.
         held_share: Part of the counted steps in which a `HeldCriterion` held, `(N,)`.
@@ -61,7 +59,6 @@ class StepState:
     age: torch.Tensor
     period_s: float
     start: dict[str, torch.Tensor]
-    kinematics: Kinematics
     success: torch.Tensor
     failed: torch.Tensor
     held_share: torch.Tensor
@@ -85,12 +82,6 @@ class StepState:
     def speed(self) -> torch.Tensor:
         """Joint speeds over the last control period, `(N, J)`, rad/s or m/s."""
         return (self.history.q[:, -1] - self.history.q[:, -2]) / self.period_s
-
-    @property
-    def tip_velocity_m_s(self) -> torch.Tensor:
-        """Velocity of the tool point over the last control period, `(N, 3)`."""
-        before_m = self.kinematics.pose(self.history.q[:, -2]).tip_in_base_m
-        return (self.tip_m - before_m) / self.period_s
 
 
 @dataclass

@@ -148,6 +148,9 @@ class ControlLoop(VecEnv):
         self.max_episode_length = task.max_episode_steps
         self.cfg: dict[str, Any] = {}
         self.starts = starts
+        self._num_near = 0
+        self._first_row = torch.zeros((), dtype=torch.int64, device=self.device)
+        """First row of the starts that resets draw; those near the target come first."""
         shape = (self.num_envs, machine.num_history, machine.num_joints)
         q, u = torch.zeros(2, *shape, device=self.device)
         self.history = History(q=q.clone(), u=u.clone())
@@ -224,9 +227,19 @@ class ControlLoop(VecEnv):
             ConfigError: The task cannot do that.
         """
         self.task.require("bring_near", "give rl.near_starts=null")
-        moved = self.task.bring_near(self.starts, near.share, near.height_m, near.way, seed)
+        share = max(near.share)
+        moved = self.task.bring_near(self.starts, share, near.height_m, near.way, seed)
         self.starts = {name: value.to(self.device) for name, value in moved.items()}
+        self._num_near = round(share * len(self.starts["q"]))
+        self.draw_near(near.share[0])
         self.begin()
+
+    def draw_near(self, share: float) -> None:
+        """Let `share` of the resets draw starts near the target, at most as many as there are."""
+        num_far = len(self.starts["q"]) - self._num_near
+        if num_far:
+            kept = min(self._num_near, round(num_far * share / (1.0 - share)))
+            self._first_row.fill_(self._num_near - kept)
 
     def capture(self, fuse: bool = False) -> None:
         """Capture the control step in a CUDA graph where device and world allow it.
@@ -452,5 +465,7 @@ class ControlLoop(VecEnv):
         )
 
     def _draw(self) -> Starts:
-        rows = torch.randint(len(self.starts["q"]), (self.num_envs,), device=self.device)
+        num = len(self.starts["q"])
+        rows = torch.randint(num, (self.num_envs,), device=self.device)
+        rows = self._first_row + rows * (num - self._first_row) // num
         return {key: value[rows] for key, value in self.starts.items()}

@@ -56,6 +56,7 @@ class TrainingRunner(OnPolicyRunner):
         group: TrainingGroup | None = None,
     ) -> None:
         self.training, self.folder = training, folder
+        self._share_spent = 0.0
         self.group = group or TrainingGroup(env.device)
         offered = list(map(str, env.get_observations().keys()))
         _require_groups(training.runner["obs_groups"], offered)
@@ -96,9 +97,12 @@ class TrainingRunner(OnPolicyRunner):
                     self.checkpoint()
 
     def _follow_schedules(self, share_spent: float) -> None:
-        """Set the divergence to aim at, the cap of the noise and the teacher's weight."""
+        """Set all that changes with the spent share of the budget."""
+        self._share_spent = share_spent
         self.alg.desired_kl = self.training.divergence(share_spent)  # type: ignore[assignment]
         distribution, teacher = self.alg.actor.distribution, self.training.teacher
+        if self.training.near_starts:
+            self.env.draw_near(self.training.near_starts.share_at(share_spent))
         if self.training.exploration and isinstance(distribution, CappedGaussian):
             distribution.set_cap(self.training.exploration.cap_at(share_spent))
         if teacher and isinstance(self.alg, DevicePPO):
@@ -165,7 +169,7 @@ class TrainingRunner(OnPolicyRunner):
         content = self.alg.save() | {
             "iter": self.current_learning_iteration,
             "learning_rate": self.alg.learning_rate,
-            "desired_kl": self.alg.desired_kl,
+            "share_spent": self._share_spent,
             **own,
             "others": parts[1:],
             "book": self.logger.state_dict(),
@@ -230,7 +234,7 @@ class TrainingRunner(OnPolicyRunner):
                 self.env.load_state_dict(part["env"])
                 set_random_state(part["random"], self.device)
             self.alg.learning_rate = content["learning_rate"]
-            self.alg.desired_kl = content["desired_kl"]
+            self._follow_schedules(content["share_spent"])
             self.current_learning_iteration = content["iter"]
             self.logger.load_state_dict(content["book"])  # last: it rewrites progress.csv
         except (KeyError, RuntimeError) as error:

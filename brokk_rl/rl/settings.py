@@ -31,6 +31,7 @@ SETTLED_PART = 0.9
 CAPPED = "brokk_rl.rl.ppo:CappedGaussian"
 """The distribution whose cap `Exploration` moves."""
 PositiveShare = Annotated[float, Interval(gt=0, le=1)]
+ShareBelowOne = Annotated[float, Interval(ge=0, lt=1)]
 Widths = Annotated[tuple[Count, ...], MinLen(1)]
 Activation = Literal[
     "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish",
@@ -159,14 +160,20 @@ class NearStarts:
     """Starts of a training that begin near the target.
 
     Attributes:
-        share: Part of the starts that are moved there, the tool upright above its target.
+        share: Part of the episodes that begin there, the tool upright above its target, at the
+            beginning and at the end of the budget; linear between them.
         height_m: Heights above the target, (lowest, highest).
         way: Parts of the way back to the drawn arm, (least, most), on which they begin.
     """
 
-    share: PositiveShare
+    share: tuple[ShareBelowOne, ShareBelowOne]
     height_m: Range
     way: Annotated[tuple[Share, Share], Ordered()]
+
+    def share_at(self, share_spent: float) -> float:
+        """Return the part of the episodes when this share of the budget is spent."""
+        first, last = self.share
+        return first + (last - first) * min(1.0, share_spent)
 
 
 @spec

@@ -10,8 +10,6 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from brokk_rl.kinematics import Kinematics
-from brokk_rl.machine import Machine
 from tasks import terms
 from tasks.term_task import RewardCurriculum, RewardTerm
 from tasks.terms import ToolState
@@ -31,7 +29,6 @@ def state() -> ToolState:
         age=torch.tensor([4.0]),
         period_s=0.05,
         start={},
-        kinematics=None,  # type: ignore[arg-type]
         held_share=torch.zeros(1),
         tip_m=torch.tensor([[2.5, 0.0, 0.9]]),
         pitch_rad=torch.tensor([1.25]),
@@ -119,18 +116,11 @@ def test_contact_costs_its_force_only_far_from_the_hole(
     assert terms.far_contact(touching, largest=0.7).item() == pytest.approx(expected)
 
 
-def test_travel_of_the_valves_and_speed_of_the_tip_are_those_of_the_last_period(
-    state: ToolState, machine: Machine
-) -> None:
-    q, u = torch.zeros(1, 3, 5), torch.zeros(1, 3, 5)
+def test_travel_of_the_valves_is_that_of_the_last_period(state: ToolState) -> None:
+    u = torch.zeros(1, 3, 5)
     u[0, :, 0] = torch.tensor([0.9, 0.5, 0.25])
-    q[0, 1:, 0] = torch.tensor([0.1, 0.1001])
-    moved = replace(state, history=History(q=q, u=u), kinematics=Kinematics(machine))
+    moved = replace(state, history=History(q=u, u=u))
     assert terms.valve_travel(moved).item() == pytest.approx(0.25 / 0.05)
-    moved = replace(moved, tip_m=Kinematics(machine).pose(q[:, -1]).tip_in_base_m)
-    # the arm is stretched to 5.2 m and slews by 1e-4 rad
-    speed_m_s = moved.tip_velocity_m_s.norm().item()
-    assert speed_m_s == pytest.approx(5.2 * 1e-4 / 0.05, rel=1e-2)
     assert not moved.is_first and replace(state, age=torch.tensor([1.0])).is_first
 
 

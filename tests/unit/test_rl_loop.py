@@ -240,10 +240,13 @@ def test_without_a_compiler_it_says_what_to_do(
         loop.capture(fuse=True)
 
 
+NEAR = NearStarts(share=(0.5, 0.0), height_m=(0.05, 0.3), way=(0.0, 0.0))
+
+
 def test_part_of_the_starts_of_a_training_lies_above_the_target(machine: Machine) -> None:
     loop = make(machine)
     before = {name: value.clone() for name, value in loop.starts.items()}
-    loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3), way=(0.0, 0.0)), 1)
+    loop.bring_near(NEAR, 1)
     start = loop.starts
     pose = Kinematics(machine).pose(start["q"][:32])
     away = pose.tip_in_base_m - start["target_m"][:32]
@@ -257,6 +260,13 @@ def test_part_of_the_starts_of_a_training_lies_above_the_target(machine: Machine
         assert torch.equal(start[name], before[name])
     assert (start["closeness"][:32][near] > before["closeness"][:32][near]).all()
     assert (loop.world.q[:, None] == start["q"]).all(2).any(1).all(), "the episodes begin there"
+    for share, most in ((NEAR.share_at(0.5), 0.25), (NEAR.share_at(1.0), 0.0)):
+        loop.draw_near(share)
+        found = []
+        for _ in range(64):
+            loop.begin()
+            found.append((loop.world.q[:, None] == start["q"][:32]).all(2).any(1).float())
+        assert torch.stack(found).mean().item() == pytest.approx(most, abs=0.08)
 
 
 def test_a_task_that_cannot_bring_its_starts_near_says_so(
@@ -265,7 +275,7 @@ def test_a_task_that_cannot_bring_its_starts_near_says_so(
     loop = make(machine)
     monkeypatch.setattr(type(loop.task), "offers", frozenset())
     with pytest.raises(ConfigError, match=r"no starts near its target.*rl\.near_starts=null"):
-        loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3), way=(0.0, 0.0)), 1)
+        loop.bring_near(NEAR, 1)
 
 
 class _Pointing:

@@ -24,7 +24,7 @@ def state(q: torch.Tensor | None = None, **changes: Any) -> StepState:
     fields: dict[str, Any] = {name: torch.zeros(3) for name in names}
     fields |= {name: torch.zeros(3, 2) for name in ("u", "u_before")}
     still = (torch.zeros(3, 2) if q is None else q)[:, None]
-    fields |= {"history": History(q=still, u=still), "start": {}, "kinematics": None}
+    fields |= {"history": History(q=still, u=still), "start": {}}
     fields |= {"lower": -torch.ones(2), "upper": torch.ones(2), "tip_m": torch.zeros(3, 3)}
     fields |= {"max_steps": 10, "period_s": 0.05, "success": NOWHERE, "failed": NOWHERE}
     return StepState(**fields | changes)
