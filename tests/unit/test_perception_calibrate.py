@@ -153,17 +153,17 @@ BASELINE_M, DISPARITY_ERROR_PX = 0.12, 0.25
 
 @pytest.fixture(scope="module")
 def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty pairs of the board in poses of the arm, one picture of nothing, and `joints.yaml`; the right camera is off."""
+    """Sixteen pairs of the board in poses of the arm, one picture of nothing, and `joints.yaml`; the right camera is off."""
     folder, chance = tmp_path_factory.mktemp("board"), np.random.default_rng(0)
     other, right = np.random.default_rng(1), np.eye(4)
     right[0, 3] = -BASELINE_M
-    poses = board.posed(option("machine", "brokk170"), 20, 0, 0.002, 0.001, 0.0005)
+    poses = board.posed(option("machine", "brokk170"), 16, 0, 0.002, 0.001, 0.0005)
     dataset.write_camera(folder, board.MATRIX, (1280, 720), None, BASELINE_M)
     for number, there in enumerate(poses.camera_from_board):
         dataset.write_picture(folder / f"{number:03d}.color.png", board.picture(there, chance))
         partner = board.picture(right @ there, other, -DISPARITY_ERROR_PX)
         dataset.write_picture(folder / f"{number:03d}.right.png", partner)
-    dataset.write_picture(folder / "020.color.png", np.full((720, 1280, 3), 90, np.uint8))
+    dataset.write_picture(folder / "016.color.png", np.full((720, 1280, 3), 90, np.uint8))
     told = {f"{number:03d}": q.tolist() for number, q in enumerate(poses.q)}
     (folder / "joints.yaml").write_text(yaml.safe_dump(told))
     return folder
@@ -178,14 +178,14 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     told = yaml.safe_load(Path("run/calibration.yaml").read_text())
     mm, degrees = off(np.array(told["T_base_cam"]))
     assert mm < 6.0 and degrees < 0.2
-    assert told["num_used"] >= 19 and told["missing"] == [] and told["corners_px"] < 0.3
+    assert told["num_used"] >= 15 and told["missing"] == [] and told["corners_px"] < 0.3
     away = transforms.compute_motion(np.array(told["T_base_cam"]), board.CAMERA)
     assert away @ np.linalg.solve(np.array(told["covariance"]), away) < 25.0
     assert told["other_half"]["median_m"] < 0.01
     disparity = told["disparity"]
     assert disparity["error_px"][0] == pytest.approx(DISPARITY_ERROR_PX, abs=0.1)
-    assert disparity["num_views"] >= 19
-    (lost,) = (one for one in told["poses"] if one["name"] == "020")
+    assert disparity["num_views"] >= 15
+    (lost,) = (one for one in told["poses"] if one["name"] == "016")
     assert "corners of the board" in lost["left_out"]
     folder = FrameFolder(
         folder=str(footage), rate_hz=1.0, least_known=0.0, needs="camera", base_from_camera="run/calibration.yaml",
@@ -212,7 +212,7 @@ def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
 ) -> None:
     same = {
         f"{number:03d}": (board.MIDDLE + 0.02 * number * np.eye(5)[4]).tolist()
-        for number in range(20)
+        for number in range(16)
     }
     Path("same.yaml").write_text(yaml.safe_dump(same))
     command = ("mode=calibrate", f"calibration.source.folder={footage}", "session.out=run")
@@ -252,7 +252,7 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
         q=q,
     )
     record.write_recording(recording, tmp_path / "run.parquet")
-    frame_s, late_s, chance = np.arange(0.5, 11.5, 0.3), 0.12, np.random.default_rng(0)
+    frame_s, late_s, chance = np.arange(0.5, 11.5, 0.4), 0.12, np.random.default_rng(0)
     dataset.write_camera(tmp_path, board.MATRIX, (1280, 720), None, None)
     there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)
     links = arm.compute_link_poses(machine, there).base_from_link
@@ -261,7 +261,7 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
         dataset.write_picture(tmp_path / f"{number:03d}.color.png", board.picture(seen, chance))
     # the folder's first frame is at 0 s, the recording's clock says 0.5 + 0.12 s then
     done = brokk(
-        "mode=calibrate", f"calibration.source.folder={tmp_path}", "calibration.source.rate_hz=3.3333333",
+        "mode=calibrate", f"calibration.source.folder={tmp_path}", "calibration.source.rate_hz=2.5",
         f"calibration.joints={tmp_path / 'run.parquet'}", "session.out=run",
     )  # fmt: skip
     assert done.code == 0, done.err
