@@ -7,9 +7,6 @@ matcher in it is the same at every distance.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import cv2
 import numpy as np
 
@@ -19,53 +16,14 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
 from perception.pose.plane import DEGENERATE, compare_pair
 
-ONE, X, Y, XX, XY, YY = (0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)
-"""Powers of y and x: indices of the sums over pixels."""
 
-
-@dataclass(frozen=True)
-class SightGrid:
-    """Lines of sight `(x, y, 1)` of the pixels of a coarse picture.
-
-    Attributes:
-        x: First coordinate of each column, `(w,)`.
-        y: Second coordinate of each row, `(h,)`.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-
-    @staticmethod
-    def of(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> SightGrid:
-        """Return the grid of the middles of cells of `step` x `step` px."""
-        y, x = (
-            (
-                (np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]
-            ).astype(np.float32)
-            for count, k in zip(shape, (1, 0), strict=True)
-        )
-        return SightGrid(x, y)
-
-    def sight(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return lines of sight, `(…, 3)`."""
-        return np.stack([self.x[columns], self.y[rows], np.ones(rows.shape, np.float32)], -1)
-
-    @cached_property
-    def half(self) -> SightGrid:
-        """Grid of every second row and column, in double precision."""
-        return SightGrid(self.x[::2].astype(float), self.y[::2].astype(float))
-
-    @cached_property
-    def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: sums over pixels are products with both."""
-        across = np.stack([np.ones_like(self.x), self.x, self.x * self.x])
-        down = np.stack([np.ones_like(self.y), self.y, self.y * self.y])
-        return across, down
-
-    def inverse(self, plane: np.ndarray) -> np.ndarray:
-        """Return inverse depth on a plane, `(h, w)`."""
-        plane = plane.astype(self.x.dtype)
-        return plane[0] * self.x + (plane[1] * self.y + plane[2])[:, None]
+def compute_sight_rays(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> np.ndarray:
+    """Return the lines of sight `(x, y, 1)` of the middles of cells of `step` x `step` px, `(h, w, 3)`."""
+    rays = np.ones((*shape, 3), np.float32)
+    for k, place in enumerate((np.arange(shape[1])[None, :], np.arange(shape[0])[:, None])):
+        middle = place * step + step // 2
+        rays[..., k] = (middle - camera_matrix[k, 2]) / camera_matrix[k, k]
+    return rays
 
 
 def scale_noise(noise_per_m: float, frame: Frame) -> float:
@@ -76,13 +34,6 @@ def scale_noise(noise_per_m: float, frame: Frame) -> float:
     square root the segmenter finds the block in haze and in the dark as often as before.
     """
     return noise_per_m * compare_pair(frame) * float(np.sqrt(frame.depth_shrink))
-
-
-def arrange_squares(sums: np.ndarray) -> np.ndarray:
-    """Return the sums of products of x, y and 1, `(3, 3)`, from sums of `x^i y^j`, `[j, i]`."""
-    return np.array(
-        [[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))]
-    )
 
 
 @spec
@@ -158,10 +109,10 @@ class PlaneSegmenter:
                 "and its range"
             )
         self._tolerance = self._settings.num_sigma * scale_noise(self._settings.noise_per_m, frame)
-        grid = SightGrid.of(frame.camera_matrix, inverse.shape, step)
+        rays = compute_sight_rays(frame.camera_matrix, inverse.shape, step)
         face = np.zeros(inverse.shape, np.uint8)
-        for plane in self._planes(grid, inverse, known):
-            face |= self._faces(plane, grid, inverse, known)
+        for plane in self._planes(rays, inverse, known):
+            face |= self._faces(plane, rays, inverse, known)
         mask = np.zeros((height, width), np.float32)
         # The last cells may be smaller ones.
         size = (min(len(face[0]) * step, width), min(len(face) * step, height))
@@ -170,7 +121,7 @@ class PlaneSegmenter:
         )
         return Masks(mask, None)
 
-    def _planes(self, grid: SightGrid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
+    def _planes(self, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
         """Return planes `n / d`, `(3,)`, the best supported first, each of pixels left by those before."""
         settings, generator = self._settings, np.random.default_rng(self._settings.seed)
         found, rest = [], known.copy()
@@ -178,27 +129,23 @@ class PlaneSegmenter:
             there = np.flatnonzero(rest)
             if len(there) < settings.min_area * known.size:
                 break
-            trials = self._trials(grid, inverse, rest, there, generator)
+            trials = self._trials(rays, inverse, rest, there, generator)
             judge = there[generator.integers(len(there), size=settings.num_samples)]
-            rows, columns = np.divmod(judge, inverse.shape[1])
-            votes = np.count_nonzero(
-                np.abs(trials @ grid.sight(rows, columns).T - inverse[rows, columns])
-                < self._tolerance,
-                axis=1,
-            )
+            off = trials @ rays.reshape(-1, 3)[judge].T - inverse.ravel()[judge]
+            votes = np.count_nonzero(np.abs(off) < self._tolerance, axis=1)
             best = int(votes.argmax()) if len(votes) else 0
             if (
                 not len(votes)
                 or votes[best] / settings.num_samples * len(there) < settings.min_area * known.size
             ):
                 break
-            found.append(self._refined(trials[best], grid, inverse, rest))
-            rest &= np.abs(grid.inverse(found[-1]) - inverse) >= self._tolerance
+            found.append(self._refined(trials[best], rays, inverse, rest))
+            rest &= np.abs(rays @ found[-1].astype(np.float32) - inverse) >= self._tolerance
         return found
 
     def _trials(
         self,
-        grid: SightGrid,
+        rays: np.ndarray,
         inverse: np.ndarray,
         rest: np.ndarray,
         there: np.ndarray,
@@ -212,12 +159,10 @@ class PlaneSegmenter:
         corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
         corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
         # (3 pixels, trials)
-        x, y, value = (
-            grid.x[corner_columns],
-            grid.y[corner_rows],
-            inverse[corner_rows, corner_columns],
-        )
-        usable = rest[corner_rows, corner_columns].all(0)
+        corners = corner_rows, corner_columns
+        x, y, _ = np.moveaxis(rays[corners], -1, 0)
+        value = inverse[corners]
+        usable = rest[corners].all(0)
         dx = x[1:] - x[0]
         dy = y[1:] - y[0]
         rise = value[1:] - value[0]
@@ -231,28 +176,26 @@ class PlaneSegmenter:
         )
 
     def _refined(
-        self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
+        self, plane: np.ndarray, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
         """Return the least-squares plane of the pixels that agree with `plane`."""
-        grid, inverse, known = grid.half, inverse[::2, ::2], known[::2, ::2]
-        across, down = grid.powers
+        # A quarter of the pixels tells it as well.
+        known = known[::2, ::2]
+        rays, inverse = rays[::2, ::2][known].astype(float), inverse[::2, ::2][known]
         for _ in range(2):
-            inside = (known & (np.abs(grid.inverse(plane) - inverse) < self._tolerance)).astype(
-                float
-            )
-            sums = arrange_squares(down @ inside @ across.T)  # of x^i y^j over the pixels, [j, i]
+            inside = np.abs(rays @ plane - inverse) < self._tolerance
+            sums = rays[inside].T @ rays[inside]
             if np.linalg.cond(sums) > DEGENERATE:
                 break
-            held = down[:2] @ (inside * inverse) @ across[:2].T
-            plane = np.linalg.solve(sums, np.array([held[0, 1], held[1, 0], held[0, 0]]))
+            plane = np.linalg.solve(sums, rays[inside].T @ inverse[inside])
         return plane
 
     def _faces(
-        self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
+        self, plane: np.ndarray, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
         """Return the connected pieces of a plane that can be faces of a block, `(h, w)` uint8."""
         settings = self._settings
-        excess = inverse - grid.inverse(plane)  # > 0: nearer than the plane
+        excess = inverse - rays @ plane.astype(np.float32)  # > 0: nearer than the plane
         support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
@@ -268,21 +211,21 @@ class PlaneSegmenter:
         faces = np.zeros_like(support)
         # Ground and wall are too large for a face. Pieces that an occluder cuts off from them must
         # also stand in front of their surroundings; a face by itself may have none in sight.
-        extents_m = [_measure_extents(piece, plane, grid) for piece in pieces]
+        extents_m = [_measure_extents(piece, plane, rays) for piece in pieces]
         wide = any(extent.prod() > settings.max_extent_m**2 for extent in extents_m)
         for piece, extent in zip(pieces, extents_m, strict=True):
-            if self._fits(piece, extent, plane, grid) and (
+            if self._fits(piece, extent, plane, rays) and (
                 not wide or self._front(piece, excess, known) >= settings.min_front
             ):
                 faces |= piece
         # An arm cuts a face into pieces; the smaller ones have hardly any surroundings but the arm.
         for piece in pieces if faces.any() else ():
-            if _measure_extents(faces | piece, plane, grid).max() <= settings.max_extent_m:
+            if _measure_extents(faces | piece, plane, rays).max() <= settings.max_extent_m:
                 faces |= piece
         return faces
 
     def _fits(
-        self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: SightGrid
+        self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, rays: np.ndarray
     ) -> bool:
         """Return whether a piece of a plane has the size of a face and is turned to the camera."""
         if (
@@ -291,9 +234,7 @@ class PlaneSegmenter:
         ):
             return False
         sums = cv2.moments(piece, binaryImage=True)
-        sight = grid.sight(
-            np.array(round(sums["m01"] / sums["m00"])), np.array(round(sums["m10"] / sums["m00"]))
-        )
+        sight = rays[round(sums["m01"] / sums["m00"]), round(sums["m10"] / sums["m00"])]
         tilt_rad = np.arccos(
             np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0)
         )
@@ -324,14 +265,10 @@ def _fill_holes(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
     return np.where(nearer > 0, np.uint8(0), np.asarray(whole, np.uint8))
 
 
-def _measure_extents(piece: np.ndarray, plane: np.ndarray, grid: SightGrid) -> np.ndarray:
+def _measure_extents(piece: np.ndarray, plane: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Return the two extents in m that a rectangle with the piece's second moments would have."""
-    depth = piece[::2, ::2] / np.maximum(grid.half.inverse(plane), 1e-6)
-    across, down = grid.half.powers
-    # Moments of x^i y^j, at [j, i].
-    first, second = down[:2] @ depth @ across[:2].T, down @ (depth * depth) @ across.T
-    number = np.count_nonzero(depth)
-    middle = np.array([first[0, 1], first[1, 0], first[0, 0]]) / number
+    seen = rays[::2, ::2][piece[::2, ::2] > 0].astype(float)
+    points_m = seen / np.maximum(seen @ plane, 1e-6)[:, None]
     # The smallest is the plane's own thickness.
-    spread = np.linalg.eigvalsh(arrange_squares(second) / number - np.outer(middle, middle))[1:]
+    spread = np.linalg.eigvalsh(np.cov(points_m.T, bias=True))[1:]
     return np.sqrt(12.0 * np.maximum(spread, 0.0))
