@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from perception.render.drilled_block import FRONT, Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
+from perception.render.scene_ranges import BlockRanges, draw_integer, draw_uniform
 from perception.render.solids import SolidPose, build_frame
-
-if TYPE_CHECKING:
-    from perception.render.scene_ranges import BlockRanges
 
 MARK_M = 0.002
 """Texel of painted marks: stains, wet patches, cracks."""
@@ -30,48 +27,34 @@ def draw_block(
     generator: np.random.Generator,
 ) -> DrilledBlock:
     """Return a block that faces along `normal`, its first hole (or its middle) at `target`."""
-    half = (
-        np.array(
-            [
-                generator.uniform(*kind.length_m),
-                generator.uniform(*kind.width_m),
-                generator.uniform(*kind.thickness_m),
-            ]
-        )
-        / 2
-    )
-    radius = float(generator.uniform(*kind.radius_m))
-    edge = float(generator.uniform(*kind.edge_m))
-    num_holes = int(generator.integers(kind.holes[0], kind.holes[1] + 1))
-    num_discs = int(generator.integers(kind.decoys[0], kind.decoys[1] + 1))
-    radii = [radius] * num_holes + [
-        float(generator.uniform(*kind.decoy_radius_m)) for _ in range(num_discs)
-    ]
+    sides = (kind.length_m, kind.width_m, kind.thickness_m)
+    half = np.array([draw_uniform(side, generator) for side in sides]) / 2
+    radius = draw_uniform(kind.radius_m, generator)
+    edge = draw_uniform(kind.edge_m, generator)
+    num_holes = draw_integer(kind.holes, generator)
+    num_discs = draw_integer(kind.decoys, generator)
+    radii = [radius] * num_holes
+    radii += [draw_uniform(kind.decoy_radius_m, generator) for _ in range(num_discs)]
     places = _scatter_discs(half[:2], radii, edge, generator)
     holes = []
     for place in places[:num_holes]:
-        holes.append(_draw_hole(kind, np.array([*place, half[2]]), radius, FRONT, generator))
-    for _ in range(int(generator.integers(kind.side_holes[0], kind.side_holes[1] + 1))):
+        depth = draw_uniform(kind.depth_m, generator)
+        holes.append(DrilledHole(np.array([*place, half[2]]), radius, depth, FRONT))
+    for _ in range(draw_integer(kind.side_holes, generator)):
         holes.append(_draw_side_hole(kind, half, radius, edge, generator))
-    discs = tuple(
-        Disc(np.array([*place, half[2]]), size)
-        for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
-    )
-    chips = tuple(chip for hole in holes[:num_holes] for chip in _draw_chips(kind, hole, generator))
-    chips += tuple(
-        dent for hole in holes[:num_holes] for dent in _draw_dents(kind, hole, generator)
-    )
+    discs = []
+    for place, size in zip(places[num_holes:], radii[num_holes:], strict=False):
+        discs.append(Disc(np.array([*place, half[2]]), size))
+    chips = []
+    for hole in holes[:num_holes]:
+        chips += _draw_chips(kind, hole, generator)
+    for hole in holes[:num_holes]:
+        chips += _draw_dents(kind, hole, generator)
     rotation = build_frame(normal, turn_rad)
     first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
     pose = SolidPose(rotation, target - rotation @ first)
-    return DrilledBlock(
-        pose,
-        half,
-        draw_block_materials(kind, half, holes, discs, generator),
-        tuple(holes),
-        chips,
-        discs,
-    )
+    materials = draw_block_materials(kind, half, holes, discs, generator)
+    return DrilledBlock(pose, half, materials, tuple(holes), tuple(chips), tuple(discs))
 
 
 def _scatter_discs(
@@ -94,12 +77,6 @@ def _scatter_discs(
     return found
 
 
-def _draw_hole(
-    kind: BlockRanges, center: np.ndarray, radius: float, part: int, generator: np.random.Generator
-) -> DrilledHole:
-    return DrilledHole(center, radius, float(generator.uniform(*kind.depth_m)), part)
-
-
 def _draw_side_hole(
     kind: BlockRanges, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator
 ) -> DrilledHole:
@@ -117,8 +94,8 @@ def _draw_side_hole(
 def _draw_chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
     """Return pieces broken off a rim: balls that cut bowls of radius `chip_m` into it."""
     found = []
-    for _ in range(int(generator.integers(kind.chips[0], kind.chips[1] + 1))):
-        angle, wide = generator.uniform(-np.pi, np.pi), float(generator.uniform(*kind.chip_m))
+    for _ in range(draw_integer(kind.chips, generator)):
+        angle, wide = generator.uniform(-np.pi, np.pi), draw_uniform(kind.chip_m, generator)
         found.append(_draw_bowl(hole, angle, hole.radius_m, wide, generator))
     return found
 
@@ -126,8 +103,8 @@ def _draw_chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Gener
 def _draw_dents(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
     """Return bowls of radius `dent_m` that a chisel left in the face beside a rim."""
     found = []
-    for _ in range(int(generator.integers(kind.dents[0], kind.dents[1] + 1))):
-        angle, wide = generator.uniform(-np.pi, np.pi), float(generator.uniform(*kind.dent_m))
+    for _ in range(draw_integer(kind.dents, generator)):
+        angle, wide = generator.uniform(-np.pi, np.pi), draw_uniform(kind.dent_m, generator)
         # Beyond the rim, up to a hole's diameter away: a chisel that misses lands near.
         away = hole.radius_m + wide + generator.uniform(0.0, 2.0 * hole.radius_m)
         found.append(_draw_bowl(hole, angle, away, wide, generator))
@@ -147,35 +124,27 @@ def draw_block_materials(
     kind: BlockRanges,
     half: np.ndarray,
     holes: Sequence[DrilledHole],
-    discs: tuple[Disc, ...],
+    discs: Sequence[Disc],
     generator: np.random.Generator,
 ) -> tuple[Material, ...]:
     """Return the materials of all parts of the block; see `Block`."""
-    bright, grain = (
-        float(generator.uniform(*kind.brightness)),
-        float(generator.uniform(*kind.grain)),
-    )
+    bright = draw_uniform(kind.brightness, generator)
+    grain = draw_uniform(kind.grain, generator)
     tint = 1.0 + 0.04 * generator.standard_normal(3)
     texture, marks = int(generator.integers(NUM_TEXTURES)), _paint_marks(kind, half, generator)
 
     def stone(brightness: float, contrast: float, with_marks: bool = False) -> Material:
-        red, green, blue = np.clip(brightness * tint, 0.005, 0.95)
-        shift = generator.uniform(0, TEXTURE_SIDE, 2)
-        return Material(
-            (float(red), float(green), float(blue)),
-            contrast,
-            0.0006,
-            texture,
-            (float(shift[0]), float(shift[1])),
-            (marks, MARK_M) if with_marks else None,
-        )
+        color = tuple(np.clip(brightness * tint, 0.005, 0.95).tolist())
+        shift = tuple(generator.uniform(0, TEXTURE_SIDE, 2).tolist())
+        painted = (marks, MARK_M) if with_marks else None
+        return Material(color, contrast, 0.0006, texture, shift, painted)
 
     face, drilled = stone(bright, grain, True), stone(0.8 * bright, grain)
     parts = [face] * 6
     for _ in holes:
-        parts += [drilled, stone(float(generator.uniform(*kind.fill_brightness)), grain)]
+        parts += [drilled, stone(draw_uniform(kind.fill_brightness, generator), grain)]
     parts.append(stone(1.1 * bright, 1.5 * grain))
-    parts += [stone(float(generator.uniform(*kind.decoy_brightness)), grain) for _ in discs]
+    parts += [stone(draw_uniform(kind.decoy_brightness, generator), grain) for _ in discs]
     return tuple(parts)
 
 
@@ -183,32 +152,24 @@ def _paint_marks(kind: BlockRanges, half: np.ndarray, generator: np.random.Gener
     """Return the relative brightness of stains, wet patches and cracks, `(h, w)` float32."""
     size = (2.4 * half[[1, 0]] / MARK_M).astype(int)
     marks = np.ones(tuple(size), np.float32)
-    for _ in range(int(generator.integers(kind.stains[0], kind.stains[1] + 1))):
-        blotch = cv2.resize(
-            generator.standard_normal((8, 8)).astype(np.float32),
-            (size[1], size[0]),
-            interpolation=cv2.INTER_CUBIC,
-        )
+    for _ in range(draw_integer(kind.stains, generator)):
+        coarse = generator.standard_normal((8, 8)).astype(np.float32)
+        blotch = cv2.resize(coarse, (size[1], size[0]), interpolation=cv2.INTER_CUBIC)
         center, spread = generator.uniform(0, size[::-1]), generator.uniform(15, 120)
         x, y = np.arange(size[1], dtype=np.float32), np.arange(size[0], dtype=np.float32)
         far = np.sqrt((x[None] - center[0]) ** 2 + (y[:, None] - center[1]) ** 2) / spread
         soft = float(generator.uniform(0.02, 0.4))
         cover = np.clip((1.0 - far + 0.35 * blotch) / soft, 0.0, 1.0)
-        marks *= 1.0 - cover * (1.0 - float(generator.uniform(*kind.stain_brightness)))
-    for _ in range(int(generator.integers(kind.cracks[0], kind.cracks[1] + 1))):
+        marks *= 1.0 - cover * (1.0 - draw_uniform(kind.stain_brightness, generator))
+    for _ in range(draw_integer(kind.cracks, generator)):
         steps = (
             generator.standard_normal((12, 2)).cumsum(0) * 6
             + generator.uniform(-1, 1, 2) * np.arange(12)[:, None] * 25
         )
         line = (steps + generator.uniform(0, size[::-1])).astype(np.int32)
         dark = float(generator.uniform(0.3, 0.8))
-        painted = cv2.polylines(
-            np.zeros_like(marks),
-            [line[:, None]],
-            False,
-            1.0,
-            int(generator.integers(1, 3)),
-            cv2.LINE_AA,
-        )
+        thick = int(generator.integers(1, 3))
+        blank = np.zeros_like(marks)
+        painted = cv2.polylines(blank, [line[:, None]], False, 1.0, thick, cv2.LINE_AA)
         marks *= 1.0 - (1.0 - dark) * np.minimum(painted, 1.0)
     return marks

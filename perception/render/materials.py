@@ -30,11 +30,11 @@ class Material:
             in m; repeats beyond.
     """
 
-    color: tuple[float, float, float]
+    color: tuple[float, ...]
     contrast: float
     texel_m: float
     texture: int = 0
-    shift: tuple[float, float] = (0.0, 0.0)
+    shift: tuple[float, ...] = (0.0, 0.0)
     marks: tuple[np.ndarray, float] | None = None
 
     def albedo(self, uv_m: np.ndarray, pixel_m: np.ndarray) -> np.ndarray:

@@ -79,47 +79,26 @@ def _build_arm(
     thick = float(generator.uniform(0.05, 0.12))
     # The yellow of a demolition machine, faded and dirty to a varying degree. Chosen by hand; not
     # searched.
-    yellow = np.clip(
-        np.array([0.75, 0.45, 0.08]) * generator.uniform(0.3, 1.2)
-        + 0.05 * generator.standard_normal(3),
-        0.02,
-        0.9,
-    )
-    paint = Material(
-        (float(yellow[0]), float(yellow[1]), float(yellow[2])),
-        0.08,
-        0.002,
-        int(generator.integers(4)),
-    )
+    faded = np.array([0.75, 0.45, 0.08]) * generator.uniform(0.3, 1.2)
+    yellow = np.clip(faded + 0.05 * generator.standard_normal(3), 0.02, 0.9)
+    paint = Material(tuple(yellow.tolist()), 0.08, 0.002, int(generator.integers(4)))
     grey = float(generator.uniform(0.03, 0.3))
     steel = Material((grey, grey, grey), 0.15, 0.001, int(generator.integers(4)))
     length = float(generator.uniform(0.6, 1.5))
-    pose = np.stack([sideways, along, np.cross(sideways, along)], 1)
+    turn = np.stack([sideways, np.cross(along, sideways), along], 1)
+    place = SolidPose(turn, start + wide * sideways)
     # Booms are boxes or tubes; both look alike to no network.
     if generator.random() < 0.5:
-        boom: Solid = Box(
-            "arm",
-            SolidPose(pose, start + wide * sideways),
-            np.array([wide, length, thick]),
-            (paint,),
-        )
+        flat = SolidPose(np.stack([sideways, along, np.cross(sideways, along)], 1), place.center_m)
+        boom: Solid = Box("arm", flat, np.array([wide, length, thick]), (paint,))
     else:
-        turn = np.stack([sideways, np.cross(along, sideways), along], 1)
-        boom = Cylinder("arm", SolidPose(turn, start + wide * sideways), wide, length, (paint,))
-    hose_turn = np.stack([sideways, np.cross(along, sideways), along], 1)
-    hose = Cylinder(
-        "arm",
-        SolidPose(hose_turn, start + 2.3 * wide * sideways + 0.08 * ray),
-        0.025,
-        length,
-        (steel,),
-    )
+        boom = Cylinder("arm", place, wide, length, (paint,))
+    beside = SolidPose(turn, start + 2.3 * wide * sideways + 0.08 * ray)
+    hose = Cylinder("arm", beside, 0.025, length, (steel,))
     # The chisel leans towards the camera, as a tool over the block does.
-    chisel_axis = 0.8 * ray + 0.6 * along
-    chisel_place = start + 3.2 * wide * sideways + 0.1 * along
-    chisel = Cylinder(
-        "arm", SolidPose(build_frame(chisel_axis, 0.0), chisel_place), 0.04, 0.25, (steel,)
-    )
+    leaning = build_frame(0.8 * ray + 0.6 * along, 0.0)
+    chisel_pose = SolidPose(leaning, start + 3.2 * wide * sideways + 0.1 * along)
+    chisel = Cylinder("arm", chisel_pose, 0.04, 0.25, (steel,))
     return [boom, hose, chisel]
 
 
@@ -187,12 +166,10 @@ def add_surroundings(
     exposure, level = _draw_exposure(kind, light, normal, target, generator)
     # The sky is a little darker than its light on a surface. Chosen by hand; not searched.
     sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
-    hidden_parts = (
-        tuple(compute_hidden_share(solids, block, hole) for hole in block.holes) if block else ()
-    )
-    hidden_discs = (
-        tuple(compute_hidden_share(solids, block, disc) for disc in block.discs) if block else ()
-    )
+    hidden_parts, hidden_discs = (), ()
+    if block:
+        hidden_parts = tuple(compute_hidden_share(solids, block, hole) for hole in block.holes)
+        hidden_discs = tuple(compute_hidden_share(solids, block, disc) for disc in block.discs)
     sight = target / np.linalg.norm(target)
     conditions = {
         "distance_m": float(np.linalg.norm(target)),
@@ -248,18 +225,13 @@ def _draw_target(
     up -= ray * (up @ ray)
     up /= np.linalg.norm(up)
     side = np.cross(ray, up)
-    azimuth, obliquity = (
-        draw_uniform(kind.sight.azimuth_rad, generator),
-        # The normal leans from the line of sight by the obliquity.
-        draw_uniform(kind.sight.obliquity_rad, generator),
-    )
+    azimuth = draw_uniform(kind.sight.azimuth_rad, generator)
+    # The normal leans from the line of sight by the obliquity.
+    obliquity = draw_uniform(kind.sight.obliquity_rad, generator)
     lean = math.cos(azimuth) * up + math.sin(azimuth) * side
     normal = -math.cos(obliquity) * ray + math.sin(obliquity) * lean
-    return (
-        ray * draw_uniform(kind.sight.distance_m, generator),
-        normal,
-        float(generator.uniform(-np.pi, np.pi)),
-    )
+    target = ray * draw_uniform(kind.sight.distance_m, generator)
+    return target, normal, float(generator.uniform(-np.pi, np.pi))
 
 
 def draw_material(
@@ -272,41 +244,24 @@ def draw_material(
     """Return a material of about this brightness, of a random pattern and a slight tint."""
     color = brightness * (1.0 + tint * generator.standard_normal(3))
     pattern = int(generator.integers(NUM_TEXTURES))
-    shift = tuple(generator.uniform(0, TEXTURE_SIDE, 2))
-    red, green, blue = np.clip(color, 0.01, 0.95)
-    return Material(
-        (float(red), float(green), float(blue)),
-        contrast,
-        texel_m,
-        pattern,
-        (float(shift[0]), float(shift[1])),
-    )
+    shift = generator.uniform(0, TEXTURE_SIDE, 2)
+    color = tuple(np.clip(color, 0.01, 0.95).tolist())
+    return Material(color, contrast, texel_m, pattern, tuple(shift.tolist()))
 
 
 def _draw_ground_and_backdrop(
     kind: SceneRanges, down: np.ndarray, lowest_m: float, generator: np.random.Generator
 ) -> tuple[PlaneSolid, PlaneSolid]:
     """Return ground and backdrop."""
-    soil = draw_material(
-        draw_uniform(kind.around.ground_brightness, generator),
-        generator.uniform(0.15, 0.4),
-        0.002,
-        generator,
-        0.12,
-    )
-    wall = draw_material(
-        generator.uniform(0.2, 0.6), generator.uniform(0.1, 0.3), 0.006, generator, 0.1
-    )
+    bright = draw_uniform(kind.around.ground_brightness, generator)
+    soil = draw_material(bright, generator.uniform(0.15, 0.4), 0.002, generator, 0.12)
+    bright = generator.uniform(0.2, 0.6)
+    wall = draw_material(bright, generator.uniform(0.1, 0.3), 0.006, generator, 0.1)
     ground = PlaneSolid("ground", SolidPose(build_frame(-down, 0.0), down * lowest_m), (soil,))
     level = np.array([0.0, 0.0, 1.0]) - down * down[2]
     level /= np.linalg.norm(level)
-    backdrop = PlaneSolid(
-        "ground",
-        SolidPose(
-            build_frame(-level, 0.0), level * draw_uniform(kind.around.backdrop_m, generator)
-        ),
-        (wall,),
-    )
+    behind = level * draw_uniform(kind.around.backdrop_m, generator)
+    backdrop = PlaneSolid("ground", SolidPose(build_frame(-level, 0.0), behind), (wall,))
     return ground, backdrop
 
 
@@ -332,18 +287,15 @@ def _draw_clutter(
         place = ray * way * generator.uniform(0.9, 1.0) - down * half[2]
         if not 0.8 < place[2] < 12.0:
             continue
-        tilt = build_frame(
-            -down + 0.15 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi))
-        )
-        stuff = draw_material(
-            generator.uniform(0.05, 0.6), generator.uniform(0.05, 0.3), 0.001, generator, 0.25
-        )
+        upwards = -down + 0.15 * generator.standard_normal(3)
+        tilt = build_frame(upwards, float(generator.uniform(-np.pi, np.pi)))
+        bright = generator.uniform(0.05, 0.6)
+        stuff = draw_material(bright, generator.uniform(0.05, 0.3), 0.001, generator, 0.25)
         thing = Box("clutter", SolidPose(tilt, place), half, (stuff,))
-        reach = float(np.linalg.norm(half))
-        if block and np.linalg.norm(place - block.pose.center_m) < reach + np.linalg.norm(
-            block.half_m
-        ):
-            continue
+        if block:
+            away_m = np.linalg.norm(place - block.pose.center_m)
+            if away_m < np.linalg.norm(half) + np.linalg.norm(block.half_m):
+                continue
         # Clutter must not change the labels of the holes.
         if block and any(compute_hidden_share([thing], block, hole) > 0 for hole in block.holes):
             continue
@@ -359,10 +311,8 @@ def _draw_light(
     generator: np.random.Generator,
 ) -> Light:
     """Return sun, sky and light from the ground, and unseen things that throw shadows on the face."""
-    elevation, azimuth = (
-        draw_uniform(kind.light.elevation_rad, generator),
-        generator.uniform(-np.pi, np.pi),
-    )
+    elevation = draw_uniform(kind.light.elevation_rad, generator)
+    azimuth = generator.uniform(-np.pi, np.pi)
     frame = build_frame(-down, 0.0)
     to_sun = frame @ [
         math.cos(elevation) * math.cos(azimuth),
@@ -371,19 +321,15 @@ def _draw_light(
     ]
     shade = []
     for _ in range(draw_integer(kind.light.shadows, generator)):
-        beam = build_frame(
-            to_sun + 0.3 * generator.standard_normal(3),
-            float(generator.uniform(-np.pi, np.pi)),
-            # About 3 m towards the sun, out of sight of the camera.
-        )
+        # About 3 m towards the sun, out of sight of the camera.
+        toward = to_sun + 0.3 * generator.standard_normal(3)
+        beam = build_frame(toward, float(generator.uniform(-np.pi, np.pi)))
         beside = beam[:, :2] @ generator.uniform(-0.25, 0.25, 2)
         half = np.array([generator.uniform(0.03, 0.25), 1.5, 0.02])
         dark = draw_material(0.3, 0.1, 0.01, generator)
         shade.append(Box("clutter", SolidPose(beam, target + beside + 3.0 * to_sun), half, (dark,)))
-    sun, ambient = (
-        draw_uniform(kind.light.sun, generator),
-        draw_uniform(kind.light.ambient, generator),
-    )
+    sun = draw_uniform(kind.light.sun, generator)
+    ambient = draw_uniform(kind.light.ambient, generator)
     # Open ground: shadows of block and machine are left out.
     sent = ground_brightness * (ambient + sun * math.sin(elevation))
     ground = GroundBounce(-down, sent) if kind.light.bounces else None
