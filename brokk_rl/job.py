@@ -31,19 +31,18 @@ def run(cfg: DictConfig) -> float | None:
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
     extensions.refuse_ambiguous(HydraConfig.get().runtime.choices)
     built: dict[str, Any] = {}
-    if not WITH_POLICIES.isdisjoint(cfg):
-        from brokk_rl.policy_choice import insert_policy  # its imports take 0.2 s
+    goes_on = cfg.get("resume") is not None
+    if any(cfg.get(node) for node in WITH_POLICIES):
+        from brokk_rl import policy_choice  # its imports take 0.2 s
 
-        cfg, built = insert_policy(cfg)
+        cfg, built = policy_choice.insert_policy(cfg)
+        goes_on |= policy_choice.is_going_on(cfg)
     values, shared = extensions.read_values(cfg)
     if "session" not in values:
         mode = build_mode(values | built, shared)
         distributed.check_together(type(mode), sweep)
         return mode.run()
-    from brokk_rl.policy_choice import is_going_on
-
     folder = choose_run_folder(values)
-    goes_on = is_going_on(cfg, folder)
     try:
         if not (sweep or goes_on) and distributed.read_rank().first:
             require_new_folder(folder)

@@ -108,12 +108,13 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
     return cfg, built
 
 
-def is_going_on(cfg: DictConfig, folder: Path) -> bool:
-    """Return whether a command goes on with the run in `folder`."""
-    if cfg.get(RUN) != TRAIN:
-        return cfg.get("resume") is not None
+def is_going_on(cfg: DictConfig) -> bool:
+    """Return whether a training goes on in the folder of its policy."""
     path = OmegaConf.select(cfg, "policy.path", default=None)
-    return path is not None and _find_run(path).resolve() == folder.resolve()
+    out = OmegaConf.select(cfg, "session.out", default=None)
+    if cfg.get(RUN) != TRAIN or path is None or out is None:
+        return False
+    return _find_run(path).resolve() == Path(out).resolve()
 
 
 def _refuse_old_keys(arguments: Sequence[str], given: Mapping[str, Override]) -> None:
@@ -204,8 +205,7 @@ def _choose_beginning(cfg: DictConfig, target: str | None) -> str | None:
         return None
     cfg.policy[TARGET] = TRAINED
     run = _find_run(str(cfg.policy.path))
-    out = OmegaConf.select(cfg, "session.out", default=None) or "."
-    is_new = is_going_on(cfg, Path(out)) and read_record(run) and not (run / CONTRACT).exists()
+    is_new = is_going_on(cfg) and read_record(run) and not (run / CONTRACT).exists()
     return None if is_new else TRAINED  # a run that was stopped before it began knows nothing
 
 

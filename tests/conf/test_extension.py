@@ -112,9 +112,8 @@ def test_an_option_that_two_packages_offer_is_chosen_with_its_package(
     listed = brokk("mode=list").out
     assert "mine/sticky" in listed and "yours/sticky" in listed
     for name, share in (("mine", 0.25), ("yours", 0.5)):
-        done = brokk(
-            "mode=train", f"actuator={name}/sticky", "--cfg", "job", "--package", "actuator"
-        )
+        words = ("mode=train", f"actuator={name}/sticky")
+        done = brokk(*words, "--cfg", "job", "--package", "actuator")
         assert f"share: {share}" in done.out
     for words in (("mode=train", "actuator=sticky"), ("mode=show",)):
         done = brokk(*words, "session.out=run")
@@ -131,29 +130,22 @@ def test_an_entry_point_without_its_package_is_named(mine: Path, brokk: Callable
     assert "mine.missing" in done.err
 
 
-def test_a_failed_run_says_so_in_its_record(
-    mine: Path, brokk: Callable[..., Any], tmp_path: Path
+@pytest.mark.parametrize(
+    ("fails", "code", "recorded"),
+    [
+        ("by us", 1, ('"outcome": "failed"', "our own fault")),
+        ("by hand", 130, ('"outcome": "interrupted"',)),
+        ("to learn", 0, ('"objective": null',)),
+    ],
+)
+def test_the_record_says_how_a_run_ended(
+    fails: str, code: int, recorded: tuple[str, ...], mine: Path, brokk: Callable[..., Any]
 ) -> None:
-    done = brokk("mode=show", "session.out=run", "fails='by us'")
-    assert done.code == 1
-    assert "RuntimeError: our own fault" in done.err
-    record = (tmp_path / "run" / "session.json").read_text()
-    assert '"outcome": "failed"' in record
-    assert "our own fault" in record
-
-
-def test_an_interrupted_run_says_so_in_its_record(
-    mine: Path, brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    assert brokk("mode=show", "session.out=run", "fails='by hand'").code == 130
-    assert '"outcome": "interrupted"' in (tmp_path / "run" / "session.json").read_text()
-
-
-def test_an_objective_that_is_no_number_does_not_break_the_record(
-    mine: Path, brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    assert brokk("mode=show", "session.out=run", "fails='to learn'").code == 0
-    assert '"objective": null' in (tmp_path / "run" / "session.json").read_text()
+    done = brokk("mode=show", "session.out=run", f"fails='{fails}'")
+    assert done.code == code
+    assert ("RuntimeError: our own fault" in done.err) is (code == 1)
+    for part in recorded:
+        assert part in Path("run/session.json").read_text()
 
 
 def test_a_group_may_be_chosen_as_a_list(
@@ -166,27 +158,17 @@ def test_a_group_may_be_chosen_as_a_list(
 def test_a_sweep_has_one_folder_for_each_job_and_no_others(
     mine: Path, brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
-    assert (
-        brokk(
-            "-m",
-            "mode=show",
-            "session.seed=3,4",
-            "actuator.share=0.5,0.75",
-            "session.device=cpu",
-            "session.out=sweep",
-        ).code
-        == 0
-    )
+    words = ("mode=show", "session.seed=3,4", "actuator.share=0.5,0.75", "session.device=cpu")
+    assert brokk("-m", *words, "session.out=sweep").code == 0
     jobs = [
-        f"{i}_seed-{seed}_share-{share}"
-        for i, (seed, share) in enumerate(((3, 0.5), (3, 0.75), (4, 0.5), (4, 0.75)))
+        "0_seed-3_share-0.5",
+        "1_seed-3_share-0.75",
+        "2_seed-4_share-0.5",
+        "3_seed-4_share-0.75",
     ]
     assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [*jobs, "multirun.yaml"]
-    assert sorted(path.name for path in (tmp_path / "sweep" / jobs[1]).iterdir()) == [
-        "resolved.yaml",
-        "seen.json",
-        "session.json",
-    ]
+    files = sorted(path.name for path in (tmp_path / "sweep" / jobs[1]).iterdir())
+    assert files == ["resolved.yaml", "seen.json", "session.json"]
     assert '"objective": 0.75' in (tmp_path / "sweep" / jobs[1] / "session.json").read_text()
     assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
 
@@ -201,10 +183,8 @@ def test_the_jobs_of_a_sweep_go_on_when_one_fails(
     mine: Path, brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
     assert brokk("-m", "mode=show", "session.seed=x,4", "session.out=sweep").code == 2
-    assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [
-        "1_seed-4",
-        "multirun.yaml",
-    ]
+    left = sorted(path.name for path in (tmp_path / "sweep").iterdir())
+    assert left == ["1_seed-4", "multirun.yaml"]
 
 
 def test_resolved_runs_again_in_a_new_folder(

@@ -57,16 +57,13 @@ def test_a_file_may_hold_several_effects_and_stand_in_a_list(
     (tmp_path / "one.yaml").write_text(
         "_target_: actuators.effects.speed.FlowGain\njoints: all\ngain: [0.9, 1.1]\n"
     )
-    effect = composed(brokk, "mode=train", 'effect=["@found, today.yaml", lag, @one.yaml]')[
-        "effect"
-    ]
+    words = ("mode=train", 'effect=["@found, today.yaml", lag, @one.yaml]')
+    effect = composed(brokk, *words)["effect"]
     assert list(effect) == ["stiction", "backlash", "lag", "flow_gain"]
     assert effect["backlash"]["gap_rad"] == 0.031
     assert effect["flow_gain"]["gain"] == [0.9, 1.1]
-    assert list(composed(brokk, "mode=train", "effect='@found, today.yaml'")["effect"]) == [
-        "stiction",
-        "backlash",
-    ]
+    alone = composed(brokk, "mode=train", "effect='@found, today.yaml'")["effect"]
+    assert list(alone) == ["stiction", "backlash"]
 
 
 def test_a_file_replaces_a_part_of_another_option(
@@ -93,13 +90,8 @@ def test_a_sweep_takes_files_beside_options(
 ) -> None:
     (tmp_path / "fits").mkdir()
     (tmp_path / "fits" / "lag.yaml").write_text(LAG)
-    done = brokk(
-        "-m",
-        "mode=bench",
-        "actuator=ideal,@fits/lag.yaml",
-        "bench.num_envs=[0]",
-        "session.out=sweep",
-    )
+    words = ("mode=bench", "actuator=ideal,@fits/lag.yaml", "bench.num_envs=[0]")
+    done = brokk("-m", *words, "session.out=sweep")
     assert done.code == 2
     for job in (0, 1):  # each was composed, and refused for its size alone
         (message,) = (one for one in caplog.messages if one.startswith(f"job {job} failed"))
@@ -107,44 +99,19 @@ def test_a_sweep_takes_files_beside_options(
     assert not (tmp_path / "sweep").exists()
 
 
+IDEAL = "_target_: actuators.models.lag.Ideal\n"
+
+
 @pytest.mark.parametrize(
     ("group", "text", "told"),
     [
-        (
-            "actuator",
-            "_target_: os.system\n",
-            ("'_target_: os.system' is no actuator", "actuators.models.lag.FirstOrderLag"),
-        ),
-        (
-            "effect",
-            "backlash: {_target_: os.system}\n",
-            ("'backlash._target_: os.system' is no effect",),
-        ),
-        (
-            "effect",
-            "a: {_target_: actuators.effects.speed.Backlash, gap_rad: {_target_: os.getcwd}}\n",
-            ("nothing of ours",),
-        ),
-        (
-            "actuator",
-            "_target_: actuators.models.lag.Ideal\nspeed_scale: ${oc.env:HOME}\n",
-            ("interpolation", "${oc.env:HOME}"),
-        ),
-        (
-            "actuator",
-            '_target_: actuators.models.lag.Ideal\nspeed_scale: "\\x24{now:}"\n',
-            ("interpolation",),
-        ),
-        (
-            "actuator",
-            "_target_: actuators.models.lag.Ideal\n_partial_: true\n",
-            ("'_partial_' is a setting of Hydra's",),
-        ),
-        (
-            "actuator",
-            "# @package _global_\n_target_: actuators.models.lag.Ideal\n",
-            ("lies outside 'actuator'",),
-        ),
+        ("actuator", "_target_: os.system\n", ("'_target_: os.system' is no actuator", "actuators.models.lag.FirstOrderLag")),
+        ("effect", "backlash: {_target_: os.system}\n", ("'backlash._target_: os.system' is no effect",)),
+        ("effect", "a: {_target_: actuators.effects.speed.Backlash, gap_rad: {_target_: os.getcwd}}\n", ("nothing of ours",)),
+        ("actuator", IDEAL + "speed_scale: ${oc.env:HOME}\n", ("interpolation", "${oc.env:HOME}")),
+        ("actuator", IDEAL + 'speed_scale: "\\x24{now:}"\n', ("interpolation",)),
+        ("actuator", IDEAL + "_partial_: true\n", ("'_partial_' is a setting of Hydra's",)),
+        ("actuator", "# @package _global_\n" + IDEAL, ("lies outside 'actuator'",)),
         ("experiment", "hydra: {sweep: {dir: /}}\n", ("Hydra's own settings",)),
         ("experiment", "defaults: [override /hydra/launcher: joblib]\n", ("Hydra's own settings",)),
         ("actuator", "", ("expected a mapping",)),
@@ -153,7 +120,7 @@ def test_a_sweep_takes_files_beside_options(
         ("actuator", "a: " + 50 * "[" + 50 * "]", ("expected at most 40 levels",)),
         ("actuator", "a: &a\n  b: *a\n", ("expected an alias of an earlier value, got *a",)),
     ],
-)
+)  # fmt: skip
 def test_a_file_that_does_more_than_name_values_is_refused(
     group: str, text: str, told: tuple[str, ...], brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -183,16 +150,12 @@ def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Callable[..., Any
 
 def test_a_table_in_the_place_of_a_range_is_explained(brokk: Callable[..., Any]) -> None:
     table = "{q1: [0.05, 0.1], other: 0.12}"
-    done = brokk("mode=train", "effect=[stiction]", f"effect.stiction.start={table}")
+    words = ("mode=train", "effect=[stiction]")
+    done = brokk(*words, f"effect.stiction.start={table}")
     assert done.code == 2
     assert "effect.stiction.start holds a list and you gave a table" in done.err
-    effect = composed(
-        brokk,
-        "mode=train",
-        "effect=[stiction]",
-        "~effect.stiction.start",
-        f"+effect.stiction.start={table}",
-    )
+    anew = ("~effect.stiction.start", f"+effect.stiction.start={table}")
+    effect = composed(brokk, *words, *anew)
     assert effect["effect"]["stiction"]["start"] == {"q1": [0.05, 0.1], "other": 0.12}
 
 

@@ -280,14 +280,6 @@ def test_a_reset_touches_only_the_worlds_of_its_mask(machine):
     assert not torch.equal(before["state"][1], after["state"][1])
 
 
-def test_an_empty_mask_changes_nothing(machine):
-    world = _world(machine, 2)
-    world.step(torch.full((2, 5), 0.01))
-    before = world.state_dict()
-    world.reset(torch.zeros(2, dtype=torch.bool), torch.zeros(2, 5), make_nominal_scenes(2))
-    assert all(torch.equal(tensor, world.state_dict()[name]) for name, tensor in before.items())
-
-
 def test_a_restored_state_goes_on_bit_for_bit(machine):
     generator = torch.Generator().manual_seed(3)
     increments = 0.02 * torch.randn(40, 4, 5, generator=generator)
