@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from composed import option
 from scipy.spatial.transform import Rotation
 
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from perception.calibrate import arm, transforms
 from perception.calibrate.hand_eye import HandEyeViews
@@ -83,8 +83,8 @@ def posed(
 
 @lru_cache
 def charuco() -> Any:
-    """Returns the ChArUco board of `conf/perception/camera_pose`."""
-    return option("perception/camera_pose", "charuco")
+    """Returns the ChArUco board of `conf/board.yaml`."""
+    return load_part("board")
 
 
 def corners_m() -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -37,26 +37,6 @@ class CameraPose:
 
     world_from_camera: np.ndarray
     error_px: float
-
-
-class CameraTracker(Protocol):
-    """Finds the pose of the camera."""
-
-    def locate(self, frame: Frame) -> CameraPose:
-        """Return the camera's pose.
-
-        Raises:
-            FrameError: this frame does not determine it; the message says why.
-        """
-        ...
-
-
-class CameraTrackerSpec(Protocol):
-    """A spec in `conf/perception/camera_pose`."""
-
-    def build(self) -> CameraTracker:
-        """Return a tracker."""
-        ...
 
 
 @dataclass(frozen=True)

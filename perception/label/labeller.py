@@ -21,7 +21,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
-from perception.label.camera_pose import CameraTrackerSpec
+from perception.label.camera_pose import Charuco
 from perception.label.measured import MeasuredHole, MeasuredScene, read_measured
 
 FRAMES, OVERLAYS = "frames", "overlays"
@@ -64,7 +64,7 @@ class BlockLabelling:
     """
 
     source: FrameSourceSpec
-    board: CameraTrackerSpec
+    board: Charuco
     measured: str
     noise_per_m: Positive
     num_sigma: Positive

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.session import Session, write_text
 from brokk_rl.spec import Count, spec
 from perception import dataset
 from perception.calibrate.pair_lens import calibrate_pair, find_board_pair
-from perception.label.camera_pose import BoardTracker, CameraTrackerSpec
+from perception.label.camera_pose import Charuco
 from perception.sources import validation
 from perception.sources.folder import read_camera, read_yaml
 from perception.sources.lens_file import PairLens, read_pair_lens
@@ -45,7 +45,7 @@ class RecordCamera:
     session: Session
     capture: SourceCapture | StereoVideo | ExportedPictures | RosLog
     lens: str | None
-    board: CameraTrackerSpec
+    board: Charuco
     every: Count
     count: Count | None
 
@@ -82,8 +82,6 @@ class RecordCamera:
     def _calibrate_lens(self) -> None:
         """Write the lens of both cameras, by the pairs that show the board."""
         tracker = self.board.build()
-        if not isinstance(tracker, BoardTracker):
-            raise ConfigError("board: expected perception/camera_pose@board=charuco")
         pairs, num_frames, size_px = [], 0, (0, 0)
         for frame in self._read_kept():
             num_frames += 1

@@ -22,7 +22,7 @@ from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from perception.benchmark.session_score import HoleError, match_found_holes
-from perception.label.camera_pose import CameraTrackerSpec
+from perception.label.camera_pose import Charuco
 from perception.label.measured import MeasuredHole, read_measured
 
 log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ class ScoreCamera:
     session: Session
     perception: FinderSpec
     source: FrameSourceSpec
-    board: CameraTrackerSpec
+    board: Charuco
     score: ScoreOptions
 
     def run(self) -> float | None:

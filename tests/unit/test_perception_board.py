@@ -12,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from composed import option
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception.modes.board import draw_board
 
@@ -33,7 +33,7 @@ def test_the_page_is_to_scale(brokk: Callable[..., Any], tmp_path: Path) -> None
 
 
 def test_opencv_finds_every_corner_at_its_place_on_the_page() -> None:
-    board = option("perception/camera_pose", "charuco")
+    board = load_part("board")
     figure = draw_board(board, 0.03)
     file = io.BytesIO()
     figure.savefig(file, dpi=50.8, format="png")  # 2 px for a millimetre
@@ -51,7 +51,7 @@ def test_opencv_finds_every_corner_at_its_place_on_the_page() -> None:
 
 
 def test_small_blurred_markers_are_read_in_linear_light() -> None:
-    charuco = option("perception/camera_pose", "charuco")
+    charuco = load_part("board")
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, charuco.dictionary))
     board = cv2.aruco.CharucoBoard((8, 6), charuco.square_m, charuco.marker_m, markers)
     picture = board.generateImage((8 * 112, 6 * 112)).astype(np.float32) / 255
@@ -80,6 +80,6 @@ def test_small_blurred_markers_are_read_in_linear_light() -> None:
 
 
 def test_a_board_that_cannot_be_drawn_is_refused() -> None:
-    board = option("perception/camera_pose", "charuco")
+    board = load_part("board")
     with pytest.raises(ConfigError, match="has 50 markers, 12 x 10 squares need 60"):
         draw_board(replace(board, dictionary="DICT_4X4_50", columns=12, rows=10), 0.03)

@@ -14,6 +14,7 @@ import yaml
 from composed import option
 
 from brokk_rl.errors import FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import dataset
 from perception.label.camera_pose import CameraPose, Charuco
@@ -53,12 +54,13 @@ def write_labels(views: list[cuboid.View], folder: Path, **block: list[float]) -
         return CameraPose(board_from_world @ views[int(frame.name[-2:])].world_from_camera, 0.1)
 
     source = option("perception/source", "folder", folder=str(folder / "in"))
-    board = SimpleNamespace(build=lambda: SimpleNamespace(locate=locate))
-    labelling = BlockLabelling(
-        source=source, board=board, measured=str(folder / "measured.yaml"), noise_per_m=0.003,
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Charuco, "build", lambda self: SimpleNamespace(locate=locate))
+        labelling = BlockLabelling(
+        source=source, board=load_part("board"), measured=str(folder / "measured.yaml"), noise_per_m=0.003,
         num_sigma=3.0, min_depth_share=0.5,
-    )  # fmt: skip
-    return labelling.label(folder)
+        )  # fmt: skip
+        return labelling.label(folder)
 
 
 def test_labels_of_a_measured_block_are_those_of_the_renderer(
@@ -86,7 +88,7 @@ def test_a_block_in_the_wrong_place_is_left_out_and_said(
 
 
 def test_a_board_tells_where_the_camera_was() -> None:
-    spec = option("perception/camera_pose", "charuco")
+    spec = load_part("board")
     view = board_view(spec)
     pose = spec.build().locate(view)
     assert pose.error_px < 0.6

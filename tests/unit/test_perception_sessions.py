@@ -15,9 +15,10 @@ import yaml
 
 from brokk_rl.contracts.vision import FrameDetections, HolePose
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.label.camera_pose import CameraPose
+from perception.label.camera_pose import CameraPose, Charuco
 from perception.label.measured import read_measured
 from perception.modes.score_camera import ScoreCamera, ScoreOptions
 from perception.segment.network import NetworkSegmenter
@@ -123,7 +124,6 @@ def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> f
     parts: dict[str, Any] = {
         "perception": SimpleNamespace(find=FrameDetections([hole]).in_base_frame),
         "source": Source(),
-        "board": SimpleNamespace(locate=lambda frame: CameraPose(pose, 0.1)),
     }
     built = {key: SimpleNamespace(build=lambda part=part: part) for key, part in parts.items()}
     options = ScoreOptions(
@@ -131,7 +131,11 @@ def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> f
     )  # fmt: skip
     session = Session(out=str(tmp_path / name), seed=0, device="cpu")
     (tmp_path / name).mkdir(exist_ok=True)
-    return ScoreCamera(session=session, score=options, **built).run()
+    tracker = SimpleNamespace(locate=lambda frame: CameraPose(pose, 0.1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Charuco, "build", lambda self: tracker)
+        board = load_part("board")
+        return ScoreCamera(session=session, score=options, board=board, **built).run()
 
 
 def test_a_session_is_scored_by_holes_measured_in_the_frame_of_the_board(tmp_path: Path) -> None:
