@@ -57,14 +57,12 @@ class FacePlane:
         m: `(3,)` 1/m; the points `P` with `m · P = 1`.
         cov: Covariance of `m`, `(3, 3)`.
         sigma: Standard deviation of the residuals of inverse depth, 1/m.
-        num_points: Points with a weight above 0.
         extent: Extent of the support around the ellipse, in radii.
     """
 
     m: np.ndarray
     cov: np.ndarray
     sigma: float
-    num_points: int
     extent: float
 
     @property
@@ -107,14 +105,12 @@ class FaceSupport:
         inverse: Inverse depth, `(P,)` 1/m.
         radii: Distance from the ellipse's centre in its own radii, `(P,)`, increasing.
         cell: Number of each pixel's square of the picture, `(P,)`; noise is correlated within one.
-        known: Part of the surroundings with known depth.
     """
 
     rays: np.ndarray
     inverse: np.ndarray
     radii: np.ndarray
     cell: np.ndarray
-    known: float
 
 
 def compute_inverse_depth(
@@ -176,9 +172,6 @@ def collect_support(
     lean = np.sqrt(max((ellipse[2] / ellipse[3]) ** 2 - 1.0, 0.0)) + LEAN
     with np.errstate(divide="ignore", invalid="ignore"):
         good &= np.abs(radius_m / (size * depth) - 1.0) < NEARNESS + radii * size * lean
-    ring = (radii > inner) & (radii < certain)
-    # Share of the innermost ring with known depth, the evidence for "without depth".
-    known = float(np.isfinite(depth[ring]).mean()) if ring.any() else 0.0
     good &= (radii > inner) & (radii < outer)
     line, place = np.nonzero(good)
     radii, inverse = radii[good], 1.0 / depth[good].astype(float)
@@ -192,7 +185,7 @@ def collect_support(
     inverse = inverse[outwards]
     cell = cell[outwards]
     rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
-    return FaceSupport(rays, inverse, radii, cell, known)
+    return FaceSupport(rays, inverse, radii, cell)
 
 
 def fit_plane(
@@ -262,7 +255,7 @@ def fit_plane(
     )
     if cov is None:
         return None
-    return FacePlane(m, cov, sigma, int(np.count_nonzero(weight)), extent)
+    return FacePlane(m, cov, sigma, extent)
 
 
 def compute_upper_median(values: np.ndarray) -> float:

@@ -47,11 +47,6 @@ class UNet(nn.Module):
         self.head = nn.Conv2d(below, len(CHANNELS), 1)
         nn.init.constant_(self.head.bias, -2.0)  # type: ignore[arg-type] (both are rare in a picture)
 
-    @property
-    def multiple(self) -> int:
-        """Height and width of a picture are multiples of this."""
-        return 2 ** (len(self.widths) - 1)
-
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         """Return logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
         # In the square root photon noise is the same at every brightness, and shade is not black.

@@ -75,7 +75,7 @@ def test_a_face_whose_tilt_is_wrong_stretches_a_rim_as_a_wrong_focal_length_does
     m = normal / float(normal @ [0.0, 0.0, 2.0])
     # The plane of such a covariance turns about the axis across the slope by `std_rad`.
     moved = float(np.linalg.norm(m)) * std_rad * np.cross(across, normal)
-    face = FacePlane(m, np.outer(moved, moved), 1e-4, 1000, 7.0)
+    face = FacePlane(m, np.outer(moved, moved), 1e-4, 7.0)
     chart = build_chart(np.array([0.0, 0.0, 2.0]), m, K)
     # As it is seen, a rim is shorter by the cosine; on a steeper plane it is longer than it is wide.
     longer = np.cos(tilt_rad) / np.cos(tilt_rad + std_rad)

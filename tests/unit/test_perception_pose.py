@@ -56,7 +56,7 @@ def test_a_tone_curve_moves_no_rim_and_changes_no_evidence_once_it_is_known(esti
     assert found.center_m == pytest.approx(plain.center_m, abs=5e-5)
     assert found.radius_m == pytest.approx(plain.radius_m, abs=5e-5)
     assert taken_for_linear.radius_m < plain.radius_m - 2e-4, "edges move into the dark"
-    face = plane.FacePlane(AXIS / (AXIS @ CENTER), np.eye(3) * 1e-6, 1e-4, 1000, 7.0)
+    face = plane.FacePlane(AXIS / (AXIS @ CENTER), np.eye(3) * 1e-6, 1e-4, 7.0)
     slopes = []
     for one in (frame, curved):
         gray = convert_to_gray(one)  # not linearised: the ratio of logarithms needs no exponent
@@ -77,7 +77,7 @@ def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -
     off, ray = 0.3 / pull_px, CENTER / CENTER[2]
     depth = (1.0 / (RAYS @ m + off)).astype(np.float32)
     begin = plane.FacePlane(
-        m + np.array([0.0, 0.0, off]), np.diag([1e-4, 1e-4, 1.0]), 0.5 / pull_px, 1000, 7.0
+        m + np.array([0.0, 0.0, off]), np.diag([1e-4, 1e-4, 1.0]), 0.5 / pull_px, 7.0
     )
     errors, claims = [], []
     for _ in range(16):
@@ -185,7 +185,7 @@ def test_a_plane_among_gross_errors_is_as_uncertain_as_it_varies() -> None:
         gross = chance.random(1500) < 0.3
         noise = np.where(gross, chance.uniform(-8e-3, 8e-3, 1500), chance.normal(0, 1e-3, 1500))
         radii = np.sort(chance.uniform(1.25, 12.0, 1500))
-        points = plane.FaceSupport(rays, rays @ true + noise, radii, np.arange(1500) % 40, 1.0)
+        points = plane.FaceSupport(rays, rays @ true + noise, radii, np.arange(1500) % 40)
         face = plane.fit_plane(points, (2.6, 4.0, 7.0, 12.0), 1e-4, np.random.default_rng(0))
         assert face is not None
         off = face.m - true
@@ -290,9 +290,7 @@ def test_the_covariance_of_a_plane_is_that_of_its_repetitions(rings: tuple[float
     cell, radii = np.arange(2000) // 4, np.repeat([1.5, 2.5], 1000)
     fits = []
     for _ in range(150):
-        support = plane.FaceSupport(
-            rays, rays @ m + generator.normal(0, sigma, 2000), radii, cell, 1.0
-        )
+        support = plane.FaceSupport(rays, rays @ m + generator.normal(0, sigma, 2000), radii, cell)
         found = plane.fit_plane(support, rings, 1e-5, generator)
         assert found is not None
         fits.append(found)
@@ -307,7 +305,7 @@ def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
     generator, m = np.random.default_rng(5), np.array([0.1, 0.4, 0.7])
     line = np.column_stack([np.full(400, 0.25), np.linspace(-0.2, 0.2, 400), np.ones(400)])
     for rays in (line, np.ones((400, 3))):
-        support = plane.FaceSupport(rays, rays @ m, np.full(400, 2.0), np.arange(400) // 20, 1.0)
+        support = plane.FaceSupport(rays, rays @ m, np.full(400, 2.0), np.arange(400) // 20)
         assert plane.fit_plane(support, (2.6,), 2e-4, generator) is None
     rays = np.column_stack([generator.uniform(-0.1, 0.1, (400, 2)), np.ones(400)])
     lonely = np.where(
@@ -316,7 +314,7 @@ def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
     cell = np.maximum(np.arange(400) - 240, 0) // 10
     assert (
         plane.fit_plane(
-            plane.FaceSupport(rays, lonely, np.full(400, 2.0), cell, 1.0), (2.6,), 2e-4, generator
+            plane.FaceSupport(rays, lonely, np.full(400, 2.0), cell), (2.6,), 2e-4, generator
         )
         is None
     )
