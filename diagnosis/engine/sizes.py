@@ -103,7 +103,7 @@ def describe_numbers(
     """Return the numbers of an effect with intervals, by name and joint (or `machine`)."""
     found: dict[str, dict[str, Estimate]] = {}
     if hold is not None:
-        for name, value in _describe_hold(hold, machine).items():
+        for name, value in describe_hold(hold, machine).items():
             for joint in machine.joint_names:
                 interval = (0.8 * value, 1.25 * value)
                 found.setdefault(name, {})[joint] = Estimate(value, interval)
@@ -181,7 +181,7 @@ def _measure_stretched_share(joint: int, machine: Machine) -> float:
     return float(measure_full_loads(machine)[joint]) * GRAVITY_M_S2 / force
 
 
-def _describe_hold(hold: HeldCourse, machine: Machine) -> dict[str, float]:
+def describe_hold(hold: HeldCourse, machine: Machine) -> dict[str, float]:
     """Return the numbers of held commands from their course."""
     delays = hold.delays
     if not hold.course.is_loss:

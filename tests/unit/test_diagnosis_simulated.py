@@ -22,6 +22,7 @@ from diagnosis.engine.joint_model import Course
 from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_units, stack_side
+from diagnosis.engine.sizes import describe_hold
 from diagnosis.engine.valve import VALVE
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from diagnosis.repair_proof import EngineProof
@@ -153,6 +154,19 @@ def test_the_nuisance_is_a_covariance() -> None:
     log_likelihood = multivariate_normal(cov=covariance).logpdf(residual)
     own = -0.5 * (exact + projection.log_determinant + 12 * np.log(2.0 * np.pi * spread))
     assert own == pytest.approx(log_likelihood)
+
+
+def test_share_and_persistence_of_losses_are_read_from_their_course(machine: Machine) -> None:
+    probability, persistence = 0.1, 0.7
+    delays = [0]
+    for chance in np.random.default_rng(5).uniform(size=50_000):
+        was_lost = delays[-1] > 0
+        is_lost = chance < (1.0 - persistence) * probability + persistence * was_lost
+        delays.append(delays[-1] + 1 if is_lost else 0)
+    course = Course("frame_loss", probability, persistence)
+    found = describe_hold(holds.HeldCourse(course, np.array(delays), 1.0, 0.0, 0.0, 0.0), machine)
+    expected = {"probability": probability, "persistence": persistence}
+    assert found == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize("effect", ["frame_loss", "delay_jitter"])
