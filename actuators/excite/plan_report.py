@@ -56,8 +56,7 @@ class PlanTrack:
 
 
 def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> dict[str, Any]:
-    """Return `plan.json`: segments of each run with predicted times, travel and commands."""
-    used = (track.stage != AFTER).sum(0)
+    """Return `plan.json`: the segments of each run with predicted times."""
     return {
         "schema": 1,
         "machine": machine.name,
@@ -66,7 +65,6 @@ def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> 
         "num_runs": len(plan.runs),
         "predicted": "by a nominal machine: dead time, full speed times command",
         "runs": [_summarise_run(run, track, n, machine) for n, run in enumerate(plan.runs)],
-        "run_time_unused_s": [_round_ms(plan.run_s - machine.period_s * count) for count in used],
     }
 
 
@@ -74,28 +72,15 @@ def _summarise_run(
     run: tuple[Segment, ...], track: PlanTrack, n: int, machine: Machine
 ) -> list[dict[str, Any]]:
     """Return the segments of one run; one that finds no time has no `start_s`."""
-    period_s, stage, found = machine.period_s, track.stage[:, n], []
+    period_s, inside, found = machine.period_s, np.isin(track.stage[:, n], (PLAYING, AWAY)), []
     for i, segment in enumerate(run):
-        mine = track.segment[:, n] == i
-        inside = mine & np.isin(stage, (PLAYING, AWAY))
-        rows = np.flatnonzero(inside)
-        joints = {}
-        for j, joint in enumerate(machine.joints):
-            q, u = track.q[inside, n, j], track.u[inside, n, j]
-            joints[joint.name] = {
-                f"travel_{joint.unit}": round(float(np.abs(np.diff(q)).sum()), 4),
-                f"range_{joint.unit}": np.round([q.min(), q.max()], 4).tolist() if len(q) else None,
-                "commanded": round(float((u != 0).mean()), 4) if len(q) else 0.0,
-            }
+        rows = np.flatnonzero((track.segment[:, n] == i) & inside)
         entry = {
             "name": segment.name,
             "program_s": _round_ms(len(segment.u) * period_s),
-            "approach_s": _round_ms((mine & (stage == BEFORE)).sum() * period_s),
             "start_s": _round_ms(track.t_s[rows[0]]) if len(rows) else None,
             "end_s": _round_ms(track.t_s[rows[-1]] + period_s) if len(rows) else None,
-            "away_s": _round_ms((stage[inside] == AWAY).sum() * period_s),
             "cut_s": _round_ms((len(segment.u) - len(rows)) * period_s),
-            "joints": joints,
         }
         found.append(entry)
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,7 +10,6 @@ import numpy as np
 
 from actuators import open_loop
 from actuators.identify import dead_time, pictures
-from actuators.identify.dead_time import RESOLUTION_S
 from actuators.identify.scores import FreeRunScores, average_joints, bound_interval
 from actuators.identify.stages import FitStage, FittedModel, list_recordings
 from actuators.identify.training_data import list_sources
@@ -58,12 +57,11 @@ def write_verdict(result: Mapping[str, Any], machine: Machine) -> list[VerdictSe
     overall = result["overall"][result["model"]]
     given = [horizon for horizon, value in overall.items() if value is not None]
     horizon = f"{HEADLINE_S:g}" if f"{HEADLINE_S:g}" in given else given[-1]
+    warnings = [*_doubt_excitation(result), *_doubt_test_data(result)]
     return [
         _judge_comparison(result, horizon),
-        _judge_worst_joint(result, given[-1], machine),
         *_judge_dead_time(result, machine),
-        *_judge_excitation(result),
-        *_judge_test_data(result),
+        *(VerdictSentence("warn", text) for text in warnings),
     ]
 
 
@@ -79,57 +77,29 @@ def _judge_comparison(result: Mapping[str, Any], horizon: str) -> VerdictSentenc
     total, change = against["overall"][horizon], against["overall"][horizon]["reduction_percent"]
     word = "less" if change >= 0 else "more"
     text = f"{mine}, against {overall[rival]:.2f} % of {rival}: {abs(change):.0f} % {word}"
-    if total["reduction_ci95"]:
-        low, high = total["reduction_ci95"]
-        text += f" (95 %: {low:.0f} to {high:.0f} % less)"
     if total["ci95"] is None:
         text += ". Judged by one run only, so there is no saying whether that holds for others."
         return VerdictSentence("warn", text)
+    low, high = total["reduction_ci95"]
+    text += f" (95 %: {low:.0f} to {high:.0f} % less)"
     # an interval that excludes 0 leaves no doubt
     intervals = {joint: against[joint][horizon]["ci95"] or (-np.inf, np.inf) for joint in joints}
     better = [joint for joint, (_, high) in intervals.items() if high < 0]
     worse = [joint for joint, (low, _) in intervals.items() if low > 0]
     text += f". Better beyond doubt on {_name_joints(better, joints)}"
     text += f", worse on {_name_joints(worse, joints)}." if worse else "."
-    strongest = min(overall, key=lambda name: overall[name])
-    if strongest not in (model, rival):
-        text += f" The best of those compared is {strongest} with {overall[strongest]:.2f} %."
     if total["ci95"][1] < 0 and not worse:
         return VerdictSentence("good", text)
     is_bad = total["ci95"][0] > 0 or len(worse) > len(better)
     return VerdictSentence("bad" if is_bad else "warn", text)
 
 
-def _judge_worst_joint(
-    result: Mapping[str, Any], horizon: str, machine: Machine
-) -> VerdictSentence:
-    model = result["model"]
-    rows = {joint: models[model][horizon] for joint, models in result["joints"].items()}
-    joint = max(rows, key=lambda name: rows[name]["percent"])
-    unit = machine.joints[machine.joint_names.index(joint)].unit
-    percent, rmse = rows[joint]["percent"], rows[joint]["rmse"]
-    text = f"Worst joint: {joint}, {percent:.2f} % of its travel ({rmse:.2g} {unit}) after {horizon} s."
-    return VerdictSentence("plain", text)
-
-
 def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[VerdictSentence]:
     known = {joint: delay for joint, delay in result["delay_s"].items() if delay is not None}
-    if not known:
-        return []
-    history_s = machine.num_history * machine.period_s
-    values = [delay["value"] for delay in known.values()]
-    span = f"{min(values):.2f} s"
-    if max(values) - min(values) >= RESOLUTION_S / 2:
-        span = f"{min(values):.2f} to {max(values):.2f} s"
-    stated = f"machine '{machine.name}' says {machine.dead_time_s:g} s"
-    lost, long, off = [], [], []
-    for joint, delay in known.items():
-        if not delay["found"]:
-            lost.append(joint)
-        elif delay["ci95"][1] > history_s:
-            long.append(joint)
-        if abs(delay["value"] - machine.dead_time_s) > DELAY_TOLERANCE_S:
-            off.append(joint)
+    history_s, stated_s = machine.num_history * machine.period_s, machine.dead_time_s
+    lost = [joint for joint, delay in known.items() if not delay["found"]]
+    long = [one for one in known if one not in lost and known[one]["ci95"][1] > history_s]
+    off = [one for one in known if abs(known[one]["value"] - stated_s) > DELAY_TOLERANCE_S]
     found: list[VerdictSentence] = []
     if lost:
         text = f"The dead time of {', '.join(lost)} is not found: the motion does not follow the command."
@@ -142,16 +112,16 @@ def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[Verdic
         )
         found.append(VerdictSentence("bad", text))
     if off:
-        text = f"Dead time {span}, but {stated}: correct dead_time_s ({', '.join(off)})."
+        said = ", ".join(f"{known[joint]['value']:.2f} s on {joint}" for joint in off)
+        text = f"Dead time {said}, but machine '{machine.name}' says {stated_s:g} s: correct dead_time_s."
         found.append(VerdictSentence("warn", text))
-    elif not found:
-        text = f"Dead time {span}: inside the history of {history_s:.2f} s, and {stated}."
+    if known and not found:
+        text = f"The dead times are as machine '{machine.name}' says, {stated_s:g} s, and inside the history of {history_s:.2f} s."
         found.append(VerdictSentence("good", text))
     return found
 
 
-def _judge_excitation(result: Mapping[str, Any]) -> list[VerdictSentence]:
-    found = []
+def _doubt_excitation(result: Mapping[str, Any]) -> Iterator[str]:
     for joint, facts in result["data"]["excitation"].items():
         lacks = []
         if facts["commanded_s"] < THIN_S:
@@ -164,26 +134,19 @@ def _judge_excitation(result: Mapping[str, Any]) -> list[VerdictSentence]:
         if -low < THIN_COMMAND:
             lacks.append(f"no command beyond -{-low:.2g}")
         if lacks:
-            text = f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model."
-            found.append(VerdictSentence("warn", text))
-    return found
+            yield f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model."
 
 
-def _judge_test_data(result: Mapping[str, Any]) -> list[VerdictSentence]:
-    texts, data = [], result["data"]
+def _doubt_test_data(result: Mapping[str, Any]) -> Iterator[str]:
+    data = result["data"]
     idle = [joint for joint, facts in data["excitation"].items() if facts["judged_s"] <= 0]
     if idle:
-        texts.append(
-            f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing."
-        )
+        yield f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing."
     runs = data["test"]["runs"]
     if runs < FEW_RUNS:
-        texts.append(
-            f"Judged by {runs} runs: intervals from so few are coarse, most likely too narrow."
-        )
+        yield f"Judged by {runs} runs: intervals from so few are coarse, most likely too narrow."
     for horizon, reason in result["missing"].items():
-        texts.append(f"No figure at {horizon} s: {reason}.")
-    return [VerdictSentence("warn", text) for text in texts]
+        yield f"No figure at {horizon} s: {reason}."
 
 
 def _name_joints(some: list[str], every: list[str]) -> str:
