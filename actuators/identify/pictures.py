@@ -11,18 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
 from actuators.identify.scores import TAILS, FreeRunScores
+from actuators.motion_panels import MotionWindow, draw_motion_panels
 from actuators.recordings.split import COMMANDED
-from brokk_rl.plot import (
-    BLUE,
-    GREY,
-    ORANGE,
-    OTHERS,
-    RED,
-    add_legend,
-    draw_grid,
-    make_joint_panels,
-    remove_frame,
-)
+from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, add_legend, draw_grid, make_joint_panels
 
 COLOURS = {"hold": GREY, "arx": ORANGE}
 
@@ -39,59 +30,29 @@ def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
     Typical: the window of median error among those in which the joint is commanded; liveliest: of
     the longest way; worst: of the largest error of the model (the paper's figure 2).
     """
-    cut, machine = scores.cut, scores.machine
-    t_s = machine.period_s * np.arange(1, cut.measured.shape[1] + 1)
-    # Inches. Laid out by hand, which is much faster than any layout engine with so many axes.
-    height = 2.75 * machine.num_joints + 0.5
-    figure = Figure(figsize=(12.0, height))
-    rows = figure.add_gridspec(
-        machine.num_joints, 3, left=0.075, right=0.99, bottom=0.45 / height, top=1.0 - 0.6 / height,
-        wspace=0.17, hspace=0.28,
-    )  # fmt: skip
-    for j, joint in enumerate(machine.joints):
-        for column, (title, window) in enumerate(_select_windows(scores, model, j).items()):
-            grid = rows[j, column].subgridspec(2, 1, height_ratios=[3.2, 1.0], hspace=0.12)
-            above = figure.add_subplot(grid[0])
-            below = figure.add_subplot(grid[1], sharex=above)
-            _draw_paths(above, scores, model, window, j)
-            run = str(cut.run[window]).rsplit("/", 1)[-1].removesuffix(".parquet")
-            above.set_title(f"{title}: {run}", fontsize=8.5, loc="left")
-            above.tick_params(labelbottom=False)
-            u = cut.u[window, cut.num_before - 1 :, j]
-            below.fill_between(t_s - machine.period_s, u, step="post", color=GREY, alpha=0.5, lw=0)
-            below.axhline(0.0, color=GREY, lw=0.5)
-            below.set(ylim=(-1.05, 1.05), yticks=[-1, 0, 1], xlim=(0.0, t_s[-1]))
-            if column == 0:
-                above.set_ylabel(f"{joint.name} [{joint.unit}]")
-                below.set_ylabel("u", rotation=0, va="center")
-            if j == machine.num_joints - 1:
-                below.set_xlabel("time of the free run [s]")
-            remove_frame(above)
-            remove_frame(below)
-    add_legend(figure, figure.axes[0])
-    return figure
+    machine, rows = scores.machine, {}
+    for joint in range(machine.num_joints):
+        chosen = _select_windows(scores, model, joint)
+        rows[joint] = [_show_window(scores, model, joint, *one) for one in chosen.items()]
+    return draw_motion_panels(rows, machine, (1.0, 1.0, 1.0))
 
 
-def _draw_paths(axis: Axes, scores: FreeRunScores, model: str, window: int, joint: int) -> None:
-    """Draw the paths of a window; the axis is bound by measurement and model, whatever rivals do."""
-    machine, measured = scores.machine, scores.cut.measured[window, :, joint]
-    t_s = machine.period_s * np.arange(1, len(measured) + 1)
+def _show_window(
+    scores: FreeRunScores, model: str, joint: int, title: str, window: int
+) -> MotionWindow:
+    cut = scores.cut
+    measured = cut.measured[window, :, joint]
     given = np.isfinite(measured)
-    colour = assign_colours(list(scores.predicted), model)
-    axis.plot(t_s, measured, color="black", lw=1.8, label="measured", zorder=3)
-    for name, path in scores.predicted.items():
-        shown = np.where(given, path[window, :, joint], np.nan)
-        is_mine = name == model
-        style = {"lw": 1.6, "zorder": 4} if is_mine else {"lw": 1.0, "ls": "--"}
-        axis.plot(t_s, shown, color=colour[name], label=name, **style)
-    shown = np.concatenate([measured[given], scores.predicted[model][window, : given.sum(), joint]])
-    lower, upper = float(machine.lower[joint]), float(machine.upper[joint])
-    middle = (shown.max() + shown.min()) / 2.0
-    half = max(float(np.ptp(shown)) * 0.62, 0.01 * (upper - lower))
-    axis.set_ylim(middle - half, middle + half)
-    for limit in (lower, upper):
-        if abs(limit - middle) < half:
-            axis.axhline(limit, color=RED, lw=1.0, ls=":")
+    t_s = scores.machine.period_s * np.arange(1, len(measured) + 1)[given]
+    colour, paths = assign_colours(list(scores.predicted), model), []
+    for name in sorted(scores.predicted, key=lambda name: name == model):
+        style = {"color": colour[name], "label": name, "lw": 1.0, "ls": "--"}
+        if name == model:
+            style |= {"lw": 1.6, "ls": "-"}
+        paths.append((t_s, scores.predicted[name][window, given, joint], style))
+    run = str(cut.run[window]).rsplit("/", 1)[-1].removesuffix(".parquet")
+    u = cut.u[window, cut.num_before - 1 :, joint][given]
+    return MotionWindow(f"{title}: {run}", t_s, measured[given], u, paths, paths[-1][1])
 
 
 def draw_error_over_horizon(scores: FreeRunScores, model: str) -> Figure:
