@@ -57,7 +57,7 @@ def write_verdict(result: Mapping[str, Any], machine: Machine) -> list[VerdictSe
     overall = result["overall"][result["model"]]
     given = [horizon for horizon, value in overall.items() if value is not None]
     horizon = f"{HEADLINE_S:g}" if f"{HEADLINE_S:g}" in given else given[-1]
-    warnings = [*_doubt_excitation(result), *_doubt_test_data(result)]
+    warnings = [*_list_excitation_doubts(result), *_list_test_doubts(result)]
     return [
         _judge_comparison(result, horizon),
         *_judge_dead_time(result, machine),
@@ -121,7 +121,7 @@ def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[Verdic
     return found
 
 
-def _doubt_excitation(result: Mapping[str, Any]) -> Iterator[str]:
+def _list_excitation_doubts(result: Mapping[str, Any]) -> Iterator[str]:
     for joint, facts in result["data"]["excitation"].items():
         lacks = []
         if facts["commanded_s"] < THIN_S:
@@ -137,7 +137,7 @@ def _doubt_excitation(result: Mapping[str, Any]) -> Iterator[str]:
             yield f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model."
 
 
-def _doubt_test_data(result: Mapping[str, Any]) -> Iterator[str]:
+def _list_test_doubts(result: Mapping[str, Any]) -> Iterator[str]:
     data = result["data"]
     idle = [joint for joint, facts in data["excitation"].items() if facts["judged_s"] <= 0]
     if idle:
