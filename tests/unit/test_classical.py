@@ -74,10 +74,8 @@ def test_the_reach_is_measured_in_the_plane_of_the_arm(machine: Machine) -> None
     target = torch.tensor([[x + 2.0, 0.0, z]]).repeat(2, 1)
     found = classical.guide(*at_rest(q, machine), target, torch.full((2,), 1.57), RANGE_M)
     assert found.reach_m.tolist() == pytest.approx([2.0, 2.0], abs=1e-4)
-    assert (
-        found.reach_3d_m[0].item() == pytest.approx(2.0, abs=1e-4)
-        and found.reach_3d_m[1].item() > 2.1
-    )
+    assert found.reach_3d_m[0].item() == pytest.approx(2.0, abs=1e-4)
+    assert found.reach_3d_m[1].item() > 2.1
 
 
 def test_exclusive_joints_rest_in_the_approach(machine: Machine) -> None:
@@ -86,11 +84,8 @@ def test_exclusive_joints_rest_in_the_approach(machine: Machine) -> None:
     pose, jacobian = classical.kinematics.pose_and_jacobian(q)
     error = torch.randn(64, 3)
     share = classical.approach(jacobian.tip, jacobian.pitch, error, torch.randn(64))
-    assert (
-        (share[:, 1] == 0).all()
-        and (share[:, [0, 2, 3, 4]].abs().amax(1) > 0).all()
-        and (share.abs() <= 1).all()
-    )
+    assert (share[:, 1] == 0).all() and (share.abs() <= 1).all()
+    assert (share[:, [0, 2, 3, 4]].abs().amax(1) > 0).all()
     assert pose.tip_in_base_m.isfinite().all()
 
 
@@ -111,9 +106,8 @@ def test_the_valve_map_is_inverted_where_it_moves_anything(machine: Machine) -> 
     classical = controller(machine)
     share = torch.linspace(0.06, 1.0, 20)[:, None].repeat(1, 5)  # more than creep
     share[1::2] *= -1
-    torch.testing.assert_close(
-        classical.rate(classical.valve(share)) / classical.speed, share, rtol=0, atol=1e-6
-    )
+    found = classical.rate(classical.valve(share)) / classical.speed
+    torch.testing.assert_close(found, share, rtol=0, atol=1e-6)
 
 
 def test_small_speeds_become_pulses_of_creep_and_tiny_ones_nothing(machine: Machine) -> None:
@@ -128,16 +122,12 @@ def test_nothing_is_driven_into_a_limit(machine: Machine) -> None:
     q = torch.tensor(machine.home, dtype=torch.float32).repeat(2, 1)
     q[0, 4], q[1, 4] = float(machine.upper[4]) - 0.04, float(machine.lower[4]) + 0.04
     pose = classical.kinematics.pose(q)
-    further = pose.pitch_rad + torch.tensor([0.5, -0.5])
-    found = classical.guide(*at_rest(q, machine), pose.tip_in_base_m, further, RANGE_M)
-    assert found.command[:, 4].tolist() == [0.0, 0.0]
-    back = classical.guide(
-        *at_rest(q, machine),
-        pose.tip_in_base_m,
-        pose.pitch_rad - torch.tensor([0.5, -0.5]),
-        RANGE_M,
+    turn = torch.tensor([0.5, -0.5])
+    further, back = (
+        classical.guide(*at_rest(q, machine), pose.tip_in_base_m, wanted, RANGE_M).command[:, 4]
+        for wanted in (pose.pitch_rad + turn, pose.pitch_rad - turn)
     )
-    assert back.command[0, 4] < 0 < back.command[1, 4]
+    assert further.tolist() == [0.0, 0.0] and back[0] < 0 < back[1]
 
 
 def test_whoever_commands_within_the_bounds_slows_down_before_the_ends(machine: Machine) -> None:
@@ -145,18 +135,10 @@ def test_whoever_commands_within_the_bounds_slows_down_before_the_ends(machine: 
     classical = controller(machine, margin_rad=0.05, brake_s=0.2, dead_band=0.08)
     speed, upper = torch.tensor(machine.max_speed), torch.tensor(machine.upper)
     q = torch.stack([upper - 0.05 - share * speed * 0.2 for share in (0.0, 0.5, 2.0)]).float()
-    found = classical.guide(
-        *at_rest(q, machine),
-        torch.tensor([[2.8, 0.0, 0.75]]).repeat(3, 1),
-        torch.full((3,), 1.57),
-        RANGE_M,
-    )
-    torch.testing.assert_close(
-        found.highest[1:],
-        torch.tensor([[0.08 + 0.92 * 0.5], [1.0]]).expand(-1, 5),
-        atol=1e-5,
-        rtol=0,
-    )
+    target_m = torch.tensor([[2.8, 0.0, 0.75]]).repeat(3, 1)
+    found = classical.guide(*at_rest(q, machine), target_m, torch.full((3,), 1.57), RANGE_M)
+    half_and_free = torch.tensor([[0.08 + 0.92 * 0.5], [1.0]]).expand(-1, 5)
+    torch.testing.assert_close(found.highest[1:], half_and_free, atol=1e-5, rtol=0)
     assert (found.highest[0] <= 0.081).all() and (found.lowest == -1.0).all()
 
 
@@ -175,9 +157,8 @@ def test_errors_are_told_in_the_plane_of_the_arm(machine: Machine) -> None:
     q = torch.tensor(machine.home, dtype=torch.float32)[None].clone()
     q[0, 0] = torch.pi / 2  # the arm points along y
     tip = classical.kinematics.pose(q).tip_in_base_m
-    found = classical.guide(
-        *at_rest(q, machine), tip + torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([1.57]), RANGE_M
-    )
+    target_m = tip + torch.tensor([[0.1, 0.2, 0.3]])
+    found = classical.guide(*at_rest(q, machine), target_m, torch.tensor([1.57]), RANGE_M)
     # radial, tangential, up
     assert found.error_m[0].tolist() == pytest.approx([0.2, -0.1, 0.3], abs=1e-5)
 
@@ -185,10 +166,8 @@ def test_errors_are_told_in_the_plane_of_the_arm(machine: Machine) -> None:
 def test_the_block_solver_agrees_with_torch() -> None:
     torch.manual_seed(0)
     factor = torch.randn(256, 4, 5, dtype=torch.float64)
-    a, b = (
-        factor @ factor.transpose(1, 2) + 0.05 * torch.eye(4, dtype=torch.float64),
-        torch.randn(256, 4, 1, dtype=torch.float64),
-    )
+    a = factor @ factor.transpose(1, 2) + 0.05 * torch.eye(4, dtype=torch.float64)
+    b = torch.randn(256, 4, 1, dtype=torch.float64)
     torch.testing.assert_close(_solve_4(a, b), torch.linalg.solve(a, b))
 
 
@@ -206,9 +185,8 @@ def test_it_gets_there_from_many_starts_through_dead_time_and_lag(
     start = process.starts(num, 11)
     everywhere = torch.ones(num, dtype=torch.bool)
     world.reset(everywhere, start["q"], start["scene"])
-    history = History(
-        q=torch.zeros(num, machine.num_history, 5), u=torch.zeros(num, machine.num_history, 5)
-    )
+    q, u = torch.zeros(2, num, machine.num_history, 5)
+    history = History(q=q, u=u)
     history.reset(everywhere, start["q"])
     model.reset(everywhere)
     process.reset(everywhere, start)

@@ -60,13 +60,9 @@ def shallow(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     runner = runs.make(machine, folder, training, loop)
     runner.run()
     actor, process = runner.alg.get_policy(), loop.task
-    contract = describe_policy(
-        training.describe_network(),
-        process,
-        loop.description,
-        machine,
-        actuator=option("actuator", "lag"),
-    )
+    network = training.describe_network()
+    plant = {"actuator": option("actuator", "lag")}
+    contract = describe_policy(network, process, loop.description, machine, **plant)
     write_policy(folder, contract, actor.state_dict())
     export_onnx(folder, actor, process, machine, contract, runner.record_answers())  # type: ignore[arg-type]
     return folder
@@ -90,9 +86,7 @@ def test_each_field_of_the_behaviour_counts() -> None:
         "action.mask": insertion(action=replace(task.action, mask=False)),
         "noise.filter": insertion(noise=replace(task.noise, filter="none")),
         "switch.rule": insertion(switch=replace(task.switch, rule="text")),
-        "scaling.target_std_m": insertion(
-            scaling=replace(task.scaling, target_std_m=(1.0, 1.0, 1.0))
-        ),
+        "scaling.pitch_rad": insertion(scaling=replace(task.scaling, pitch_rad=(1.0, 1.0))),
         "classical.gain_1_s": insertion(classical=replace(task.classical, gain_1_s=1.0)),
     }
     own = describe_task(task)
@@ -123,12 +117,9 @@ def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
     default = insertion(episode_s=short)
     mine = TrainedPolicy(path=str(shallow), task=replace(default, depth_m=0.1))
     shipped = TrainedPolicy(path=str(SHIPPED), task=own_task(default, str(SHIPPED)))
-    by_default = evaluate_policies(
-        runs.plant(machine, default),
-        how,
-        session,
-        {"shallow": mine, "shipped": shipped, "classical": ClassicalPolicy(task=mine.task)},
-    )
+    classical = ClassicalPolicy(task=mine.task)
+    policies: Any = {"shallow": mine, "shipped": shipped, "classical": classical}
+    by_default = evaluate_policies(runs.plant(machine, default), how, session, policies)
     alone = evaluate_policies(
         runs.plant(machine, insertion(episode_s=short, depth_m=0.1)),
         how,
@@ -163,9 +154,8 @@ def test_a_checkpoint_is_exported_by_what_it_says(
     content["answers"] = (content["answers"][0], content["answers"][1] + 0.01)
     torch.save(content, tmp_path / "model_2.pt")
     other = replace(policy, path=str(tmp_path / "model_2.pt"))
-    with pytest.raises(
-        CheckpointError, match=r"differs from the answers .* not the one of the run"
-    ):
+    told = r"differs from the answers .* not the one of the run"
+    with pytest.raises(CheckpointError, match=told):
         replace(export, policy=other).run()
 
 
@@ -226,10 +216,7 @@ FEW = ("evaluation.num_recorded=1", "evaluation.video=false", "actuator=lag", "s
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (
-            ("task.action.kind=residual",),
-            "task.action.kind=residual was asked for, the policy has dir",
-        ),
+        (("task.action.kind=residual",), "kind=residual was asked for, the policy has dir"),
         (("task.action={kind: residual}",), "task.action.kind=residual was asked for"),
         (("task.depth_m=0.1",), "task.depth_m=0.1 was asked for, the policy has 0.14"),
         (("task=goal_pose",), "for task=borehole_insertion, but task=goal_pose was asked for"),
@@ -349,10 +336,8 @@ def test_a_value_that_counts_only_at_the_beginning_is_refused_before_the_run_is_
     run = ("mode=train", "session.out=run", "session.device=cpu", "task.episode_s=1.0")
     assert brokk(*run, *small, *FEW, "evaluation.episodes=1").code == 0
     before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    for value in (
-        "rl.runner.algorithm.learning_rate=0.001",
-        "rl.runner.actor.distribution_cfg.init_std=2.0",
-    ):
+    settings = ("algorithm.learning_rate=0.001", "actor.distribution_cfg.init_std=2.0")
+    for value in (f"rl.runner.{setting}" for setting in settings):
         done = brokk("mode=train", "policy=run", "session.out=run", value)
         assert done.code == 2 and f"{value} was asked for, but the training in run" in done.err
     done = brokk("mode=train", "policy=run/model_1.pt", "session.out=new", value)

@@ -28,9 +28,8 @@ def test_a_process_started_by_hand_is_alone() -> None:
 
 def test_torchrun_says_which_process_this_is(monkeypatch: pytest.MonkeyPatch) -> None:
     told(monkeypatch, RANK=5, LOCAL_RANK=1, WORLD_SIZE=8)
-    assert (
-        distributed.read_rank() == distributed.Rank(5, 1, 8) and not distributed.read_rank().first
-    )
+    rank = distributed.read_rank()
+    assert rank == distributed.Rank(5, 1, 8) and not rank.first
 
 
 def test_half_an_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,25 +85,16 @@ def test_each_process_has_its_own_gpu(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_alone_a_group_changes_nothing() -> None:
     with TrainingGroup(torch.device("cpu")) as group:
-        assert (
-            not group.together
-            and group.gather(3) == [3]
-            and group.broadcast_first(4) == 4
-            and group.gather_on_first({"a": 1}) == [{"a": 1}]
-        )
-        assert group.pool_statistics({"x": 0.25, "episodes": 8.0, "fault_rate": 0.5}) == {
-            "x": 0.25,
-            "episodes": 8.0,
-            "fault_rate": 0.5,
-        }
+        assert not group.together and group.gather(3) == [3] and group.broadcast_first(4) == 4
+        assert group.gather_on_first({"a": 1}) == [{"a": 1}]
+        figures = {"x": 0.25, "episodes": 8.0, "fault_rate": 0.5}
+        assert group.pool_statistics(figures) == figures
 
 
 def test_figures_of_several_weigh_by_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
     group = TrainingGroup(torch.device("cpu"))
-    parts = [
-        {"x": 1.0, "episodes": 3.0, "fault_rate": 0.0},
-        {"x": 0.0, "episodes": 1.0, "fault_rate": 0.5},
-    ]
+    names = ("x", "episodes", "fault_rate")
+    parts = [dict(zip(names, row, strict=True)) for row in ((1.0, 3.0, 0.0), (0.0, 1.0, 0.5))]
     monkeypatch.setattr(group, "gather", lambda figures: parts)
     assert group.pool_statistics(parts[0]) == {"x": 0.75, "episodes": 4.0, "fault_rate": 0.25}
 
@@ -112,8 +102,5 @@ def test_figures_of_several_weigh_by_episodes(monkeypatch: pytest.MonkeyPatch) -
 def test_a_fingerprint_sees_the_last_bit() -> None:
     weights = {"a": torch.ones(3), "b": torch.tensor(2.0)}
     nudged = weights | {"b": torch.nextafter(weights["b"], torch.tensor(3.0))}
-    assert (
-        hash_tensors(weights)
-        == hash_tensors({k: v.clone() for k, v in weights.items()})
-        != hash_tensors(nudged)
-    )
+    again = {name: value.clone() for name, value in weights.items()}
+    assert hash_tensors(weights) == hash_tensors(again) != hash_tensors(nudged)

@@ -30,11 +30,8 @@ def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
     tracker.close()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     scalars = events.Scalars("episode/success_strict")
-    assert [(event.step, round(event.value, 3)) for event in scalars] == [
-        (0, 0.0),
-        (1, 0.1),
-        (2, 0.2),
-    ]
+    found = [(event.step, round(event.value, 3)) for event in scalars]
+    assert found == [(0, 0.0), (1, 0.1), (2, 0.2)]
     assert len(events.Scalars("loss/value")) == 3
 
 
@@ -45,9 +42,8 @@ def test_a_run_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
             tracker.log({"loss/value": float(process)}, step)
         tracker.close()
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload().Scalars("loss/value")
-    assert [(one.step, one.value) for one in events] == [
-        (step, float(step >= 5)) for step in range(10)
-    ]
+    wanted = [(step, float(step >= 5)) for step in range(10)]
+    assert [(one.step, one.value) for one in events] == wanted
 
 
 @pytest.mark.slow
@@ -65,9 +61,8 @@ def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
         tracker.close()
     found = [list((folder / "wandb").glob("offline-run-*")) for folder in folders]
     assert [len(runs) for runs in found] == [1, 1], "one run a job, in its own run folder"
-    assert found[0][0].name != found[1][0].name and all(
-        list(runs[0].glob("run-*.wandb")) for runs in found
-    )
+    assert found[0][0].name != found[1][0].name
+    assert all(list(runs[0].glob("run-*.wandb")) for runs in found)
     tracking.open(folders[0], {"seed": 0}, 1).close()
     again = {path.name.rpartition("-")[2] for path in (folders[0] / "wandb").glob("offline-run-*")}
     assert again == {found[0][0].name.rpartition("-")[2]}, "a job that goes on keeps its id"
