@@ -14,7 +14,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -316,36 +316,8 @@ class LoopFeed:
         return self._memory.frame and self._memory.frame.peek("t_s")
 
     def _list_targets(self, aim: Any | None) -> tuple[BoreholeChoice, ...]:
-        """Return the boreholes that perception knows, and the one that the advice is for."""
-        holes = read_holes(self._memory.holes)
-        # The target may be perception's own or one from a file; the nearest known hole is shown
-        # as chosen.
-        chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
-        found = []
-        for hole in holes:
-            choice = BoreholeChoice(
-                name=str(int(hole["name"])),
-                center_in_base_m=to_vector(hole["center_in_base_m"]),
-                axis_in_base=to_vector(hole["axis_in_base"]),
-                radius_m=float(hole["radius_m"]),
-                std_m=float(hole["std_m"]),
-                confidence=float(hole["score"]),
-                chosen=hole is chosen,
-            )
-            found.append(choice)
-        if aim is not None and chosen is None:
-            choice = BoreholeChoice(
-                name=UNNAMED,
-                center_in_base_m=to_vector(aim["center_in_base_m"]),
-                axis_in_base=UP,
-                radius_m=self._config.page.borehole_radius_m,
-                # 0 stands for "not known" in shared memory.
-                std_m=float(aim["std_m"]) or None,
-                confidence=None,
-                chosen=True,
-            )
-            found.append(choice)
-        return tuple(found)
+        radius_m = self._config.page.borehole_radius_m
+        return list_boreholes(read_holes(self._memory.holes), aim, radius_m)
 
     def _find_named(self, name: str) -> TargetPosition | None:
         """Return the position of the borehole of that name."""
@@ -367,3 +339,43 @@ class LoopFeed:
         # A hole that perception knows is better measured than one touch.
         known = find_nearest(read_holes(self._memory.holes), found[0])
         return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
+
+
+def list_boreholes(
+    holes: Sequence[Mapping[str, Any]], aim: Mapping[str, Any] | None, radius_m: float
+) -> tuple[BoreholeChoice, ...]:
+    """Return the boreholes that perception knows, and the one that the advice is for.
+
+    Args:
+        holes: Records of `deploy.runtime.shm_layout.HOLE`, or their fields by name.
+        aim: `center_in_base_m` and `std_m` of the target; `None` without one.
+        radius_m: Of a borehole of which only the centre is known.
+    """
+    # The target may be perception's own or one from a file; the nearest known hole is shown as
+    # chosen.
+    chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
+    found = []
+    for hole in holes:
+        choice = BoreholeChoice(
+            name=str(int(hole["name"])),
+            center_in_base_m=to_vector(hole["center_in_base_m"]),
+            axis_in_base=to_vector(hole["axis_in_base"]),
+            radius_m=float(hole["radius_m"]),
+            std_m=float(hole["std_m"]),
+            confidence=float(hole["score"]),
+            chosen=hole is chosen,
+        )
+        found.append(choice)
+    if aim is not None and chosen is None:
+        choice = BoreholeChoice(
+            name=UNNAMED,
+            center_in_base_m=to_vector(aim["center_in_base_m"]),
+            axis_in_base=UP,
+            radius_m=radius_m,
+            # 0 stands for "not known".
+            std_m=float(aim["std_m"]) or None,
+            confidence=None,
+            chosen=True,
+        )
+        found.append(choice)
+    return tuple(found)

@@ -21,6 +21,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from deploy.guidance import AXES, convert_to_positions, find_full_angles_rad
 from deploy.kernel.guard import GuardState, GuardTrip
+from deploy.page.loop_feed import list_boreholes
 from deploy.page.protocol import (
     BoreholeChoice,
     LoopHealth,
@@ -31,15 +32,13 @@ from deploy.page.protocol import (
     ShownAdvice,
     SourceAge,
     TimelineMark,
-    Vector,
     read_view,
 )
-from deploy.page.scene import place_tool, to_vector
+from deploy.page.scene import place_tool
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
 from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import ALIVE_S, AdviceStatus, OperatorState
 from deploy.runtime.shared_memory import RecordLayout
-from deploy.runtime.target import NEAR_M
 
 VIEWS = (PICTURE, LENS, CLOUD, CAMERA_POSE)
 """Topics of the camera."""
@@ -49,8 +48,6 @@ MOST_MARKS = 200
 """Marks on the timeline; each state carries them. Chosen by hand."""
 RADIUS_M = 0.05
 """Radius of a borehole of which the recording holds the centre alone, as in `conf/page`."""
-UP: Vector = (0.0, 0.0, 1.0)
-UNNAMED = "+"
 
 
 @spec
@@ -271,28 +268,10 @@ class ReplayFeed:
         self, at_s: float, advice: dict[str, Any] | None
     ) -> tuple[BoreholeChoice, ...]:
         """Return the boreholes known at that time; the one that the advice is for is chosen."""
-        seen = self._find("holes", at_s)
-        valid = advice is not None and advice["reason"] == AdviceStatus.VALID.value
-        goal_m = np.array(advice["target_in_base_m"]) if advice is not None and valid else None
-        found, is_chosen = [], False
-        for hole in [] if seen is None else seen[2]["holes"]:
-            center_m = np.array(hole["center_in_base_m"])
-            chosen = goal_m is not None and float(np.linalg.norm(center_m - goal_m)) < NEAR_M
-            chosen = chosen and not is_chosen
-            is_chosen |= chosen
-            choice = BoreholeChoice(
-                str(hole["name"]),
-                to_vector(center_m),
-                to_vector(np.array(hole["axis_in_base"])),
-                hole["radius_m"],
-                hole["std_m"],
-                hole["score"],
-                chosen,
-            )
-            found.append(choice)
-        if goal_m is not None and not is_chosen:
-            found.append(BoreholeChoice(UNNAMED, to_vector(goal_m), UP, RADIUS_M, None, None, True))
-        return tuple(found)
+        seen, aim = self._find("holes", at_s), None
+        if advice is not None and advice["reason"] == AdviceStatus.VALID.value:
+            aim = {"center_in_base_m": advice["target_in_base_m"], "std_m": 0.0}
+        return list_boreholes([] if seen is None else seen[2]["holes"], aim, RADIUS_M)
 
 
 class _Topic:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -161,18 +162,14 @@ def read_holes(slot: Slot) -> list[Any]:
     return [] if record is None else list(record["holes"][: int(record["count"])])
 
 
-def find_nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
+def find_nearest(holes: Sequence[Any], center_m: np.ndarray) -> Any | None:
     """Return the one of `holes` at `center_m`, `None` for none."""
-    one = min(
-        holes,
-        key=lambda hole: float(np.linalg.norm(hole["center_in_base_m"] - center_m)),
-        default=None,
-    )
-    return (
-        one
-        if one is not None and np.linalg.norm(one["center_in_base_m"] - center_m) <= NEAR_M
-        else None
-    )
+
+    def measure_m(hole: Any) -> float:
+        return float(np.linalg.norm(np.array(hole["center_in_base_m"]) - center_m))
+
+    near = [hole for hole in holes if measure_m(hole) <= NEAR_M]
+    return min(near, key=measure_m, default=None)
 
 
 def locate_hole(hole: Any) -> TargetPosition:

@@ -261,61 +261,40 @@ def list_names(shown: PageState) -> list[str]:
     return [f"{one.level} {one.name} {one.detail}".strip() for one in alarms.list_alarms(shown)]
 
 
-def test_alarms_name_what_has_failed_and_nothing_else() -> None:
-    assert list_names(SHOWN) == []
-    assert list_names(replace(SHOWN, alive=False)) == ["alarm control computer silent"]
-    old = (*SHOWN.streams[:2], SourceAge("borehole", 700.0, 600.0), SourceAge("camera", 3.0, 1.0))
-    assert list_names(replace(SHOWN, streams=old)) == [
-        "alarm too old camera",
-        "caution too old borehole",
-    ]
-    never = (SourceAge("positions", None, 0.1), SourceAge("camera", None, 1.0))
-    assert list_names(replace(SHOWN, streams=never)) == [
-        "alarm nothing has come positions",
-        "caution nothing has come camera",
-    ]
+ON = RecordingStatus(on=True, seconds=3.0, dropped=0, failed=False)
+STREAMS = (SourceAge("borehole", 700.0, 600.0), SourceAge("camera", 3.0, 1.0))
+NEVER = (SourceAge("positions", None, 0.1), SourceAge("camera", None, 1.0))
+LATCHED = {"guard": GuardState.LATCHED, "cause": GuardTrip.JOINT_STILL, "observed_joint": 3}
+ALARMS: list[tuple[PageState, list[str]]] = [
+    (SHOWN, []),
+    (replace(SHOWN, alive=False), ["alarm control computer silent"]),
+    (replace(SHOWN, streams=(*SHOWN.streams[:2], *STREAMS)), ["alarm too old camera", "caution too old borehole"]),
+    (replace(SHOWN, streams=NEVER), ["alarm nothing has come positions", "caution nothing has come camera"]),
+    (replace(SHOWN, health=replace(SHOWN.health, delay_s=0.07)), []),
+    (replace(SHOWN, health=replace(SHOWN.health, delay_s=0.08)), ["caution messages arrive late 80 ms"]),
+    (replace(SHOWN, health=replace(SHOWN.health, delay_s=0.2)), ["alarm messages arrive late 200 ms"]),
+    (replace(SHOWN, recording=ON), []),
+    (replace(SHOWN, recording=ON, health=replace(SHOWN.health, log_behind=True)), ["alarm recorder does not write"]),
+    (replace(SHOWN, recording=replace(ON, dropped=4)), ["alarm recording has gaps 4"]),
+    (replace(SHOWN, recording=replace(ON, on=False, failed=True)), ["alarm recording failed"]),
+    (replace(SHOWN, health=replace(SHOWN.health, supervisor_silent=True)), ["alarm supervisor silent"]),
+    (change_state(SHOWN, guard=GuardState.SILENT, trip=GuardTrip.LEVER), []),
+    (change_state(SHOWN, target=GuardTrip.TARGET_REACH), ["alarm borehole out of reach"]),
+    (change_state(SHOWN, prompt=True), ["alarm are you there"]),
+    (change_state(SHOWN, **LATCHED), [f"alarm {GuardTrip.JOINT_STILL.value} joint 3"]),
+    (change_state(SHOWN, estop=True, guard=GuardState.LATCHED, cause=GuardTrip.ESTOP), ["alarm emergency stop"]),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("delay_s", "names"),
-    [
-        (0.07, []),
-        (0.08, ["caution messages arrive late 80 ms"]),
-        (0.2, ["alarm messages arrive late 200 ms"]),
-    ],
-)
-def test_delay_warns_at_half_its_limit(delay_s: float, names: list[str]) -> None:
-    assert list_names(replace(SHOWN, health=replace(SHOWN.health, delay_s=delay_s))) == names
-
-
-def test_a_recorder_that_is_dead_or_stuck_is_an_alarm_and_one_that_is_off_is_none() -> None:
-    on = RecordingStatus(on=True, seconds=3.0, dropped=0, failed=False)
-    stuck = replace(SHOWN.health, log_behind=True)
-    assert list_names(replace(SHOWN, recording=on)) == []
-    assert list_names(replace(SHOWN, recording=on, health=stuck)) == [
-        "alarm recorder does not write"
-    ]
-    assert list_names(replace(SHOWN, recording=replace(on, dropped=4))) == [
-        "alarm recording has gaps 4"
-    ]
-    dead = replace(on, on=False, failed=True)
-    assert list_names(replace(SHOWN, recording=dead)) == ["alarm recording failed"]
-    silent = replace(SHOWN.health, supervisor_silent=True)
-    assert list_names(replace(SHOWN, health=silent)) == ["alarm supervisor silent"]
+@pytest.mark.parametrize(("shown", "names"), ALARMS)
+def test_alarms_name_what_has_failed_and_nothing_else(shown: PageState, names: list[str]) -> None:
+    assert list_names(shown) == names
 
 
 @pytest.mark.parametrize("trip", [GuardTrip.JOINT_DRIFTS, GuardTrip.FLOW_UNASKED])
 def test_a_fault_of_sensor_or_valve_is_an_alarm_where_nothing_is_sent(trip: GuardTrip) -> None:
     listening = change_state(SHOWN, guard=GuardState.SILENT, trip=trip, observed_joint=3)
     assert list_names(listening) == [f"alarm {trip.value} joint 3"]
-    calm = change_state(SHOWN, guard=GuardState.SILENT, trip=GuardTrip.LEVER)
-    assert list_names(calm) == []
-
-
-def test_a_borehole_beyond_its_limits_and_an_operator_who_has_to_answer_are_alarms() -> None:
-    refused = change_state(SHOWN, target=GuardTrip.TARGET_REACH)
-    assert list_names(refused) == ["alarm borehole out of reach"]
-    assert list_names(change_state(SHOWN, prompt=True)) == ["alarm are you there"]
 
 
 @pytest.mark.parametrize("before", ["link", "open", "none"])
@@ -337,15 +316,6 @@ def test_the_link_with_the_token_is_its_owners_alone(
     record_property("page: page.url was a link, or of mode 666; mode", mode)
     assert path.read_text() == "http://localhost/#token=x\n" and not path.is_symlink()
     assert path.stat().st_mode & 0o777 == 0o600 and other.read_text() == "another's"
-
-
-def test_the_guard_and_its_observer_are_alarms() -> None:
-    latched = {"guard": GuardState.LATCHED, "cause": GuardTrip.JOINT_STILL, "observed_joint": 3}
-    assert list_names(change_state(SHOWN, **latched)) == [
-        f"alarm {GuardTrip.JOINT_STILL.value} joint 3"
-    ]
-    stopped = change_state(SHOWN, estop=True, guard=GuardState.LATCHED, cause=GuardTrip.ESTOP)
-    assert list_names(stopped) == ["alarm emergency stop"]
 
 
 def test_both_languages_say_everything() -> None:
