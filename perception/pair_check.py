@@ -200,11 +200,14 @@ class PairCheck:
             return nothing
         my_px, their_px = cv2.KeyPoint.convert(mine), cv2.KeyPoint.convert(theirs)
         apart_px = their_px[None, :, 1] - my_px[:, None, 1]
-        first, second = _match_words(my_words, their_words, np.ones(apart_px.shape, bool))
-        shift_px = apart_px[first, second]
-        votes = compute_biweight(shift_px[:, None] - shift_px, self.common_px).sum(1)
-        near = np.abs(apart_px - shift_px[np.argmax(votes)]) < self.common_px
-        first, second = _match_words(my_words, their_words, near)
+        allowed = np.ones(apart_px.shape, bool)
+        for _ in range(2):
+            first, second = _match_words(my_words, their_words, allowed)
+            if not len(first):
+                return nothing
+            shift_px = apart_px[first, second]
+            votes = compute_biweight(shift_px[:, None] - shift_px, self.common_px).sum(1)
+            allowed = np.abs(apart_px - shift_px[np.argmax(votes)]) < self.common_px
         start, end = my_px[first], their_px[second]
         # Features of several scales at one place share their error: one of each cell counts.
         cell = np.floor(start / self.cell_px)
@@ -286,9 +289,9 @@ def fit_alignment(matches: PairMatches, frame: Frame, alike: float) -> PairAlign
     design = _build_design(frame, matches.right[:, 0], matches.right[:, 1])
     # A hundredth of a pixel: pictures drawn without noise would leave no scale.
     precision = np.sqrt(matches.texture / np.median(matches.texture))
-    row, column = np.floor(matches.left / (alike * frame.color.shape[1])).T
-    weighted = design * precision[:, None], shift_px * precision
-    solution, cov = fit_linear(*weighted, 0.01, cell=row * 1000 + column)
+    square = np.floor(matches.left / (alike * frame.color.shape[1]))
+    cell = square[:, 0] * 1000 + square[:, 1]
+    solution, cov = fit_linear(design * precision[:, None], shift_px * precision, 0.01, cell=cell)
     # Where something was matched: beyond, three numbers of few features say anything.
     gram = design.T @ design / len(design)
     noise = float(np.trace(gram @ cov)) if np.isfinite(cov).all() else np.inf

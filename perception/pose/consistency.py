@@ -184,11 +184,11 @@ def _measure_oval(
 ) -> np.ndarray:
     """Return how oval weighted edges are on a face, along its slope and diagonally, in radii.
 
-    By the focal length over the factor of this logarithm.
+    The focal length is that of the chart over the factor of this logarithm.
     """
     waves, distance_m = _expand_outline(pixels, row, chart, face, logarithm)
     heavy = waves.T * weight
-    solution = np.linalg.solve(heavy @ waves, heavy @ distance_m)
+    solution = np.linalg.lstsq(heavy @ waves, heavy @ distance_m, rcond=None)[0]
     return solution[3:5] / solution[0]
 
 

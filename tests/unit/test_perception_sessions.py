@@ -59,8 +59,10 @@ def test_a_stereo_video_becomes_frames(
     assert yaml.safe_load((out / "frames/camera.yaml").read_text())["baseline_m"] == 0.12
     assert len(list((out / "frames").glob("*.color.png"))) == 2
     both = [cv2.imread(str(out / f"frames/00001.{side}.png")) for side in ("color", "right")]
-    assert both[0] is not None and both[1] is not None
-    np.testing.assert_allclose(np.concatenate(both, 1), draw_pair(2), atol=12)  # YUV of the codec
+    pictures = [one for one in both if one is not None]
+    np.testing.assert_allclose(
+        np.concatenate(pictures, 1), draw_pair(2), atol=12
+    )  # YUV of the codec
     refused = brokk("mode=record_camera", "capture.input=gone.mp4", f"lens={lens}", "session.out=x")
     assert refused.code == 2 and "gone.mp4" in refused.err
 
@@ -125,7 +127,9 @@ def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> f
         "perception": SimpleNamespace(find=FrameDetections([hole]).in_base_frame),
         "source": Source(),
     }
-    built = {key: SimpleNamespace(build=lambda part=part: part) for key, part in parts.items()}
+    built: dict[str, Any] = {
+        key: SimpleNamespace(build=lambda part=part: part) for key, part in parts.items()
+    }
     options = ScoreOptions(
         truth=str(tmp_path / "measured.yaml"), kind=kind, name=name,
     )  # fmt: skip
