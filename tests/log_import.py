@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 from conftest import Done
+from mcap.writer import Writer
 
 from actuators.modes.import_logs import summarise
 from actuators.recordings import conversion, log_draft
@@ -64,3 +67,21 @@ def import_log(*options: str) -> tuple[Done, list[dict[str, np.ndarray]]]:
                 columns[f"q_{name}_{unit}"] = one.q[:, j]
             found.append(columns)
     return Done(0, describe_draft(draft), ""), found
+
+
+def write_messages(
+    path: str | Path, messages: Iterable[tuple[float, str, Any]], chunk_size: int = 1 << 20
+) -> None:
+    """Writes an MCAP file of time in s, topic and content, as JSON or as bytes, of each message."""
+    with Path(path).open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_size)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        channels: dict[str, int] = {}
+        for t_s, topic, content in messages:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "json", schema)
+            time_ns = 1_700_000_000_000_000_000 + round(t_s * 1e9)
+            data = content if isinstance(content, bytes) else json.dumps(content).encode()
+            writer.add_message(channels[topic], time_ns, data, time_ns)
+        writer.finish()

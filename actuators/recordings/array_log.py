@@ -30,6 +30,8 @@ MOST_COLUMNS = 256
 """Widest matrix that is taken for joints; wider ones are pictures."""
 INDEX = "__index_level_"
 """Begin of the names under which pandas writes an index without a name."""
+HEAD_ROWS = 50
+"""Rows in the first of which a list is not empty, of which the number of items is told."""
 FORMATS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json"}
 """Formats of pyarrow by the ending of their files."""
 TABLE_ERRORS = (OSError, pa.ArrowException, ValueError)
@@ -83,7 +85,7 @@ class TableLog(LogFile):
     def _list_places(self) -> dict[str, tuple[str, str, int, int]]:
         """Return field, field within it, item and number of items of each name."""
         try:
-            head = self._open().head(1)
+            head = self._open().head(HEAD_ROWS)
         except FileNotFoundError as error:
             raise RecordingError(f"{self.path}: no such log") from error
         except TABLE_ERRORS as error:
@@ -93,7 +95,7 @@ class TableLog(LogFile):
         for field in head.column_names if head.num_rows else ():
             part = flatten_table(head.select([field]))
             for name, column in zip(part.column_names, part.columns, strict=True):
-                value = column[0].as_py()
+                value = next(filter(None, column.to_pylist()), None)
                 if _is_number(column.type):
                     is_index = name.startswith(INDEX) and pa.types.is_timestamp(column.type)
                     places["timestamp" if is_index else name] = (field, name, 0, 1)
@@ -294,18 +296,22 @@ def _is_list(kind: pa.DataType) -> bool:
 
 
 def _convert_column(column: pa.ChunkedArray, length: int) -> np.ndarray:
-    """Return numbers or lists of numbers as `(T, K)`.
+    """Return numbers or lists of numbers as `(T, K)`; NaN for an empty cell.
 
     Raises:
         ValueError: A list has another length.
     """
     whole: Any = column.combine_chunks()
-    flat = whole.flatten() if _is_list(column.type) else whole
-    if len(flat) != length * len(column):
+    flat, is_there = whole, np.full(len(whole), True)
+    if _is_list(column.type):
+        flat, is_there = whole.flatten(), np.asarray(whole.is_valid())
+    if len(flat) != length * is_there.sum():
         raise ValueError(f"a list of another length than {length}")
     unit = 1.0
     if _is_time(flat.type):
         unit = TIME_UNITS[flat.type.unit]
         flat = flat.cast(pa.int64())
     numbers = flat.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
-    return unit * numbers.reshape(-1, length)
+    found = np.full((len(whole), length), np.nan)
+    found[is_there] = unit * numbers.reshape(-1, length)
+    return found

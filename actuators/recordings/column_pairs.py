@@ -214,6 +214,8 @@ class PairFinder:
         rivals = [name for name in rivals if name not in taken]
         if rivals:
             self.remarks.append(f"other commands that were not taken: {', '.join(rivals)}")
+        if moving := [one.full_name for one in lone if one.is_changing]:
+            self.remarks.append(f"positions that move without a command: {', '.join(moving)}")
         if left and lone:
             missed = min(len(left), len(lone))
             listed = ", ".join(one.full_name for one in (*left, *lone))

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -54,18 +55,6 @@ def found(
     return inspect_recording(recording, machine, thresholds).findings
 
 
-def changed(
-    recording: Recording, u: np.ndarray | None = None, q: np.ndarray | None = None
-) -> Recording:
-    return replace(recording, u=recording.u if u is None else u, q=recording.q if q is None else q)
-
-
-def test_a_sound_recording_has_no_findings(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    assert found(sound(machine), machine, thresholds) == []
-
-
 def test_its_figures_are_those_it_was_made_with(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
@@ -84,35 +73,84 @@ def test_the_step_of_a_coarse_sensor_is_found(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     whole = sound(machine)
-    coarse = inspect_recording(
-        changed(whole, q=np.round(whole.q / 0.004) * np.float32(0.004)), machine, thresholds
-    )
+    coarse_q = np.round(whole.q / 0.004) * np.float32(0.004)
+    coarse = inspect_recording(replace(whole, q=coarse_q), machine, thresholds)
     assert coarse.joints["q3"]["step"] == pytest.approx(0.004, rel=0.01)
 
 
-def test_a_command_that_moves_nothing_is_found(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    whole = sound(machine)
-    u = whole.u.copy()
-    u[200:280, 3] = 0.8  # the interlock was open
-    (finding,) = found(changed(whole, u=u), machine, thresholds)
-    assert (finding.kind, finding.joint) == ("command without motion", "q4")
-    # told from where the joint should long have moved: dead time and 0.3 s later
-    assert (finding.row, finding.row + finding.num_rows) == (200 + 17, 280)
-    assert finding.t_s == pytest.approx(217 * PERIOD_S)
-    assert finding.text == "commanded +0.80, does not move"
+Arrays = tuple[np.ndarray, np.ndarray, Machine]
 
 
-def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(
-    machine: Machine, thresholds: InspectionThresholds
+def ignore_command(arrays: Arrays) -> None:
+    arrays[0][200:280, 3] = 0.8
+
+
+def press_at_stop(arrays: Arrays) -> None:
+    u, q, machine = arrays
+    u[200:280, 3] = 0.8
+    q[:, 3] = np.minimum(q[:, 3] + machine.upper[3] - machine.home[3], machine.upper[3])
+
+
+def sink(arrays: Arrays) -> None:
+    arrays[1][:, 1] += 0.002 * PERIOD_S * np.arange(len(arrays[1]))
+
+
+def freeze_moving(arrays: Arrays) -> None:
+    arrays[1][120:126, 2] = arrays[1][119, 2]
+
+
+def freeze_resting(arrays: Arrays) -> None:
+    arrays[1][500:520, 0] = arrays[1][499, 0]
+
+
+def coarsen(arrays: Arrays) -> None:
+    _, q, machine = arrays
+    q[:] = np.round((q - machine.home) / 0.004) * 0.004 + machine.home
+
+
+def lose_frames(arrays: Arrays) -> None:
+    for row in (110, 111):
+        arrays[1][row] = arrays[1][row - 1]
+
+
+def leave_limits(arrays: Arrays) -> None:
+    _, q, machine = arrays
+    q[:, 4] += machine.upper[4] + 0.05 - machine.home[4]
+
+
+def command_together(arrays: Arrays) -> None:
+    arrays[0][100:120, 1] = 0.2  # q2 while q3 is commanded
+
+
+@pytest.mark.parametrize(
+    ("change", "expected", "text"),
+    [
+        (lambda arrays: None, [], ""),
+        # told from where the joint should long have moved: dead time and 0.3 s later
+        (ignore_command, [("command without motion", "q4", 217, 63)], "commanded +0.80, does not move"),
+        (press_at_stop, [], ""),
+        (sink, [("motion without command", "q2", 17, 1183)], "+0.002 rad/s"),
+        (freeze_moving, [("frozen sensor", "q3", 119, 7)], "7 equal samples, then a jump of 0.04"),  # 7 periods at 0.13 rad/s
+        (freeze_resting, [("frozen sensor", "q1", 499, 21)], "21 equal samples of a sensor with noise"),
+        (coarsen, [], ""),
+        (lose_frames, [("frozen sensor", "q3", 109, 3), ("lost frames", None, 110, 2)], ""),
+        (leave_limits, [("beyond limit", "q5", 0, 1200)], "up to 0.05"),
+        (command_together, [("exclusive joint", "q2", 100, 20)], "together with another joint"),
+    ],
+)  # fmt: skip
+def test_what_is_planted_is_found_where_it_was_put_and_nothing_else(
+    machine: Machine,
+    thresholds: InspectionThresholds,
+    change: Callable[[Arrays], None],
+    expected: list[tuple[Any, ...]],
+    text: str,
 ) -> None:
     whole = sound(machine)
     u, q = whole.u.copy(), whole.q.copy()
-    u[200:280, 3] = 0.8
-    q[:, 3] += machine.upper[3] - machine.home[3]
-    q[:, 3] = np.minimum(q[:, 3], machine.upper[3])
-    assert found(changed(whole, u=u, q=q), machine, thresholds) == []
+    change((u, q, machine))
+    findings = found(replace(whole, u=u, q=q), machine, thresholds)
+    assert [(f.kind, f.joint, f.row, f.num_rows) for f in findings] == expected
+    assert all(text in finding.text for finding in findings)
 
 
 def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_held_one_is(
@@ -131,7 +169,7 @@ def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_
     )  # fmt: skip
     assert found(follows, arm, thresholds) == []
     q[700:, 2] -= 0.05 * np.minimum(np.arange(300) / 20, 1.0)  # the arm is pushed away
-    (finding,) = found(changed(follows, q=q.astype(np.float32)), arm, thresholds)
+    (finding,) = found(replace(follows, q=q.astype(np.float32)), arm, thresholds)
     assert (finding.kind, finding.joint) == ("motion without command", "elbow")
 
 
@@ -160,84 +198,6 @@ def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
     named = [one for one in findings if one.kind == "does not obey"]
     assert bool(named) == is_found
     assert all(one.joint == "elbow" and one.row >= 495 for one in named)
-
-
-def test_a_joint_that_sinks_is_found_with_its_speed(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    whole = sound(machine)
-    q = whole.q.copy()
-    q[:, 1] += 0.002 * whole.t_s
-    (finding,) = found(changed(whole, q=q), machine, thresholds)
-    assert (finding.kind, finding.joint) == ("motion without command", "q2")
-    assert "+0.002 rad/s" in finding.text
-    assert finding.duration_s == pytest.approx(60.0, abs=2.0)
-
-
-def test_a_frozen_sensor_is_found_amid_motion_and_at_rest(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    whole = sound(machine)
-    q = whole.q.copy()
-    q[120:126, 2] = q[119, 2]  # q3 is moving
-    q[500:520, 0] = q[499, 0]  # q1 rests, but its noise is gone
-    moving, resting = found(changed(whole, q=q), machine, thresholds)
-    assert (moving.kind, moving.joint, moving.row, moving.num_rows) == (
-        "frozen sensor",
-        "q3",
-        119,
-        7,
-    )
-    assert "7 equal samples, then a jump of 0.04" in moving.text  # 7 periods at 0.13 rad/s
-    assert (resting.kind, resting.joint, resting.row, resting.num_rows) == (
-        "frozen sensor",
-        "q1",
-        499,
-        21,
-    )
-
-
-def test_a_coarse_sensor_at_rest_between_motions_is_not_frozen(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    whole = sound(machine)
-    q = np.round((whole.q - machine.home) / 0.004) * np.float32(0.004) + machine.home
-    assert found(changed(whole, q=q.astype(np.float32)), machine, thresholds) == []
-
-
-def test_lost_frames_are_found(machine: Machine, thresholds: InspectionThresholds) -> None:
-    whole = sound(machine)
-    q = whole.q.copy()
-    for row in (110, 111, 130):
-        q[row] = q[row - 1]
-    kinds = [
-        (finding.kind, finding.row, finding.num_rows)
-        for finding in found(changed(whole, q=q), machine, thresholds)
-    ]
-    assert [entry for entry in kinds if entry[0] == "lost frames"] == [
-        ("lost frames", 110, 2),
-        ("lost frames", 130, 1),
-    ]
-
-
-def test_positions_beyond_the_limits_and_exclusive_joints_in_company_are_found(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    whole = sound(machine)
-    u, q = whole.u.copy(), whole.q.copy()
-    u[100:120, 1] = 0.2  # q2 while q3 is commanded
-    q[:, 4] += machine.upper[4] + 0.05 - machine.home[4]
-    exclusive, beyond = sorted(
-        found(changed(whole, u=u, q=q), machine, thresholds), key=lambda finding: str(finding.joint)
-    )
-    assert (exclusive.kind, exclusive.joint, exclusive.row, exclusive.num_rows) == (
-        "exclusive joint",
-        "q2",
-        100,
-        20,
-    )
-    assert (beyond.kind, beyond.joint, beyond.num_rows) == ("beyond limit", "q5", whole.num_samples)
-    assert "up to 0.05" in beyond.text
 
 
 def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(

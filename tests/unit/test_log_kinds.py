@@ -20,8 +20,7 @@ import pandas as pd
 import pytest
 import scipy.io
 from conftest import Done
-from log_import import import_log, try_draft
-from mcap.writer import Writer
+from log_import import import_log, try_draft, write_messages
 
 from actuators.recordings.advice import ADVICE
 from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
@@ -202,6 +201,17 @@ def test_columns_of_parquet_of_every_kind_are_read(kind: str) -> None:
     done, recordings = import_log("log.input=a.parquet")
     assert "No guess is unsure" in done.out
     check_joints(recordings)
+
+
+def test_a_list_that_is_empty_at_first_is_read_and_a_position_without_command_is_told() -> None:
+    rows = make_rows()
+    targets = [None, *([one] for one in rows[1:, 1])]
+    positions = [None, *(rows[1:, 2::2].tolist())]
+    frame = pd.DataFrame({"time": rows[:, 0], "target": targets, "position": positions})
+    frame.to_parquet("a.parquet")
+    done, recordings = import_log("log.input=a.parquet", "log.damaged=skip")
+    assert "positions that move without a command: position[1]" in done.out
+    np.testing.assert_allclose(recordings[0]["q_joint_0_rad"][1:], rows[2:, 2], atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -612,20 +622,6 @@ def test_commands_for_logs_that_a_page_prints_run_as_they_stand(
                 shutil.rmtree(folder, ignore_errors=True)
         done = brokk(*shlex.split(command))
         assert done.code == 0, done.err
-
-
-def write_messages(path: str, messages: list[tuple[float, str, dict[str, Any]]]) -> None:
-    with Path(path).open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("any", "jsonschema", b"{}")
-        channels: dict[str, int] = {}
-        for t_s, topic, content in messages:
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "json", schema)
-            time_ns = 1_700_000_000_000_000_000 + round(t_s * 1e9)
-            writer.add_message(channels[topic], time_ns, json.dumps(content).encode(), time_ns)
-        writer.finish()
 
 
 def test_arm_and_wheels_on_one_topic_keep_their_own_rates() -> None:

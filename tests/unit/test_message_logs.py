@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from carriage import check, make_carriage, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from log_import import write_messages
 from mcap.writer import Writer
 
 from actuators.recordings.column_map import AlignedTime, Column
@@ -55,15 +55,11 @@ def list_rows() -> list[tuple[int, float, float]]:
 
 
 def write_json(path: Path) -> Any:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channels = [writer.register_channel(topic, "json", schema) for topic in ("/command", "/state")]  # fmt: skip
-        for time_ns, u, q in list_rows():
-            for channel, content in zip(channels, ({"u": {"raw": [0.0, u]}}, {"q": q, "text": "a"}), strict=True):  # fmt: skip
-                writer.add_message(channel, time_ns, json.dumps(content).encode(), time_ns)
-        writer.finish()
+    messages = []
+    for t_s, u, q in zip(*make_signals().values(), strict=True):
+        messages.append((t_s, "/command", {"u": {"raw": [0.0, u]}}))
+        messages.append((t_s, "/state", {"q": q, "text": "a"}))
+    write_messages(path, messages)
     return make_topic_map("u.raw[1]", "q")
 
 
@@ -170,20 +166,14 @@ def test_messages_of_every_encoding_give_the_same_recording(
 def test_the_sensor_clock_of_a_topic_replaces_a_late_recorder(
     tmp_path: Path, carriage: Machine
 ) -> None:
-    generator = random.Random(0)
-    path = tmp_path / "late.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channels = [writer.register_channel(topic, "json", schema) for topic in ("/command", "/state")]  # fmt: skip
-        for time_ns, u, q in list_rows():
-            stamp_s = (time_ns - BEGIN_NS) * 1e-9 + 5.0  # seconds since the sensor was switched on
-            for channel, value in zip(channels, (u, q), strict=True):
-                late_ns = time_ns + int(1e6 + 2e6 * generator.random())
-                content = {"header": {"stamp": stamp_s}, "value": value}
-                writer.add_message(channel, late_ns, json.dumps(content).encode(), time_ns)
-        writer.finish()
+    generator, path = random.Random(0), tmp_path / "late.mcap"
+    messages = []
+    for t_s, u, q in zip(*make_signals().values(), strict=True):
+        header = {"stamp": t_s + 5.0}  # seconds since the sensor was switched on
+        for topic, value in (("/command", u), ("/state", q)):
+            late_s = t_s + 0.001 + 0.002 * generator.random()
+            messages.append((late_s, topic, {"header": header, "value": value}))
+    write_messages(path, messages)
     late = make_topic_map("value", "value").read(path, carriage)[0]
     time = AlignedTime(
         column="header.stamp", scale=1.0, anchor=Column(column="log_time", scale=1.0, offset=0.0)
@@ -229,16 +219,11 @@ def test_a_damaged_sqlite_bag_is_refused_by_its_name(tmp_path: Path, carriage: M
 def test_a_message_that_cannot_be_decoded_is_told_by_its_number(
     tmp_path: Path, carriage: Machine
 ) -> None:
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channel = writer.register_channel("/state", "json", schema)
-        for number, (time_ns, u, q) in enumerate(list_rows()):
-            data = b'{"u": 1.0, "q"' if number == 120 else json.dumps({"u": u, "q": q}).encode()
-            writer.add_message(channel, time_ns, data, time_ns)
-        writer.finish()
+    path, messages = tmp_path / "a.mcap", []
+    for number, (t_s, u, q) in enumerate(zip(*make_signals().values(), strict=True)):
+        content = b'{"u": 1.0, "q"' if number == 120 else {"u": u, "q": q}
+        messages.append((t_s, "/state", content))
+    write_messages(path, messages)
     place = r"topic /state, message 120, 1\.200 s from the first one, in the chunk at byte \d+: cannot be decoded"
     with pytest.raises(RecordingError, match=place):
         make_map("/state:u", "/state:q", "log_time").read(path, carriage)
@@ -246,15 +231,10 @@ def test_a_message_that_cannot_be_decoded_is_told_by_its_number(
 
 def write_chunks(path: Path) -> Any:
     """Writes JSON messages in many small chunks of random text, which compression cannot shrink."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2000)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channel = writer.register_channel("/state", "json", schema)
-        for time_ns, u, q in list_rows():
-            content = json.dumps({"u": u, "q": q, "text": random.Random(time_ns).random()}).encode()
-            writer.add_message(channel, time_ns, content, time_ns)
-        writer.finish()
+    messages, generator = [], random.Random(0)
+    for t_s, u, q in zip(*make_signals().values(), strict=True):
+        messages.append((t_s, "/state", {"u": u, "q": q, "text": generator.random()}))
+    write_messages(path, messages, 2000)
     return replace(
         make_map("/state:u", "/state:q", "log_time"), longest_gap_s=0.015, shortest_s=0.0
     )
@@ -291,13 +271,7 @@ def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(
 
 def test_items_of_lists_keep_their_order(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channel = writer.register_channel("/state", "json", schema)
-        writer.add_message(channel, 0, json.dumps({"q": list(range(12))}).encode(), 0)
-        writer.finish()
+    write_messages(path, [(0.0, "/state", {"q": list(range(12))})])
     opened = open_log(path)
     (run,) = opened.read_runs(opened.list_tables(), None)
     assert list(run.tables["/state"].columns)[1:] == [f"q[{j}]" for j in range(12)]
