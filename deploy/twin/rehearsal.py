@@ -171,8 +171,6 @@ def run_person(
                 begun_s = now_s + rest_s
             t_s = now_s - begun_s
             person.move(remote, t_s)
-            if remote.is_ready:
-                bus.send(remote.build_frame())
             # A busy twin may not answer in time: then the person tries again.
             with contextlib.suppress(TimeoutError):
                 if person.holds("e-stop", t_s) and not pressed:

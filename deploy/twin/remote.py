@@ -68,7 +68,7 @@ class RadioRemote:
             self._stamp_s, self.is_ready = values[STAMP], True
 
     def iterate_cycles(self, stop: Stop, bus: OpenCanBus) -> Iterator[float]:
-        """Yield the time at which each message is due, until told to stop; listen in between."""
+        """Yield the time at which each message is due, then send it, until told to stop; listen in between."""
         timer = CycleTimer(self.period_s)
         while not stop():
             while (left_s := timer.next_s - time.monotonic()) > 0:
@@ -77,6 +77,8 @@ class RadioRemote:
                     self.hear(frame)
             timer.begin()
             yield time.monotonic()
+            if self.is_ready:
+                bus.send(self.build_frame())
 
     def build_frame(self, frozen: int | None = None) -> CanFrame:
         """Return the next message; `frozen` is a counter that stands still, a fault."""
@@ -136,8 +138,6 @@ def run_operator(
                     given = hands.step(proposed)[0].numpy().astype(float)
                 angles_rad, remote.button_right = own.levers(given)
                 remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
-            if remote.is_ready:
-                bus.send(remote.build_frame())
 
 
 def _read_displayed_command(memory: LoopMemory, levers: LeverMap) -> np.ndarray:
@@ -215,6 +215,4 @@ def run_gamepad(
             if not gamepad.connected:
                 log.warning("the gamepad %s is gone: the remote is silent", settings.device)
                 break
-            if remote.is_ready:
-                bus.send(remote.build_frame())
     gamepad.close()
