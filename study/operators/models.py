@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from actuators.person import HumanFollower
@@ -26,8 +24,6 @@ class AdviceFollower:
     """
 
     hands: HumanFollower
-
-    label: ClassVar[str] = "follower"
 
     def build(self, machine: Machine, person: Person) -> AdviceFollowerModel:
         """See `study.operators.person.Operator`."""
