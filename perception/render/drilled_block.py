@@ -148,10 +148,7 @@ class DrilledBlock:
         entry = start + t[struck, None] * along
         near = np.zeros(len(struck), bool)
         for disc_number, disc in enumerate(self.discs):
-            x, y = (
-                entry[:, 0] - np.float32(disc.center_m[0]),
-                entry[:, 1] - np.float32(disc.center_m[1]),
-            )
+            x, y = (entry[:, :2] - disc.center_m[:2].astype(np.float32)).T
             on = (part[struck] == FRONT) & (x * x + y * y < disc.radius_m**2)
             part[struck[on]] = self.break_part + 1 + disc_number
         for hole in self.holes:
@@ -183,10 +180,8 @@ class DrilledBlock:
         for _ in range(_MARCH):
             for enter, leave, end in cavities:
                 inside = (enter <= way + 1e-6) & (leave > way + 1e-6)
-                way, part = (
-                    np.where(inside, leave, way).astype(np.float32),
-                    np.where(inside, end, part),
-                )
+                way = np.where(inside, leave, way).astype(np.float32)
+                part = np.where(inside, end, part)
         return way, part
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
@@ -198,29 +193,25 @@ class DrilledBlock:
         normal = normal.copy()
         openness, sunlit = np.ones(len(part), np.float32), np.ones(len(part), bool)
         opening, bounced = normal.copy(), np.zeros((len(part), 2), np.float32)
-        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
-            np.float32
-        )
+        local = self.pose.local_point(point)
         sun = (to_sun @ self.pose.rotation).astype(np.float32)
         for number, hole in enumerate(self.holes):
-            rows = np.flatnonzero(
-                (part == NUM_FACES + 2 * number) | (part == NUM_FACES + 2 * number + 1)
-            )
+            wall, floor = NUM_FACES + 2 * number, NUM_FACES + 2 * number + 1
+            rows = np.flatnonzero((part == wall) | (part == floor))
             if len(rows):
-                inside = _describe_inside(
-                    hole, local[rows], part[rows] == NUM_FACES + 2 * number + 1, sun
-                )
+                is_floor = part[rows] == floor
+                inside = _describe_inside(hole, local[rows], is_floor, sun)
                 normal[rows] = inside.normal @ self.pose.rotation.T.astype(np.float32)
                 uv[rows], openness[rows], sunlit[rows] = inside.uv_m, inside.openness, inside.sunlit
                 # Light comes in through the mouth, whatever the direction of the wall.
                 opening[rows] = (self.pose.rotation @ hole.outward).astype(np.float32)
-                wall, floor = (
-                    float(np.mean(self.materials[min(at, len(self.materials) - 1)].color))
-                    for at in (NUM_FACES + 2 * number, NUM_FACES + 2 * number + 1)
-                )
+                last = len(self.materials) - 1
+                bright = [
+                    float(np.mean(self.materials[min(at, last)].color)) for at in (wall, floor)
+                ]
                 rise = float(sun[hole.axis] * hole.sign)
-                rings = compute_bounced_light(hole.radius_m, hole.depth_m, wall, floor, rise)
-                bounced[rows] = rings.at(hole.across_m(local[rows])[2], part[rows] % 2 == 1)
+                rings = compute_bounced_light(hole.radius_m, hole.depth_m, *bright, rise)
+                bounced[rows] = rings.at(hole.across_m(local[rows])[2], is_floor)
         for chip in self.chips:
             away = chip.center_m.astype(np.float32) - local
             on = (part == self.break_part) & (

@@ -70,19 +70,10 @@ def _build_pyramid(number: int) -> tuple[np.ndarray, ...]:
         coarse = generator.standard_normal((1 << octave, 1 << octave)).astype(np.float32)
         pad = 2
         scale = TEXTURE_SIDE >> octave
-        wide = cv2.resize(
-            np.pad(coarse, pad, mode="wrap"),
-            None,
-            fx=scale,
-            fy=scale,
-            interpolation=cv2.INTER_CUBIC,
-        )
-        total += (
-            rise ** (octave - _COARSEST_OCTAVE)
-            * wide[
-                pad * scale : pad * scale + TEXTURE_SIDE, pad * scale : pad * scale + TEXTURE_SIDE
-            ]
-        )
+        padded = np.pad(coarse, pad, mode="wrap")
+        wide = cv2.resize(padded, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        inner = slice(pad * scale, pad * scale + TEXTURE_SIDE)
+        total += rise ** (octave - _COARSEST_OCTAVE) * wide[inner, inner]
     if number >= NUM_TEXTURES // 2:  # gravel: bright and dark stones
         total = np.tanh(2.0 * total / total.std())
     levels = [(total - total.mean()) / total.std()]
@@ -119,11 +110,6 @@ def _interpolate_bilinear(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     rows = -(-count // _ROW)
     maps = np.zeros((2, rows * _ROW), np.float32)
     maps[:, :count] = wrapped.T
-    found = cv2.remap(
-        picture,
-        maps[0].reshape(rows, _ROW),
-        maps[1].reshape(rows, _ROW),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_WRAP,
-    )
+    x, y = maps.reshape(2, rows, _ROW)
+    found = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return found.ravel()[:count]

@@ -72,6 +72,16 @@ class SolidPose:
         turn = self.rotation.astype(np.float32)
         return ((origin - self.center_m) @ self.rotation).astype(np.float32), direction @ turn
 
+    def local_point(self, point_m: np.ndarray) -> np.ndarray:
+        """Return points, `(M, 3)`, of the camera's coordinates in those of the solid, float32."""
+        away_m = point_m - self.center_m.astype(np.float32)
+        return away_m @ self.rotation.astype(np.float32)
+
+    def list_corners(self, half_m: np.ndarray) -> np.ndarray:
+        """Return the corners, `(8, 3)`, of a box about the origin in the camera's coordinates."""
+        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+        return self.point(signs * half_m)
+
     def point(self, local_m: np.ndarray) -> np.ndarray:
         """Return a point, `(…, 3)`, of the solid's coordinates in those of the camera."""
         return local_m @ self.rotation.T + self.center_m
@@ -136,11 +146,7 @@ class PlaneSolid:
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describe the plane; its texture lies along its first two axes."""
         normal = np.broadcast_to(self.pose.rotation[:, 2].astype(np.float32), point.shape)
-        return Surface(
-            normal,
-            (point - self.pose.center_m.astype(np.float32))
-            @ self.pose.rotation[:, :2].astype(np.float32),
-        )
+        return Surface(normal, self.pose.local_point(point)[:, :2])
 
 
 @dataclass(frozen=True)
@@ -158,8 +164,7 @@ class Box:
     @property
     def corners_m(self) -> np.ndarray:
         """The eight corners."""
-        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-        return self.pose.point(signs * self.half_m)
+        return self.pose.list_corners(self.half_m)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
         """Return where rays enter the box; rays that start inside miss."""
@@ -185,9 +190,7 @@ class Box:
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describe faces; opposite ones show different places of the texture."""
-        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
-            np.float32
-        )
+        local = self.pose.local_point(point)
         axis, sign = part // 2, (2.0 * (part % 2) - 1.0).astype(np.float32)
         normal = self.pose.rotation.T.astype(np.float32)[axis] * sign[:, None]
         rows = np.arange(len(part))
@@ -208,8 +211,8 @@ class Cylinder:
     @property
     def corners_m(self) -> np.ndarray:
         """The eight corners of the box around it."""
-        signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-        return self.pose.point(signs * [self.radius_m, self.radius_m, self.half_length_m])
+        half_m = np.array([self.radius_m, self.radius_m, self.half_length_m])
+        return self.pose.list_corners(half_m)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
         """Return where rays enter the cylinder."""
@@ -233,9 +236,7 @@ class Cylinder:
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describe side and caps; the texture goes round the side."""
-        local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
-            np.float32
-        )
+        local = self.pose.local_point(point)
         side, up = local.copy(), np.zeros_like(local)
         side[:, 2] = 0.0
         side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
