@@ -22,22 +22,17 @@ def crop_segmenter_views(
     """Return the segmenter's pictures, `(F, 2, 3, h, w)` uint8, and their masks, `(F, 2, 2, h, w)`."""
     width, height = size_px
     full = tuple(views.layers.shape[3:])
-    room = (
-        full[1] * (1.0 - 1.0 / ROOM) / 2.0,
-        full[0] * (1.0 - 1.0 / ROOM) / 2.0,
-        full[1] / ROOM,
-        full[0] / ROOM,
-    )
+    height_px, width_px = full
+    beside = 0.5 * (1.0 - 1.0 / ROOM)
+    room = (width_px * beside, height_px * beside, width_px / ROOM, height_px / ROOM)
     seen = np.empty((len(views), len(LOOKS), 5, height, width), np.uint8)
-    for look, window in enumerate(
-        (cover_picture(full, size_px), center_window(room, size_px, 0.0))
-    ):
+    windows = cover_picture(full, size_px), center_window(room, size_px, 0.0)
+    for look, window in enumerate(windows):
         for frame in range(len(views)):
             layers = views.layers[frame, look].numpy().transpose(1, 2, 0)
             for part in (slice(0, 3), slice(3, 5)):
-                seen[frame, look, part] = window.take(
-                    np.ascontiguousarray(layers[..., part]), size_px
-                ).transpose(2, 0, 1)
+                taken = window.take(np.ascontiguousarray(layers[..., part]), size_px)
+                seen[frame, look, part] = taken.transpose(2, 0, 1)
     layers = torch.from_numpy(seen)
     return layers[:, :, :3], layers[:, :, 3:] > 127
 
@@ -48,11 +43,8 @@ def predict(network: UNet, pictures: torch.Tensor, device: torch.device) -> torc
     network.eval()
     flat, found = pictures.flatten(0, 1), []
     for first in range(0, len(flat), BATCH):
-        found.append(
-            torch.sigmoid(network(flat[first : first + BATCH].to(device).float() / 255.0))
-            .float()
-            .cpu()
-        )
+        batch = flat[first : first + BATCH].to(device).float() / 255.0
+        found.append(torch.sigmoid(network(batch)).float().cpu())
     return torch.cat(found).unflatten(0, pictures.shape[:2])
 
 

@@ -110,11 +110,9 @@ class TrainingViews:
 
     def join(self, other: TrainingViews) -> TrainingViews:
         """Return the frames of both."""
-        return TrainingViews(
-            torch.cat([self.layers, other.layers]),
-            (*self.conditions, *other.conditions),
-            (*self.names, *other.names),
-        )
+        layers = torch.cat([self.layers, other.layers])
+        conditions = (*self.conditions, *other.conditions)
+        return TrainingViews(layers, conditions, (*self.names, *other.names))
 
 
 class Samples:
@@ -259,9 +257,8 @@ def read_views(
             conditions = list(track_items(work, "reading frames", len(stems)))
     finally:
         cv2.setNumThreads(threads)
-    return TrainingViews(
-        torch.from_numpy(layers), tuple(conditions), tuple(str(stem) for stem in stems)
-    )
+    names = tuple(str(stem) for stem in stems)
+    return TrainingViews(torch.from_numpy(layers), tuple(conditions), names)
 
 
 def _read_frame(path: Path, is_negative: bool) -> tuple[np.ndarray, np.ndarray, str]:
@@ -290,11 +287,9 @@ def _choose_windows(
     first = cover_picture(known.shape, size_px)
     box = bound_block(known[..., 0] / 255.0, THRESHOLD, SMALLEST_PIECE)
     if box is None:
-        side = generator.uniform(0.2, 0.8) * np.array([known.shape[1], known.shape[0]])
-        corner = generator.uniform(0.0, 1.0, 2) * (
-            np.array([known.shape[1], known.shape[0]]) - side
-        )
-        box = (*corner, *side)
+        size = np.array([known.shape[1], known.shape[0]])
+        side = generator.uniform(0.2, 0.8) * size
+        box = (*(generator.uniform(0.0, 1.0, 2) * (size - side)), *side)
     room = ROOM * (1.0 + 2.0 * margin)
     closer = center_window(box, size_px, (room - 1.0) / 2.0)
     room *= max(1.0, size_px[0] / ENLARGED / closer.width)

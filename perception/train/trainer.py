@@ -126,12 +126,8 @@ class _Training:
         settings = self._settings
         pictures, known = evaluation.crop_segmenter_views(self._unseen, settings.size_px)
         total = torch.zeros((), device=self._device)
-        log.info(
-            "%d frames to train on, %d to judge by, %s",
-            len(self._train),
-            len(self._unseen),
-            self._device,
-        )
+        counts = len(self._train), len(self._unseen)
+        log.info("%d frames to train on, %d to judge by, %s", *counts, self._device)
         begun = time.monotonic()
         change = settings.augment.build()
         samples = Samples(
@@ -203,15 +199,10 @@ class _Training:
         paths = training_data.list_pictures(settings.negatives)
         unseen = paths[:: settings.hold_out]
         learned = [path for path in paths if path not in set(unseen)]
-        views = []
-        for some in (learned, unseen):
-            views.append(
-                training_data.read_views(
-                    some, settings.size_px, settings.margin, seed, negatives=True
-                )
-            )
-        self._train = self._train.join(views[0])
-        return evaluation.crop_segmenter_views(views[1], settings.size_px)[0]
+        shape = settings.size_px, settings.margin, seed
+        self._train = self._train.join(training_data.read_views(learned, *shape, negatives=True))
+        quiet = training_data.read_views(unseen, *shape, negatives=True)
+        return evaluation.crop_segmenter_views(quiet, settings.size_px)[0]
 
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         self._network.train()
@@ -231,16 +222,14 @@ class _Training:
     @torch.no_grad()
     def _remember(self, part: float) -> None:
         """Move the mean network by a part of the way to the one under training."""
-        now = self._network.state_dict()
-        moving = []
-        for name, value in now.items():
+        means, now = [], []
+        for name, value in self._network.state_dict().items():
             if value.is_floating_point():
-                moving.append(name)
+                means.append(self._mean[name])
+                now.append(value)
         # all at once: a graphics card takes longer to be told of each of a hundred small tensors
         # than to move them
-        torch._foreach_lerp_(
-            [self._mean[name] for name in moving], [now[name] for name in moving], part
-        )
+        torch._foreach_lerp_(means, now, part)
 
     def _spent(self) -> float:
         """Return which part of the training is over, by updates or by seconds, in [0, 1]."""
@@ -264,15 +253,8 @@ class _Training:
         figures = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)["all"]
         block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
         quiet = self._measure_quiet(network)
-        self._curve.append(
-            {
-                "update": self._update,
-                "loss": mean_loss,
-                "block": block,
-                "mouth": mouth,
-                "quiet": quiet,
-            }
-        )
+        point = {"update": self._update, "loss": mean_loss}
+        self._curve.append(point | {"block": block, "mouth": mouth, "quiet": quiet})
         if mean_loss is not None and not math.isfinite(mean_loss):
             raise CheckpointError(
                 f"the training diverged before update {self._update}; try a smaller training.rate"
@@ -285,13 +267,8 @@ class _Training:
             header = self._build_header(block, mouth)
             export.write_checkpoint(self._folder / export.TENSORS, self._best_network, header)
         passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
-        log.info(
-            "update %d: %soverlap of blocks %.3f, of mouths %.3f",
-            self._update,
-            passed,
-            block,
-            mouth,
-        )
+        told = self._update, passed, block, mouth
+        log.info("update %d: %soverlap of blocks %.3f, of mouths %.3f", *told)
 
     def _measure_quiet(self, network: UNet) -> float | None:
         """Return the share of unseen negatives on which the network names no block."""
