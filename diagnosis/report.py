@@ -10,8 +10,9 @@ from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
 from brokk_rl.report import Tone, embed_picture, render_page
 from brokk_rl.session import write_text
-from diagnosis import plots, report_checks
+from diagnosis import plots
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
+from diagnosis.closure import MIN_RESTORED, Gate
 
 REPORT_FILE = "report.html"
 TEMPLATE = Path(__file__).with_name("diagnosis.html.jinja")
@@ -130,6 +131,39 @@ def describe_remainder(answer: Answer) -> str:
     return f"What is left beyond the floor is {format_error(beyond, gap.unit)}."
 
 
+def list_failed_gates(gates: Sequence[Gate]) -> list[str]:
+    """Return a line for each gate that failed."""
+    lines = []
+    for gate in gates:
+        if not gate.passed:
+            numbers = "" if gate.value is None else f" ({gate.value:.3g}, limit {gate.limit:.3g})"
+            lines.append(f"failed: {gate.name}{numbers}: {gate.text}")
+    return lines
+
+
+def describe_bounds(one: Selected) -> str:
+    """Return which sizes of an effect ended at a bound, or nothing."""
+    names = []
+    for name, values in one.parameters.items():
+        names += [f"{name} {joint}" for joint, value in values.items() if value.at_bound]
+    if not names:
+        return ""
+    effect = one.effect.replace("_", " ")
+    return f"At its bound: {', '.join(names)} of {effect}. The true size may lie beyond, or another effect is meant."
+
+
+def describe_edit(one: Selected) -> str:
+    """Return that an effect failed the edit test, or nothing."""
+    if one.identified is not False or one.edit is None:
+        return ""
+    effect = one.effect.replace("_", " ")
+    return (
+        f"Not identified: without {effect} the repaired simulator's error rises by "
+        f"{100 * one.edit['restored']:.0f} % of this effect's part; "
+        f"{100 * MIN_RESTORED:.0f} % or more are expected."
+    )
+
+
 def format_estimate(
     value: Estimate | None, factor: float = 1.0, style: str = ".3g"
 ) -> tuple[str, str]:
@@ -199,8 +233,8 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "earned": _rank_rivals(more.get("evidence")),
         "remainder": describe_remainder(answer),
         "describe_class": describe_class,
-        "describe_bounds": report_checks.describe_bounds,
-        "describe_edit": report_checks.describe_edit,
+        "describe_bounds": describe_bounds,
+        "describe_edit": describe_edit,
         "name_effect": name_effect,
         "join_words": join_words,
         "format_error": format_error,

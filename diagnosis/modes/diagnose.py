@@ -19,7 +19,7 @@ from brokk_rl.parallel import use_workers
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import answer, case, effect_library, effects_file, report, report_checks
+from diagnosis import answer, case, effect_library, effects_file, report
 from diagnosis.answer import Answer, Outcome
 from diagnosis.case import GapCase
 from diagnosis.effect_library import EffectType
@@ -172,10 +172,10 @@ def _print_answer(found: Answer, folder: Path) -> None:
     print_text(f"{found.verdict}: {found.reason}", "bold")
     if found.selected:
         print_table(("effect", "joints", "probability", "numbers", "closes", "same as"), rows)
-    for line in report_checks.list_failed_gates(found.gates):
+    for line in report.list_failed_gates(found.gates):
         print_text(line)
     for one in found.selected:
-        for line in (report_checks.describe_bounds(one), report_checks.describe_edit(one)):
+        for line in (report.describe_bounds(one), report.describe_edit(one)):
             if line:
                 print_text(line)
     print_text(f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}")

@@ -104,11 +104,47 @@ def seen(name: str, machine: Machine, levels: list[float], **numbers: Any) -> li
     return model.inner.seen
 
 
-def test_dead_time_between_samples_is_the_mean_over_the_period(machine: Machine) -> None:
+SEEN: list[tuple[str, dict[str, float], list[float], list[float]]] = [
     # 75 ms are one and a half periods: nothing, then half a period of full speed, then all of it
-    assert seen("dead_time", machine, [1, 1, 1, 0, 0, 0], dead_time_s=0.075) == pytest.approx(
-        [0, 0.5, 1, 1, 0.5, 0]
-    )
+    ("dead_time", {"dead_time_s": 0.075}, [1, 1, 1, 0, 0, 0], [0, 0.5, 1, 1, 0.5, 0]),
+    # (0.55 - 0.1) / 0.9 and (0.6 - 0.2) / 0.8
+    ("dead_band", {"extend": 0.1, "retract": 0.2}, [1, 0.55, 0.1, 0, -0.2, -0.6, -1], [1, 0.5, 0, 0, 0, -0.5, -1]),
+    ("saturation", {"level": 0.7}, [1, 0.6, -0.8, -1], [0.7, 0.6, -0.7, -0.7]),
+    # a full stroke in 0.2 s is a quarter a period
+    ("rate_limit", {"stroke_s": 0.2}, [1, 1, 0.6, 0.6, -1], [0.25, 0.5, 0.6, 0.6, 0.35]),
+    # a reversal is a new start
+    ("stiction", {"start": 0.15, "stop": 0.05}, [0.1, 0.2, 0.1, 0.06, 0.05, 0.1, -0.1, -0.16, 0.1],
+     [0, 0.2, 0.1, 0.06, 0, 0, 0, -0.16, 0]),
+]  # fmt: skip
+MOVED: list[tuple[str, dict[str, float], list[float], list[float]]] = [
+    ("flow_gain", {"gain": 0.8}, [1, 0.5, -1], [0.016, 0.008, -0.016]),
+    ("asymmetry", {"extend_gain": 1.0, "retract_gain": 1.5}, [1, -1], [0.02, -0.03]),
+    # a play of 0.03, half of it open at rest: 0.015 lost, then 0.03 at each reversal
+    ("backlash", {"gap_rad": 0.03}, [1, 1, -1, -1, -1, 0, 1, 1], [0.005, 0.02, 0, -0.01, -0.02, 0, 0, 0.01]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "numbers", "levels", "expected"), SEEN)
+def test_the_valve_sees_other_commands(
+    name: str,
+    numbers: dict[str, float],
+    levels: list[float],
+    expected: list[float],
+    machine: Machine,
+) -> None:
+    assert seen(name, machine, levels, **numbers) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("name", "numbers", "levels", "expected"), MOVED)
+def test_the_joint_moves_otherwise(
+    name: str,
+    numbers: dict[str, float],
+    levels: list[float],
+    expected: list[float],
+    machine: Machine,
+) -> None:
+    got = steps(wrapped(name, machine, **numbers), machine, levels)
+    assert got == pytest.approx(expected, abs=1e-6)
 
 
 def test_dead_time_adds_to_that_of_the_model_beyond_the_history(machine: Machine) -> None:
@@ -171,14 +207,6 @@ def test_frame_loss_holds_the_command_for_all_joints_at_once(machine: Machine) -
     assert (second.abs() < 1e-4).float().mean().item() == pytest.approx(0.0625, abs=0.015)
 
 
-def test_dead_band_on_each_side_leaves_the_full_command(machine: Machine) -> None:
-    # (0.55 - 0.1) / 0.9 and (0.6 - 0.2) / 0.8
-    levels = [1, 0.55, 0.1, 0, -0.2, -0.6, -1]
-    assert seen("dead_band", machine, levels, extend=0.1, retract=0.2) == pytest.approx(
-        [1, 0.5, 0, 0, 0, -0.5, -1]
-    )
-
-
 def test_effects_without_memory_hold_for_the_whole_history(machine: Machine) -> None:
     model = wrapped("saturation", machine, level=0.5)
     history = History(
@@ -186,19 +214,6 @@ def test_effects_without_memory_hold_for_the_whole_history(machine: Machine) -> 
     )
     model.step(history)
     torch.testing.assert_close(model.inner.history.u, history.u.clamp(-0.5, 0.5))
-
-
-def test_saturation_cuts_both_ways(machine: Machine) -> None:
-    assert seen("saturation", machine, [1, 0.6, -0.8, -1], level=0.7) == pytest.approx(
-        [0.7, 0.6, -0.7, -0.7]
-    )
-
-
-def test_rate_limit_bounds_the_slope(machine: Machine) -> None:
-    # a full stroke in 0.2 s is a quarter a period
-    assert seen("rate_limit", machine, [1, 1, 0.6, 0.6, -1], stroke_s=0.2) == pytest.approx(
-        [0.25, 0.5, 0.6, 0.6, 0.35]
-    )
 
 
 @given(levels=LEVELS, stroke_s=st.floats(0.01, 2.0))
@@ -211,18 +226,6 @@ def test_rate_limit_never_exceeds_its_slope_nor_the_command(
     assert np.abs(got).max() <= np.abs(levels).max() + 1e-6
 
 
-def test_stiction_starts_later_than_it_stops(machine: Machine) -> None:
-    levels = [0.1, 0.2, 0.1, 0.06, 0.05, 0.1, -0.1, -0.16, 0.1]
-    expected = [0, 0.2, 0.1, 0.06, 0, 0, 0, -0.16, 0]  # a reversal is a new start
-    assert seen("stiction", machine, levels, start=0.15, stop=0.05) == pytest.approx(expected)
-
-
-def test_flow_gain_scales_both_ways(machine: Machine) -> None:
-    assert steps(wrapped("flow_gain", machine, gain=0.8), machine, [1, 0.5, -1]) == pytest.approx(
-        [0.016, 0.008, -0.016], abs=1e-6
-    )
-
-
 def test_a_gain_does_not_compound_in_a_model_that_goes_on_from_increments(machine: Machine) -> None:
     got = steps(wrapped("flow_gain", machine, inner=Glide(machine), gain=0.8), machine, [1.0] * 20)
     plain = steps(Glide(machine), machine, [1.0] * 20)
@@ -230,21 +233,10 @@ def test_a_gain_does_not_compound_in_a_model_that_goes_on_from_increments(machin
     assert got[-1] == pytest.approx(0.8 * FULL, abs=1e-5)
 
 
-def test_asymmetry_changes_one_direction(machine: Machine) -> None:
-    got = steps(wrapped("asymmetry", machine, extend_gain=1.0, retract_gain=1.5), machine, [1, -1])
-    assert got == pytest.approx([0.02, -0.03], abs=1e-6)
-
-
 def test_lag_follows_the_analytic_step_response(machine: Machine) -> None:
     path = roll(wrapped("lag", machine, time_constant_s=0.12), machine, [0.5] * 20)[:, 0, 0]
     t_s = 0.05 * np.arange(21)
     np.testing.assert_allclose(path, 0.2 * (t_s - 0.12 * (1 - np.exp(-t_s / 0.12))), atol=2e-6)
-
-
-def test_backlash_is_taken_up_at_reversals(machine: Machine) -> None:
-    # a play of 0.03, half of it open at rest: 0.015 lost, then 0.03 at each reversal
-    got = steps(wrapped("backlash", machine, gap_rad=0.03), machine, [1, 1, -1, -1, -1, 0, 1, 1])
-    assert got == pytest.approx([0.005, 0.02, 0, -0.01, -0.02, 0, 0, 0.01], abs=1e-6)
 
 
 def test_backlash_of_a_moving_joint_is_closed(machine: Machine) -> None:
