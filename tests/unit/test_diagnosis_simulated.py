@@ -19,6 +19,7 @@ from diagnosis.case import GapCase
 from diagnosis.engine import holds
 from diagnosis.engine.decide import Decider
 from diagnosis.engine.joint_model import Course
+from diagnosis.engine.measure import Motion, fit_variance
 from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_units, stack_side
@@ -154,6 +155,24 @@ def test_the_nuisance_is_a_covariance() -> None:
     log_likelihood = multivariate_normal(cov=covariance).logpdf(residual)
     own = -0.5 * (exact + projection.log_determinant + 12 * np.log(2.0 * np.pi * spread))
     assert own == pytest.approx(log_likelihood)
+
+
+def test_a_resized_form_stays_where_its_effect_is_defined() -> None:
+    # a valve that stops sticking only above where it began is none
+    row = Row("stiction", (("start_command", "add", 0.2), ("stop_ratio", "add", 0.5)))
+    larger = row.resize(3.0, shape=3.0)
+    assert larger.size == pytest.approx(0.6)
+    assert larger.changes[1][2] < 1.0
+
+
+def test_the_variance_of_increments_is_that_of_what_was_drawn() -> None:
+    generator = np.random.default_rng(4)
+    motion = Motion(*generator.uniform(0.0, 2.0, (2, 40_000)))
+    drawn = np.array([0.4, 0.0, 0.5, 0.0, 0.2])
+    expected = motion.stack() @ drawn
+    increments = generator.normal(0.0, np.sqrt(expected))
+    found = fit_variance(increments, motion, np.ones(len(increments), bool))
+    assert motion.stack() @ found == pytest.approx(expected, rel=0.1)
 
 
 def test_share_and_persistence_of_losses_are_read_from_their_course(machine: Machine) -> None:
