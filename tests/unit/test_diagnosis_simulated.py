@@ -22,8 +22,8 @@ from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Motion, fit_variance
 from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row
-from diagnosis.engine.side import Side, measure_units, stack_side
-from diagnosis.engine.sizes import describe_hold
+from diagnosis.engine.side import Side, measure_full_loads, measure_units, stack_side
+from diagnosis.engine.sizes import describe_hold, translate
 from diagnosis.engine.valve import VALVE
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from diagnosis.repair_proof import EngineProof
@@ -173,6 +173,15 @@ def test_the_variance_of_increments_is_that_of_what_was_drawn() -> None:
     increments = generator.normal(0.0, np.sqrt(expected))
     found = fit_variance(increments, motion, np.ones(len(increments), bool))
     assert motion.stack() @ found == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize(("number", "lowering"), [("load_both", 1.0), ("load_opposing", 0.0)])
+def test_dependence_on_weight_is_told_per_yield_force(
+    machine: Machine, number: str, lowering: float
+) -> None:
+    found = translate(Row("load_dependence", ((number, "add", 0.05),)), 1, machine)
+    share = 9.81 * measure_full_loads(machine)[1] / machine.bodies[1].yield_force.value
+    assert found == pytest.approx({"sensitivity": 2 * 0.05 / share, "lowering": lowering}, rel=1e-3)
 
 
 def test_share_and_persistence_of_losses_are_read_from_their_course(machine: Machine) -> None:
