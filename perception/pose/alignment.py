@@ -388,10 +388,7 @@ def measure_parallax(
         for some, most in zip((v[:, 0], u[0]), depth_m.shape, strict=True)
     )
     depth = depth_m[np.ix_(rows, columns)]
-    with np.errstate(invalid="ignore"):
-        before = (
-            1.0 / depth - face.inverse_depth(both.camera_matrix, u, v) > 4 * face.sigma
-        ).astype(np.uint8)
+    before = face.find_nearer(depth, both.camera_matrix, u, v).astype(np.uint8)
     shown = both.inside(u, v, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
     # Occlusion by the arm looks like depth: pixels that the right camera cannot see are left out.
     hidden = shown & (radii < inner) & _find_hidden_from_right(both, face, depth_m, u, v)
@@ -420,12 +417,8 @@ def _find_hidden_from_right(
     # Such an occluder lies to their right in the left picture.
     columns = np.arange(max(0, int(u[0, 0])), depth_m.shape[1])
     depth = depth_m[rows, columns[0] :]
-    # Float32 halves the memory of a whole row of the picture.
-    here = face.inverse_depth(both.camera_matrix, columns[None, :], rows[:, None]).astype(
-        np.float32
-    )
-    with np.errstate(invalid="ignore", divide="ignore"):
-        row, column = np.nonzero(1.0 / depth - here > 4 * face.sigma)
+    nearer = face.find_nearer(depth, both.camera_matrix, columns[None, :], rows[:, None])
+    row, column = np.nonzero(nearer)
     shadow = np.zeros((len(rows), depth_m.shape[1]), np.uint8)
     # A point of the occluder hides the face where both fall on one column of the right picture.
     place = np.rint(columns[column] - both.pull_px / depth[row, column]).astype(int)
@@ -433,7 +426,5 @@ def _find_hidden_from_right(
     shadow[row[on], place[on]] = 1
     shadow = cv2.dilate(shadow, np.ones((3, 2 * MARGIN_PX + 1), np.uint8))
     away = both.pull_px * face.inverse_depth(both.camera_matrix, u, v)
-    return (
-        np.take_along_axis(shadow, np.rint(u - away).astype(int).clip(0, shadow.shape[1] - 1), 1)
-        > 0
-    )
+    seen = np.rint(u - away).astype(int).clip(0, shadow.shape[1] - 1)
+    return np.take_along_axis(shadow, seen, 1) > 0

@@ -228,10 +228,5 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
         column, line = np.rint(points).astype(int).T
         on = (column >= 0) & (column < width) & (line >= 0) & (line < height)
         depth = frame.depth_m[line.clip(0, height - 1), column.clip(0, width - 1)]
-        rays = (
-            np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
-        )
-        # Four standard deviations: of 72 points none is nearer by chance.
-        # False where depth is unknown.
-        nearer |= on & (1.0 / depth - rays @ face.m > 4 * face.sigma)
+        nearer |= on & face.find_nearer(depth, frame.camera_matrix, *points.T)
     return float(nearer.mean())

@@ -32,6 +32,8 @@ NEARNESS, LEAN = 0.3, 0.4
 addition to the slope that its shape allows: occluders differ by more."""
 DEGENERATE = 1e12
 """Condition number of a plane's normal equations from which its points lie on a line."""
+CLEARLY = 4.0
+"""Standard deviations by which an occluder is nearer than a face: no pixel of a face is by chance."""
 LEAST = 60
 """Least number of points of a plane."""
 USUAL_PULL_PX_M = 126.72
@@ -90,6 +92,14 @@ class FacePlane:
     def inverse_depth(self, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return inverse depth at columns and rows of a picture, which are broadcast."""
         return compute_inverse_depth(self.m, camera_matrix, u, v)
+
+    def find_nearer(
+        self, depth_m: np.ndarray, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray
+    ) -> np.ndarray:
+        """Find pixels at columns `u` and rows `v` whose depth lies before it; unknown depth does not."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            away = 1.0 / depth_m - self.inverse_depth(camera_matrix, u, v)
+            return away > CLEARLY * self.sigma
 
     def point(self, ray: np.ndarray) -> np.ndarray:
         """Return the point at which a ray `(3,)` with z = 1 meets the plane."""

@@ -90,12 +90,8 @@ def measure_wall_light(
     part = light[top:bottom, left:right].astype(np.float32)
     rows, columns = np.mgrid[top:bottom, left:right]
     radii = conic.measure_radii(ellipse, columns, rows)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        nearer = 1.0 / depth_m[top:bottom, left:right] - plane.inverse_depth(
-            camera_matrix, columns, rows
-        )
-    before = (nearer > 4 * plane.sigma).astype(np.uint8)
-    free = cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
+    before = plane.find_nearer(depth_m[top:bottom, left:right], camera_matrix, columns, rows)
+    free = cv2.dilate(before.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     inside = free & (radii < min(OUTERMOST, 1.0 - BRINK_PX / b))
     ring = free & (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < LEAST_INSIDE or ring.sum() < LEAST_INSIDE:
