@@ -52,6 +52,8 @@ DOUBLED_SHARE = 0.2
 """Share of equal stamps with other values from which two programs send to one topic."""
 MOST_TURNS = 2.0
 """Turns beyond which a target in rad is in doubt: joints of arms and legs stop before, winches do not."""
+LAST_LAG = 0.95
+"""Part of the longest lag that is tried, beyond which a lag was cut off by it."""
 SPIKE_SHARE = 0.01
 """Share of spikes from which a column holds two sources."""
 
@@ -249,7 +251,7 @@ class _JointJudge:
             f"correlation of {FOLLOWED[joint.kind]} with command {r:.2f}, {joint.lag_s:.2f} s later"
         )
         joint.evidence.append((text, _weigh_correlation(r, joint.kind)))
-        if joint.lag_s > 0.95 * LONGEST_LAG_S:
+        if joint.lag_s > LAST_LAG * LONGEST_LAG_S:
             joint.evidence.append(
                 ("no longer lag is tried: its delay is longer, or it is no pair", -5.0)
             )

@@ -67,6 +67,10 @@ class MessageLog(LogFile):
         """Return the units that the log states for the columns of a table."""
         return {}
 
+    def _list_numbers(self, content: Any) -> dict[str, float]:
+        """Return the numbers of a decoded message by their path."""
+        return dict(list_numbers(content))
+
     def list_tables(self) -> dict[str, list[str]]:
         """Return the numbers in the first messages of each topic."""
         known = self._list_known()
@@ -131,7 +135,7 @@ class MessageLog(LogFile):
     ) -> dict[str, float]:
         """Return the numbers of a message, none of a damaged one that is left out."""
         try:
-            return dict(list_numbers(message.decode(message.data)))
+            return self._list_numbers(message.decode(message.data))
         except Exception as error:  # decoders raise what they stumble over
             self.report_damage(
                 f"topic {message.table}, message {number}, {elapsed_s:.3f} s from the first one{message.place}: "
