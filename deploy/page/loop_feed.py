@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.contracts.vision import CameraView
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
@@ -35,7 +34,6 @@ from deploy.page.protocol import (
     ShownAdvice,
     SourceAge,
     Vector,
-    read_view,
 )
 from deploy.page.scene import locate_borehole, place_tool, to_vector
 from deploy.page.server import serve_page
@@ -44,7 +42,7 @@ from deploy.page.video_relay import VideoRelay
 from deploy.runtime.operator_state import LoopSnapshot, PageSignal, PolicyAdvice
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
-from deploy.runtime.shm_layout import LOG_BYTES, VIEW, LoopMemory
+from deploy.runtime.shm_layout import LOG_BYTES, LoopMemory
 from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, read_holes
 
 log = logging.getLogger(__name__)
@@ -186,7 +184,7 @@ class LoopFeed:
             targets=targets,
             insertion=insertion,
             path_in_base_m=path,
-            view=self._read_view(),
+            view=self._memory.view.read(),
         )
 
     def _is_guiding(self, snapshot: LoopSnapshot) -> bool:
@@ -304,13 +302,6 @@ class LoopFeed:
             log_behind=any(pipe.waiting > LOG_BEHIND_BYTES for pipe in memory.logs),
             supervisor_silent=silent,
         )
-
-    def _read_view(self) -> CameraView | None:
-        record = self._memory.view.read()
-        if record is None:
-            return None
-        values = {name: record[name].item() for name in VIEW.names or ()}
-        return read_view(values | {"name": values["name"].decode()})
 
     def _read_frame_t_s(self) -> float | None:
         return self._memory.frame and self._memory.frame.peek("t_s")

@@ -8,8 +8,7 @@ greys them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, Protocol, get_args
 
 from brokk_rl.contracts.vision import CameraView
@@ -276,11 +275,6 @@ def convert_to_plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [convert_to_plain(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def read_view(values: Mapping[str, Any]) -> CameraView:
-    """Return the view of a moving camera from its plain values, among others perhaps."""
-    return CameraView(**{one.name: values[one.name] for one in fields(CameraView)})
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from brokk_rl.contracts.vision import CameraView
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
@@ -32,7 +33,6 @@ from deploy.page.protocol import (
     ShownAdvice,
     SourceAge,
     TimelineMark,
-    read_view,
 )
 from deploy.page.scene import place_tool
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
@@ -172,7 +172,7 @@ class ReplayFeed:
             targets=targets,
             insertion=insertion,
             path_in_base_m=path,
-            view=None if view is None else read_view(view[2]),
+            view=None if view is None else CameraView(**view[2]),
             replay=ReplayTimeline(position_s, self._duration_s, self._speed, self._marks),
         )
 

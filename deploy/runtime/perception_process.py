@@ -120,11 +120,7 @@ def point_camera(
     view = source.aim(None if state is None else np.array(state.q), hole, t_s)
     if view is None:
         return
-    record = memory.view.new()
-    record["t_s"] = t_s
-    for name, value in vars(view).items():
-        record[name] = value.encode() if isinstance(value, str) else value
-    memory.view.write(record)
+    memory.view.write(view)
     text = {"topic": "view", "t_s": t_s, **vars(view)}
     memory.vision_log.put(TEXT + json.dumps(text).encode())
 

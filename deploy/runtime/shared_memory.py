@@ -28,6 +28,8 @@ ALIGNMENT_BYTES = 8
 READ_ATTEMPTS = 5
 """A reader that is overtaken more often was as good as stopped. Chosen by hand: bus and policy
 write every 10 and 50 ms, and a read takes microseconds."""
+TEXT = "U64"
+"""Type of a text in a record: 64 characters, enough for a name."""
 LENGTH_BYTES = 4
 """Of the length in front of each entry of a pipe."""
 
@@ -144,8 +146,8 @@ R = TypeVar("R")
 class RecordLayout(Generic[R]):
     """Packs a dataclass into a numpy record, and unpacks it.
 
-    Its fields are `float`, `bool`, `int`, an enumeration (stored as the member's position), or an
-    array (`Joints`, `Axes`, `Point`).
+    Its fields are `float`, `bool`, `int`, a short text, an enumeration (stored as the member's
+    position), or an array (`Joints`, `Axes`, `Point`).
 
     Args:
         kind: The dataclass.
@@ -166,7 +168,7 @@ class RecordLayout(Generic[R]):
                 self._members[one.name] = tuple(hint)
                 layout.append((one.name, np.int8))
             else:
-                layout.append((one.name, np.dtype(hint)))
+                layout.append((one.name, TEXT if hint is str else np.dtype(hint)))
         self.fields = np.dtype(layout)
 
     def pack(self, record: R) -> np.ndarray:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from brokk_rl.contracts.vision import CameraView
 from deploy.runtime.operator_state import (
     LoopSnapshot,
     OperatorControls,
@@ -46,21 +47,6 @@ HOLE = np.dtype(
 
 HOLES = np.dtype([("t_s", float), ("count", np.uint8), ("holes", HOLE, (MOST_HOLES,))])
 """All boreholes that perception knows."""
-
-VIEW = np.dtype(
-    [
-        ("t_s", float),
-        ("name", "S64"),
-        ("is_moving", bool),
-        ("travel_s", float),
-        ("seen_s", float),
-        ("seen_before_s", float),
-        ("horizon_s", float),
-        ("std_m", float),
-        ("std_before_m", float),
-    ]
-)
-"""Where a camera on a mount looks, and why; see `brokk_rl.contracts.vision.CameraView`."""
 
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])
 """The borehole to drill: when it was found, the centre of its rim, and its standard deviation."""
@@ -111,7 +97,7 @@ class LoopMemory:
     page: RecordSlot[PageSignal]
     frame: Slot | None
     holes: Slot
-    view: Slot
+    view: RecordSlot[CameraView]
     bus_log: Pipe
     policy_log: Pipe
     page_log: Pipe
@@ -138,7 +124,7 @@ class LoopMemory:
             page=RecordSlot("page", PageSignal, num_joints),
             frame=Slot("frame", build_frame_fields(frame_px)) if frame_px else None,
             holes=Slot("holes", HOLES),
-            view=Slot("view", VIEW),
+            view=RecordSlot("view", CameraView, num_joints),
             bus_log=Pipe("bus_log", LOG_BYTES),
             policy_log=Pipe("policy_log", LOG_BYTES),
             page_log=Pipe("page_log", LOG_BYTES),
