@@ -301,7 +301,8 @@ class _LateImport(MetaPathFinder, Loader):
         if self.is_refusing:
             del module.__path__  # the import of a part asks for it
             module.__class__ = _LateModule
-        elif self._loader is not None:
+        elif self._loader is not None and module.__spec__ is not None:
+            module.__spec__.loader = module.__loader__ = self._loader
             self._loader.exec_module(module)
 
 
