@@ -27,7 +27,7 @@ from brokk_rl.errors import BrokkError, ConfigError, group_by_reason, list_choic
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
-from diagnosis.answer import Estimate
+from diagnosis.answer import Estimate, Stage
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ class EffectType:
         return {n: one for n, one in self.target.numbers.items() if one.is_on(self.machine)}
 
     @property
-    def stage(self) -> str:
+    def stage(self) -> Stage:
         """On which part of the way from command to estimate it lies."""
         return self.target.stage
 

@@ -47,7 +47,9 @@ def _show_windows(outcome: Outcome, joint: int, title: str, windows: np.ndarray)
         (before, RED, "simulated before"),
         (outcome.after, BLUE, "simulated after"),
     ):
-        for number, window in enumerate(windows if runs is not None else ()):
+        if runs is None:
+            continue
+        for number, window in enumerate(windows):
             begin = int(before.row[window])
             end = min(begin + steps, count)
             style = {"color": colour, "lw": 1.3, "label": None if number else label}

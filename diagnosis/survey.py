@@ -174,7 +174,7 @@ class Survey:
         parts = [part for part in self.location.largest() if part.gap > 0.0]
         regimes = [RegimeGap(part.joint, part.category, part.gap) for part in parts]
         named = selected[0].effect if selected else ""
-        stage = next((kind.stage for kind in kinds if kind.name == named), None)
+        stage: Stage | None = next((kind.stage for kind in kinds if kind.name == named), None)
         if stage is None:
             seen = [one for one in self.findings if one.rms_m > 0.0]
             stage = max(seen, key=lambda one: one.rms_m).stage if seen else None
