@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.kinematics import compute_tool_kinematics
 from deploy.kernel.flow_check import FROM_PC, LEVERS, NOBODY, FlowCheck
 from deploy.kernel.guard import GuardTrip
 from deploy.kernel.limits import FlowLimits
@@ -239,3 +241,21 @@ def test_a_borehole_counts_once_it_has_stayed() -> None:
     # Counted from where it stood first: it may not creep away.
     assert look(11.1, jump_m + 0.001) is GuardTrip.TARGET_JUMPS
     assert look(11.1 + settle_s, jump_m + 0.001) is GuardTrip.NONE
+
+
+def test_the_chisel_may_touch_from_just_above_the_rim_downwards_near_the_axis() -> None:
+    check, q, contact_m = build_check(), np.array(MACHINE.home), GUARD.target.contact_m
+    tip_m = compute_tool_kinematics(MACHINE, q).tip_in_base_m
+    for off_m, may_touch in (
+        ((0.0, 0.0, -0.9 * contact_m), True),
+        ((0.0, 0.9 * contact_m, 0.5), True),
+        ((0.0, 0.0, -1.1 * contact_m), False),
+        ((1.1 * contact_m, 0.0, 0.5), False),
+        ((math.nan, math.nan, math.nan), False),
+    ):
+        target = SeenTarget(tuple(tip_m + off_m), 0.0, ())
+        assert check.may_touch(q, target) is may_touch
+    assert not check.may_touch(q, None)
+    bare = option("machine", "mini_excavator")
+    here = SeenTarget(tuple(tip_m), 0.0, ())
+    assert not TargetCheck(GUARD.target, bare, None, UP).may_touch(q, here)

@@ -28,7 +28,7 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page import access, alarms, frame_codec
-from deploy.page.connections import ConnectionBudget, SendWindow
+from deploy.page.connections import ConnectionBudget
 from deploy.page.files import load_files
 from deploy.page.protocol import (
     BoreholeChoice,
@@ -88,13 +88,6 @@ def test_only_the_whole_token_fits() -> None:
         access.compare_tokens(given, TOKEN)
         for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ")
     )
-
-
-def test_wishes_are_read() -> None:
-    assert access.parse_request('{"kind": "record", "value": "on"}') == OperatorRequest(
-        "record", "on"
-    )
-    assert access.parse_request('{"kind": "stop", "value": ""}') == OperatorRequest("stop", "")
 
 
 @given(
@@ -208,16 +201,6 @@ def test_depth_and_colour_of_different_sizes_are_refused() -> None:
         frame_codec.encode_frame(
             replace(frame(16, 32), depth_m=np.ones((8, 8), np.float32)), 640, 80
         )
-
-
-def test_a_page_has_no_more_undrawn_messages_than_the_limit() -> None:
-    window = SendWindow(2)
-    window.note_sent(1)
-    assert window._free.is_set()
-    window.note_sent(2)
-    assert not window._free.is_set()
-    window.note_drawn(2)  # drawn the newest: the one before is of no use either
-    assert window._free.is_set()
 
 
 def test_the_way_leads_over_the_rim_and_then_down_the_axis() -> None:
