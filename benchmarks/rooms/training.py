@@ -103,9 +103,9 @@ MEASUREMENTS = (
         name="short_training",
         title="`make train`",
         conditions="Training from nothing for 290 s: the policy commands alone. The baseline is the classical controller; no gain is shown. The seeds ran beside each "
-        "other on two cores each of a busy computer, 4.0 million steps each; two cores that do nothing else make 5.8 million.",
+        "other on two cores each of a busy computer, 2.2 million steps each; two cores that do nothing else make more than twice as many.",
         commands=(
-            "brokk -m mode=train preset=laptop session.seed=1,2,3 evaluation.video=false session.out={out}/seeds",
+            "brokk -m mode=train preset=laptop session.seed=1,2,3,4 evaluation.video=false session.out={out}/seeds",
         ),
         code=TRAINING_CODE,
         read=lambda folder: read_evaluations(folder / "seeds", "seed"),
