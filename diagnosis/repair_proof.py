@@ -38,6 +38,8 @@ NOISE_FACTOR = 3.0
 """An error within so many deviations of the sensor's noise is none."""
 SURE_QUANTILE = 0.95
 """An error grew for sure where it did so in this share of the bootstraps."""
+STEP_ERROR = 0.02
+"""Relative error of the step of a coarse sensor: the width of a peak in the transform."""
 LEAST_GAP = 0.02
 """Least gap over the error, so that its share can be told where the floor nearly reaches it."""
 
@@ -280,6 +282,15 @@ class EngineProof(RepairProof):
     def moves(self) -> bool:
         """True if a named effect acts on the free runs; one that shows by itself need not."""
         return any(one.rows or one.hold for one in self._findings)
+
+    @property
+    def steps(self) -> dict[str, Estimate]:
+        """Steps of coarse sensors, rad or m, by joint."""
+        values = self._decider.evidence.steps * measure_units(self.machine)
+        found = {}
+        for name, step in zip(self.machine.joint_names, values.tolist(), strict=True):
+            found[name] = Estimate(step, ((1.0 - STEP_ERROR) * step, (1.0 + STEP_ERROR) * step))
+        return found
 
     def judge(self) -> list[Gate]:
         """Return the gates of all repairs, and one that fails for each simulated effect without a number in the library."""

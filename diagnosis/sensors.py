@@ -20,6 +20,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel, estimate_interval
+from diagnosis.engine.sizes import SIGMAS, get_form_error
 
 SIZES = np.geomspace(0.05, 40.0, 40)
 """Sizes that are tried, of typical; steps of 19 %, up to what a broken sensor shows. Steps chosen by
@@ -195,7 +196,10 @@ def _estimate_parameters(
 ) -> dict[str, dict[str, Estimate]]:
     parameters: dict[str, dict[str, Estimate]] = {}
     for j in np.flatnonzero(mask):
-        ends = np.array(estimate_interval(SIZES, fit.likelihood[:, j]))
+        size, low, high = estimate_interval(SIZES, fit.likelihood[:, j])
+        own = np.log(high / low) / (2.0 * SIGMAS)
+        factor = np.exp(SIGMAS * np.hypot(own, get_form_error(fit.kind.name)))
+        ends = size * np.array([1.0, 1.0 / factor, factor])
         for name in fit.kind.fitted:
             mean, low, high = (
                 float(v) for v in fit.kind.numbers[name].none + fit.kind.size(name)[j] * ends

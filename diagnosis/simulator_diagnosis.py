@@ -22,7 +22,7 @@ from diagnosis.answer import Answer, Outcome, Ranked, Selected, Where
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
-from diagnosis.engine.sizes import FORM_ERROR, SIGMAS
+from diagnosis.engine.sizes import SIGMAS
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import describe_joints
 from diagnosis.grown_effects import GrownEffect
@@ -45,6 +45,8 @@ from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
 from diagnosis.simulator_search import SimulatorSearch
 from diagnosis.survey import examine_gap
 
+FORM_ERROR = 0.1
+"""Relative error of a size that its form makes, 1 sigma. Chosen by hand: no comparison is recorded."""
 LEAST_NEED = 0.05
 """Least share of the error without an effect that the effect takes away, on the half of the field that its
 size was not fitted to. Chosen by hand."""

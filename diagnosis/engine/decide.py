@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from diagnosis.engine.direct import find_step, weigh_stalls
+from diagnosis.engine.direct import find_step, weigh_step
 from diagnosis.engine.evidence import FieldJoint, JointRow, RowEvidence
 from diagnosis.engine.generic import GenericCauses
 from diagnosis.engine.holds import HeldCommands, HeldCourse, hold_commands
@@ -38,14 +38,15 @@ SAME_JOINT_SHARE = 0.5
 """Least share of the first where both share a joint."""
 HELD_NATS = 60.0
 """Least gain of held commands, which follow whatever is left."""
-BESIDE_STALLS_NATS = 60.0
+MAX_SIMULATED = 2
+"""Most simulated effects that are named together: of eight third ones on 400 practice cases one was there."""
 SHOWN_NATS = 1e3
-"""Coarse sensors and stalls that show by themselves come before all that is simulated."""
+"""A coarse sensor or a late clock shows by itself and comes before all that is simulated."""
+LATTICE_NATS = 50.0
+"""Evidence of a coarse sensor beyond twice that of the reference: 50 practice cases with fine sensors have
+at most 26, eight joints with coarse ones 145 and more."""
 COARSE_NATS = 30.0
-"""Evidence of a coarse sensor beyond twice that of the reference."""
-STALL_NATS = 20.0
-MAX_STALLED = 3
-"""More joints that stall have a common cause, such as a pump."""
+"""Least gain of an effect beside a coarse sensor."""
 JITTER_FACTOR = 2.0
 """Jitter can copy lost frames, so it earns so much more, unless it delays most of the time."""
 MOSTLY = 0.8
@@ -122,9 +123,17 @@ class Decider:
         reference: The machine as it was.
         field: The machine as it is.
         noises: Standard deviation of the noise that sensors of the field add, `(J,)`, units.
+        clock_late_s: By how much the field's positions are known to be late.
     """
 
-    def __init__(self, reference: Side, field: Side, noises: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        reference: Side,
+        field: Side,
+        noises: np.ndarray | None = None,
+        clock_late_s: float = 0.0,
+    ) -> None:
+        self.clock_late_s = clock_late_s
         self.evidence = RowEvidence(reference, field)
         if noises is not None:
             self.evidence.noises = noises
@@ -139,49 +148,49 @@ class Decider:
         coarse = self._find_coarse()
         healthy = [base.numbers for base in evidence.bases]
         joints = evidence.view_field(healthy)
+        shown = []
+        if self.clock_late_s:
+            shown.append(self._describe_clock())
+            joints = self._apply(healthy, shown[0])
         table = evidence.weigh_rows(joints)
-        stalled = self._find_stalled(table, coarse)
-        skip = frozenset(stalled)
-        rivals = self._list_findings(joints, table, skip)
+        held = self._find_held(joints)
+        rivals = self._list_findings(joints, table, held)
         outside = [one for one in rivals if one.effect in self.outside]
         library = [one for one in rivals if one.effect not in self.outside]
-        groups = self._weigh_generic(joints, skip)
+        groups = self._weigh_generic(joints)
         strongest = _find_strongest(groups)
-        direct = []
         if coarse:
-            direct.append(EffectFinding("quantisation", tuple(coarse), SHOWN_NATS))
-        if stalled:
-            direct.append(EffectFinding("stiction", tuple(stalled), SHOWN_NATS))
-        named = list(direct)
+            shown.append(EffectFinding("quantisation", tuple(coarse), SHOWN_NATS))
+        named = list(shown)
         best = library[0]
         needed = HELD_NATS if best.effect in HELD else LEAST_NATS
         if coarse:
             needed = max(needed, COARSE_NATS)
-        if stalled:
-            needed = max(needed, BESIDE_STALLS_NATS)
+        further = library if best.nats >= needed else []
         seconds: list[EffectFinding] = []
         left = 0.0
-        is_new = best.effect not in [one.effect for one in direct]
-        if best.nats >= needed and len(named) < 2 and is_new:
-            named.append(best)
-            joints = self._apply(healthy, best)
+        while further:
+            one = further[0]
+            if one.name in [other.name for other in named]:
+                break
+            if one is not best and not self._is_further(best, one):
+                break
+            named.append(one)
+            numbers = [joint.numbers for joint in joints]
+            joints = self._apply(numbers, one, joints[0].side)
+            left = _find_strongest(self._weigh_generic(joints))[1]
+            if len(named) == len(shown) + MAX_SIMULATED:
+                break
             table = evidence.weigh_rows(joints)
-            seconds = [
-                one
-                for one in self._list_findings(joints, table, skip)
-                if one.effect != best.effect and {one.name, best.name} != {"thermal_drift"}
-            ]
-            left = _find_strongest(self._weigh_generic(joints, skip))[1]
-            left = max([left, *(one.nats for one in seconds if one.effect in self.outside)])
-            seconds = [one for one in seconds if one.effect not in self.outside]
-            if len(named) < 2 and seconds and self._is_second(best, seconds[0], named):
-                named.append(seconds[0])
-                numbers = [joint.numbers for joint in joints]
-                field = joints[0].side
-                after = self._apply(numbers, seconds[0], field)
-                left = _find_strongest(self._weigh_generic(after, skip))[1]
+            can_hold = joints[0].side is evidence.field
+            held = self._find_held(joints) if can_hold else None
+            found = self._list_findings(joints, table, held)
+            further = [other for other in found if other.effect not in self.outside]
+            further = _drop_names(further, named)
+            left = max([left, *(other.nats for other in found if other.effect in self.outside)])
+            seconds = seconds or further
         verdict = "none"
-        earned = sum(one.nats for one in named if one not in direct)
+        earned = sum(one.nats for one in named if one not in shown)
         hunting = groups.get("hunting", 0.0)
         most = max(best.nats, 0.0)
         pump = max([one.nats for one in outside if one.effect == "pump_lag"], default=0.0)
@@ -189,7 +198,7 @@ class Decider:
         is_odd |= strongest[1] > most + GENERIC_NATS
         is_odd |= left > LEFT_SHARE * earned + LEFT_NATS
         is_odd |= best.effect in HELD and pump > 0.5 * most
-        if (is_odd and not direct) or hunting > HUNTING_FACTOR * most + HUNTING_NATS:
+        if (is_odd and not shown) or hunting > HUNTING_FACTOR * most + HUNTING_NATS:
             verdict = "unknown"
             named = []
         elif named:
@@ -204,54 +213,42 @@ class Decider:
             left,
         )
 
+    def _describe_clock(self) -> EffectFinding:
+        """Return the clock that is late as a dead time of all joints."""
+        row = Row("dead_time", (("delay_s", "add", self.clock_late_s),))
+        joints = range(self.num_joints)
+        return EffectFinding("dead_time", tuple(joints), SHOWN_NATS, dict.fromkeys(joints, row))
+
+    def _find_held(self, joints: Sequence[FieldJoint]) -> EffectFinding | None:
+        """Return the likelier of lost frames and jitter with what it earns."""
+        hold = _choose_hold(self.holds.find(joints))
+        return None if hold is None else _weigh_hold(hold, self.num_joints)
+
     def _find_coarse(self) -> list[int]:
         """Return the joints with a coarse sensor on the field; their steps enter the scale."""
         found, evidence = [], self.evidence
         for j in np.flatnonzero(evidence.noises == 0.0).tolist():
             nats, step = find_step(evidence.field, j)
-            known, _ = find_step(evidence.reference, j)
-            if nats > 2.0 * known + COARSE_NATS:
+            if nats < LATTICE_NATS:
+                continue
+            if nats > 2.0 * weigh_step(evidence.reference, j, step) + LATTICE_NATS:
                 evidence.steps[j] = step
                 found.append(j)
         return found
-
-    def _find_stalled(
-        self, table: Mapping[str, Mapping[int, JointRow]], coarse: Sequence[int]
-    ) -> list[int]:
-        """Return the joints that stick and slip; one that rings as well is compliant."""
-        found = []
-        if "stiction" not in table:
-            return found
-        ringing = table["compliance"]
-        for j in range(self.num_joints):
-            is_rough = j in coarse or self.evidence.noises[j] > 0.0
-            numbers = self.evidence.bases[j].numbers
-            nats = 0.0 if is_rough else weigh_stalls(self.evidence, j, numbers)
-            rings = ringing[j].gain if j in ringing else 0.0
-            if nats < STALL_NATS or rings >= nats:
-                continue
-            # A joint that another effect stops, such as a wider dead band, does not stick.
-            own = [rows[j] for name, rows in table.items() if j in rows and name != "stiction"]
-            best = max(own, key=lambda one: one.gain)
-            changed = self.evidence.field.model.change(numbers, [best.row])[0]
-            if best.gain < nats or weigh_stalls(self.evidence, j, changed) >= STALL_NATS:
-                found.append(j)
-        return found if len(found) <= MAX_STALLED else []
 
     def _list_findings(
         self,
         joints: Sequence[FieldJoint],
         table: Mapping[str, Mapping[int, JointRow]],
-        skip: frozenset[int],
+        held: EffectFinding | None,
     ) -> list[EffectFinding]:
         """Return all effects with what they earn, the best first."""
-        found = [_add_up(effect, rows, skip) for effect, rows in table.items()]
+        found = [_add_up(effect, rows) for effect, rows in table.items()]
         if "thermal_drift" in table:
             common = self.evidence.weigh_common("thermal_drift", joints)
-            found.append(_add_up("thermal_all", common, skip))
-        if all(joint.side is self.evidence.field for joint in joints):
-            holds = self.holds.find(joints)
-            found += [_weigh_hold(hold, self.num_joints) for hold in _choose_hold(holds)]
+            found.append(_add_up("thermal_all", common))
+        if held is not None:
+            found.append(held)
         return sorted(found, key=lambda one: -one.nats)
 
     def _apply(
@@ -267,26 +264,19 @@ class Decider:
             side = hold_commands(side, finding.hold.delays)
         return self.evidence.view_field(changed, side)
 
-    def _is_second(
-        self, first: EffectFinding, second: EffectFinding, named: Sequence[EffectFinding]
-    ) -> bool:
-        """Return whether a second effect earns enough."""
-        is_whole = first.effect in WHOLE or second.effect in WHOLE
-        shares = bool(set(first.joints) & set(second.joints)) and not is_whole
+    def _is_further(self, first: EffectFinding, further: EffectFinding) -> bool:
+        """Return whether a further effect earns enough beside the first."""
+        is_whole = first.effect in WHOLE or further.effect in WHOLE
+        shares = bool(set(first.joints) & set(further.joints)) and not is_whole
         needed = (SAME_JOINT_SHARE if shares else SECOND_SHARE) * first.nats
-        if second.effect in HELD:
+        if further.effect in HELD:
             needed = max(needed, HELD_NATS)
-        is_new = second.effect not in [one.effect for one in named]
-        return is_new and second.nats >= max(needed, LEAST_NATS)
+        return further.nats >= max(needed, LEAST_NATS)
 
-    def _weigh_generic(
-        self, joints: Sequence[FieldJoint], skip: frozenset[int]
-    ) -> dict[str, float]:
+    def _weigh_generic(self, joints: Sequence[FieldJoint]) -> dict[str, float]:
         """Return what each group earns on all joints, nats."""
         total: dict[str, float] = {}
         for joint in joints:
-            if joint.joint in skip:
-                continue
             for name, nats in self.generic.weigh(joint).items():
                 total[name] = total.get(name, 0.0) + max(nats - JOINT_NATS, 0.0)
         return total
@@ -300,7 +290,7 @@ def _find_strongest(groups: Mapping[str, float]) -> tuple[str, float]:
     return name, groups[name]
 
 
-def _add_up(effect: str, rows: Mapping[int, JointRow], skip: frozenset[int]) -> EffectFinding:
+def _add_up(effect: str, rows: Mapping[int, JointRow]) -> EffectFinding:
     """Return an effect with the joints that it pays on."""
     if effect in SHARED or effect == "thermal_all":
         nats = sum(row.gain - row.price for row in rows.values()) - JOINT_NATS
@@ -309,7 +299,7 @@ def _add_up(effect: str, rows: Mapping[int, JointRow], skip: frozenset[int]) -> 
     nets = {}
     for j, row in rows.items():
         net = row.gain - row.price - JOINT_NATS
-        if net > 0.0 and j not in skip:
+        if net > 0.0:
             nets[j] = net
     total = sum(nets.values())
     total -= BESIDES_NATS.get(effect, 0.0)
@@ -330,13 +320,21 @@ def _weigh_hold(hold: HeldCourse, num_joints: int) -> EffectFinding:
     return EffectFinding(hold.course.effect, joints, nats - hold.price - JOINT_NATS, {}, hold)
 
 
-def _choose_hold(holds: Mapping[str, HeldCourse]) -> list[HeldCourse]:
-    """Return the likelier of lost frames and jitter."""
+def _choose_hold(holds: Mapping[str, HeldCourse]) -> HeldCourse | None:
+    """Return the likelier of lost frames and jitter; `None` where neither was found."""
     if len(holds) < 2:
-        return list(holds.values())
+        return next(iter(holds.values()), None)
     jitter, loss = holds["delay_jitter"], holds["frame_loss"]
     earned = jitter.gain - jitter.price
     other = max(loss.gain - loss.price, 1.0)
     is_jitter = earned > JITTER_FACTOR * other
     is_jitter |= jitter.share > MOSTLY and earned > 1.05 * other
-    return [jitter if is_jitter else loss]
+    return jitter if is_jitter else loss
+
+
+def _drop_names(
+    findings: Sequence[EffectFinding], named: Sequence[EffectFinding]
+) -> list[EffectFinding]:
+    """Return the findings but for those whose name is there already."""
+    names = {one.name for one in named}
+    return [one for one in findings if one.name not in names]

@@ -56,6 +56,7 @@ class HeldCourse:
         price: The same on the reference, at the length of the field, nats.
         starts: Gain while the arm speeds up, nats.
         stops: Gain while it slows down, nats.
+        weights: Share of each sample in what is seen of the delays, `(T,)`.
     """
 
     course: Course
@@ -64,6 +65,7 @@ class HeldCourse:
     price: float
     starts: float
     stops: float
+    weights: np.ndarray
 
     @property
     def share(self) -> float:
@@ -317,6 +319,14 @@ def hold_commands(side: Side, delays: np.ndarray) -> Side:
     return side.with_commands(delay_commands(side.u, delays))
 
 
+def _weigh_samples(side: Side) -> np.ndarray:
+    """Return the share of each sample in the squared changes of all commands, `(T,)`: no other delay shows."""
+    steps = np.diff(side.u, axis=0, prepend=side.u[:1])
+    steps[side.starts] = 0.0
+    squares = np.square(steps).sum(1)
+    return squares / max(float(squares.sum()), 1e-12)
+
+
 def _price_course(delays: np.ndarray, course: Course, num_delays: int) -> np.ndarray:
     """Return the log prior of each step of a course, against no delay at all, `(T,)`."""
     states = np.rint(delays * course.parts)
@@ -375,7 +385,9 @@ class HeldCommands:
             best = found.get(course.effect)
             if best is None or gain - price > best.gain - best.price:
                 starts, stops = float(gains[rising].sum()), float(gains[~rising].sum())
-                found[course.effect] = HeldCourse(course, delays, gain, price, starts, stops)
+                found[course.effect] = HeldCourse(
+                    course, delays, gain, price, starts, stops, _weigh_samples(side)
+                )
         return found
 
     def _price(self, course: Course) -> float:

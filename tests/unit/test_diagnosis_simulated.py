@@ -7,11 +7,13 @@ from itertools import product
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
 from brokk_rl import extensions
+from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library
@@ -23,9 +25,10 @@ from diagnosis.engine.measure import Motion, fit_variance
 from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_full_loads, measure_units, stack_side
-from diagnosis.engine.sizes import describe_hold, translate
+from diagnosis.engine.sizes import SEEN_SHARE, describe_hold, translate
 from diagnosis.engine.valve import VALVE
-from diagnosis.reference_diagnosis import ReferenceDiagnosis
+from diagnosis.geometry import TOOL_COLUMNS
+from diagnosis.reference_diagnosis import ReferenceDiagnosis, measure_clock_shift
 from diagnosis.repair_proof import EngineProof
 
 RATE_HZ = 20.0
@@ -192,8 +195,11 @@ def test_share_and_persistence_of_losses_are_read_from_their_course(machine: Mac
         is_lost = chance < (1.0 - persistence) * probability + persistence * was_lost
         delays.append(delays[-1] + 1 if is_lost else 0)
     course = Course("frame_loss", probability, persistence)
-    found = describe_hold(holds.HeldCourse(course, np.array(delays), 1.0, 0.0, 0.0, 0.0), machine)
-    expected = {"probability": probability, "persistence": persistence}
+    weights = np.full(len(delays), 1.0 / len(delays))
+    held = holds.HeldCourse(course, np.array(delays), 1.0, 0.0, 0.0, 0.0, weights)
+    found = {name: value for name, (value, _) in describe_hold(held, machine).items()}
+    # A course on a machine shows a part of the losses only.
+    expected = {"probability": probability / SEEN_SHARE, "persistence": persistence}
     assert found == pytest.approx(expected, abs=0.02)
 
 
@@ -289,12 +295,49 @@ def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine)
     assert "in_library" in [gate.name for gate in answer.gates if not gate.passed]
 
 
-def test_a_coarse_sensor_is_named_without_a_number(two_joints: Machine) -> None:
+@pytest.mark.parametrize("step_rad", [0.004, 0.04])
+def test_a_coarse_sensor_is_named_with_its_step(two_joints: Machine, step_rad: float) -> None:
     case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
-    for recording in case.field:
-        recording.q[:, 1] = 0.02 * np.round(recording.q[:, 1] / 0.02)
-    answer = diagnose(case)
-    assert [(one.effect, one.joints) for one in answer.selected] == [("quantisation", ("q4",))]
+    field = [replace(one, q=np.round(one.q / step_rad) * step_rad) for one in case.field]
+    answer = diagnose(replace(case, field=[replace(r, q=r.q.astype("f4")) for r in field]))
+    assert answer.verdict == "effects"
+    found = {one.effect: one.parameters["step_rad"] for one in answer.selected}
+    assert found.keys() == {"quantisation"}
+    for one in found["quantisation"].values():
+        assert one.mean == pytest.approx(step_rad, rel=0.01)
+
+
+def test_a_lattice_that_the_reference_has_too_is_no_coarse_sensor(two_joints: Machine) -> None:
+    case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
+    rounded = []
+    for half in (case.reference, case.field):
+        rounded.append([replace(r, q=(np.round(r.q / 0.004) * 0.004).astype("f4")) for r in half])
+    assert diagnose(GapCase(two_joints, *rounded)).verdict == "none"
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.03])
+def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
+    machine: Machine, late_s: float
+) -> None:
+    generator = np.random.default_rng(0)
+    t_s = np.arange(4000) / RATE_HZ
+    middle = 0.5 * (machine.lower + machine.upper)
+    half = 0.2 * (machine.upper - machine.lower)
+    rates = 2.0 * np.pi * np.array([0.05, 0.07, 0.09, 0.11, 0.13])
+
+    def place(at_s: np.ndarray) -> np.ndarray:
+        return middle + half * np.sin(at_s[:, None] * rates)
+
+    # The tracker sees an arm whose third encoder is wrong by half a degree.
+    true = place(t_s) + np.array([0.0, 0.0, 0.009, 0.0, 0.0])
+    tip = Kinematics(machine).pose(torch.as_tensor(true, dtype=torch.float32)).tip_in_base_m
+    seen = tip.numpy() + generator.normal(0.0, 0.0015, (len(t_s), 3))
+    shown = replace(
+        record(machine, np.zeros_like(true), np.zeros_like(true)),
+        q=place(t_s - late_s).astype("f4"),
+        extra=dict(zip(TOOL_COLUMNS, seen.T, strict=True)),
+    )
+    assert measure_clock_shift([shown], machine) == pytest.approx(late_s, abs=0.002)
 
 
 def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machine) -> None:
