@@ -16,6 +16,7 @@ import trimesh
 from composed import option
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.check import check_machine
@@ -359,6 +360,7 @@ def test_drives_that_are_too_stiff_are_named_with_a_stiffness_that_is_not(machin
 
 
 def test_a_machine_that_is_known_by_its_joints_only_is_no_error() -> None:
-    found = check_machine(option("machine", "mini_excavator"), 10, np.random.default_rng(0))
+    mode = load_mode("mode=check", "machine=mini_excavator", "session.out=unused")
+    found = check_machine(mode.machine, 10, np.random.default_rng(0))
     assert found.problems == [] and found.reach == {}
     assert any("recorded and identified" in text for text in found.missing)
