@@ -47,7 +47,7 @@ FORM_ERRORS = {
     "torque_limit": 0.33,
 }
 """The same by effect: 198 numbers of 400 practice cases of three makes. With a make left out of the choice, the
-90 % intervals hold 172 of its numbers; benchmarks/results/size_errors.json has them all."""
+90 % intervals hold 172 of its numbers; benchmarks/results/size_errors has them all."""
 SEEN_SHARE = 0.36
 """Share of lost frames that a course finds, on 13 of these cases: a loss between equal commands leaves no trace."""
 SIGMAS = 1.96

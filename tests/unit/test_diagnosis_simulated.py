@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 import warp as wp
@@ -25,7 +28,7 @@ from diagnosis.engine.measure import Motion, fit_variance
 from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_full_loads, measure_units, stack_side
-from diagnosis.engine.sizes import SEEN_SHARE, describe_hold, translate
+from diagnosis.engine.sizes import FORM_ERROR, SEEN_SHARE, describe_hold, get_form_error, translate
 from diagnosis.engine.valve import VALVE
 from diagnosis.geometry import TOOL_COLUMNS
 from diagnosis.reference_diagnosis import ReferenceDiagnosis, measure_clock_shift
@@ -359,3 +362,24 @@ def test_units_do_not_matter(two_joints: Machine) -> None:
     one, two = make_side(two_joints, u), make_side(other, u)
     assert measure_units(other) == pytest.approx(2.0 * measure_units(two_joints))
     assert two.q == pytest.approx(0.5 * one.q)
+
+
+def test_form_errors_are_those_of_sizes_that_were_stated_and_known() -> None:
+    path = Path(__file__).parents[2] / "benchmarks/results/size_errors/rows.json"
+    table = json.loads(path.read_text())
+    rows = pd.DataFrame(table["rows"], columns=table["columns"])
+    # Losses that no course finds are a bias, and leave their scatter only.
+    lost = rows.effect == "frame_loss"
+    assert np.exp(rows.log_ratio[lost].mean()) == pytest.approx(SEEN_SHARE, abs=0.01)
+    every = rows[~lost]
+    rows.loc[lost, "log_ratio"] -= rows.log_ratio[lost].mean()
+
+    def measure_rest(some: pd.DataFrame) -> float:
+        return float(np.mean(some.log_ratio**2) - np.mean(some.own_error**2))
+
+    assert np.sqrt(measure_rest(every)) == pytest.approx(FORM_ERROR, abs=0.01)
+    for effect, some in rows.groupby("effect"):
+        share = len(some) / (len(some) + 3.0)
+        own = max(measure_rest(some), 0.03**2)
+        expected = np.sqrt(share * own + (1.0 - share) * FORM_ERROR**2)
+        assert get_form_error(str(effect)) == pytest.approx(expected, abs=0.01), effect
