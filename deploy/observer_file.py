@@ -186,8 +186,8 @@ def _replay(observer: Observer, recording: Recording, machine: Machine) -> Itera
     times_s = np.arange(recording.num_samples) * machine.period_s
     for row, t_s in enumerate(times_s):
         # The observer gets the flow of the period that has just ended.
-        flow = recording.u[max(0, row - 1)]
-        observer.update(float(t_s), recording.q[row].astype(float), flow.astype(float))
+        flow, q = recording.u[max(0, row - 1)].astype(float), recording.q[row].astype(float)
+        observer.update(float(t_s), q, flow, may_touch=False)
         yield
 
 

@@ -113,7 +113,7 @@ class Observer:
             self._fault, self._joint = GuardTrip.NONE, -1
             self._begin_window()
 
-    def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool = False) -> None:
+    def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool) -> None:
         """Take in one control period.
 
         Args:

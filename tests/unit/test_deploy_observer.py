@@ -330,7 +330,7 @@ def test_the_newest_quarter_of_the_window_names_the_fault() -> None:
 def test_a_period_is_due_when_it_is_over() -> None:
     observer = Joints().observer
     assert observer.is_due(0.0)
-    observer.update(10.0, HOME, np.zeros(5))
+    observer.update(10.0, HOME, np.zeros(5), may_touch=False)
     assert not observer.is_due(10.0 + 0.85 * PERIOD_S) and observer.is_due(10.0 + 0.95 * PERIOD_S)
     observer.forget()
     assert observer.is_due(10.0)
