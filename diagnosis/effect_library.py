@@ -251,7 +251,6 @@ class DetectedEffect:
         net_gain: Log-likelihood gain less its penalty, nats.
         gain: Log-likelihood gain, nats.
         closed: Share of the statistic that the effect explains.
-        rivals: Gain of other effects in its place, by name, nats.
     """
 
     kind: EffectType
@@ -260,7 +259,6 @@ class DetectedEffect:
     net_gain: float
     gain: float
     closed: float
-    rivals: Mapping[str, float]
 
     def values(self, count: int = 1) -> dict[str, np.ndarray]:
         """Return the numbers of `count` candidates that all have the effect, each `(C, J)` or `(C, 1)`."""

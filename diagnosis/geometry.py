@@ -328,18 +328,11 @@ def _describe_effect(
     mine = tuple(c for c in best if causes[c].kind is kind)
     rest = tuple(c for c in best if c not in mine)
     own = gain - fits[rest].gain
-    rivals = {}
-    for c, cause in enumerate(causes):
-        swapped = tuple(sorted({*rest, c}))
-        if cause.kind is not kind and swapped in fits:
-            rivals[cause.kind.name] = max(
-                rivals.get(cause.kind.name, -np.inf), fits[swapped].gain - fits[rest].gain
-            )
     without = max(
         value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
     )
     closed = float(np.clip(own / max(gain, 1e-9), 0.0, 1.0))
-    return DetectedEffect(kind, mask, parameters, worth[best] - without, own, closed, rivals)
+    return DetectedEffect(kind, mask, parameters, worth[best] - without, own, closed)
 
 
 def _list_errors(

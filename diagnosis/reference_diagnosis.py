@@ -334,13 +334,13 @@ def measure_clock_shift(recordings: Sequence[Recording], machine: Machine) -> fl
         seen = np.stack([recording.extra[column] for column in geometry.TOOL_COLUMNS], 1)
         pose, _ = kinematics.pose_and_jacobian(torch.as_tensor(recording.q, dtype=torch.float32))
         tip = pose.tip_in_base_m.numpy().astype(float)
-        given = np.isfinite(seen).all(1)
+        given = np.flatnonzero(np.isfinite(seen).all(1))
         positions.append(recording.q[given].astype(float))
         errors.append((seen - tip)[given])
         # Noise of the encoders would shorten the shift: the slope is that of some tenths of a second.
         width = 2 * max(2, round(SLOPE_S / machine.period_s / 2.0)) + 1
-        velocity = savgol_filter(tip, width, 2, deriv=1, delta=machine.period_s, axis=0)
-        velocities.append(velocity[given])
+        slope = savgol_filter(tip, width, 2, deriv=1, delta=machine.period_s, axis=0)
+        velocities.append(np.asarray(slope)[given])
     q = np.concatenate(positions)
     first, second = np.triu_indices(q.shape[1])
     known = np.concatenate([np.ones((len(q), 1)), q, q[:, first] * q[:, second]], 1)

@@ -125,14 +125,9 @@ def find_sensor_effects(
         if worth <= 0:
             continue
         earned = float(gain[place][mask].sum())
-        rivals = {}
-        for other, rival in enumerate(fits):
-            if other != place:
-                behind = float((highest[place] - highest[other])[mask].sum())
-                rivals[rival.kind.name] = earned - behind
         parameters = _estimate_parameters(fit, mask, machine)
         closed = _compute_closed_share(seen[mask], fit.after[mask], plain.mean(0)[mask])
-        found.append(DetectedEffect(fit.kind, mask, parameters, worth, earned, closed, rivals))
+        found.append(DetectedEffect(fit.kind, mask, parameters, worth, earned, closed))
     return found
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.fft import next_fast_len
 
 from diagnosis.engine.side import Side
 
@@ -42,7 +41,7 @@ def _find_step_between(
     if len(q) < MIN_POSITIONS:
         return 0.0, 0.0
     places = np.floor((q - q.min()) / BIN_UNITS).astype(int)
-    size = PADDING * next_fast_len(int(places.max()) + 1)
+    size = PADDING * (int(places.max()) + 1)
     lengths = np.abs(np.fft.rfft(np.bincount(places, minlength=size)))[1:] / len(q)
     steps = size * BIN_UNITS / np.arange(1, len(lengths) + 1)
     nats = _weigh_length(lengths, len(q)) * ((steps >= smallest) & (steps <= largest))
