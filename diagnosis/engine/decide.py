@@ -45,8 +45,6 @@ SHOWN_NATS = 1e3
 LATTICE_NATS = 50.0
 """Evidence of a coarse sensor beyond twice that of the reference: 50 practice cases with fine sensors have
 at most 26, eight joints with coarse ones 145 and more."""
-COARSE_NATS = 30.0
-"""Least gain of an effect beside a coarse sensor."""
 JITTER_FACTOR = 2.0
 """Jitter can copy lost frames, so it earns so much more, unless it delays most of the time."""
 MOSTLY = 0.8
@@ -164,8 +162,6 @@ class Decider:
         named = list(shown)
         best = library[0]
         needed = HELD_NATS if best.effect in HELD else LEAST_NATS
-        if coarse:
-            needed = max(needed, COARSE_NATS)
         further = library if best.nats >= needed else []
         seconds: list[EffectFinding] = []
         left = 0.0

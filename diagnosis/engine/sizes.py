@@ -134,7 +134,9 @@ def describe_numbers(
     if hold is not None:
         for name, (value, relative) in describe_hold(hold, machine).items():
             factor = float(np.exp(SIGMAS * relative))
-            estimate = Estimate(value, (value / factor, value * factor))
+            # A share of frames is no more than all of them.
+            most = np.inf if name == "jitter_s" else 1.0
+            estimate = Estimate(value, (value / factor, min(value * factor, most)))
             found[name] = dict.fromkeys(machine.joint_names, estimate)
         return found
     is_shared = bool(list_shared_effects([kind]))
