@@ -201,8 +201,9 @@ class Desk:
         """Goes the operator's way until the machine moves as the commander asks."""
         end_s = time.monotonic() + patience_s
         self.fault("none")
-        self.arm()
         while time.monotonic() < end_s:
+            # The commander may just have written older switches.
+            self.arm()
             self.fault("deadman_released", seconds=0.15)
             time.sleep(0.4)
             if all(
