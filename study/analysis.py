@@ -4,6 +4,9 @@ During a sitting only the loop's capture is written, and the trial's file says f
 counts. Its recording is made here, so that an interruption leaves nothing half converted.
 """
 
+# pyright: reportArgumentType=false
+# The stubs of pandas and SciPy name more types than are returned here.
+
 from __future__ import annotations
 
 import math

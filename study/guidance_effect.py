@@ -7,6 +7,9 @@ missing this is the mixed model with random persons. The p-value that decides is
 draws of the sequences as `study.design` makes them: one coin for each pair of persons.
 """
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# The stubs of pandas and SciPy name more types than are returned here.
+
 from __future__ import annotations
 
 import math
@@ -159,8 +162,8 @@ def adjust_by_holm(
     from statsmodels.stats.multitest import multipletests
 
     p = {name: effects[name].p for name in family if effects[name].p is not None}
-    adjusted = multipletests(list(p.values()), method="holm")[1].tolist() if p else []
-    return dict(zip(p, adjusted, strict=True))
+    adjusted = np.asarray(multipletests(list(p.values()), method="holm")[1]) if p else ()
+    return dict(zip(p, map(float, adjusted), strict=True))
 
 
 def _permute_sequences(first: np.ndarray, other: np.ndarray, num_draws: int) -> np.ndarray:
@@ -174,7 +177,7 @@ def _permute_sequences(first: np.ndarray, other: np.ndarray, num_draws: int) -> 
         axis=-1,
         rng=0,
     )
-    return test.pvalue
+    return np.asarray(test.pvalue)
 
 
 def _compare_means(first: np.ndarray, other: np.ndarray, axis: int) -> np.ndarray:

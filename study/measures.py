@@ -133,7 +133,7 @@ def differentiate(values: np.ndarray, period_s: float) -> np.ndarray:
     """Return the slope over `SLOPE_SAMPLES` (Savitzky and Golay 1964), `(T, …)`; 0 in shorter ones."""
     if len(values) < SLOPE_SAMPLES:
         return np.zeros_like(values)
-    return savgol_filter(values, SLOPE_SAMPLES, 1, deriv=1, delta=period_s, axis=0)
+    return np.asarray(savgol_filter(values, SLOPE_SAMPLES, 1, deriv=1, delta=period_s, axis=0))
 
 
 def detect_lever_movements(u: np.ndarray) -> np.ndarray:

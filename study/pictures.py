@@ -3,6 +3,9 @@
 Guided is always blue and solid, unguided orange and dotted.
 """
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+# The stubs of pandas and SciPy name more types than are returned here.
+
 from __future__ import annotations
 
 from collections.abc import Sequence

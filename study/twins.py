@@ -7,6 +7,9 @@ are independent of each other, so that several processes share them.
 Axes: `J` joints.
 """
 
+# pyright: reportArgumentType=false
+# The stubs of joblib do not know what its generator yields.
+
 from __future__ import annotations
 
 from dataclasses import asdict, replace

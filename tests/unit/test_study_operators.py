@@ -106,7 +106,7 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
     assert effects.simulated.all() and effects.num_persons["several_joints"] == 4
     assert "no person took part" in (run / "report.html").read_text()
     trial = json.loads((run / "trials" / "P01_1_01.json").read_text())
-    assert trial["simulated"] is True and trial["operator"] in ("follower", "novice")
+    assert trial["simulated"] is True and trial["operator"] in ("advicefollower", "novice")
     assert "simulated operators" in (run / "plan.html").read_text()
     erased = brokk(
         "mode=study", "study.do=erase", "study.folder=run", "study.participant=P02",
