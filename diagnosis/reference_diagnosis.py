@@ -141,10 +141,10 @@ class ReferenceDiagnosis:
         for one in detected:
             if not (is_held and one.kind.name == "sensor_noise" and one.joints.all()):
                 found.append(NamedEffect(one.kind, None, one))
-        is_late = self.clock_late_s != 0.0
         for finding in decision.named if decision.verdict == "effects" else ():
             # The engine simulates a clock that is late as a dead time of all joints.
-            name = "clock_offset" if is_late and finding.name == "dead_time" else finding.name
+            is_clock = self.clock_late_s != 0.0 and finding.name == "dead_time"
+            name = "clock_offset" if is_clock else finding.name
             if name in kinds and name not in [one.kind.name for one in found]:
                 found.append(NamedEffect(kinds[name], finding, None))
         return found

@@ -17,7 +17,7 @@ CommandKind = Literal["velocity", "position", "torque"]
 SURE, LIKELY = 0.97, 0.8
 """Least probabilities of a sure and of a likely guess."""
 Damaged = Literal["refuse", "skip"]
-"""What is done about damaged parts of a log."""
+"""Choices for damaged parts of a log."""
 Evidence = tuple[str, float]
 """An observation as text, and the logarithm of the odds that it adds."""
 

@@ -87,17 +87,8 @@ def size_finding(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[i
 
 
 def fit_rows(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, Row]:
-    """Return the rows of a finding with sizes fitted to these joints; for one without rows those of its effect."""
-    found = {}
-    for j in finding.joints:
-        row = finding.rows.get(j)
-        if row is None:
-            some = [one for one in joints[j].side.model.rows if one.effect == finding.name]
-            if not some:
-                continue
-            row = some[int(np.argmax(joints[j].score(some)))]
-        found[j] = joints[j].refine(row)[1]
-    return found
+    """Return the rows of a finding with sizes fitted to these joints."""
+    return {j: joints[j].refine(row)[1] for j, row in finding.rows.items()}
 
 
 def is_plain(row: Row, model: JointModel) -> bool:
@@ -147,14 +138,14 @@ def describe_numbers(
             if name in values:
                 sizes[j] = (values[name], sized.relative)
         if is_shared and sizes:
-            sizes = dict.fromkeys(sizes, _average(list(sizes.values())))
+            sizes = dict.fromkeys(sizes, _average_sizes(list(sizes.values())))
         for j, (value, relative) in sizes.items():
             estimate = _estimate_number(kind, name, j, value, relative)
             found.setdefault(name, {})[machine.joint_names[j]] = estimate
     return found
 
 
-def _average(sizes: Sequence[tuple[float, float]]) -> tuple[float, float]:
+def _average_sizes(sizes: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """Return the mean of sizes, weighed by their relative errors, and the smallest of these: forms err alike."""
     values = np.array([value for value, _ in sizes])
     errors = np.array([relative for _, relative in sizes])

@@ -75,7 +75,7 @@ async def _use(host: str, run: Path) -> None:
 
 
 def is_led(shown: dict[str, Any]) -> bool:
-    """Whether somebody who holds the dead-man is shown a valid advice."""
+    """Return whether an operator who holds the dead-man sees a valid advice."""
     advice = shown["advice"]
     return bool(shown["alive"] and advice and advice["valid"] and shown["safety"]["deadman"])
 

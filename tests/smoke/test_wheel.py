@@ -1,4 +1,4 @@
-"""What `make dist` builds in empty environments, without the checkout: it evaluates, plays, and takes a package."""
+"""Wheel and source distribution in empty environments, without the checkout: they evaluate, play, and take a package."""
 
 from __future__ import annotations
 

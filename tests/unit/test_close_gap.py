@@ -1,4 +1,4 @@
-"""What a diagnosis is worth to a policy: intervals and sentences; and the mode's refusals."""
+"""Gain in success by training with a diagnosis: intervals, sentences, and the mode's refusals."""
 
 from __future__ import annotations
 

@@ -344,6 +344,15 @@ def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
     assert measure_clock_shift([shown], machine) == pytest.approx(late_s, abs=0.002)
 
 
+def test_a_late_clock_is_told_once_and_beside_other_effects(two_joints: Machine) -> None:
+    case = make_case(two_joints, np.array([0.4, 0.4]), np.array([1.0, 0.8]))
+    reference, field = (stack_side(side, two_joints) for side in (case.reference, case.field))
+    decider = Decider(reference, field, clock_late_s=0.1)
+    named = [(one.name, one.joints) for one in decider.decide().named]
+    # The engine calls a late clock a dead time of all joints.
+    assert named == [("dead_time", (0, 1)), ("flow_gain", (1,))]
+
+
 def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machine) -> None:
     # The second joint goes the other way: a simulator without this errs by twice its motion.
     case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, -1.0]))

@@ -147,32 +147,25 @@ def test_the_joint_moves_otherwise(
     assert got == pytest.approx(expected, abs=1e-6)
 
 
+def build_late_model(machine: Machine) -> Any:
+    """Returns a joint that follows its command after 0.55 s."""
+    sharp = {"dead_band_extend": 0.0, "dead_band_retract": 0.0, "time_constant_s": 0.0}
+    return replace(shipped("actuator", "lag"), dead_time_s=0.55, **sharp).build(machine, 1, CPU)
+
+
 def test_dead_time_adds_to_that_of_the_model_beyond_the_history(machine: Machine) -> None:
-    inner = shipped("actuator", "lag")
-    inner = replace(
-        inner, dead_time_s=0.55, dead_band_extend=0.0, dead_band_retract=0.0, time_constant_s=0.0
-    ).build(machine, 1, CPU)
-    path = roll(
-        wrapped("dead_time", machine, inner=inner, dead_time_s=0.5), machine, [1.0] + [0.0] * 24
-    )[:, 0, 0]
+    model = wrapped("dead_time", machine, inner=build_late_model(machine), dead_time_s=0.5)
+    path = roll(model, machine, [1.0] + [0.0] * 24)[:, 0, 0]
     # 1.05 s are 21 periods, more than the 13 samples of the history
     np.testing.assert_allclose(path[[21, 22, 25]], [0, FULL, FULL], atol=1e-6)
 
 
-def test_clock_offset_goes_both_ways(machine: Machine) -> None:
-    inner = replace(
-        shipped("actuator", "lag"),
-        dead_time_s=0.55,
-        dead_band_extend=0.0,
-        dead_band_retract=0.0,
-        time_constant_s=0.0,
-    )
-    for offset_s, first in ((0.1, 13), (0.0, 11), (-0.1, 9)):
-        model = wrapped(
-            "clock_offset", machine, inner=inner.build(machine, 1, CPU), offset_s=offset_s
-        )
-        path = roll(model, machine, [1.0] * 20)[:, 0, 0]
-        np.testing.assert_allclose(path[[first, first + 1]], [0, FULL], atol=1e-6)
+@pytest.mark.parametrize(("offset_s", "first"), [(0.1, 13), (0.0, 11), (-0.1, 9)])
+def test_clock_offset_goes_both_ways(machine: Machine, offset_s: float, first: int) -> None:
+    inner = build_late_model(machine)
+    model = wrapped("clock_offset", machine, inner=inner, offset_s=offset_s)
+    path = roll(model, machine, [1.0] * 20)[:, 0, 0]
+    np.testing.assert_allclose(path[[first, first + 1]], [0, FULL], atol=1e-6)
 
 
 def test_delay_jitter_never_goes_back_in_time(machine: Machine) -> None:
