@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -191,7 +192,7 @@ def list_changes(result: WhyResult) -> list[NextStep]:
 def list_records(result: WhyResult) -> list[NextStep]:
     """Return what to record next."""
     doctor, found = result.doctor, result.diagnosis
-    texts = [text for log in doctor["logs"] for text in log["cannot_tell"]]
+    texts = list(chain.from_iterable(log["cannot_tell"] for log in doctor["logs"]))
     if doctor["verdict"] == "code":
         if not doctor["named"]:
             texts.append("the observation vector (obs_0, obs_1, …), whose first wrong number tells the place")  # fmt: skip

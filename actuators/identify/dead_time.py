@@ -8,6 +8,7 @@ loop, whose own lag is no delay: for each delay the best loop is found by free-r
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.optimize import minimize
@@ -42,7 +43,7 @@ FREQUENCIES_RAD_S = np.geomspace(1.0, 300.0, 20)
 """Natural frequencies of a position loop that are tried first: from 0.16 Hz to a loop that is at its target at once."""
 DAMPINGS = (0.2, 0.4, 0.7, 1.0, 1.5, 2.5)
 """Damping ratios that are tried first."""
-STARTS = [(w, z) for w in np.log(FREQUENCIES_RAD_S) for z in np.log(DAMPINGS)]
+STARTS = list(product(np.log(FREQUENCIES_RAD_S), np.log(DAMPINGS)))
 """Logarithms of frequency and damping of each of them."""
 LOOP_BOUNDS = np.log([[0.3, 0.05], [400.0, 5.0]])
 """Logarithms of the bounds of frequency and damping."""

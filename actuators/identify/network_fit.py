@@ -203,7 +203,8 @@ class _NetworkFitting:
 
     def _update(self, u: torch.Tensor, q: torch.Tensor) -> None:
         """Descend on windows `(J, B, H + K)`."""
-        networks, size = self._networks, self._networks.num_history
+        networks = self._networks
+        size = networks.num_history
         scale = networks.increment_scale[:, None, None]
         horizon = q.shape[2] - size
         if horizon == 1:

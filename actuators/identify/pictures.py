@@ -30,7 +30,8 @@ def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
     Typical: the window of median error among those in which the joint is commanded; liveliest: of
     the longest way; worst: of the largest error of the model (the paper's figure 2).
     """
-    machine, rows = scores.machine, {}
+    machine = scores.machine
+    rows = {}
     for joint in range(machine.num_joints):
         chosen = _select_windows(scores, model, joint)
         rows[joint] = [_show_window(scores, model, joint, *one) for one in chosen.items()]
@@ -44,7 +45,8 @@ def _show_window(
     measured = cut.measured[window, :, joint]
     given = np.isfinite(measured)
     t_s = scores.machine.period_s * np.arange(1, len(measured) + 1)[given]
-    colour, paths = assign_colours(list(scores.predicted), model), []
+    colour = assign_colours(list(scores.predicted), model)
+    paths = []
     for name in sorted(scores.predicted, key=lambda name: name == model):
         style = {"color": colour[name], "label": name, "lw": 1.0, "ls": "--"}
         if name == model:

@@ -90,7 +90,8 @@ class ServoFit:
         low, high = np.array([self.free[name] for name in NUMBERS]).T
         # a joint answers no earlier than its history reaches back
         high[0] = min(high[0], (machine.num_history - 1) * machine.period_s)
-        found, told = [], {name: {} for name in NUMBERS}
+        found = []
+        told = {name: {} for name in NUMBERS}
         for j, joint in enumerate(machine.joint_names):
             pairs = []
             for target, one in zip(targets, recordings, strict=True):
@@ -133,10 +134,10 @@ class _JointRuns:
     def fit(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `NUMBERS` within their bounds, and their standard errors."""
         grid_s = np.arange(0.0, high[0] + 1e-9, RESOLUTION_S)
-        best, scale = None, 0.0
-        for delay, w, damping in ServoLoops(self._pairs, self._period_s, grid_s).list_loops()[
-            :NUM_STARTS
-        ]:
+        best = None
+        scale = 0.0
+        loops = ServoLoops(self._pairs, self._period_s, grid_s).list_loops()
+        for delay, w, damping in loops[:NUM_STARTS]:
             start = np.array([grid_s[delay], 1.0 / w, damping, FIRST_PLAY * high[3], 0.0, 0.0])
             x = np.clip(start, low + 1e-3 * STEPS, high - 1e-3 * STEPS)
             # one scale for all starts, so that their losses compare

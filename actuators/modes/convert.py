@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 from actuators.recordings import conversion
 from actuators.recordings.conversion import LogReader
 from actuators.recordings.inspection import InspectionThresholds
@@ -52,7 +54,7 @@ class Convert:
         pieces = conversion.read_logs(self.convert.input, self.reader, self.machine)
         folder = self.session.folder / conversion.FOLDER
         conversion.write_recordings(pieces, folder)
-        self._show_remarks([one for several in pieces.values() for one in several])
+        self._show_remarks(list(chain.from_iterable(pieces.values())))
         choices = (read_record(self.session.folder) or {}).get("choices", {})
         print_text("then:")
         print_text(

@@ -98,7 +98,8 @@ class CanLog(MessageLog):
                         f"{self.path}: message '{table}' comes on the channels {', '.join(both)}, which are two sources; "
                         f"{advise('channel', channel=both[0])}"
                     )
-                time_ns, decode = round(frame.timestamp * 1e9), decoders[frame_id]
+                time_ns = round(frame.timestamp * 1e9)
+                decode = decoders[frame_id]
                 yield LoggedMessage(table, time_ns, bytes(frame.data), decode, f", frame {number}")
 
 

@@ -143,7 +143,8 @@ def _judge_clock(
     subject: str, text: str, values: np.ndarray, table: Table, given: GivenColumns
 ) -> TimeGuess | str | None:
     """Return a clock made of a column, a sentence about one that is broken, or `None` for no clock."""
-    skip, is_given = given.is_skipping, given.time is not None
+    skip = given.is_skipping
+    is_given = given.time is not None
     plain, stated = split_unit(text)
     words = {*split_words(plain)}
     is_chosen = is_given or text not in table.columns  # a pair is chosen by its two units
