@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import sys
 import tempfile
-from collections import Counter, defaultdict
+from collections import defaultdict
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -32,11 +32,10 @@ class FirstUpdate(BaseException):
 
 
 class PathRecorder:
-    """Profiler that notes files, functions, and calls from one file into another."""
+    """Profiler that notes files and their functions."""
 
     def __init__(self) -> None:
         self.functions: dict[str, set[str]] = defaultdict(set)
-        self.jumps: Counter[tuple[str, str]] = Counter()
 
     def __call__(self, frame: FrameType, event: str, argument: Any) -> None:
         """Note one event of `sys.setprofile`."""
@@ -53,18 +52,12 @@ class PathRecorder:
                 raise FirstUpdate
             return
         self.functions[file].add(code.co_qualname)
-        caller = frame.f_back.f_code.co_filename if frame.f_back else ""
-        if caller.startswith(f"{ROOT}/") and caller != code.co_filename:
-            self.jumps[caller.removeprefix(f"{ROOT}/"), file] += 1
 
     def print_table(self) -> None:
         """Print the files, most functions first."""
         for file, names in sorted(self.functions.items(), key=lambda item: -len(item[1])):
-            calls = sum(count for (_, to), count in self.jumps.items() if to == file)
-            print(f"{len(names):4d} functions {calls:6d} calls from other files  {file}")
-        num_functions = sum(map(len, self.functions.values()))
-        num_jumps = sum(self.jumps.values())
-        print(f"{len(self.functions)} files, {num_functions} functions, {num_jumps} jumps")
+            print(f"{len(names):4d} functions  {file}")
+        print(f"{len(self.functions)} files, {sum(map(len, self.functions.values()))} functions")
 
 
 def main() -> None:

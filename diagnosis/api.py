@@ -41,6 +41,8 @@ from diagnosis.case import GapCase
 from diagnosis.modes.diagnose import Diagnose, DiagnosisSubject
 from diagnosis.request import FITS
 
+REPEATABILITY = 0.01
+"""As `diagnosis.repeatability` in conf/mode/diagnose.yaml."""
 HELD_OUT = 4
 """One recording in so many stops a fit."""
 
@@ -168,6 +170,7 @@ def diagnose(
     unseen: RecordingSet | None = None,
     fit: str | Path | ActuatorFit | None = None,
     effects: Sequence[str] | None = None,
+    repeatability: float = REPEATABILITY,
     seed: int = 0,
     workers: int = 1,
 ) -> Outcome:
@@ -183,6 +186,7 @@ def diagnose(
         fit: Option of `fit` that makes the simulator of joints commanded by torque from a reference;
             `None`: `force`.
         effects: Names to choose among; `None`: all that the machine may have.
+        repeatability: How much the machine repeats from day to day, standard deviation over the value.
         seed: Of all random numbers.
         workers: Processes that share the work, on Linux.
 
@@ -192,7 +196,9 @@ def diagnose(
     """
     if not field.recordings:
         raise RecordingError("diagnose: expected a recording or more of the machine, got none")
-    asked = _build_mode(field.machine, folder, simulator, fit, effects, seed, workers)
+    asked = _build_mode(
+        field.machine, folder, simulator, fit, effects, seed, workers, repeatability
+    )
     asked.session.seed_all()
     before = () if reference is None else reference.recordings
     later = () if unseen is None else unseen.recordings
@@ -272,6 +278,7 @@ def _build_mode(
     effects: Sequence[str] | None,
     seed: int,
     workers: int,
+    repeatability: float = REPEATABILITY,
 ) -> Diagnose:
     """Return the mode with the options that the command line would give it."""
     return Diagnose(  # pyright: ignore[reportCallIssue]
@@ -287,6 +294,7 @@ def _build_mode(
             field="",  # recordings are given, none is read
             unseen=None,
             effects=None if effects is None else tuple(effects),
+            repeatability=repeatability,
             workers=workers,
         ),
     )

@@ -18,8 +18,8 @@ from brokk_rl.record import Recording
 from diagnosis.closure import Gate
 
 # Limits here were chosen by hand on practice cases from a plant of other making; not searched. Those of
-# `does not obey` and `jumps` are from benchmarks/logs/remark_limits.py: 60 sound servo logs and the seven of
-# the SO-101 have 0, logs whose drive is off for 5 % of the time 0.045, one jump a minute 0.067 (medians).
+# `does not obey` and `jumps` were chosen on simulated servos: 60 sound logs and seven of a real SO-101
+# have 0, logs whose drive is off for 5 % of the time 0.045, one jump a minute 0.067 (medians).
 MAX_REMARK_SHARES = {
     "unlogged input": 0.1,
     "interlock": 0.02,

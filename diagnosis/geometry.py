@@ -1,17 +1,15 @@
 """Errors of geometry and encoders, from measured tool points and forward kinematics alone.
 
-No simulator takes part, so the actuators do not matter. `compare_tool_points` measures the distance
-and the best single explanation. `find_geometry_errors` compares sets of errors by least squares:
-the errors are small, so their effects add up.
+No simulator takes part, so the actuators do not matter. `find_geometry_errors` compares sets of errors
+by least squares: the errors are small, so their effects add up.
 Axes: `S` samples, `J` joints, `D` coordinates of all samples (`S` times 3).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,96 +22,6 @@ from diagnosis.case import GapCase
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
-MIN_SAMPLES = 100
-"""Least number of samples with a measured tool point; chosen by hand."""
-
-
-@dataclass(frozen=True)
-class ToolPointErrors:
-    """Distance of measured tool points from those of the machine's file.
-
-    Attributes:
-        rms_m: Root mean square distance, m.
-        cause: The error of geometry that explains most of it, e.g. `encoder_bias q3`.
-        size: Its size, in `unit`.
-        unit: `rad`, `m`, or `` for a part of the whole.
-        explained: Part of the mean squared distance that it explains.
-        count: Samples.
-    """
-
-    rms_m: float
-    cause: str
-    size: float
-    unit: str
-    explained: float
-    count: int
-
-    def plain(self) -> dict[str, Any]:
-        """Return it as plain JSON data."""
-        return asdict(self)
-
-
-def compare_tool_points(
-    recordings: Sequence[Recording], machine: Machine
-) -> ToolPointErrors | None:
-    """Return the errors of measured tool points, `None` with too few or without known geometry."""
-    if not machine.has_bodies:
-        return None
-    having = [r for r in recordings if all(column in r.extra for column in TOOL_COLUMNS)]
-    if not having:
-        return None
-    seen = np.concatenate(
-        [np.stack([r.extra[column] for column in TOOL_COLUMNS], 1) for r in having]
-    ).astype(float)
-    q = np.concatenate([r.q for r in having])
-    given = np.isfinite(seen).all(1)
-    if given.sum() < MIN_SAMPLES:
-        return None
-    pose, jacobian = Kinematics(machine).pose_and_jacobian(
-        torch.as_tensor(q[given], dtype=torch.float32)
-    )
-    off = seen[given] - pose.tip_in_base_m.numpy()
-    whole = float((off**2).sum())
-    columns = _list_single_errors(machine, q[given], pose, jacobian.tip.numpy())
-    found = [(*_fit_size(column, off, whole), cause, unit) for cause, unit, column in columns]
-    explained, size, cause, unit = max(found)
-    return ToolPointErrors(float(np.sqrt(whole / len(off))), cause, size, unit, explained, len(off))
-
-
-def _list_single_errors(
-    machine: Machine, q: np.ndarray, pose: Any, tip: np.ndarray
-) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield the displacement of the tip by each error of unit size, `(S, 3)`."""
-    origins, end = (
-        pose.joints_in_base_m.numpy().astype(float),
-        pose.tip_in_base_m.numpy().astype(float),
-    )
-    points = np.concatenate([origins, end[:, None]], 1)
-    for j, joint in enumerate(machine.joints):
-        yield (
-            f"encoder_bias {joint.name}",
-            joint.unit,
-            -tip[:, :, j],
-        )  # the sensor says too much: the tip is less far
-        yield f"encoder_scale {joint.name}", "", -tip[:, :, j] * q[:, j : j + 1]
-        link = points[:, j + 1] - points[:, j]
-        length = np.linalg.norm(link, axis=1, keepdims=True)
-        if length.min() > 1e-6:
-            yield f"link_length {joint.name}", "m", link / length
-    for name, axis in (("x", (1.0, 0.0, 0.0)), ("y", (0.0, 1.0, 0.0))):
-        yield f"base_tilt about {name}", "rad", np.cross(axis, end)
-    for name, axis in zip("xyz", np.eye(3), strict=True):
-        yield f"offset along {name}", "m", np.tile(axis, (len(end), 1))
-
-
-def _fit_size(column: np.ndarray, off: np.ndarray, whole: float) -> tuple[float, float]:
-    """Return the explained part of the squared distance and the size."""
-    norm = max(float((column**2).sum()), np.finfo(float).tiny)
-    size = float((column * off).sum()) / norm
-    return size**2 * norm / max(whole, np.finfo(float).tiny), size
-
-
-COLUMNS_TOOL = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SECONDS = 40
 """Least time with measured tool points, s; chosen by hand."""
 NUM_ROUNDS = 3
@@ -166,34 +74,20 @@ def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
     if not machine.has_bodies:
         return False
     given = [
-        np.isfinite(np.stack([r.extra[column] for column in COLUMNS_TOOL])).all(0).sum() / r.rate_hz
+        np.isfinite(np.stack([r.extra[column] for column in TOOL_COLUMNS])).all(0).sum() / r.rate_hz
         for r in recordings
         if _is_measured(r)
     ]
     return sum(given) >= MIN_SECONDS
 
 
-@dataclass(frozen=True)
-class GeometryFindings:
-    """Errors of geometry and encoders in measured tool points.
-
-    Attributes:
-        found: Errors of geometry and encoders.
-        left: Root mean square of the residual over that of the reference; 1 where nothing is
-            measured.
-    """
-
-    found: Sequence[DetectedEffect]
-    left: float
-
-
 def find_geometry_errors(
     case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
-) -> GeometryFindings:
+) -> list[DetectedEffect]:
     """Return the errors of geometry and encoders that the measured tool points show."""
     field, reference, machine = case.field, case.reference, case.machine
     if not is_tracked(field, machine):
-        return GeometryFindings([], 1.0)
+        return []
     kinds = [
         k
         for k in kinds
@@ -201,29 +95,13 @@ def find_geometry_errors(
         and k.target.smooth
         and k.target.side in ("kinematics", "measurement")
     ]
-    q, seen, ways = _collect_samples(field, machine)
-    off, causes = (
-        _remove_timing((seen - _compute_tool_points(None, {}, q, machine)).ravel(), ways),
-        _list_errors(kinds, q, ways, machine),
-    )
+    q, off, ways = _measure_errors(field, machine)
+    causes = _list_errors(kinds, q, ways, machine)
     everything = np.concatenate([cause.columns for cause in causes], 1)
-    size_m = usual_m = max(
-        MIN_NOISE_M,
-        float(np.std(off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0])),
-    )
+    left = off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0]
+    size_m = max(MIN_NOISE_M, float(np.std(left)))
     if is_tracked(reference, machine):
-        at, known, moved = _collect_samples(reference, machine)
-        usual_m = max(
-            MIN_NOISE_M,
-            float(
-                np.std(
-                    _remove_timing(
-                        (known - _compute_tool_points(None, {}, at, machine)).ravel(), moved
-                    )
-                )
-            ),
-        )
-        size_m = max(size_m, usual_m)
+        size_m = max(size_m, float(np.std(_measure_errors(reference, machine)[1])))
     straight, chosen = off, ()
     for _ in range(NUM_ROUNDS):  # errors act linearly about the sizes of the round before
         fits, worth = _score_sets(causes, straight, size_m, price, name_price)
@@ -236,17 +114,9 @@ def find_geometry_errors(
             for c, own in zip(chosen, values, strict=True)
         ]
         straight = off - _remove_timing(np.sum(bent, 0), ways)
-    large = _select_relevant(causes, chosen, fits, size_m, max(usual_m, size_m), len(off))
+    large = _select_relevant(causes, chosen, fits, size_m, len(off))
     names = dict.fromkeys(causes[c].kind.name for c in large)
-    left = (
-        straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen].sizes
-        if chosen
-        else straight
-    )
-    return GeometryFindings(
-        [_describe_effect(name, large, causes, fits, worth, machine) for name in names],
-        float(np.std(left)) / usual_m,
-    )
+    return [_describe_effect(name, large, causes, fits, worth, machine) for name in names]
 
 
 def _select_relevant(
@@ -254,7 +124,6 @@ def _select_relevant(
     chosen: tuple[int, ...],
     fits: Mapping[tuple[int, ...], SetFit],
     size_m: float,
-    least_m: float,
     count: int,
 ) -> tuple[int, ...]:
     """Return those of the errors `chosen` that matter: large, and beyond what instruments err by.
@@ -263,9 +132,8 @@ def _select_relevant(
         causes: All errors.
         chosen: Places of the errors that were chosen together.
         fits: Fits of all sets of errors.
-        size_m: Noise of tool points for which gains were computed, m.
-        least_m: Least displacement, root mean square, that an error must explain beside the
-            others, m.
+        size_m: Noise of tool points for which gains were computed, m; an error explains as much
+            beside the others.
         count: Coordinates, `D`.
     """
     relevant = []
@@ -276,7 +144,7 @@ def _select_relevant(
         gain = fits[chosen].gain - fits[rest].gain
         # undoes the scale of `_fit`: a gain is a sum of squares over 2 * 3 * size_m ** 2
         explained_m = np.sqrt(max(gain, 0.0) * 6.0 * size_m**2 / count)
-        if _measure_size(causes[c], own) >= MIN_SIZE and explained_m >= MIN_RATIO * least_m:
+        if _measure_size(causes[c], own) >= MIN_SIZE and explained_m >= MIN_RATIO * size_m:
             relevant.append(c)
     return tuple(relevant)
 
@@ -441,32 +309,32 @@ def _measure_size(cause: _GeometryError, values: np.ndarray) -> float:
     )
 
 
-def _collect_samples(
+def _measure_errors(
     recordings: Sequence[Recording], machine: Machine
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return positions, tool points and their travel a period before and after, once a second."""
+    """Return positions `(S, J)`, errors of the tool points `(D,)`, and how they travel `(D, 2)`, once a second.
+
+    Errors along the way that the tool goes are left out.
+    """
     having = [r for r in recordings if _is_measured(r)]
     every = max(1, round(having[0].rate_hz))
-    seen = np.concatenate(
-        [np.stack([r.extra[column] for column in COLUMNS_TOOL], 1)[::every] for r in having]
-    ).astype(float)
-    q = [r.q.astype(float) for r in having]
-    steps = [np.diff(_compute_tool_points(None, {}, one, machine), axis=0) for one in q]
-    none = np.zeros((1, 3))
-    ways = [
-        np.stack([np.concatenate([none, one]), np.concatenate([one, none])], -1)[::every]
-        for one in steps
-    ]
-    given = np.isfinite(seen).all(1)
-    return (
-        np.concatenate([one[::every] for one in q])[given],
-        seen[given],
-        np.concatenate(ways)[given].reshape(-1, 2),
-    )
+    q, errors, ways = [], [], []
+    for recording in having:
+        seen = np.stack([recording.extra[column] for column in TOOL_COLUMNS], 1)[::every]
+        points = _compute_tool_points(None, {}, recording.q, machine)
+        step = np.diff(points, axis=0)
+        none = np.zeros((1, 3))
+        way = np.stack([np.concatenate([none, step]), np.concatenate([step, none])], -1)
+        given = np.isfinite(seen).all(1)
+        q.append(recording.q[::every][given].astype(float))
+        errors.append((seen - points[::every])[given])
+        ways.append(way[::every][given])
+    both = np.concatenate(ways).reshape(-1, 2)
+    return np.concatenate(q), _remove_timing(np.concatenate(errors).ravel(), both), both
 
 
 def _is_measured(recording: Recording) -> bool:
-    return all(column in recording.extra for column in COLUMNS_TOOL)
+    return all(column in recording.extra for column in TOOL_COLUMNS)
 
 
 def _compute_tool_points(

@@ -113,23 +113,23 @@ class ReferenceDiagnosis:
 
     def _detect(self) -> list[DetectedEffect]:
         """Return the effects that tool points and the scatter of samples show."""
-        on_tool = geometry.find_geometry_errors(self.case, self.kinds, DIRECT_NATS, NAME_NATS)
-        noisy = [kind for kind in self.kinds if kind.name in ("sensor_noise", "quantisation")]
-        rough = sensors.find_sensor_effects(self.case, noisy, DIRECT_NATS, NAME_NATS)
-        # Steps of a coarse sensor are found by the engine itself.
-        return [*on_tool.found, *(one for one in rough if one.kind.name == "sensor_noise")]
+        found = geometry.find_geometry_errors(self.case, self.kinds, DIRECT_NATS, NAME_NATS)
+        for kind in self.kinds:
+            # Steps of a coarse sensor are found by the engine itself.
+            if kind.name == "sensor_noise":
+                noise = sensors.find_sensor_noise(self.case, kind, DIRECT_NATS, NAME_NATS)
+                found += [] if noise is None else [noise]
+        return found
 
     def _measure_noise(self, detected: Sequence[DetectedEffect]) -> np.ndarray:
         """Return the noise that noisy sensors add, units, `(J,)`."""
         machine = self.case.machine
-        noisy = np.zeros(machine.num_joints, dtype=bool)
+        found = np.zeros(machine.num_joints)
         for one in detected:
             if one.kind.name == "sensor_noise":
-                noisy |= one.joints
-        if not noisy.any():
-            return np.zeros(machine.num_joints)
-        excess = sensors.measure_excess_scatter(self.case.field, self.case.reference, machine)
-        return excess * noisy / measure_units(machine)
+                for name, sigma in one.parameters["sigma_rad"].items():
+                    found[machine.joint_names.index(name)] = sigma.mean
+        return found / measure_units(machine)
 
     def _list_named(
         self, decision: Decision, detected: Sequence[DetectedEffect]

@@ -23,6 +23,8 @@ MAX_RIVALS = 14
 """Most rivals of the table. Chosen by hand: a screen."""
 MAX_LISTED = 8
 """Most remarks in sight; the rest is folded. Chosen by hand: a screen."""
+MAX_CHANGES = 20
+"""Most measured changes of the table. Chosen by hand: a screen."""
 RIVALS = {
     "hold": "standing still",
     "arx": "ARX with dead-band hinges, fitted to other parts of the field",
@@ -39,7 +41,6 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
         told = f" Error over free runs: {format_error(gap.before, gap.unit)} before"
         told += f", {format_error(gap.after, gap.unit)} after" if answer.selected else ""
         told += "; " + _describe_floor(gap) + "."
-    told += _describe_tool(answer)
     if answer.verdict == "none":
         return (
             f"No gap: the simulator errs as the unchanged machine would under this motion.{told}",
@@ -67,16 +68,6 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
     share = f"{_format_share(closed, ' of the gap')}"
     below = " The error is then below its floor." if closed.mean > 1.0 else ""
     return f"The simulator lacks {names}; adding {it} closes {share}.{below}{told}", tone
-
-
-def _describe_tool(answer: Answer) -> str:
-    """Return the error of the tool, where a named effect moves the tool only."""
-    cause = str((answer.more.get("geometry") or {}).get("cause") or "").split(" ")[0]
-    if cause not in {one.effect for one in answer.selected}:
-        return ""
-    found = answer.more.get("tool", ())
-    texts = [one["text"] for one in found if one["stage"] == "kinematics"]
-    return "".join(f" {text[0].upper()}{text[1:]}." for text in texts)
 
 
 def _describe_floor(gap: Gap) -> str:
@@ -139,6 +130,19 @@ def list_failed_gates(gates: Sequence[Gate]) -> list[str]:
             numbers = "" if gate.value is None else f" ({gate.value:.3g}, limit {gate.limit:.3g})"
             lines.append(f"failed: {gate.name}{numbers}: {gate.text}")
     return lines
+
+
+def list_beyond(changes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for each of the largest measured changes beyond what the machine repeats."""
+    lines = []
+    for one in changes:
+        if one["is_beyond"]:
+            after = one["before"] + one["change"]
+            lines.append(
+                f"measured: {one['joint']}, {one['quantity']}: {one['before']:.3g} before, "
+                f"{after:.3g} ± {one['half_width']:.2g} {one['unit']} now"
+            )
+    return lines[:MAX_LISTED]
 
 
 def describe_bounds(one: Selected) -> str:
@@ -230,6 +234,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "rivals": RIVALS,
         "severities": SEVERITIES,
         "max_listed": MAX_LISTED,
+        "max_changes": MAX_CHANGES,
         "earned": _rank_rivals(more.get("evidence")),
         "remainder": describe_remainder(answer),
         "describe_class": describe_class,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, spec
 
 FITS = {"speed": "valve", "position": "servo", "torque": "force"}
 """Fit of each command interface."""
@@ -22,6 +22,8 @@ class DiagnosisSubject:
         unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
             fitted: how far the effects carry.
         effects: Names of the effects to choose among; `null`: all that are registered.
+        repeatability: How much the machine repeats from day to day, standard deviation over the
+            value; where the reference is of two days or more it is measured.
         workers: Processes that share the work; 1 where the system has no safe fork.
     """
 
@@ -29,6 +31,7 @@ class DiagnosisSubject:
     field: str | tuple[str, ...] | None
     unseen: str | tuple[str, ...] | None
     effects: tuple[str, ...] | None
+    repeatability: NonNegative
     workers: int
 
     def check(self) -> None:

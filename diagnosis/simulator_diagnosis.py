@@ -157,7 +157,7 @@ class SimulatorDiagnosis:
             found = []
         on_tool: Sequence[DetectedEffect] = ()
         if not failed:
-            on_tool = geometry.find_geometry_errors(case, self.kinds, DIRECT_NATS, NAME_NATS).found
+            on_tool = geometry.find_geometry_errors(case, self.kinds, DIRECT_NATS, NAME_NATS)
         tell("sizes and proof", 0.85)
         proof, found = self._prove(search, found, reference)
         judged = [] if failed else self._judge(proof, found)

@@ -1,4 +1,4 @@
-"""Survey of a gap: location, error of the tool, geometry, touched holes, recordings.
+"""Survey of a gap: location, error of the tool, touched holes, recordings.
 
 The errors of the joints add up at the tip as vectors and may cancel. The part of joint `j` is its
 contribution along the whole error, summed over all samples: `Σ (J_j e_j) · d / Σ d · d` with
@@ -23,15 +23,12 @@ from brokk_rl.record import Recording
 from diagnosis.answer import JointGap, RegimeGap, Selected, Stage, Where
 from diagnosis.effect_library import EffectType
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points
+from diagnosis.geometry import TOOL_COLUMNS
 from diagnosis.where import GapLocation, locate_gap
 
 CONTACT_N = 200.0
 """Force at the tool that counts as contact, N; chosen by hand: above the noise of a force that is
 computed from pressures."""
-MIN_EXPLAINED, MIN_EXCESS_RATIO = 0.05, 1.5
-"""Share explained by one error of geometry, and ratio to the reference's error, from which the
-kinematics count as wrong; chosen by hand: the noise of tool points differs between poses."""
 MAX_TARGET_DISTANCE_M = 0.5
 """Largest distance of the touched hole from the tip, m; chosen by hand."""
 TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
@@ -74,43 +71,19 @@ def measure_tip_error(runs: WindowedRuns, machine: Machine) -> TipError:
 
 
 @dataclass(frozen=True)
-class ToolFinding:
-    """Error at the tool that no joint shows.
+class BoreholeError:
+    """Distance of touched points from the estimated borehole.
 
     Attributes:
-        stage: Whether geometry or estimates of boreholes are wrong.
         rms_m: Its size, m.
         text: Why, in a sentence.
     """
 
-    stage: Stage
     rms_m: float
     text: str
 
 
-def assess_kinematics(
-    field: ToolPointErrors | None, reference: ToolPointErrors | None
-) -> ToolFinding | None:
-    """Return what measured tool points say about the geometry; `None` without any."""
-    if field is None:
-        return None
-    floor_m = reference.rms_m if reference else 0.0
-    excess_m = float(np.sqrt(max(field.rms_m**2 - floor_m**2, 0.0)))
-    by_cause_m = field.rms_m * float(np.sqrt(field.explained))
-    text = f"measured tool points lie {1e3 * field.rms_m:.1f} mm from forward kinematics"
-    text += f" ({1e3 * floor_m:.1f} mm on the reference)" if reference else ""
-    is_explained = field.explained > max(
-        MIN_EXPLAINED, 2.0 * reference.explained if reference else 0.0
-    )
-    if is_explained or field.rms_m > MIN_EXCESS_RATIO * floor_m:
-        scale, unit = (1e3, f"m{field.unit}") if field.unit else (1e2, "%")
-        text += f"; {100 * field.explained:.0f} % of it is explained by {field.cause} of {scale * field.size:+.1f} {unit}"
-    else:
-        excess_m = 0.0
-    return ToolFinding("kinematics", by_cause_m if is_explained else excess_m, text)
-
-
-def assess_perception(recordings: Sequence[Recording], machine: Machine) -> ToolFinding | None:
+def assess_perception(recordings: Sequence[Recording], machine: Machine) -> BoreholeError | None:
     """Return the distance of estimated boreholes from the touched points, `None` without both."""
     if not machine.has_bodies:
         return None
@@ -136,7 +109,7 @@ def assess_perception(recordings: Sequence[Recording], machine: Machine) -> Tool
     text = (
         f"at {len(off)} touches the tip is {1e3 * rms_m:.0f} mm (RMS) from the estimated borehole"
     )
-    return ToolFinding("perception", rms_m, text)
+    return BoreholeError(rms_m, text)
 
 
 @dataclass(frozen=True)
@@ -146,23 +119,21 @@ class Survey:
     Attributes:
         remarks: About the recordings.
         location: Where the gap lies.
-        findings: Errors at the tool that no joint shows.
+        touches: Error of estimated boreholes; `None` where none was touched.
         tip: Errors of the tip: `before`, `after` the effects, `floor`; empty without geometry.
-        geometry: Errors of measured tool points.
         machine: The machine.
     """
 
     remarks: Sequence[RecordingRemark]
     location: GapLocation
-    findings: Sequence[ToolFinding]
+    touches: BoreholeError | None
     tip: dict[str, TipError]
-    geometry: ToolPointErrors | None
     machine: Machine
 
     def where(self, selected: Sequence[Selected], kinds: Sequence[EffectType]) -> Where:
         """Return the field `where` of `diagnosis.json`; shares are those of the gap.
 
-        The stage is that of the first named effect, otherwise that of the largest error at the tool.
+        The stage is that of the first named effect, otherwise that of wrong boreholes.
 
         Args:
             selected: The named effects, the first first.
@@ -175,9 +146,8 @@ class Survey:
         regimes = [RegimeGap(part.joint, part.category, part.gap) for part in parts]
         named = selected[0].effect if selected else ""
         stage: Stage | None = next((kind.stage for kind in kinds if kind.name == named), None)
-        if stage is None:
-            seen = [one for one in self.findings if one.rms_m > 0.0]
-            stage = max(seen, key=lambda one: one.rms_m).stage if seen else None
+        if stage is None and self.touches is not None:
+            stage = "perception"
         units = {joint.name: joint.unit for joint in self.machine.joints}
         return Where(joints, tuple(regimes[:MAX_LISTED]), stage, units)
 
@@ -186,9 +156,8 @@ class Survey:
         return {
             "sanity": [remark.plain() for remark in self.remarks],
             "location": self.location.plain(),
-            "tool": [asdict(one) for one in self.findings],
+            "touches": self.touches and asdict(self.touches),
             "tip": {name: asdict(one) for name, one in self.tip.items()},
-            "geometry": self.geometry and self.geometry.plain(),
         }
 
 
@@ -214,17 +183,11 @@ def examine_gap(
         generator: Draws the permutations.
     """
     location = locate_gap(before, floor, machine, dead_time_s, generator)
-    geometry = compare_tool_points(before.recordings, machine)
-    reference_geometry = compare_tool_points(floor.recordings, machine) if floor else None
     tip: dict[str, TipError] = {}
     if machine.has_bodies:
         for name, runs in (("before", before), ("after", after), ("floor", floor)):
             if runs is not None:
                 tip[name] = measure_tip_error(runs, machine)
-    findings = (
-        assess_kinematics(geometry, reference_geometry),
-        assess_perception(before.recordings, machine),
-    )
+    touches = assess_perception(before.recordings, machine)
     remarks = examine_recordings(before.recordings, machine, thresholds)
-    given = [one for one in findings if one is not None]
-    return Survey(remarks, location, given, tip, geometry, machine)
+    return Survey(remarks, location, touches, tip, machine)

@@ -33,8 +33,7 @@ JUMP = 1.5
 
 FAR_SHARE, STAND_SHARE = 0.25, 0.2
 """Parts of the travel from which on a joint stays away from its target, and by which a target moves that it
-does not follow. The elbow of a sound SO-101 sags by 0.11 and sticks over 0.1 of its travel; benchmarks/logs/remark_limits.py
-has the shares of broken logs by them."""
+does not follow. The elbow of a sound SO-101 sags by 0.11 and sticks over 0.1 of its travel."""
 STILL_TRAVEL, STILL_TARGET = 0.01, 0.05
 """A joint stands below so many parts of the travel per s, whatever the machine's top speed is said to be, and
 below such a part of the mean speed of its target: a slow machine moves by less."""

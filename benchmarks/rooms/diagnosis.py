@@ -6,42 +6,21 @@ from pathlib import Path
 
 from measurement import Measurement, Table, load_json
 
-CODE = (
-    "diagnosis", "actuators/effects", "actuators/models", "actuators/identify",
-)  # fmt: skip
-ROWS = {
-    "top1": "one effect: named first",
-    "top1_equivalent": "… or an equivalent",
-    "exactly_one": "one effect: nothing else named",
-    "exact_set": "several effects: exact set",
-    "exact_set_equivalent": "… or equivalents",
-    "set_f1": "several effects: F1",
-    "joints": "joints right",
-    "false_alarms_none": "unchanged machines: an effect or `unknown`",
-    "false_alarms_faint": "faintly changed: a false effect or `unknown`",
-    "unknown_recall": "outside causes: said unknown",
-    "unknown_auroc": "AUROC of `unknown`",
-    "unknown_wrongly": "effects called unknown",
-    "missed": "effects called none",
-    "ece": "calibration error",
-    "parameter_error": "size: median error",
-    "cover_90": "size: inside 90 %",
-    "closed_of_oracle": "gap closed, of the possible",
-    "closed_examined": "gap closed, withheld parts",
-    "closed_differs": "stated closing contradicted",
-    "closed_missing": "named without closing",
-}
+from exam.metrics import METRICS
+
+CODE = ("diagnosis", "actuators/effects", "actuators/models", "actuators/identify")
 
 
 def read_marks(folder: Path) -> Table:
     """Return every rate of the marks of an exam."""
     marks = load_json(folder / "marks/marks.json")["candidates"]["diagnosis"]
     rows: Table = []
-    for name, meaning in ROWS.items():
+    for name, metric in METRICS.items():
         one = marks.get(name)
         if one is not None and one["value"] is not None:
             low, high = one["ci95"]
-            row = {"": meaning, "reached": round(one["value"], 2), "of": one["of"]}
+            title = metric.title.replace("  ", "… ")
+            row = {"": title, "reached": round(one["value"], 2), "of": one["of"]}
             row["95 %"] = f"{low:.2f} to {high:.2f}"
             rows.append(row)
     return rows
@@ -84,5 +63,18 @@ MEASUREMENTS = (
         read=read_marks,
         where="two cores",
         minutes=300,
+    ),
+    Measurement(
+        name="ablations",
+        title="What each ingredient of the diagnosis earns",
+        conditions="The same development cases of valves, answered with one ingredient of the engine switched off. The baseline is the first row, with nothing switched off.",
+        commands=(
+            "brokk mode=exam exam.mix.num_cases=100 session.seed=78 exam.workers=32 session.out={out}/exam",
+            "python benchmarks/diagnosis/ablations.py {out}/ablations.json {out}/exam --workers 32",
+        ),
+        code=CODE,
+        read=lambda folder: load_json(folder / "ablations.json")["rows"],
+        where="32 cores",
+        minutes=30,
     ),
 )

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from diagnosis.engine.direct import find_step, weigh_step
+from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.evidence import FieldJoint, JointRow, RowEvidence
 from diagnosis.engine.generic import GenericCauses
 from diagnosis.engine.holds import HeldCommands, HeldCourse, hold_commands
@@ -42,9 +42,6 @@ MAX_SIMULATED = 2
 """Most simulated effects that are named together: of eight third ones on 400 practice cases one was there."""
 SHOWN_NATS = 1e3
 """A coarse sensor or a late clock shows by itself and comes before all that is simulated."""
-LATTICE_NATS = 50.0
-"""Evidence of a coarse sensor beyond twice that of the reference: 50 practice cases with fine sensors have
-at most 26, eight joints with coarse ones 145 and more."""
 JITTER_FACTOR = 2.0
 """Jitter can copy lost frames, so it earns so much more, unless it delays most of the time."""
 MOSTLY = 0.8
@@ -226,11 +223,8 @@ class Decider:
         """Return the joints with a coarse sensor on the field; their steps enter the scale."""
         found, evidence = [], self.evidence
         for j in np.flatnonzero(evidence.noises == 0.0).tolist():
-            nats, step = find_step(evidence.field, j)
-            if nats < LATTICE_NATS:
-                continue
-            if nats > 2.0 * weigh_step(evidence.reference, j, step) + LATTICE_NATS:
-                evidence.steps[j] = step
+            evidence.steps[j] = find_lattice(evidence.field, evidence.reference, j)
+            if evidence.steps[j]:
                 found.append(j)
         return found
 

@@ -19,7 +19,7 @@ from brokk_rl.parallel import use_workers
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import answer, case, effect_library, effects_file, report
+from diagnosis import answer, case, effect_library, effects_file, measured_changes, report
 from diagnosis.answer import Answer, Outcome
 from diagnosis.case import GapCase
 from diagnosis.effect_library import EffectType
@@ -104,13 +104,25 @@ class Diagnose:
 
             generator = self.session.generator("diagnosis")
             if doubts := given.doubts():
-                return describe_doubts(given, "; ".join(doubts))
+                return self._add_changes(describe_doubts(given, "; ".join(doubts)), given)
             if given.reference and self.machine.interface in MODELS:
                 work = ReferenceDiagnosis(given, self._kinds, self.thresholds, generator)
-                return work.run(tell)
-            base, seed = self._find_base(given), self.session.stream("base")
-            search = SimulatorDiagnosis(given, base, self._kinds, self.thresholds, generator, seed)
-            return search.run(tell)
+            else:
+                base, seed = self._find_base(given), self.session.stream("base")
+                work = SimulatorDiagnosis(
+                    given, base, self._kinds, self.thresholds, generator, seed
+                )
+            return self._add_changes(work.run(tell), given)
+
+    def _add_changes(self, found: Outcome, given: GapCase) -> Outcome:
+        """Return the outcome with what changed on the machine since the reference, whatever the cause."""
+        if not given.reference:
+            return found
+        changes = measured_changes.measure_changes(
+            given.reference, given.field, self.machine, self.diagnosis.repeatability
+        )
+        more = {**found.answer.more, "changes": measured_changes.list_changes(changes)}
+        return replace(found, answer=replace(found.answer, more=more))
 
     def write(self, outcome: Outcome) -> None:
         """Write `diagnosis.json`, `report.html` and `effects.yaml`.
@@ -172,6 +184,8 @@ def _print_answer(found: Answer, folder: Path) -> None:
     print_text(f"{found.verdict}: {found.reason}", "bold")
     if found.selected:
         print_table(("effect", "joints", "probability", "numbers", "closes", "same as"), rows)
+    for line in report.list_beyond(found.more.get("changes", ())):
+        print_text(line)
     for line in report.list_failed_gates(found.gates):
         print_text(line)
     for one in found.selected:

@@ -1,0 +1,74 @@
+"""What is measured to have changed, against what was planted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording, make_motion
+from diagnosis.measured_changes import MeasuredChange, measure_changes
+
+PERIOD_S = 0.05
+OUT = "speed at full command, moving out"
+
+
+@pytest.fixture(scope="module")
+def two_joints(machine: Machine) -> Machine:
+    """A machine of two arms that answers at once."""
+    joints = machine.joints[2:4]
+    return replace(machine, joints=joints, exclusive=(), levers=(), name="two", dead_time_s=0.0)
+
+
+def record(machine: Machine, seed: int, slower_out: float = 0.0, heavier: float = 0.0) -> Recording:
+    """Return a minute of levels; the first joint is slower out and takes more torque by shares."""
+    rng = np.random.default_rng(seed)
+    size = rng.choice([0.0, 0.5, 0.8], (12, 2)).repeat(2, 0)
+    level = (size * np.tile([[1.0], [-1.0]], (12, 1))).repeat(50, 0)
+    gain = np.where((level > 0) & (np.arange(2) == 0), 1.0 - slower_out, 1.0)
+    speed = level * gain * machine.max_speed
+    q = np.cumsum(speed, 0) * PERIOD_S + 2e-4 * rng.standard_normal(speed.shape)
+    torque = (1.0 + heavier) * (20.0 * np.sign(speed[:, 0]) + 5.0 * speed[:, 0]) + 50.0
+    told = make_motion(machine, f"{seed}", np.arange(len(q)) * PERIOD_S, level, q)
+    noisy = torque + rng.standard_normal(len(q))
+    name = f"torque_{machine.joint_names[0]}_nm"
+    return replace(told, extra={name: noisy.astype(np.float32)})
+
+
+def compare(
+    machine: Machine,
+    reference: list[Recording] | None = None,
+    repeats: float = 0.0,
+    **change: float,
+) -> dict[tuple[str, str], MeasuredChange]:
+    known = reference or [record(machine, seed) for seed in range(4)]
+    field = [record(machine, seed, **change) for seed in range(4, 7)]
+    found = measure_changes(known, field, machine, repeats)
+    return {(one.joint, one.quantity): one for one in found}
+
+
+def test_a_slower_and_heavier_joint_is_measured_and_the_other_is_unchanged(
+    two_joints: Machine,
+) -> None:
+    first, second = two_joints.joint_names
+    found = compare(two_joints, slower_out=0.1, heavier=0.2)
+    slower = found[first, OUT]
+    assert slower.change == pytest.approx(-0.1 * two_joints.max_speed[0], rel=0.05)
+    heavier = found[first, "torque, moving out"].change - found[first, "torque, moving in"].change
+    assert heavier == pytest.approx(0.2 * 40.0, rel=0.1)
+    assert slower.is_beyond and found[first, "torque, moving out"].is_beyond
+    assert not found[first, "speed at full command, moving in"].is_beyond
+    assert not found[second, OUT].is_beyond
+
+
+def test_a_change_within_what_the_machine_repeats_is_none(two_joints: Machine) -> None:
+    quantity = two_joints.joint_names[0], OUT
+    assert compare(two_joints, slower_out=0.02)[quantity].is_beyond
+    assert not compare(two_joints, repeats=0.02, slower_out=0.02)[quantity].is_beyond
+    reference = []
+    for day in range(3):
+        one = record(two_joints, day, slower_out=0.05 * day)
+        reference.append(replace(one, metadata={"created": f"2026-03-0{day + 1}T09:00:00"}))
+    assert not compare(two_joints, reference, slower_out=0.1)[quantity].is_beyond
