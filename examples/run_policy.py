@@ -61,7 +61,7 @@ class ExportedPolicy:
         batch = observation[None].astype(np.float32)
         return self.session.run(None, {"observation": batch})[0][0]
 
-    def find_end(self, target_m, q, time_s, pitch_rad=0.0):
+    def find_end(self, target_m, q, time_s, pitch_rad=np.pi / 2):
         """Return why the episode ends now, or `None` while it goes on."""
         stop, limits = self.contract["stop"], self.contract["limits"]
         margin = stop["joint_margin"]
@@ -71,11 +71,14 @@ class ExportedPolicy:
         ).any():
             return "joint limit"
         tip_m, tip_pitch_rad = self.locate_tip(q)
-        left_m = target_m - tip_m
+        bearing = target_m[:2] / np.hypot(*target_m[:2])
+        wanted_axis = np.append(np.cos(pitch_rad) * bearing, -np.sin(pitch_rad))
+        past_m = tip_m - target_m
+        depth_m = past_m @ wanted_axis
         measured = {
-            "least_depth_below_target_m": left_m[2],
-            "largest_lateral_m": np.hypot(*left_m[:2]),
-            "largest_distance_m": np.linalg.norm(left_m),
+            "least_depth_below_target_m": depth_m,
+            "largest_lateral_m": np.linalg.norm(past_m - depth_m * wanted_axis),
+            "largest_distance_m": np.linalg.norm(past_m),
             "largest_pitch_error_rad": abs(pitch_rad - tip_pitch_rad),
         }
         reached = []

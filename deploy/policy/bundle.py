@@ -8,7 +8,7 @@ here.
 
 from __future__ import annotations
 
-import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +20,11 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, restore_encoder
 from brokk_rl.plain_files import check_plain_file, parse_json, read_json
-from brokk_rl.policy_folder import TaskDescription
 from brokk_rl.registry import resolve_package_path
 
-log = logging.getLogger(__name__)
-
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
-SCHEMAS = (1, 2)
-"""Versions of the contract that are read; the first does not describe the policy's task."""
+SCHEMA = 2
+"""Version of the contract that is read."""
 MOST_JSON_BYTES, MOST_ONNX_BYTES = 1 << 21, 1 << 30
 """Sizes beyond which a file is none of a policy; the shipped ones have 150 KB and 300 KB."""
 ERRORS_ONLY = 3
@@ -51,7 +48,6 @@ class PolicyBundle:
     Attributes:
         encoder: The training's own observation code, with the bundle's scaling.
         contract: Contents of `policy.json`.
-        task: Description of the task that the policy was trained in; `None` in old files.
 
     Raises:
         CheckpointError: see the module; the message names the difference.
@@ -71,7 +67,6 @@ class PolicyBundle:
         place, self._machine = resolve_package_path(folder), machine
         self.contract = _read(place / CONTRACT, folder)
         _check_contract(self.contract, machine, folder)
-        self.task = _read_task(self.contract, folder)
         observation = self.contract["observation"]
         if observation is None:
             raise CheckpointError(
@@ -125,15 +120,35 @@ class PolicyBundle:
         off_m = np.abs(target_m - np.array(scaling["mean_m"]))
         return bool((off_m <= TRAINED * np.array(scaling["std_m"])).all())
 
-    def is_done(self, q: np.ndarray, target_m: np.ndarray) -> bool:
-        """Return whether the tool, at joint positions `(J,)`, is where episodes of the training end."""
+    def is_done(self, q: np.ndarray, target_m: np.ndarray, pitch_rad: float | None) -> bool:
+        """Return whether the tool, at joint positions `(J,)`, is where episodes of the training end.
+
+        Args:
+            q: Joint positions, `(J,)`.
+            target_m: Target, `(3,)`.
+            pitch_rad: Wanted pitch of the tool; `None`: straight down.
+        """
         success = self.contract.get("stop", {}).get("success")
         if success is None or not self._machine.has_bodies:
             return False
-        left_m = target_m - compute_tool_kinematics(self._machine, q).tip_in_base_m
-        lateral_m = float(np.hypot(left_m[0], left_m[1]))
-        is_deep = left_m[2] >= success["least_depth_below_target_m"]
-        return bool(is_deep and lateral_m <= success["largest_lateral_m"])
+        tool = compute_tool_kinematics(self._machine, q)
+        wanted_rad = math.pi / 2 if pitch_rad is None else pitch_rad
+        axis = _find_wanted_axis(target_m, wanted_rad)
+        tip_m, along = tool.tip_in_base_m, tool.axis_in_base
+        tool_pitch_rad = math.atan2(-along[2], along[:2] @ tip_m[:2] / np.hypot(*tip_m[:2]))
+        past_m = tip_m - target_m
+        depth_m = past_m @ axis
+        measured = {
+            "least_depth_below_target_m": depth_m,
+            "largest_lateral_m": np.linalg.norm(past_m - depth_m * axis),
+            "largest_distance_m": np.linalg.norm(past_m),
+            "largest_pitch_error_rad": abs(wanted_rad - tool_pitch_rad),
+        }
+        for name, bound in success.items():
+            sign = -1.0 if name.startswith("least") else 1.0
+            if sign * measured[name] > sign * bound:
+                return False
+        return True
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         """Return masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
@@ -157,25 +172,20 @@ class PolicyBundle:
                 )
 
 
-def _read_task(contract: dict[str, Any], folder: str) -> TaskDescription | None:
-    """Return the description of the policy's task; say what is assumed where there is none."""
-    if "task" in contract:
-        return TaskDescription.from_json(contract["task"], folder)
-    log.warning(
-        "%s: %s does not say which task the policy was trained in; assumed: %s holds all of it, as "
-        "its golden answers show",
-        folder,
-        CONTRACT,
-        ONNX,
+def _find_wanted_axis(target_m: np.ndarray, pitch_rad: float) -> np.ndarray:
+    """Return the direction, `(3,)`, of a tool at `target_m` that has a pitch."""
+    bearing_rad = math.atan2(target_m[1], target_m[0])
+    out = math.cos(pitch_rad)
+    return np.array(
+        [out * math.cos(bearing_rad), out * math.sin(bearing_rad), -math.sin(pitch_rad)]
     )
-    return None
 
 
 def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> None:
-    if contract.get("schema") not in SCHEMAS:
+    if contract.get("schema") != SCHEMA:
         raise CheckpointError(
-            f"{folder}: the contract has schema {contract.get('schema')}, expected one of "
-            f"{', '.join(map(str, SCHEMAS))}"
+            f"{folder}: the contract has schema {contract.get('schema')}, expected {SCHEMA}; export "
+            "it again (mode=export)"
         )
     machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
     facts = {
@@ -187,9 +197,8 @@ def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> 
             raise CheckpointError(
                 f"{folder}: the policy's {name} is {contract.get(name)}, that of machine '{machine.name}' {here}"
             )
-    if contract.get("command", {}).get("order") != list(machine.joint_names) or not contract[
-        "command"
-    ].get("masked"):
+    command = contract.get("command", {})
+    if command.get("order") != list(machine.joint_names) or not command.get("masked"):
         raise CheckpointError(
             f"{folder}: expected masked commands in the order {', '.join(machine.joint_names)}"
         )
@@ -197,18 +206,10 @@ def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> 
 
 def _is_different(mine: Any, other: Any) -> bool:
     """Return whether two pieces of plain data differ by more than rounding."""
-    if isinstance(mine, dict):
-        return (
-            not isinstance(other, dict)
-            or mine.keys() != other.keys()
-            or any(_is_different(mine[k], other[k]) for k in mine)
-        )
-    if isinstance(mine, (list, tuple)):
-        return (
-            not isinstance(other, list)
-            or len(mine) != len(other)
-            or any(map(_is_different, mine, other))
-        )
+    if isinstance(mine, dict) and isinstance(other, dict):
+        return mine.keys() != other.keys() or any(_is_different(mine[k], other[k]) for k in mine)
+    if isinstance(mine, (list, tuple)) and isinstance(other, list):
+        return len(mine) != len(other) or any(map(_is_different, mine, other))
     if isinstance(mine, (int, float)) and isinstance(other, (int, float)):
         return not abs(mine - other) <= ROUNDING  # NaN is no number of a contract
     return mine != other

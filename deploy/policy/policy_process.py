@@ -174,7 +174,7 @@ class PolicyAdviser:
             elif not self._bundle.is_trained_for(target_m):
                 status = AdviceStatus.TARGET_UNKNOWN
             # What comes after the end of its episodes no policy has been trained for.
-            elif self._bundle.is_done(self._history.q[-1], target_m):
+            elif self._is_done(target_m):
                 status = AdviceStatus.DONE
         if status is AdviceStatus.VALID:
             begun = time.perf_counter()
@@ -205,6 +205,9 @@ class PolicyAdviser:
             return AdviceStatus.FAULT
         self._history.sample(state, missed)
         return AdviceStatus.VALID if self._history.full else AdviceStatus.WARMING_UP
+
+    def _is_done(self, target_m: np.ndarray) -> bool:
+        return self._bundle.is_done(self._history.q[-1], target_m, self._config.pitch_rad)
 
     def _infer(self, target_m: np.ndarray) -> np.ndarray | None:
         """Return masked commands, `(J,)`; `None` where the policy's answer is not usable."""

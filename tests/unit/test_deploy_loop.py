@@ -19,13 +19,15 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import torch
 from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import CheckpointError, ConfigError
-from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.sim.scene import make_nominal_scenes
 from deploy.bus.can_bus import CanBus
 from deploy.guidance import AXES, LeverDisplay, LeverMap
 from deploy.policy.bundle import PolicyBundle
@@ -33,6 +35,7 @@ from deploy.runtime.process import CycleTimer
 from deploy.runtime.process_group import BusAndPolicySettings
 from deploy.runtime.shared_memory import Pipe, Slot
 from deploy.runtime.target import FileTarget
+from tasks.settings import find_tool_direction
 
 SHIPPED = "tasks:policies/borehole_insertion"
 FIELDS = np.dtype([("a", float), ("b", float, (3,))])
@@ -182,14 +185,33 @@ def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> 
     )
     found = bundle.command(np.array(golden["observation"], np.float32))
     assert np.abs(found - np.array(golden["command"])).max() < 1e-3 and np.abs(found).max() > 0.5
-    q = np.array(machine.home)
-    tip_m = compute_tool_kinematics(machine, q).tip_in_base_m
-    for off_m, is_done in (
-        ((0.01, 0.0, 0.11), True),
-        ((0.01, 0.0, 0.09), False),
-        ((0.02, 0.0, 0.11), False),
-    ):
-        assert bundle.is_done(q, tip_m + off_m) is is_done
+
+
+@pytest.mark.parametrize("name", ["borehole_insertion", "slanted", "goal_pose"])
+def test_a_policy_is_done_where_its_task_says_so(machine: Machine, copied: Path, name: str) -> None:
+    task: Any = option("task", name)
+    change(copied, "policy.json", stop={"success": task.describe_success()})
+    bundle, generator = PolicyBundle(str(copied), machine), np.random.default_rng(1)
+    pose = Kinematics(machine).pose(torch.tensor(machine.home, dtype=torch.float32)[None])
+    told, outcomes = None, set()
+    for _ in range(200):
+        pitch_rad = torch.tensor([math.pi / 2])
+        if name != "borehole_insertion":
+            pitch_rad = pose.pitch_rad + 0.1 * generator.uniform(-1.0, 1.0)
+            told = float(pitch_rad)
+        axis = find_tool_direction(pose.tip_in_base_m, pitch_rad).numpy()[0]
+        depth_m = generator.uniform(0.05, 0.15) if name != "goal_pose" else 0.0
+        off_m = generator.uniform(-0.015, 0.015, 3) - depth_m * axis
+        target_m = pose.tip_in_base_m.numpy()[0] + off_m
+        start = {
+            "target_m": torch.tensor(target_m, dtype=torch.float32)[None],
+            "target_pitch_rad": pitch_rad,
+            "scene": make_nominal_scenes(1),
+        }
+        judged = task.judge(pose.tip_in_base_m, pose.pitch_rad, torch.zeros(1), start)
+        assert bundle.is_done(np.array(machine.home), target_m, told) == bool(judged.reached)
+        outcomes.add(bool(judged.reached))
+    assert outcomes == {True, False}
 
 
 def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
