@@ -8,7 +8,6 @@ Axes: `B` draws of the bootstrap, `W` windows, `J` joints.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -44,35 +43,58 @@ MAX_LEVELS = 200
 samples are no freeze (effect `quantisation`). A 12-bit encoder visits a thousand or more."""
 
 
-@dataclass(frozen=True)
-class RemarkedShare:
-    """The joint on which a finding lasts longest, as a share of the field's time."""
-
-    share: float
-    joint: str
-
-
 def judge_recordings(
     remarks: Sequence[RecordingRemark],
+    known: Sequence[RecordingRemark],
     field: Sequence[Recording],
     reference: Sequence[Recording],
     machine: Machine,
 ) -> list[Gate]:
-    """Return the gates of the recordings: findings that make any cause untellable."""
+    """Return the gates of the recordings: findings that make any cause untellable.
+
+    What the reference shows as often is how the machine moves: the overshoot of a controller after each
+    stop is no unlogged input.
+
+    Args:
+        remarks: About the field.
+        known: About the reference.
+        field: The machine as it is.
+        reference: The machine as it was; empty without any.
+        machine: The machine.
+    """
     gates = []
     for name, limit in MAX_REMARK_SHARES.items():
-        counted = [one for one in remarks if one.name == name]
+        shares = measure_shares(name, remarks, field)
+        usual = measure_shares(name, known, reference)
         if name in ("frozen sensor", "jumps"):
             coarse = find_coarse_sensors(field, machine)
-            counted = [one for one in counted if one.joint not in coarse]
-        worst = _find_worst_joint(counted, field)
-        text = f"'{name}' on {worst.joint} in {100 * worst.share:.0f} % of the time; {REMARKS[name].advice}"
-        sound = f"'{name}' in {100 * worst.share:.1f} % of the time"
-        passed = worst.share <= limit
-        gates.append(
-            Gate(name.replace(" ", "_"), passed, worst.share, limit, sound if passed else text)
-        )
+            shares = {joint: share for joint, share in shares.items() if joint not in coarse}
+        beyond = {joint: share - usual.get(joint, 0.0) for joint, share in shares.items()}
+        joint = max(beyond, key=beyond.__getitem__, default="")
+        share = max(beyond.get(joint, 0.0), 0.0)
+        text = f"'{name}' in {100 * shares.get(joint, 0.0):.1f} % of the time"
+        if reference:
+            text += f", {100 * usual.get(joint, 0.0):.1f} % on the reference"
+        if share > limit:
+            text = f"{text}, on {joint}; {REMARKS[name].advice}"
+        gates.append(Gate(name.replace(" ", "_"), share <= limit, share, limit, text))
     return [*gates, _judge_limits(reference or field, machine)]
+
+
+def measure_shares(
+    name: str, remarks: Sequence[RecordingRemark], recordings: Sequence[Recording]
+) -> dict[str, float]:
+    """Return the share of the time with remarks of a kind, by joint."""
+    total_s = sum(recording.duration_s for recording in recordings)
+    duration_s = {name_recording(recording): recording.duration_s for recording in recordings}
+    found: dict[str, float] = {}
+    for remark in remarks:
+        if remark.name != name:
+            continue
+        joint = remark.joint or "all joints"
+        seconds = remark.share * duration_s.get(remark.recording, 0.0)
+        found[joint] = found.get(joint, 0.0) + seconds / max(total_s, 1e-9)
+    return found
 
 
 def find_coarse_sensors(recordings: Sequence[Recording], machine: Machine) -> set[str]:
@@ -83,22 +105,6 @@ def find_coarse_sensors(recordings: Sequence[Recording], machine: Machine) -> se
         if len(np.unique(column)) <= MAX_LEVELS:
             found.add(name)
     return found
-
-
-def _find_worst_joint(
-    remarks: Sequence[RecordingRemark], field: Sequence[Recording]
-) -> RemarkedShare:
-    total_s = sum(recording.duration_s for recording in field)
-    duration_s = {name_recording(recording): recording.duration_s for recording in field}
-    by_joint: dict[str, float] = {}
-    for remark in remarks:
-        joint = remark.joint or "all joints"
-        seconds = remark.share * duration_s.get(remark.recording, 0.0)
-        by_joint[joint] = by_joint.get(joint, 0.0) + seconds / max(total_s, 1e-9)
-    if not by_joint:
-        return RemarkedShare(0.0, "")
-    joint = max(by_joint, key=by_joint.__getitem__)
-    return RemarkedShare(by_joint[joint], joint)
 
 
 def _judge_limits(recordings: Sequence[Recording], machine: Machine) -> Gate:

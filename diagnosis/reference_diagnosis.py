@@ -87,7 +87,8 @@ class ReferenceDiagnosis:
         case, machine = self.case, self.case.machine
         tell("recordings", 0.05)
         remarks = examine_recordings(case.field, machine, self.thresholds)
-        told = gates.judge_recordings(remarks, case.field, case.reference, machine)
+        known = examine_recordings(case.reference, machine, self.thresholds)
+        told = gates.judge_recordings(remarks, known, case.field, case.reference, machine)
         tell("sensors and tool points", 0.1)
         detected = self._detect()
         tell("fitting the reference", 0.2)
@@ -278,7 +279,7 @@ def accept_named_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate
     """
     found = []
     for gate in told:
-        is_named = any(f"on {name} " in gate.text for name in named)
+        is_named = any(f", on {name};" in gate.text for name in named)
         passed = gate.passed or (gate.name in ACCEPTED_FINDINGS and is_named)
         found.append(replace(gate, passed=passed))
     return found

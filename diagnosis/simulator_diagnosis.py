@@ -143,7 +143,8 @@ class SimulatorDiagnosis:
         case, machine = self.case, self.case.machine
         tell("recordings", 0.02)
         remarks = examine_recordings(case.field, machine, self.thresholds)
-        told = gates.judge_recordings(remarks, case.field, case.reference, machine)
+        known = examine_recordings(case.reference, machine, self.thresholds)
+        told = gates.judge_recordings(remarks, known, case.field, case.reference, machine)
         runs = self._cut(case.field)
         reference = self._cut(case.reference) if case.reference else None
         search = SimulatorSearch(runs, reference, self.kinds)

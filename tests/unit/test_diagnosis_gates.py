@@ -31,7 +31,7 @@ def test_findings_beyond_their_share_forbid_any_telling(
 ) -> None:
     field = [recording(machine)]
     for share, passes in ((limit, True), (1.01 * limit, False)):
-        found = by_name(gates.judge_recordings([remark(name, "q3", share)], field, [], machine))
+        found = by_name(gates.judge_recordings([remark(name, "q3", share)], [], field, [], machine))
         gate = found[name.replace(" ", "_")]
         assert gate.passed is passes and gate.value == pytest.approx(share)
         others = [one for one in found.values() if one is not gate]
@@ -39,12 +39,22 @@ def test_findings_beyond_their_share_forbid_any_telling(
         assert ("q3" in gate.text) is not passes
     # joints are judged one by one, recordings together: half of the time here, none there
     halves = [remark(name, "q3", limit), remark(name, "q4", limit)]
-    assert by_name(gates.judge_recordings(halves, field, [], machine))[gate.name].passed
+    assert by_name(gates.judge_recordings(halves, [], field, [], machine))[gate.name].passed
     calm = replace(recording(machine), metadata={"run": "calm"})
     some = [remark(name, "q3", 1.9 * limit)]
-    assert by_name(gates.judge_recordings(some, [*field, calm], [], machine))[gate.name].passed
+    assert by_name(gates.judge_recordings(some, [], [*field, calm], [], machine))[gate.name].passed
     more = [remark(name, "q3", 2.1 * limit)]
-    assert not by_name(gates.judge_recordings(more, [*field, calm], [], machine))[gate.name].passed
+    assert not by_name(gates.judge_recordings(more, [], [*field, calm], [], machine))[
+        gate.name
+    ].passed
+
+
+def test_what_the_reference_shows_as_often_forbids_no_telling(machine: Machine) -> None:
+    one, usual = [recording(machine)], [remark("unlogged input", "q3", 0.2)]
+    for share, passes in ((0.25, True), (0.35, False)):
+        now = [remark("unlogged input", "q3", share)]
+        found = by_name(gates.judge_recordings(now, usual, one, one, machine))
+        assert found["unlogged_input"].passed is passes
 
 
 def test_a_coarse_sensor_is_not_frozen(machine: Machine) -> None:
@@ -55,7 +65,7 @@ def test_a_coarse_sensor_is_not_frozen(machine: Machine) -> None:
         field = [replace(fine, q=q)]
         assert ("q3" in gates.find_coarse_sensors(field, machine)) is passes
         frozen = [remark("frozen sensor", "q3", 0.8)]
-        found = by_name(gates.judge_recordings(frozen, field, [], machine))
+        found = by_name(gates.judge_recordings(frozen, [], field, [], machine))
         assert found["frozen_sensor"].passed is passes
 
 
@@ -70,18 +80,20 @@ def test_limits_that_the_recordings_leave_are_told(machine: Machine) -> None:
 
     for beyond, passes in ((0.049, True), (0.051, False)):
         (gate,) = [
-            one for one in gates.judge_recordings([], [moved(beyond)], [], machine) if one.name == "limits"
+            one for one in gates.judge_recordings([], [], [moved(beyond)], [], machine) if one.name == "limits"
         ]  # fmt: skip
         assert gate.passed is passes and gate.value == pytest.approx(beyond)
         assert ("q4" in gate.text) is not passes
     below = replace(plain, q=2 * machine.lower - machine.upper + 0.0 * plain.q)
-    assert not by_name(gates.judge_recordings([], [below], [], machine))["limits"].passed
+    assert not by_name(gates.judge_recordings([], [], [below], [], machine))["limits"].passed
     # a field that alone leaves them may have a biased encoder
-    assert by_name(gates.judge_recordings([], [moved(0.3)], [plain], machine))["limits"].passed
-    assert not by_name(gates.judge_recordings([], [plain], [moved(0.3)], machine))["limits"].passed
+    assert by_name(gates.judge_recordings([], [], [moved(0.3)], [plain], machine))["limits"].passed
+    assert not by_name(gates.judge_recordings([], [], [plain], [moved(0.3)], machine))[
+        "limits"
+    ].passed
     spike = moved(0.3)
     spike.q[4:400, 3] = machine.home[3]
-    assert by_name(gates.judge_recordings([], [spike], [], machine))["limits"].passed
+    assert by_name(gates.judge_recordings([], [], [spike], [], machine))["limits"].passed
 
 
 def test_fast_motion_without_command_is_an_unlogged_input_and_slow_one_a_leak(
@@ -97,7 +109,7 @@ def test_fast_motion_without_command_is_an_unlogged_input_and_slow_one_a_leak(
         names = {one.name: one for one in found if one.joint == "q2"}
         assert name in names and len({"unlogged input", "motion without command"} & {*names}) == 1
         assert names[name].share > 0.8
-        told = gates.judge_recordings(found, [plain], [], machine)
+        told = gates.judge_recordings(found, [], [plain], [], machine)
         assert by_name(told)["unlogged_input"].passed is (share < 0.2)
 
 
