@@ -19,8 +19,6 @@ from actuators.excite.player import (
     predict_tool_speed,
 )
 from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
-from actuators.recordings import preview_report
-from actuators.recordings.preview import EffectPreview, PreviewResult
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.contracts.link import Connection
@@ -77,10 +75,9 @@ class Collect:
     link: Connection
     excitation: dict[str, Excitation]
     collect: Collection
-    preview: EffectPreview | None
 
     def run(self) -> None:
-        """Write `plan.png`, `plan.json` with the preview, and `recordings/<run>_<part>.parquet` into the run folder.
+        """Write `plan.png`, `plan.json` and `recordings/<run>_<part>.parquet` into the run folder.
 
         Raises:
             ConfigError: the plan finds no room in a run.
@@ -123,14 +120,10 @@ class Collect:
             drive(NominalLink(machine, count), self._runner(plan), machine, count, plan.run_s)
         )
         summary = plan_report.summarise_plan(plan, track, machine)
-        preview = self._preview(track)
-        told = {"preview": preview.plain()} if preview else {}
-        write_json(self.session.folder / "plan.json", summary | told)
+        write_json(self.session.folder / "plan.json", summary)
         tool_speed_m_s = predict_tool_speed(machine, track.q[:, 0])
         path = self.session.folder / "plan.png"
         plan_report.draw_plan(plan, track, machine, tool_speed_m_s, path)
-        if preview:
-            preview_report.show_preview(preview, machine)
         unplayed = set()
         for entry in chain.from_iterable(summary["runs"]):
             if entry["cut_s"] > CUT * entry["program_s"]:
@@ -141,17 +134,6 @@ class Collect:
         log.info(
             "plan: %d segments in the first of %d runs; see %s", len(plan.runs[0]), count, path
         )
-
-    def _preview(self, track: PlanTrack) -> PreviewResult | None:
-        """Return which effects the plan could tell; `None` without a preview, or without any motion long enough."""
-        if self.preview is None:
-            return None
-        motions = []
-        for n in range(self.collect.num_runs):
-            motions.append(
-                record.make_motion(self.machine, f"{n}", track.t_s, track.u[:, n], track.q[:, n])
-            )
-        return preview_report.run_preview(self.preview, motions, self.machine, False)
 
     def _metadata(self, plan: ExcitationPlan) -> dict[str, str]:
         return {

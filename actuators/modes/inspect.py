@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from actuators.identify import dead_time
-from actuators.recordings import inspection_picture, preview_report
+from actuators.recordings import inspection_picture
 from actuators.recordings.finding_kinds import FINDINGS
 from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
-from actuators.recordings.preview import EffectPreview, PreviewResult
 from actuators.recordings.recording_checks import find_targets
 from brokk_rl import record
 from brokk_rl.commands import view_recordings
@@ -45,7 +44,7 @@ class InspectionRequest:
     pictures: Index
 
     def check(self) -> None:
-        record.find_files(self.recordings, "recording")  # refused before the preview loads torch
+        record.find_files(self.recordings, "recording")  # refused before torch is loaded
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,6 @@ class Inspect:
     machine: Machine
     inspect: InspectionRequest
     thresholds: InspectionThresholds
-    preview: EffectPreview | None
 
     def run(self) -> None:
         """Write `inspection.json`, `inspection.html` and pictures, and print the tables.
@@ -110,11 +108,6 @@ class Inspect:
             "remarks": _list_resampled(inspected),
             "recordings": [one.plain() for one in inspected],
         }
-        preview = None
-        if self.preview is not None and sound:
-            preview = preview_report.run_preview(self.preview, sound, self.machine, True)
-        if preview:
-            result["preview"] = preview.plain()
         write_json(folder / "inspection.json", result)
         pictures: dict[str, Path] = {}
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
@@ -124,10 +117,8 @@ class Inspect:
                     path, one.recording, self.machine, one.inspection, one.breaches
                 )
                 pictures[one.path.name] = path
-        self._page(result, inspected, pictures, preview).write(folder / "inspection.html")
+        self._page(result, inspected, pictures).write(folder / "inspection.html")
         self._show(result, inspected)
-        if preview:
-            preview_report.show_preview(preview, self.machine)
         log.info("report: %s", folder / "inspection.html")
 
     def _look(self, path: Path) -> InspectedFile:
@@ -226,11 +217,7 @@ class Inspect:
             print_text(remark)
 
     def _page(
-        self,
-        result: dict[str, Any],
-        inspected: Sequence[InspectedFile],
-        pictures: dict[str, Path],
-        preview: PreviewResult | None,
+        self, result: dict[str, Any], inspected: Sequence[InspectedFile], pictures: dict[str, Path]
     ) -> Report:
         broken = sum(bool(one.breaches) for one in inspected)
         minutes = (
@@ -251,11 +238,6 @@ class Inspect:
             *self._figures(result),
             "Shares are of the time; noise and step in the unit of the joint.",
         )
-        if preview:
-            page.add_heading("Effects that these recordings could tell")
-            shown = preview_report.describe_preview(preview, self.machine)
-            page.add_table(shown.head, shown.rows)
-            page.add_list(shown.remarks)
         page.add_heading("Findings")
         head, rows = self._counts(result)
         page.add_table(head, rows)

@@ -53,7 +53,7 @@ def mode(out: Path, *overrides: str) -> Collect:
         name: instantiate(cfg[name], _convert_="all")
         for name in ("session", "machine", "link", "excitation", "collect")
     }
-    return Collect(**parts, preview=None)
+    return Collect(**parts)
 
 
 @pytest.fixture(scope="module")
@@ -117,12 +117,7 @@ def test_the_same_seed_records_the_same_and_another_does_not(
 def test_actuator_and_effects_are_chosen_as_everywhere(
     brokk: Callable[..., Any], machine: Machine
 ) -> None:
-    small = (
-        "collect.num_runs=1",
-        "collect.run_minutes=0.4",
-        "collect.file_minutes=0.4",
-        "preview=null",
-    )
+    small = ("collect.num_runs=1", "collect.run_minutes=0.4", "collect.file_minutes=0.4")
     chosen = (
         "actuator=hydraulic",
         "effect=[backlash,stiction]",

@@ -120,7 +120,7 @@ TINY = (
 def test_collect_and_identify_from_the_command(
     brokk: Callable[..., object], tmp_path: Path, machine: Machine
 ) -> None:
-    small = ("collect.run_minutes=1.0", "collect.file_minutes=0.5", "actuator=lag", "preview=null")
+    small = ("collect.run_minutes=1.0", "collect.file_minutes=0.5", "actuator=lag")
     assert brokk("mode=collect", "session.out=sine", "collect.num_runs=10", *small).code == 0
     assert (
         brokk(

@@ -699,7 +699,7 @@ def test_a_joint_that_hangs_is_remarked_by_convert_and_inspect(brokk: Callable[.
     (line,) = [line for line in done.out.splitlines() if "does not obey" in line]
     assert "knee" in line and "6.0" in line and "13." in line
     assert "jumps" in done.out
-    inspected = ("inspect.recordings=read/recordings/*", "preview=null", "session.out=seen")
+    inspected = ("inspect.recordings=read/recordings/*", "session.out=seen")
     done = brokk("mode=inspect", options[0], *inspected)
     assert done.code == 0, done.err
     found = json.loads(Path("seen/inspection.json").read_text())["recordings"][0]["findings"]
