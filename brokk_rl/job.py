@@ -22,7 +22,7 @@ from brokk_rl.sweep import name_job
 
 log = logging.getLogger(__name__)
 
-WITH_POLICIES = {"policy", "rivals", "panel"}
+WITH_POLICIES = {"policy", "rivals"}
 """Nodes that may hold a policy."""
 
 

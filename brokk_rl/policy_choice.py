@@ -60,15 +60,17 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
         ConfigError: A key has another name now; the message ends with the command that works.
     """
     words = [word for word in arguments if "=" in word and not word.startswith("-")]
-    given = {one.key_or_group: one for one in OverridesParser.create().parse_overrides(words)}
+    overrides = OverridesParser.create().parse_overrides(words)
+    # `policy@rivals.<name>` is another key than `policy`
+    given = {one.key_or_group: one for one in overrides if one.package is None}
     _refuse_old_keys(arguments, given)
     prepared = list(arguments)
     is_whole = any(word.startswith(WHOLE) for word in arguments)
-    for override in given.values():
+    for override in overrides:
         if override.key_or_group == "policy":
             for name in _list_paths(override):
                 _offer(name)
-                if is_whole:  # such a configuration has no groups
+                if is_whole and override.package is None:  # such a configuration has no groups
                     prepared.remove(str(override.input_line))
                     prepared.append(f"policy={{{TARGET}: {TRAINED}, path: '{name}', task: null}}")
     return prepared if is_whole else prepared + _recall_overrides(given)
@@ -101,10 +103,9 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
                 "the classical controller acts, for the shipped policy does not fit: %s", error
             )
             cfg.policy = {TARGET: CLASSICAL, "task": None}
-    for group in ("rivals", "panel"):
-        for node in (cfg.get(group) or {}).values():
-            if node[TARGET] == TRAINED:
-                _insert_task(cfg, node)
+    for node in (cfg.get("rivals") or {}).values():
+        if node[TARGET] == TRAINED:
+            _insert_task(cfg, node)
     return cfg, built
 
 

@@ -7,6 +7,7 @@ pages show the evidence.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
@@ -20,7 +21,6 @@ from brokk_rl.report import Cell, Report, Tone
 from diagnosis import answer, effects_file, report
 from diagnosis.answer import Answer
 from diagnosis.deployment.page import EVIDENCE_FILE, PAGE_FILE, REMEDIES
-from diagnosis.retraining import SuccessRate, format_rate, subtract_rates
 from diagnosis.story import HANDED_ON_FOLDER
 
 WHY_FILE, WHY_PAGE = "why.json", "why.html"
@@ -37,6 +37,8 @@ TITLES: Mapping[Cause, tuple[str, Tone]] = {
     "nothing": ("No cause found in these logs", "good"),
     "cannot_tell": ("These logs do not suffice for an answer", "warn"),
 }
+SuccessRate = Mapping[str, Any]
+"""`mean` and `ci95` of a rate or of a difference of two."""
 NextStep = tuple[str, str]
 """A sentence, and the command for it or nothing."""
 
@@ -116,6 +118,25 @@ class WhyResult:
             "change": [f"{text} {command}".strip() for text, command in list_changes(self)],
             "record": [f"{text} {command}".strip() for text, command in list_records(self)],
         }
+
+
+def subtract_rates(first: SuccessRate, second: SuccessRate) -> SuccessRate:
+    """Return `first` less `second` with its 95 % interval.
+
+    Source: Newcombe 1998, Statistics in Medicine 17, method 10, from two Wilson intervals. Policies
+    meet the same starts, so their outcomes go together and the interval is rather too wide.
+    """
+    mean = first["mean"] - second["mean"]
+    (low, high), (lower, higher) = first["ci95"], second["ci95"]
+    below = math.hypot(first["mean"] - low, higher - second["mean"])
+    above = math.hypot(high - first["mean"], second["mean"] - lower)
+    return {"mean": mean, "ci95": [max(-1.0, mean - below), min(1.0, mean + above)]}
+
+
+def format_rate(share: SuccessRate) -> str:
+    """Return `91 % (88 to 93)`."""
+    low, high = (100 * bound for bound in share["ci95"])
+    return f"{100 * share['mean']:.0f} % ({low:.0f} to {high:.0f})"
 
 
 def is_own_simulator(simulator: str) -> bool:

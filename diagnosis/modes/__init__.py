@@ -1,1 +1,1 @@
-"""Modes of the diagnosis: `diagnose`, `close_gap`, `rehearse`."""
+"""Modes of the diagnosis: `diagnose`, `rehearse`, `why`."""

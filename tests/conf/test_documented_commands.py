@@ -44,7 +44,6 @@ WITHOUT_VALUES = {
     "mode=diagnose …": "the values before the dots stand in the block above it",
     "diagnosis.case=": "the folder is the reader's",
     "subject.model=arm.urdf": "the file is the reader's",
-    "effect@stand_in": "the file of the reader holds effects by name",
     '"$': "a variable of the shell holds a value that must be given",
 }
 """Parts of commands that leave out such values: groups and fields are checked alone."""

@@ -75,7 +75,10 @@ def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
         "changed",
         "field",
         "diagnosis",
-        "repair",
+        "retrained",
+        "in_simulator",
+        "in_repaired",
+        "on_machine",
     ]
     training = played.commands["policy"]
     assert (
@@ -90,7 +93,16 @@ def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
         for name, words in played.commands.items()
         if not any("withheld" in word for word in words)
     ]
-    assert blind == ["reference", "simulator", "policy", "believed", "diagnosis"]
+    assert blind == [
+        "reference",
+        "simulator",
+        "policy",
+        "believed",
+        "diagnosis",
+        "retrained",
+        "in_simulator",
+        "in_repaired",
+    ]
     assert (folder / "case/field").readlink() == folder / "field/recordings"
 
 

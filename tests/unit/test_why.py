@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from brokk_rl.statistics import compute_wilson_interval
 from diagnosis.answer import Answer, Selected, Where
 from diagnosis.why_answer import (
     ALL_EFFECTS,
@@ -17,6 +18,7 @@ from diagnosis.why_answer import (
     WhyResult,
     list_changes,
     list_records,
+    subtract_rates,
     write_page,
     write_summary,
 )
@@ -117,3 +119,12 @@ def test_the_page_says_cost_and_next_step(tmp_path: Path) -> None:
     text = (tmp_path / WHY_PAGE).read_text()
     for part in ("-50", "brokk mode=train", "diagnosis/report.html"):
         assert part in text, part
+
+
+def test_the_interval_of_a_difference_is_newcombe_s() -> None:
+    # his table II, case (a), 56/70 and 48/80: 0.0524 to 0.3339
+    first, second = (
+        {"mean": k / n, "ci95": list(compute_wilson_interval(k, n))}
+        for k, n in ((56, 70), (48, 80))
+    )
+    assert subtract_rates(first, second)["ci95"] == pytest.approx([0.0524, 0.3339], abs=5e-5)
