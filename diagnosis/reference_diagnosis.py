@@ -15,7 +15,7 @@ import torch
 from scipy.signal import savgol_filter
 
 from actuators.recordings.inspection import InspectionThresholds
-from actuators.recordings.recording_checks import examine_recordings
+from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -28,9 +28,8 @@ from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
 from diagnosis.engine.decide import Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import SIGMAS, describe_numbers
-from diagnosis.free_runs import WindowedRuns
 from diagnosis.repair_proof import EngineProof
-from diagnosis.survey import Survey, examine_gap
+from diagnosis.where import find_stage, locate_gap
 
 ProgressCallback = Callable[[str, float], None]
 """Receives the name of a step and the share of the whole that is done."""
@@ -74,7 +73,7 @@ class ReferenceDiagnosis:
         case: The recordings.
         kinds: The library.
         thresholds: When a stretch of a recording is worth telling.
-        generator: Draws bootstraps and permutations.
+        generator: Draws bootstraps.
     """
 
     case: GapCase
@@ -86,9 +85,8 @@ class ReferenceDiagnosis:
         """Return the outcome; `tell` receives the name and the progress of each step."""
         case, machine = self.case, self.case.machine
         tell("recordings", 0.05)
-        remarks = examine_recordings(case.field, machine, self.thresholds)
         known = examine_recordings(case.reference, machine, self.thresholds)
-        told = gates.judge_recordings(remarks, known, case.field, case.reference, machine)
+        told = gates.judge_recordings(self.remarks, known, case.field, case.reference, machine)
         tell("sensors and tool points", 0.1)
         detected = self._detect()
         tell("fitting the reference", 0.2)
@@ -151,6 +149,11 @@ class ReferenceDiagnosis:
         return found
 
     @cached_property
+    def remarks(self) -> list[RecordingRemark]:
+        """Findings about the field's recordings."""
+        return examine_recordings(self.case.field, self.case.machine, self.thresholds)
+
+    @cached_property
     def clock_late_s(self) -> float:
         """By how much the encoders lag behind the tool tracker more than on the reference, s; 0 within its own wandering."""
         now = measure_clock_shift(self.case.field, self.case.machine)
@@ -172,31 +175,24 @@ class ReferenceDiagnosis:
         before = proof.view(proof.before)
         after = proof.view(proof.after) if named else None
         floor = proof.view_floor()
-        survey = self._examine(before, floor, after)
         selected = [self._describe(one, proof) for one in sorted(named, key=_get_nats)]
         verdict = "effects" if selected else decision.verdict
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
             ranking=rank_effects(selected, decision.rivals, verdict, machine),
-            where=survey.where(selected, self.kinds),
+            where=locate_gap(before, floor, machine, find_stage(selected, self.kinds)),
             gap=proof.measure_gap(bool(named)),
             rivals=proof.rivals,
             gates=tuple(told),
             next_experiment=propose_measurement(selected),
             reason=_explain(verdict, selected, decision, failed),
-            more=survey.more() | {"evidence": _describe_evidence(decision, machine)},
+            more={
+                "sanity": [remark.plain() for remark in self.remarks],
+                "evidence": _describe_evidence(decision, machine),
+            },
         )
         return Outcome(answer, before, after, floor)
-
-    def _examine(
-        self, before: WindowedRuns, floor: WindowedRuns | None, after: WindowedRuns | None
-    ) -> Survey:
-        machine = self.case.machine
-        dead_time_s = np.full(machine.num_joints, machine.dead_time_s)
-        return examine_gap(
-            before, floor, after, machine, self.thresholds, dead_time_s, self.generator
-        )
 
     def _describe(self, one: NamedEffect, proof: EngineProof) -> Selected:
         machine = self.case.machine

@@ -38,29 +38,25 @@ CREEP_COMMAND = 0.3
 """Largest command of a creeping joint; chosen by hand: a usual dead band takes half of it."""
 
 
-def label_recordings(
-    recordings: Sequence[Recording], machine: Machine, dead_time_s: np.ndarray
-) -> list[np.ndarray]:
+def label_recordings(recordings: Sequence[Recording], machine: Machine) -> list[np.ndarray]:
     """Return the number of the regime of each sample, for each recording `(T, J)`.
 
     Args:
         recordings: The recordings.
-        machine: Gives limits and period.
-        dead_time_s: Time from command to motion of each joint, `(J,)`.
+        machine: Gives limits, period and dead time.
     """
     found = []
     for one in recordings:
-        acting = shift_by_dead_time(one.u, dead_time_s, 1.0 / one.rate_hz)
+        acting = shift_by_dead_time(one.u, machine.dead_time_s, 1.0 / one.rate_hz)
         found.append(label_regimes(acting, one.q, machine, one.rate_hz))
     return found
 
 
-def shift_by_dead_time(u: np.ndarray, dead_time_s: np.ndarray, period_s: float) -> np.ndarray:
+def shift_by_dead_time(u: np.ndarray, dead_time_s: float, period_s: float) -> np.ndarray:
     """Return the command that moved each joint before each row, `(T, J)`."""
     found = np.zeros(u.shape)
-    for j, delay_s in enumerate(dead_time_s):
-        back = round(float(delay_s) / period_s) + 1  # row k - 1 is in force until row k is measured
-        found[back:, j] = u[: max(0, len(u) - back), j]
+    back = round(dead_time_s / period_s) + 1  # row k - 1 is in force until row k is measured
+    found[back:] = u[: max(0, len(u) - back)]
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from actuators.recordings.inspection import InspectionThresholds
-from actuators.recordings.recording_checks import examine_recordings
+from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.machine import Machine
 from diagnosis import gates, geometry
@@ -43,7 +43,7 @@ from diagnosis.reference_diagnosis import (
 from diagnosis.repair_proof import RepairProof
 from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
 from diagnosis.simulator_search import SimulatorSearch
-from diagnosis.survey import examine_gap
+from diagnosis.where import find_stage, locate_gap
 
 FORM_ERROR = 0.1
 """Relative error of a size that its form makes, 1 sigma. Chosen by hand: no comparison is recorded."""
@@ -127,7 +127,7 @@ class SimulatorDiagnosis:
         base: The simulator.
         kinds: The library.
         thresholds: When a stretch of a recording is worth telling.
-        generator: Draws bootstraps and permutations.
+        generator: Draws bootstraps.
         seed: Of the effects that draw.
     """
 
@@ -142,9 +142,8 @@ class SimulatorDiagnosis:
         """Return the outcome; `tell` receives the name and the progress of each step."""
         case, machine = self.case, self.case.machine
         tell("recordings", 0.02)
-        remarks = examine_recordings(case.field, machine, self.thresholds)
         known = examine_recordings(case.reference, machine, self.thresholds)
-        told = gates.judge_recordings(remarks, known, case.field, case.reference, machine)
+        told = gates.judge_recordings(self.remarks, known, case.field, case.reference, machine)
         runs = self._cut(case.field)
         reference = self._cut(case.reference) if case.reference else None
         search = SimulatorSearch(runs, reference, self.kinds)
@@ -171,6 +170,11 @@ class SimulatorDiagnosis:
             selected.append(self._describe(one, numbers, proof))
         selected += [describe_detected(one, machine) for one in on_tool]
         return self._build_outcome(selected, found, search, proof, (*told, *judged), failed)
+
+    @cached_property
+    def remarks(self) -> list[RecordingRemark]:
+        """Findings about the field's recordings."""
+        return examine_recordings(self.case.field, self.case.machine, self.thresholds)
 
     def _cut(self, recordings: Sequence[Any]) -> SimulatorRuns:
         return cut_simulator_runs(self.base, recordings, self.case.machine, self.seed)
@@ -235,29 +239,26 @@ class SimulatorDiagnosis:
         machine = self.case.machine
         before, floor = proof.view(proof.before), proof.view_floor()
         after = proof.view(proof.after) if proof.moves else None
-        dead_time_s = np.full(machine.num_joints, machine.dead_time_s)
-        survey = examine_gap(
-            before, floor, after, machine, self.thresholds, dead_time_s, self.generator
-        )
         verdict = "effects" if selected else "none"
         if failed and not selected:
             verdict = "unknown"
         rivals = [one.summarise() for one in search.rivals]
         evidence = {"rivals": describe_rivals(rivals, machine), "unit": "log likelihood"}
-        more: dict[str, Any] = {"evidence": evidence}
+        sanity = [remark.plain() for remark in self.remarks]
+        more: dict[str, Any] = {"sanity": sanity, "evidence": evidence}
         if self.case.unseen:
             more["unseen"] = self._evaluate_unseen(found)
         answer = Answer(
             verdict=verdict,
             selected=tuple(sorted(selected, key=lambda one: -one.probability)),
             ranking=rank_effects(selected, rivals, verdict, machine),
-            where=survey.where(selected, self.kinds),
+            where=locate_gap(before, floor, machine, find_stage(selected, self.kinds)),
             gap=proof.measure_gap(bool(selected)),
             rivals=proof.rivals,
             gates=tuple(told),
             next_experiment=propose_measurement(selected),
             reason=_explain(verdict, selected, failed),
-            more=survey.more() | more,
+            more=more,
         )
         return Outcome(answer, before, after, floor)
 

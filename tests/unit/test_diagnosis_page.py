@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from actuators.recordings.recording_checks import RecordingRemark
-from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import plots, report
 from diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Outcome, Selected, Where
 from diagnosis.effect_library import load_effects
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.survey import Survey, examine_gap
+from diagnosis.where import find_stage, locate_gap
 
 GAIN = Selected(
     effect="flow_gain", joints=("q4",), probability=0.97, parameters={"gain": {"q4": Estimate(0.81, (0.78, 0.84))}},
@@ -45,33 +44,30 @@ def runs(machine: Machine, count: int, seed: int, factor: float) -> WindowedRuns
 
 
 @pytest.fixture(scope="module")
-def seen(machine: Machine) -> tuple[Outcome, Survey]:
+def seen(machine: Machine) -> Outcome:
     before, after, floor = (
         runs(machine, 3, 0, 1.25),
         runs(machine, 3, 0, 1.01),
         runs(machine, 6, 1, 1.0),
     )
-    thresholds = load_part("thresholds")
-    found = examine_gap(
-        before, floor, after, machine, thresholds, np.full(5, 0.55), np.random.default_rng(0)
-    )
+    stage = find_stage((GAIN,), load_effects(machine))
     rivals = [
         {"name": "flow gain q4", "score": 40.0, "selected": True},
         {"name": "backlash q3", "score": -1.0},
     ]
     answer = Answer(
-        verdict="effects", selected=(GAIN,), ranking=(), where=found.where((GAIN,), load_effects(machine)),
+        verdict="effects", selected=(GAIN,), ranking=(), where=locate_gap(before, floor, machine, stage),
         gap=Gap(0.03, 0.006, 0.004, Estimate(0.93, (0.88, 0.96))),
         next_experiment=NextExperiment("brokk mode=collect excitation=[ramps]", ("flow_gain", "saturation"), "Slow ramps."),
-        more=found.more() | {"evidence": {"rivals": rivals, "threshold": 5.0}},
+        more={"evidence": {"rivals": rivals, "threshold": 5.0}},
     )  # fmt: skip
-    return Outcome(answer, before, after, floor), found
+    return Outcome(answer, before, after, floor)
 
 
 def test_the_report_holds_names_numbers_and_pictures_and_fetches_nothing(
-    machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path
+    machine: Machine, seen: Outcome, tmp_path: Path
 ) -> None:
-    report.write_report(seen[0], tmp_path, machine)
+    report.write_report(seen, tmp_path, machine)
     text = (tmp_path / "report.html").read_text()
     for part in ("0.81", "0.78 to 0.84", "brokk mode=collect excitation=[ramps]"):
         assert part in text
@@ -79,46 +75,40 @@ def test_the_report_holds_names_numbers_and_pictures_and_fetches_nothing(
     assert text.count("data:image/png;base64,") == 1
 
 
-def test_the_survey_finds_the_joint_and_the_stage(seen: tuple[Outcome, Survey]) -> None:
-    where = seen[0].answer.where
-    assert seen[1].where((), ()).stage is None
-    assert (
-        where.joints["q4"].share > 0.9
-        and where.stage == "actuation"
-        and where.regimes[0].joint == "q4"
-    )
-    assert seen[1].tip["before"].joint_part["q4"] > 0.7
+def test_the_joint_and_the_stage_are_found(machine: Machine, seen: Outcome) -> None:
+    where = seen.answer.where
+    assert find_stage((), load_effects(machine)) is None
+    assert where.stage == "actuation"
+    assert where.joints["q4"].share > 0.9
+    assert {one.joint for one in where.regimes} == {"q4"}
     assert sum(joint.share for joint in where.joints.values()) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("verdict", ["none", "unknown"])
 def test_an_answer_without_effects_has_a_report(
-    machine: Machine, seen: tuple[Outcome, Survey], tmp_path: Path, verdict
+    machine: Machine, seen: Outcome, tmp_path: Path, verdict
 ) -> None:
     answer = replace(
-        seen[0].answer,
+        seen.answer,
         verdict=verdict,
         selected=(),
         gap=Gap(0.012, 0.012, 0.01, None),
         next_experiment=None,
         reason="Few data.",
     )
-    more = {key: value for key, value in answer.more.items() if key not in ("evidence", "tip")}
     remark = RecordingRemark("jumps", "bad", "q4", "run", 0.0, 1.0, 1, "one", "a wrap", "unwrap it")
-    bare = replace(answer, more=more | {"sanity": [remark.plain()] * 30})
+    bare = replace(answer, more={"sanity": [remark.plain()] * 30})
     assert report.write_headline(bare)[1] == ("good" if verdict == "none" else "warn")
-    report.write_report(Outcome(bare, seen[0].before, None, None), tmp_path, machine)
+    report.write_report(Outcome(bare, seen.before, None, None), tmp_path, machine)
     page = (tmp_path / "report.html").read_text()
     assert "12.0 mrad before; the floor is 10.0 mrad" in page
     assert f"{30 - report.MAX_LISTED} more" in page
 
 
-def test_an_answer_that_cannot_tell_says_why(
-    machine: Machine, seen: tuple[Outcome, Survey]
-) -> None:
+def test_an_answer_that_cannot_tell_says_why(machine: Machine, seen: Outcome) -> None:
     bare = Answer(
         verdict="unknown", selected=(), ranking=(), where=Where({}, (), None), gap=Gap(0.01, 0.01, 0.01, None),
         next_experiment=None, reason="cannot tell, because nothing moves",
     )  # fmt: skip
     assert "nothing moves" in report.write_headline(bare)[0]
-    assert plots.draw_paths(Outcome(bare, seen[0].before, None, None), machine).axes
+    assert plots.draw_paths(Outcome(bare, seen.before, None, None), machine).axes
