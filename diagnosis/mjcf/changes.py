@@ -17,6 +17,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
+from diagnosis.closure import Estimate
 from diagnosis.mjcf.plant import MjcfPlant, limit_force_range
 
 
@@ -27,14 +28,12 @@ class JointFinding:
     Attributes:
         effect: Its name, such as `dead_time`.
         joint: The joint.
-        numbers: Value of each number, in its own unit.
-        intervals: 95 % interval of each number.
+        sizes: Size of each number, in its own unit.
     """
 
     effect: str
     joint: str
-    numbers: Mapping[str, float]
-    intervals: Mapping[str, tuple[float, float] | None]
+    sizes: Mapping[str, Estimate]
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,8 @@ class _Editor:
         self.changes: list[MjcfChange] = []
 
     def get(self, number: str) -> float:
-        return self.finding.numbers.get(number, 0.0)
+        size = self.finding.sizes.get(number)
+        return 0.0 if size is None else size.mean
 
     def write(
         self,
@@ -91,10 +91,10 @@ class _Editor:
         held = getattr(owner, attribute)
         before = float(held if index is None else held[index])
         after = rule(before, self.get(number))
-        ends = self.finding.intervals.get(number)
+        size = self.finding.sizes.get(number)
         interval = None
-        if ends is not None:
-            low, high = sorted(rule(before, end) for end in ends)
+        if size is not None and size.has_interval:
+            low, high = sorted(rule(before, end) for end in size.ci95)
             interval = (low, high)
         if index is None:
             setattr(owner, attribute, after)
@@ -271,7 +271,7 @@ def _add_lag(to: _Editor) -> str | None:
 
 
 def _add_sag(to: _Editor) -> str | None:
-    if "load_rad" in to.finding.numbers:
+    if "load_rad" in to.finding.sizes:
         return "the sag follows the weight; lower kp instead"
     lower, upper = (limit[to.place] for limit in (to.machine.lower, to.machine.upper))
     stiffness = float(to.drive.gainprm[0])

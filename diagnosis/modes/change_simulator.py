@@ -18,13 +18,12 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from diagnosis import answer, effect_library, simulator_changes
+from diagnosis import answer, effect_library, effects_file
 from diagnosis.answer import Answer
 from diagnosis.own_simulator import OwnSimulator
 from diagnosis.simulator_runs import cut_simulator_runs
 
 MJCF_FILE = "changed.xml"
-RANGES_FILE, TABLE_FILE = "randomisation.yaml", "randomisation.json"
 CHANGES_FILE = "changes.json"
 
 
@@ -82,14 +81,12 @@ class ChangeSimulator:
         kinds = effect_library.load_effects(self.machine, None, own)
         recordings = self._read_recordings()
         folder.mkdir(parents=True, exist_ok=True)
-        ranges = simulator_changes.list_ranges(given, kinds)
-        simulator_changes.write_randomisation(given, kinds, ranges, folder / RANGES_FILE)
-        write_json(folder / TABLE_FILE, [asdict(one) for one in ranges])
+        effects_file.write_ranges(given, kinds, folder / effects_file.RANGES_FILE)
         told: dict[str, Any] = {"changes": [], "not_in_the_file": {}, "replay": {}}
         if own.path is not None:
             told = self._change_file(own, own.path, given, recordings)
         write_json(folder / CHANGES_FILE, told)
-        _print(told, ranges, folder)
+        _print(told, effects_file.describe_parts(given), folder)
 
     def _read_recordings(self) -> list[Recording]:
         if self.changes.recordings is None:
@@ -106,19 +103,8 @@ class ChangeSimulator:
         findings = []
         for one in given.selected:
             for joint in one.joints or self.machine.joint_names:
-                estimates = {name: row.get(joint) for name, row in one.parameters.items()}
-                values = {name: value for name, value in estimates.items() if value is not None}
-                findings.append(
-                    mjcf_changes.JointFinding(
-                        one.effect,
-                        joint,
-                        {name: value.mean for name, value in values.items()},
-                        {
-                            name: value.ci95 if value.has_interval else None
-                            for name, value in values.items()
-                        },
-                    )
-                )
+                sizes = {name: row[joint] for name, row in one.parameters.items() if joint in row}
+                findings.append(mjcf_changes.JointFinding(one.effect, joint, sizes))
         changed = folder / MJCF_FILE
         changes, left = mjcf_changes.write_changed_mjcf(path, self.machine, findings, changed)
         told: dict[str, Any] = {
@@ -141,9 +127,7 @@ class ChangeSimulator:
         return dict(zip(self.machine.joint_names, rmse.tolist(), strict=True))
 
 
-def _print(
-    told: dict[str, Any], ranges: Sequence[simulator_changes.RandomisationRange], folder: Path
-) -> None:
+def _print(told: dict[str, Any], parts: Sequence[str], folder: Path) -> None:
     if told["changes"]:
         rows = []
         for one in told["changes"]:
@@ -156,7 +140,6 @@ def _print(
     for joint, before in told["replay"].get("before", {}).items():
         after = told["replay"]["after"][joint]
         print_text(f"{joint}: error {before:.4g}, with the changes {after:.4g}")
-    for name in dict.fromkeys(one.effect for one in ranges):
-        first = next(one for one in ranges if one.effect == name)
-        print_text(f"{name}: {simulator_changes.describe_part(first)}")
+    for part in parts:
+        print_text(part)
     print_text(f"written: {folder}")

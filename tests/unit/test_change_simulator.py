@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -97,10 +98,10 @@ def test_the_changed_file_is_the_faulty_machine(tmp_path: Path) -> None:
     assert min(told["replay"]["before"].values()) > 100 * NOISE_RAD
     # MuJoCo begins a run with an empty buffer of commands; the warm-up fills it.
     assert max(told["replay"]["after"].values()) < 8 * NOISE_RAD
-    ranges = json.loads((tmp_path / "out" / "randomisation.json").read_text())
-    ranked = list(dict.fromkeys(one["effect"] for one in ranges))
+    ranges = (tmp_path / "out" / "randomisation.yaml").read_text()
+    ranked = re.findall("^# (.*): closes", ranges, re.MULTILINE)
     assert ranked == ["dead_time", "joint_friction", "backlash"]  # by the gap
-    nodes = yaml.safe_load((tmp_path / "out" / "randomisation.yaml").read_text())
+    nodes = yaml.safe_load(ranges)
     assert nodes["dead_time"]["dead_time_s"]["elbow"] == [0.048, 0.072]
     assert "joint_friction" not in nodes
     path = tmp_path / "alone.yaml"
@@ -138,7 +139,8 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
     for name, numbers in CHANGES:
         kind, findings = kinds[name], []
         for joint in machine.joint_names:
-            findings.append(JointFinding(kind.name, joint, numbers, dict.fromkeys(numbers)))
+            sizes = {number: Estimate(value, (value, value)) for number, value in numbers.items()}
+            findings.append(JointFinding(kind.name, joint, sizes))
         changed = tmp_path / "changed.xml"
         assert write_changed_mjcf(source, machine, findings, changed)[1] == {}
         values = {name: np.full((1, 2), value) for name, value in numbers.items()}
@@ -176,7 +178,7 @@ def test_a_lower_range_of_the_file_stays(tmp_path: Path) -> None:
     """60 Nm/rad times 5 % of 3 rad are 9 Nm: a shortage of 2 is a limit of 4.5 Nm."""
     machine, source = make_machine("shoulder", "elbow"), tmp_path / "arm.xml"
     source.write_text(ARM.replace('kv="4"', 'kv="4" forcerange="-3 20"'))
-    finding = JointFinding("drive_limit", "shoulder", {"shortage": 2.0}, {"shortage": (1.5, 3.0)})
+    finding = JointFinding("drive_limit", "shoulder", {"shortage": Estimate(2.0, (1.5, 3.0))})
     changes, left = write_changed_mjcf(source, machine, [finding], tmp_path / "changed.xml")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "changed.xml"))
     assert left == {} and model.actuator_forcerange.tolist() == [[-3.0, 4.5], [0.0, 0.0]]
