@@ -21,7 +21,6 @@ DISTRIBUTION_NAMES = {
     "hydra_plugins": "hydra-submitit-launcher",
     "mcap_protobuf": "mcap-protobuf-support",
     "rsl_rl": "rsl-rl-lib",
-    "sklearn": "scikit-learn",
     "tensordict": "rsl-rl-lib",
     "warp": "warp-lang",
 }

@@ -63,13 +63,13 @@ class Gap:
         before: Of the simulator as it was.
         after: With the selected effects.
         floor: Error that the unchanged machine would show under the field's own motion; without a
-            reference that of a flexible model on field recordings that it was not fitted to;
-            `None` where neither is known.
+            reference that of an ARX on field recordings that it was not fitted to, or of the
+            repaired simulator; `None` where none is known.
         closed: `(before - after) / (before - floor)`; above 1 where `after` is below the floor, which
             is an estimate and no bound; `None` together with `closed_reason`.
         unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
             over their travel.
-        floor_of: `reference`, `flexible model`, or empty.
+        floor_of: `reference` or `field`.
         joints: The same joint by joint.
         reduced: `(before - after) / before`; `None`: computed from both, without an interval.
         closed_reason: Why `closed` is `None`.

@@ -28,7 +28,6 @@ MAX_CHANGES = 20
 RIVALS = {
     "hold": "standing still",
     "arx": "ARX with dead-band hinges, fitted to other parts of the field",
-    "flexible": "flexible model, fitted to other parts of the field",
 }
 """Rivals in words."""
 
@@ -72,12 +71,8 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
 
 def _describe_floor(gap: Gap) -> str:
     if gap.floor is None:
-        return "without a reference, and with too little data for a flexible model, the floor is not known"
-    whose = (
-        ""
-        if gap.floor_of == "reference"
-        else f", that of a {gap.floor_of} on field recordings it was not fitted to"
-    )
+        return "the floor is not known"
+    whose = "" if gap.floor_of == "reference" else ", that of an ARX or of the repaired simulator"
     return f"the floor is {format_error(gap.floor, gap.unit)}{whose}"
 
 

@@ -1,15 +1,13 @@
-"""Errors of simple rivals on the windows of the gap: standing still, ARX with hinges, boosting.
+"""Errors of simple rivals on the windows of the gap: standing still, and an ARX with hinges.
 
-The fitted rivals are cross-validated: no window is predicted by a model that was fitted to it. They
-get the recorded commands and their own predictions, as the simulator does.
-Axes: `W` windows, `K` steps, `J` joints, `L` samples before the free run, `F` features, `I`
-increments, `E` entries (steps or increments of several windows).
+The ARX is cross-validated: no window is predicted by a model that was fitted to it. It gets the
+recorded commands and its own predictions, as the simulator does.
+Axes: `W` windows, `K` steps, `J` joints, `L` samples before the free run, `F` features.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -30,15 +28,7 @@ RIDGES = (1e-3, 3e-2, 1.0)
 """Pulls towards 0, for features of unit size, over the number of steps."""
 MAX_SPEED_RATIO = 1.2
 """A step is no larger than so many times the largest measured one: a fit may be unstable."""
-BOOSTING = {"max_iter": 30, "max_leaf_nodes": 6, "min_samples_leaf": 60, "learning_rate": 0.05}
-"""Parameters of the boosting: few small trees, since five minutes hold a thousand increments. On four
-practice cases 60 trees of 15 leaves erred by a fifth more."""
-NO_BOOSTING = "scikit-learn is not installed (it is part of the extra 'exam')"
 TOO_FEW = "too few windows to leave some out"
-
-
-INCREMENT_SAMPLES = 5
-"""Samples in an increment: a quarter of a second at 20 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,27 +48,12 @@ class ArxRuns:
 
 
 def measure_rivals(cut: FreeRunWindows) -> dict[str, Rival]:
-    """Return the rivals `hold`, `arx` and `flexible` on the windows of a cut."""
+    """Return the rivals `hold` and `arx` on the windows of a cut."""
     start = cut.q[:, cut.num_before - 1]
-    measured = cut.measured
-    found = {"hold": Rival(np.square(start[:, None] - measured).mean(1))}
+    found = {"hold": Rival(np.square(start[:, None] - cut.measured).mean(1))}
     if len(cut.q) < 2:
-        return found | {"arx": Rival(None, TOO_FEW), "flexible": Rival(None, TOO_FEW)}
-    arx = run_arx(cut)
-    found["arx"] = Rival(np.square(arx.paths - measured).mean(1))
-    boosted = run_boosting(cut, arx)
-    if boosted is None:
-        return found | {"flexible": Rival(None, NO_BOOSTING)}
-    error = np.cumsum(boosted - to_increments(measured, start), 1)
-    return found | {"flexible": Rival(np.square(error).mean(1))}
-
-
-def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return the increments of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
-    count = paths.shape[-2] // INCREMENT_SAMPLES
-    ends = paths[..., INCREMENT_SAMPLES - 1 : count * INCREMENT_SAMPLES : INCREMENT_SAMPLES, :]
-    first = np.broadcast_to(start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
-    return np.diff(ends, axis=-2, prepend=first)
+        return found | {"arx": Rival(None, TOO_FEW)}
+    return found | {"arx": Rival(np.square(run_arx(cut).paths - cut.measured).mean(1))}
 
 
 def assign_folds(num_windows: int) -> np.ndarray:
@@ -182,43 +157,3 @@ def _shape_commands(u: np.ndarray) -> np.ndarray:
     for edge in (0.0, *HINGES):
         columns += [np.maximum(u - edge, 0.0), np.maximum(-u - edge, 0.0)]
     return np.stack(columns, -1)
-
-
-def run_boosting(cut: FreeRunWindows, arx: ArxRuns) -> np.ndarray | None:
-    """Return increments `(W, I, J)` of the ARX with a boosted correction; `None` without scikit-learn."""
-    try:
-        from sklearn.ensemble import HistGradientBoostingRegressor  # pyright: ignore[reportMissingImports]
-        from threadpoolctl import threadpool_limits  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return None
-    start = cut.q[:, cut.num_before - 1].astype(float)
-    way, target = to_increments(arx.paths, start), to_increments(cut.measured, start)
-    shared = _collect_features(cut, way)
-
-    def correct(j: int) -> np.ndarray:
-        found = way[..., j].copy()
-        with threadpool_limits(1):
-            place = start[:, None, j] + np.cumsum(way[..., j], 1)
-            x = np.concatenate([shared, place[..., None]], -1)
-            left = target[..., j] - way[..., j]
-            size = max(float(left.std()), 1e-12)
-            for out in np.unique(arx.fold):
-                model: Any = HistGradientBoostingRegressor(random_state=0, **BOOSTING)
-                used, rest = arx.fold != out, arx.fold == out
-                model.fit(x[used].reshape(-1, x.shape[-1]), left[used].ravel() / size)
-                more = model.predict(x[rest].reshape(-1, x.shape[-1])) * size
-                found[rest] += more.reshape(int(rest.sum()), -1)
-        return found
-
-    return np.stack(map_parallel(correct, range(way.shape[2])), -1)
-
-
-def _collect_features(cut: FreeRunWindows, way: np.ndarray) -> np.ndarray:
-    """Return motion of all joints and mean commands of earlier increments, `(W, I, F)`."""
-    columns = [way, np.diff(way, axis=1, prepend=way[:, :1])]
-    count = way.shape[1]
-    for back in range(1 + cut.num_before // INCREMENT_SAMPLES // 2):
-        begin = cut.num_before - 1 - back * INCREMENT_SAMPLES
-        part = cut.u[:, begin : begin + count * INCREMENT_SAMPLES]
-        columns.append(part.reshape(len(part), count, INCREMENT_SAMPLES, -1).mean(2))
-    return np.concatenate(columns, -1)

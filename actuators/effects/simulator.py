@@ -29,8 +29,7 @@ class _InsideEffect(EffectSpec):
     ) -> EffectChain:
         """Return `model` whose plant has the number.
 
-        The flexible models that give a diagnosis its floor have no such number: around them the effect
-        does nothing.
+        Around another model, which has no such number, the effect does nothing.
         """
         chain = super().wrap(model, machine, num_envs, device)
         inner: Any = model

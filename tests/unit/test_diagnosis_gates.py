@@ -118,12 +118,12 @@ def test_gates_and_rivals_are_written_as_the_format_says() -> None:
     found = Answer(
         verdict="unknown", selected=(), ranking=(), where=Where({}, (), None),
         gap=Gap(0.03, 0.03, 0.01, None, closed_reason="why"), next_experiment=None,
-        rivals={"hold": RivalError(0.09, {"q1": 0.1}), "flexible": RivalError(None, {}, "not installed")},
+        rivals={"hold": RivalError(0.09, {"q1": 0.1}), "arx": RivalError(None, {}, "too few windows")},
         gates=(gate,),
     ).to_json()  # fmt: skip
     assert found["rivals"]["hold"]["rmse_rad"] == 0.09
-    assert found["rivals"]["flexible"]["rmse_rad"] is None
-    assert read_rivals(found["rivals"])["flexible"].reason == "not installed"
+    assert found["rivals"]["arx"]["rmse_rad"] is None
+    assert read_rivals(found["rivals"])["arx"].reason == "too few windows"
     assert found["gates"] == [
         {"name": "near_floor", "passed": False, "value": 2.5, "limit": 1.75, "text": "too far"}
     ]

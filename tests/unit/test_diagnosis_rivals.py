@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -76,23 +74,3 @@ def test_one_window_leaves_none_to_fit() -> None:
     found = measure_rivals(driven(1, 0.0))
     assert found["hold"].squares is not None
     assert found["arx"].squares is None and found["arx"].reason == rivals.TOO_FEW
-    assert found["flexible"].squares is None
-
-
-def test_a_flexible_rival_needs_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    found = measure_rivals(driven(8, 0.0))["flexible"]
-    assert found.squares is None and found.reason == rivals.NO_BOOSTING
-
-
-def test_boosting_learns_what_the_arx_cannot() -> None:
-    pytest.importorskip("sklearn")
-    cut = driven(80, 0.0, noise=1e-5)
-    # speed depends on the position: no term of the ARX
-    moved = np.diff(cut.q, axis=1)
-    q = [cut.q[:, :1]]
-    for k in range(moved.shape[1]):
-        q.append(q[-1] + moved[:, k : k + 1] * np.where(q[-1] > 0.0, 1.6, 0.6))
-    bent = FreeRunWindows(cut.u, np.concatenate(q, 1), cut.run, 13, BEFORE)
-    found = measure_rivals(bent)
-    assert rmse(found["flexible"].squares) < 0.95 * rmse(found["arx"].squares)
