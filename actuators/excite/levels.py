@@ -2,15 +2,14 @@
 
 import numpy as np
 
-from actuators.excite.poses import fill_from_poses
-from brokk_rl.contracts.actuator import Segment
+from actuators.excite.poses import PoseProgram
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import Positive, Share, spec
 
 
 @spec
-class Levels:
+class Levels(PoseProgram):
     """Random levels for random times on several joints at once, from poses of opposite load.
 
     Attributes:
@@ -51,22 +50,8 @@ class Levels:
         if self.turn_s > self.pose_s:
             raise ConfigError(f"pose_s: expected turn_s={self.turn_s} or more, got {self.pose_s}")
 
-    def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator
-    ) -> list[Segment]:
-        """Return segments of about `pose_s` each, which fill the time."""
-        return fill_from_poses(
-            "levels",
-            machine,
-            duration_s,
-            self.pose_s,
-            self.stop_margin,
-            generator,
-            lambda steps: self._program(machine, steps, generator),
-        )
-
-    def _program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
-        """Return the commands, `(T, J)`."""
+    def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
+        """Return the commands of so many control periods, `(T, J)`."""
         period_s, joints = machine.period_s, range(machine.num_joints)
         u = np.stack([self._joint(steps, period_s, generator) for _ in joints], 1)
         exclusive = machine.is_exclusive

@@ -4,7 +4,7 @@ Under a weight of one sign the unequal speed of the two directions, load depende
 uneven dead band look alike.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -47,31 +47,30 @@ def draw_start_poses(
         yield candidates[best]
 
 
-def fill_from_poses(
-    name: str,
-    machine: Machine,
-    duration_s: float,
-    pose_s: float,
-    margin: float,
-    generator: np.random.Generator,
-    program: Callable[[int], np.ndarray],
-) -> list[Segment]:
-    """Return segments of about `pose_s` each, from poses of opposite load, which fill the time.
+class PoseProgram:
+    """Base of excitations that fill the time from poses of opposite load.
 
-    Args:
-        name: Of the segments, before their numbers.
-        machine: Limits, masses and geometry.
-        duration_s: Time to fill.
-        pose_s: Length of a segment, about.
-        margin: Distance kept from the stops, as a part of each joint's travel.
-        generator: Draws the poses.
-        program: Commands of so many control periods, `(T, J)`.
+    Attributes:
+        pose_s: Time after which another start pose is taken, about.
+        stop_margin: Distance kept from the stops, as a part of each joint's travel.
     """
-    total = max(1, int(duration_s / machine.period_s))
-    count = min(max(1, round(duration_s / pose_s)), total)
-    starts = draw_start_poses(machine, margin, generator)
-    found = []
-    for i in range(count):
-        start, u = next(starts), program(total // count)
-        found.append(Segment(f"{name}_{i:02d}", start, u, "inward", margin))
-    return found
+
+    pose_s: float
+    stop_margin: float
+
+    def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
+        """Return the commands of so many control periods, `(T, J)`."""
+        raise NotImplementedError
+
+    def segments(
+        self, machine: Machine, duration_s: float, generator: np.random.Generator
+    ) -> list[Segment]:
+        """Return segments of about `pose_s` each, which fill the time."""
+        total = max(1, int(duration_s / machine.period_s))
+        count = min(max(1, round(duration_s / self.pose_s)), total)
+        starts = draw_start_poses(machine, self.stop_margin, generator)
+        name, found = type(self).__name__.lower(), []
+        for i in range(count):
+            start, u = next(starts), self.program(machine, total // count, generator)
+            found.append(Segment(f"{name}_{i:02d}", start, u, "inward", self.stop_margin))
+        return found

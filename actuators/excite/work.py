@@ -5,15 +5,14 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Interval
 
-from actuators.excite.poses import fill_from_poses
-from brokk_rl.contracts.actuator import Segment
+from actuators.excite.poses import PoseProgram
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Count, Positive, spec
 
 
 @spec
-class Work:
+class Work(PoseProgram):
     """Strokes of one or some joints that the hand ramps, then short corrections to and fro, then a pause.
 
     Attributes:
@@ -50,22 +49,8 @@ class Work:
                     f"{name}: expected [low, high] with low <= high, got [{low}, {high}]"
                 )
 
-    def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator
-    ) -> list[Segment]:
-        """Return segments of about `pose_s` each, which fill the time."""
-        return fill_from_poses(
-            "work",
-            machine,
-            duration_s,
-            self.pose_s,
-            self.stop_margin,
-            generator,
-            lambda steps: self._program(machine, steps, generator),
-        )
-
-    def _program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
-        """Return the commands, `(T, J)`."""
+    def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
+        """Return the commands of so many control periods, `(T, J)`."""
         u, at = np.zeros((steps, machine.num_joints)), 0
         while at < steps:
             first = int(generator.integers(machine.num_joints))
