@@ -73,12 +73,6 @@ class GapCase:
             found.append("the commands never change in the field recordings")
         return found
 
-    def resting(self) -> np.ndarray:
-        """Return which joints are never commanded in the field recordings, `(J,)` bool."""
-        field = view_recordings(self.field, self.machine)
-        commanded = np.abs(np.concatenate([recording.u for recording in field])) > COMMANDED
-        return np.logical_not(np.any(commanded, axis=0))
-
 
 def load_case(folder: Path, machine: Machine) -> GapCase:
     """Read a gap case: `reference/*.parquet` and `field/*.parquet`.

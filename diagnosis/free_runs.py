@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from functools import cached_property
 
 import numpy as np
@@ -56,16 +55,3 @@ class WindowedRuns:
     def error(self) -> np.ndarray:
         """Simulated less measured, `(W, K, J)`, NaN after the end of the recording."""
         return self.simulated - self.measured
-
-    @cached_property
-    def elapsed_s(self) -> np.ndarray:
-        """Time of each window since the first recording began, as far as the recordings say when they were made, `(W,)`."""
-        begun = [recording.metadata.get("created") for recording in self.recordings]
-        if all(begun):
-            stamps = [datetime.fromisoformat(text).timestamp() for text in begun if text]
-            offset_s = np.array(stamps) - min(stamps)
-        else:
-            offset_s = np.zeros(len(self.recordings))
-        return np.array(
-            [offset_s[s] + self.recordings[s].t_s[r] for s, r in zip(self.source, self.row, strict=True)]
-        )  # fmt: skip

@@ -89,11 +89,6 @@ class FieldJoint:
         self.squares = float(self.projection.measure_squares(self.residual)[0])
         self.count = self.measure.count
 
-    @property
-    def scatter(self) -> float:
-        """Mean square of the remaining increments over that of the reference."""
-        return self.squares / self.count
-
     def explain_nuisance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the wander, `(T,)`."""
         return self.nuisance.explain(
