@@ -267,26 +267,6 @@ def test_a_run_goes_on_exactly_from_its_state(name: str, machine: Machine) -> No
     assert torch.equal(other.measure(u[0]), seen)
 
 
-@pytest.mark.parametrize("name", FIXED)
-def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine) -> None:
-    model, untouched = (
-        effect(name).wrap(shipped("actuator", "lag").build(machine, 3, CPU), machine, 3, CPU)
-        for _ in range(2)
-    )
-    u = commands(machine, 20, 3)
-    roll(model, machine, u), roll(untouched, machine, u)
-    place = {key: value.data_ptr() for key, value in model.state.items()}
-    model.reset(torch.tensor([False, True, False]))
-    history = History(q=torch.zeros(3, 13, 5), u=torch.zeros(3, 13, 5))
-    history.u[:] = u[-13:].transpose(0, 1)
-    history.reset(torch.tensor([False, True, False]), torch.zeros(3, 5))
-    after, expected = model.step(history), untouched.step(history)
-    assert torch.equal(after[[0, 2]], expected[[0, 2]])
-    # at rest and without a command; only leaks move it
-    assert after[1].abs().max() < (1e-3 if name == "creep" else 1e-9)
-    assert {key: value.data_ptr() for key, value in model.state.items()} == place
-
-
 def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:
     inner = shipped("actuator", "ideal").build
     band, cut = effect("dead_band", extend=0.2, retract=0.2), effect("saturation", level=0.6)
