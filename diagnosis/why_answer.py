@@ -17,13 +17,15 @@ from typing import Any, Literal
 import yaml
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.report import Cell, Report, Tone
+from brokk_rl.report import Tone, embed_picture, render_page
+from brokk_rl.session import write_text
 from diagnosis import answer, effects_file, report
 from diagnosis.answer import Answer
 from diagnosis.deployment.page import EVIDENCE_FILE, PAGE_FILE, REMEDIES
 from diagnosis.story import HANDED_ON_FOLDER
 
 WHY_FILE, WHY_PAGE = "why.json", "why.html"
+TEMPLATE = Path(__file__).with_name("why.html.jinja")
 DOCTOR, DIAGNOSIS = "doctor", "diagnosis"
 BEFORE, ALL_EFFECTS = "as_trained", "with_effects"
 LOW_SUCCESS = 0.8
@@ -245,41 +247,23 @@ def write_page(result: WhyResult) -> None:
         StorageError: it could not be written.
     """
     title, tone = result.title
-    page = Report(title, write_summary(result), tone)
     picture = result.folder / DOCTOR / EVIDENCE_FILE
-    if picture.is_file():
-        page.add_picture(picture, "The policy's own command and the log's, or the motion beside that of the training.")  # fmt: skip
-    if result.costs:
-        page.add_heading("What it costs in success")
-        rows = []
-        for name, rate in result.success.items():
-            loss = result.costs.get(name)
-            change = Cell(None)
-            if loss is not None:
-                low, high = (-100.0 * bound for bound in reversed(loss["ci95"]))
-                change = Cell(f"{-100 * loss['mean']:+.0f}", f"{low:+.0f} to {high:+.0f}")
-            rows.append([name.replace("_", " "), format_rate(rate), change])
-        page.add_table(
-            ["simulator", "strict success", "change, points"],
-            rows,
-            "Share of simulated episodes that succeed, from the same starts, with 95 % intervals",
-        )
-        if result.success[BEFORE]["mean"] < LOW_SUCCESS:
-            text = "The policy often fails in this simulator even without the effects. Is it the one that it was trained in?"
-            page.add_text(text, "warn")
-    for heading, steps in (
-        ("What to change", list_changes(result)),
-        ("What to record next", list_records(result)),
-    ):
-        if steps:
-            page.add_heading(heading)
-        for text, command in steps:
-            page.add_text(text)
-            if command:
-                page.add_code(command)
-    page.add_heading("Evidence")
     places = [f"{DOCTOR}/{PAGE_FILE}: code, task and motion"]
     if result.diagnosis is not None:
         places.append(f"{DIAGNOSIS}/{report.REPORT_FILE}: where the simulator errs, and which effects it lacks")  # fmt: skip
-    page.add_list(places)
-    page.write(result.folder / WHY_PAGE)
+    before = result.success.get(BEFORE)
+    values = {
+        "title": title,
+        "tone": tone,
+        "summary": write_summary(result),
+        "evidence": embed_picture(picture) if picture.is_file() else "",
+        "result": result,
+        "often_fails": before is not None and before["mean"] < LOW_SUCCESS,
+        "next_steps": {
+            "What to change": list_changes(result),
+            "What to record next": list_records(result),
+        },
+        "places": places,
+        "format_rate": format_rate,
+    }
+    write_text(result.folder / WHY_PAGE, render_page(TEMPLATE, values))

@@ -13,7 +13,7 @@ from actuators.recordings.guess import CommandKind, Damaged, GivenColumns, Guess
 from actuators.recordings.log_draft import Draft
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.report import Report
+from brokk_rl.report import embed_picture, render_page
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import Positive, spec
 
@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 MAP_FILE, MACHINE_FILE = "column_map.yaml", "machine.yaml"
 GUESS_FILE, PICTURE_FILE, PAGE_FILE = "import.json", "import.png", "import.html"
 HEAD = ["subject", "guess", "how sure", "evidence"]
+TEMPLATE = Path(__file__).with_name("import.html.jinja")
 
 
 @spec
@@ -162,25 +163,17 @@ def summarise(draft: Draft, guesses: list[Guess]) -> str:
 
 def _write_page(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
     is_unsure = any(guess.sureness == "unsure" for guess in guesses)
-    page = Report(
-        f"Logs of {draft.name}", summarise(draft, guesses), "bad" if is_unsure else "plain"
-    )
-    page.add_picture(
-        folder / PICTURE_FILE,
-        "Positions (blue) and commands (orange) as the logs have them, in the units of the logs.",
-    )
-    page.add_heading("Guesses")
-    rows = [[guess.subject, guess.value, guess.sureness, guess.reason] for guess in guesses]
-    page.add_table(
-        HEAD,
-        rows,
-        "sure: name and numbers agree, or given; likely: one of the two; unsure: fill it in",
-    )
-    if draft.remarks:
-        page.add_list(list(draft.remarks))
-    page.add_heading("Next")
-    page.add_code(command)
-    page.write(folder / PAGE_FILE)
+    values = {
+        "title": f"Logs of {draft.name}",
+        "tone": "bad" if is_unsure else "",
+        "summary": summarise(draft, guesses),
+        "motion": embed_picture(folder / PICTURE_FILE),
+        "head": HEAD,
+        "guesses": guesses,
+        "draft": draft,
+        "command": command,
+    }
+    write_text(folder / PAGE_FILE, render_page(TEMPLATE, values))
 
 
 def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
