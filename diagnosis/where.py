@@ -77,7 +77,7 @@ def locate_gap(
         own = floor.square.sum(0) / np.maximum(seen, 1.0)
         # Where the reference never was in a regime, the floor of the joint counts.
         expected = np.where(seen > 0, own, base[:, None]) * count
-        chance = _estimate_chance(field, floor) * time
+        chance = _estimate_chance(floor, len(field.square)) * time
     excess = whole - base * time
     # Metres and radians do not add up, so mixed joints count by their travel.
     is_alike = len({joint.unit for joint in machine.joints}) == 1
@@ -136,21 +136,24 @@ def _number_parts(runs: WindowedRuns) -> np.ndarray:
     return np.unique(place, axis=0, return_inverse=True)[1].ravel()
 
 
-def _estimate_chance(field: _PartSums, floor: _PartSums) -> np.ndarray:
-    """Return the standard error of the excess over the floor, per sample, `(J,)`.
+def _estimate_chance(floor: _PartSums, num_parts: int) -> np.ndarray:
+    """Return the standard error of the excess of an unchanged machine over the floor, per sample, `(J,)`.
 
-    Source: the ratio estimator's, Cochran 1977, section 2.11; both sides are independent.
+    Source: the ratio estimator's, Cochran 1977, section 2.11, with the scatter of the reference on
+    both sides.
+
+    Args:
+        floor: The reference.
+        num_parts: Parts of the field.
     """
-    variance = np.zeros(field.square.shape[1])
-    for side in (field, floor):
-        square, count = side.square.sum(2), side.count.sum(2)
-        num_parts = len(square)
-        if num_parts < 2:
-            continue
-        total = np.maximum(count.sum(0), 1.0)
-        off = square - square.sum(0) / total * count
-        variance += num_parts / (num_parts - 1) * (off**2).sum(0) / total**2
-    return np.sqrt(variance)
+    square, count = floor.square.sum(2), floor.count.sum(2)
+    known = len(square)
+    if known < 2:
+        return np.zeros(square.shape[1])
+    total = np.maximum(count.sum(0), 1.0)
+    off = square - square.sum(0) / total * count
+    variance = known / (known - 1) * (off**2).sum(0) / total**2
+    return np.sqrt(variance * (1.0 + known / num_parts))
 
 
 def _take_first_positive(*choices: np.ndarray) -> np.ndarray:
