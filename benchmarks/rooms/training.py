@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from measurement import Measurement, Table, load_json, read_evaluation
 
@@ -50,14 +49,8 @@ def read_comparison(folder: Path) -> Table:
 
 def read_story(folder: Path) -> Table:
     """Return the success of each policy in each simulator and on the changed machine."""
-    rows: dict[str, dict[str, Any]] = {}
-    for stage in ("in_simulator", "in_repaired", "on_machine"):
-        found = load_json(folder / f"story/{stage}/evaluation.json")
-        for policy, one in found["policies"].items():
-            name = "after" if policy == found["policy"] else policy
-            row = rows.setdefault(name, {"policy": name})
-            row[stage.rpartition("_")[2]] = round(one["success_strict"]["mean"], 3)
-    return list(rows.values())
+    rows = read_evaluations(folder / "story", "stage")
+    return [row for row in rows if row["stage"] in ("in_simulator", "in_repaired", "on_machine")]
 
 
 MEASUREMENTS = (
