@@ -27,8 +27,8 @@ import torch
 from actuators import open_loop
 from actuators.contracts import ActuatorFit
 from actuators.recordings import log_draft
-from actuators.recordings.column_names import UNITS, read_unit
 from actuators.recordings.guess import CommandKind, GivenColumns
+from actuators.recordings.name_evidence import UNITS, read_unit
 from brokk_rl import extensions, record
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError, RecordingError, list_choices

@@ -8,9 +8,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from actuators.recordings import conversion, log_draft
-from actuators.recordings.column_names import UNITS, read_unit
 from actuators.recordings.guess import CommandKind, Damaged, GivenColumns, Guess
 from actuators.recordings.log_draft import Draft
+from actuators.recordings.name_evidence import UNITS, read_unit
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.report import embed_picture, render_page

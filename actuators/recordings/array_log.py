@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 from scipy import io as matlab
 
-from actuators.recordings.column_names import TIME_UNITS
 from actuators.recordings.log_tables import LogFile, LogRun, Table, Wanted
+from actuators.recordings.name_evidence import TIME_UNITS
 from brokk_rl.errors import RecordingError
 
 EPISODE = "episode_index"

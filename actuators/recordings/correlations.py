@@ -64,6 +64,11 @@ class Correlations:
             f"{advise('offset', table=last, offset_s=apart_s)}"
         )
 
+    @property
+    def size(self) -> np.ndarray:
+        """Size of the correlation of each position or its speed with each command, `(C, P)`."""
+        return np.maximum(np.abs(self.target), np.abs(self.speed))
+
     def get(self, kind: CommandKind) -> np.ndarray:
         """Return the correlations of a kind of command, `(C, P)`."""
         return {"position": self.target, "velocity": self.speed, "torque": self.force}[kind]
@@ -106,3 +111,10 @@ class Correlations:
             best = np.where(is_better, r, best)
             lags_s = np.where(is_better, lag * self._period_s, lags_s)
         return best, lags_s
+
+
+def weigh_correlation(size: float) -> float:
+    """Return the log odds that a correlation of some size gives to a pair of columns."""
+    if size >= CLEAR_CORRELATION:
+        return 3.0 if size >= HIGH_CORRELATION else 2.0
+    return -0.5 if size >= NO_CORRELATION else -4.5

@@ -5,23 +5,24 @@ The beginning of each log is looked at, then the whole of all. Each line says wh
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from actuators.recordings.column_pairs import JointGuess
-from actuators.recordings.column_table import read_columns
+from actuators.recordings.clock_evidence import TimeGuess
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import RunSignals
 from actuators.recordings.log_survey import JointSurvey, LogSurvey, measure_logs
+from actuators.recordings.number_evidence import JointGuess, read_columns
 from actuators.recordings.text_log import TextLog
-from actuators.recordings.time_guess import TimeGuess
 from brokk_rl.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class Draft:
         times: Clock of each table that is used.
         joints: Joints whose command changes.
         survey: Their numbers over all logs.
+        commands: Scales of their commands, of use where these set a speed or a force.
         signals: Signals of the run that each joint was judged by.
         signs: Delimiter and decimal sign of text files.
         given: Meanings that a person gave.
@@ -84,6 +86,7 @@ class Draft:
     times: Mapping[str, TimeGuess]
     joints: Sequence[JointGuess]
     survey: LogSurvey
+    commands: Mapping[str, CommandDraft]
     signals: Mapping[str, RunSignals]
     signs: tuple[str, str]
     given: GivenColumns
@@ -137,11 +140,11 @@ class Draft:
         That of the command where its unit says it, else of the fastest motion. The fastest target says
         nothing about a machine: a step of a target is infinitely fast.
         """
-        if joint.kind == "velocity" and joint.speed_scale is not None:
-            full = self.scale_command(joint)
+        if joint.kind == "velocity" and joint.u.name.speed_unit is not None:
+            full = self.commands[joint.name]
             if full.neutral == 0.0:
                 largest = max(abs(full.full_plus or 0.0), abs(full.full_minus or 0.0))
-                return joint.speed_scale * largest
+                return joint.u.name.speed_unit * largest
         numbers = self.survey.joints[joint.name]
         speed = abs(joint.scale) * numbers.top_speed
         if joint.kind == "position" and not self.has_targets:
@@ -149,24 +152,23 @@ class Draft:
             speed = max(speed, abs(joint.target_scale) * numbers.target_speed)
         return _round_up(speed)
 
-    def scale_command(self, joint: JointGuess) -> CommandDraft:
-        """Return neutral and full commands of a joint whose command sets its speed, or a force."""
-        return scale_command(joint, self.survey.joints[joint.name])
-
     def list_guesses(self) -> list[Guess]:
         """Return all guesses, those of the clocks first."""
         found = [time.guess for time in self.times.values()]
         for joint in self.joints:
             found += joint.guesses.values()
             if joint.kind != "position":
-                found.append(self.scale_command(joint).guess)
+                found.append(self.commands[joint.name].guess)
         return found
 
     def format(self, template: str) -> str:
         """Return the column map or the machine as YAML, by `MAP_TEMPLATE` or `MACHINE_TEMPLATE`."""
         folder = FileSystemLoader(Path(__file__).parent)
         environment = Environment(loader=folder, undefined=StrictUndefined)
-        environment.filters |= {"quote": _quote, "explain": _explain}
+        environment.filters |= {
+            "quote": partial(json.dumps, ensure_ascii=False),
+            "explain": _explain,
+        }
         names = {"map": MAP, "missing": MISSING, "spare": f"{SPARE:.0%}"}
         return environment.get_template(template).render(draft=self, **names)
 
@@ -209,14 +211,15 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         raise RecordingError(f"{paths[0]}: no command of any joint changes in {len(paths)} logs")
     all_remarks = [*remarks, *survey.gaps]
     signals = {name: one for name, (_, one) in best.items()}
-    return Draft(name, times, moving, survey, signals, signs, given, all_remarks)
+    commands = {joint.name: _scale_command(joint, survey.joints[joint.name]) for joint in moving}
+    return Draft(name, times, moving, survey, commands, signals, signs, given, all_remarks)
 
 
 def _rank(joint: JointGuess) -> tuple[float, float]:
     return joint.guesses["columns"].probability, joint.guesses["kind"].probability
 
 
-def scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
+def _scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
     """Return neutral and full commands of a joint whose command sets its speed, or a force."""
     low, high, neutral = survey.lowest_command, survey.highest_command, 0.0
     is_at_rest = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
@@ -239,7 +242,7 @@ def scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
         evidence = [(text, 2.0)]
     else:
         evidence = [("no command is frequent at rest, and none is 0", -1.0)]
-    if value is None and neutral == 0.0 and joint.speed_scale is not None:
+    if value is None and neutral == 0.0 and joint.u.name.speed_unit is not None:
         # a speed counts alike both ways
         low = -largest if low < 0.0 else low
         high = largest if high > 0.0 else high
@@ -262,10 +265,6 @@ def _explain(guess: Guess) -> str:
     return f"{guess.sureness}{shown}: {guess.reason}{others}".replace("\n", " ")
 
 
-def _quote(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t") + '"'
-
-
 def _round_up(value: float) -> float:
     """Return a number rounded up to two digits."""
     if value <= 0.0:
@@ -282,19 +281,19 @@ def draw_draft(draft: Draft) -> Figure:
     axes = figure.subplots(len(draft.joints), 1, squeeze=False)[:, 0]
     for joint, axis in zip(draft.joints, axes, strict=True):
         signals = draft.signals[joint.name]
-        command, position = signals.read(joint.command), signals.read(joint.position)
+        command, position = signals.read(joint.u.text), signals.read(joint.q.text)
         begin_s = min(command.t_s[0], position.t_s[0])
         axis.plot(position.t_s - begin_s, position.values, color=BLUE, lw=1.2)
         is_same_unit = joint.kind == "position" and joint.target_scale == joint.scale
         other = axis if is_same_unit else axis.twinx()
         other.step(command.t_s - begin_s, command.values, color=ORANGE, lw=0.9, where="post")
-        axis.set_ylabel(joint.position, color=BLUE, fontsize=7)
+        axis.set_ylabel(joint.q.text, color=BLUE, fontsize=7)
         if other is not axis:
-            other.set_ylabel(joint.command, color=ORANGE, fontsize=7)
+            other.set_ylabel(joint.u.text, color=ORANGE, fontsize=7)
             other.spines["top"].set_visible(False)
         columns, kind = joint.guesses["columns"], joint.guesses["kind"]
         verb = "is " if joint.kind == "position" else ""
-        title = f"{joint.name} ({columns.sureness}): {joint.command} {verb}{kind.value} ({kind.sureness}); {signals.run.name}"
+        title = f"{joint.name} ({columns.sureness}): {joint.u.text} {verb}{kind.value} ({kind.sureness}); {signals.run.name}"
         axis.set_title(title, loc="left", fontsize=8)
         remove_frame(axis)
     axes[-1].set_xlabel("s")

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from actuators.recordings.clock_evidence import TimeGuess
 from actuators.recordings.column_map import Column, ColumnMap, JointColumns, TargetColumn
-from actuators.recordings.column_pairs import JointGuess
 from actuators.recordings.guess import GivenColumns
 from actuators.recordings.log_signals import Signal
-from actuators.recordings.time_guess import TimeGuess
+from actuators.recordings.number_evidence import JointGuess
 
 GAP_PERIODS = 4
 """Least number of periods without a sample that split a log; loggers without real time skip up to two."""
@@ -51,7 +51,7 @@ class JointSurvey:
     def add(self, command: Signal, position: Signal, joint: JointGuess) -> None:
         """Add a run; positions that begin again after a turn are put next to their targets, or to those before."""
         u, q, t_s = command.values, position.values, position.t_s
-        turn = joint.wraps or 0.0
+        turn = joint.q.modulus or 0.0
         if turn > 0.0:
             middle = (
                 (self.lowest + self.highest) / 2 if self.lowest < np.inf else float(np.median(q))
@@ -162,9 +162,9 @@ def measure_logs(
     columns = {}
     for joint in joints:
         command = TargetColumn(
-            column=joint.command, scale=1.0, full_speed=None, wraps=joint.target_wraps
+            column=joint.u.text, scale=1.0, full_speed=None, wraps=joint.target_wraps
         )
-        position = Column(column=joint.position, scale=1.0, offset=0.0, wraps=joint.wraps)
+        position = Column(column=joint.q.text, scale=1.0, offset=0.0, wraps=joint.q.modulus)
         columns[joint.name] = JointColumns(command=command, position=position)
     clocks = {table: one.time for table, one in times.items()}
     reader = ColumnMap(
@@ -176,8 +176,8 @@ def measure_logs(
         for signals in reader.open_runs(path):
             read = []
             for joint in joints:
-                position = signals.read(joint.position, wraps=joint.wraps)
-                command = signals.read(joint.command, wraps=joint.target_wraps)
+                position = signals.read(joint.q.text, wraps=joint.q.modulus)
+                command = signals.read(joint.u.text, wraps=joint.target_wraps)
                 survey.joints[joint.name].add(command, position, joint)
                 read += [position, command]
             survey.add_clocks(signals.run.where, read)

@@ -23,8 +23,8 @@ import numpy as np
 import pandas as pd
 
 from actuators.recordings.advice import advise
-from actuators.recordings.column_names import is_unit
 from actuators.recordings.log_tables import LogFile, Table, Wanted
+from actuators.recordings.name_evidence import is_unit
 from brokk_rl.errors import RecordingError
 
 log = logging.getLogger(__name__)

@@ -13,9 +13,9 @@ import yaml
 from conftest import Done
 from log_import import import_log, make_draft, try_draft
 
-from actuators.recordings.column_names import read_column_name
 from actuators.recordings.guess import Guess
 from actuators.recordings.log_draft import MACHINE_TEMPLATE, MAP_TEMPLATE
+from actuators.recordings.name_evidence import read_column_name
 
 RATE_HZ = 50.0
 LAG = 6

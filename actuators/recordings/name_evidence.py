@@ -1,4 +1,4 @@
-"""Names of columns read as words: role, quantity, unit and joint."""
+"""What the name of a column says: role, quantity, unit and joint, read from its words."""
 
 from __future__ import annotations
 
@@ -82,6 +82,9 @@ OTHER_UNITS = _split("""
     l/min m/s^2 m/s² kg kn
 """)
 """Units that say neither a position nor a time."""
+SI_NAMES = (_split("q"), _split("qpos"), _split("dof"), _split("joint states"))
+"""Words of programs whose positions are in rad or m: libfranka, MuJoCo, Isaac, ROS."""
+EFFORT_UNITS = _split("nm n a v bar")
 FILLER_WORDS = _split("""
     joint joints motor motors data value values raw real header robot main percent pct norm
     controller controllers dof forward servo servos axis
@@ -91,6 +94,7 @@ ROLE_WORDS = COMMAND_WORDS | MEASURED_WORDS | frozenset().union(*QUANTITY_WORDS.
 """Words of role and quantity."""
 UNIT_SUFFIX = re.compile(r"^(.*?)\s*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
 """A name with a unit in brackets behind it."""
+UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,8 @@ class ColumnName:
         joint: Remaining words joined by `_`; may be empty or a number.
         source: Those of its table.
         speed_unit: rad/s or m/s for one of the column, where its name has a unit of speed.
+        unknown_unit: Text in brackets behind it that is no known unit.
+        is_si: The words are those of a program that logs rad or m.
     """
 
     table: str
@@ -116,6 +122,13 @@ class ColumnName:
     joint: str
     source: str
     speed_unit: float | None
+    unknown_unit: str | None
+    is_si: bool
+
+    @property
+    def key(self) -> str:
+        """Name of its joint without the signs that people set differently."""
+        return self.joint.replace("_", "")
 
 
 def is_unit(text: str) -> bool:
@@ -132,23 +145,6 @@ def split_unit(column: str) -> tuple[str, str | None]:
     if found and is_unit(found[2]) and not (found[2].isdigit() and column.endswith("]")):
         return found[1], found[2].lower()
     return column, None
-
-
-def find_bracketed(column: str) -> str | None:
-    """Return the text in brackets behind a name; an index or the name of an item in `[]` is none."""
-    found = UNIT_SUFFIX.fullmatch(column)
-    is_item = column.endswith("]") and not re.search(r"\s\[", column)
-    return found[2] if found and not is_item else None
-
-
-def read_speed_unit(column: str) -> float | None:
-    """Return rad/s or m/s for one of a column that names a unit of speed, `rad_s` or `[deg/s]`; else `None`."""
-    stated = split_unit(column)[1]
-    if stated is not None:
-        unit, _, second = stated.partition("/")
-        return UNITS[unit][1] if unit in UNITS and second == "s" else None
-    *_, unit, second = ["", "", *split_words(column)]
-    return UNITS[unit][1] if unit in UNITS and second == "s" else None
 
 
 def read_unit(text: str) -> tuple[str, float] | None:
@@ -170,6 +166,11 @@ def split_words(text: str) -> list[str]:
     return [word for word in re.split(r"[^a-z0-9äöüßµ°]+", spaced.lower()) if word]
 
 
+def read_words(column: str) -> list[str]:
+    """Return the words of a column's name without its unit."""
+    return split_words(split_unit(column)[0])
+
+
 def read_column_name(table: str, column: str, unit: str | None = None) -> ColumnName:
     """Return what the words of a column's name say, those of its table where it says nothing.
 
@@ -178,30 +179,41 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
         column: Its name in the table.
         unit: Unit that the log states beside the name.
     """
-    plain, stated = split_unit(column)
-    unit = (unit or stated or "").lower() or None
-    outer, words = split_words(table), split_words(plain)
-    words = _split_numbers(words)
-    role = _find_role(words) or _find_role(outer)
+    plain, in_brackets = split_unit(column)
+    outer, words = split_words(table), _split_numbers(split_words(plain))
+    stated = (unit or in_brackets or "").lower()
+    if not stated:
+        stated, words = _take_unit(words)
     quantity = _find_quantity(words)
     if quantity == "unknown":
         quantity = _find_quantity(outer)
-    speed_unit = read_speed_unit(f"{plain} [{unit}]" if unit else column)
+    length, _, second = stated.partition("/")
+    speed_unit = UNITS[length][1] if length in UNITS and second == "s" else None
     if speed_unit is not None:
         quantity = "velocity"
-        words = words if unit else words[:-2]  # `rad_s` is rad/s
-        unit = None
-    elif unit is None:
-        unit = next((word for word in reversed(words) if word in UNITS), None)
-    elif unit not in UNITS:
-        quantity = (
-            "effort" if quantity == "unknown" and unit in ("nm", "n", "a", "v", "bar") else quantity
-        )
-        unit = None
-    desired = {"d"} if "q" in words else set()
-    known = ROLE_WORDS | FILLER_WORDS | set(UNITS) | desired
+    elif quantity == "unknown" and stated in EFFORT_UNITS:
+        quantity = "effort"
+    is_si = any(name <= {*words, *outer} for name in SI_NAMES)
+    known = ROLE_WORDS | FILLER_WORDS | UNITS.keys() | ({"d"} if "q" in words else set())
     joint, source = ("_".join(one for one in each if one not in known) for each in (words, outer))
-    return ColumnName(table, column, role, quantity, unit, joint, source, speed_unit)
+    return ColumnName(
+        table, column, _find_role(words) or _find_role(outer), quantity, stated if stated in UNITS else None,
+        joint, source, speed_unit, unit or _find_bracketed(column), is_si,
+    )  # fmt: skip
+
+
+def _find_bracketed(column: str) -> str | None:
+    """Return the text in brackets behind a name; an index or the name of an item in `[]` is none."""
+    found = UNIT_SUFFIX.fullmatch(column)
+    is_item = column.endswith("]") and not re.search(r"\s\[", column)
+    return found[2] if found and not is_item else None
+
+
+def _take_unit(words: list[str]) -> tuple[str, list[str]]:
+    """Return the unit that is one of the words, or empty, and the words without that of a speed, `rad_s`."""
+    if len(words) > 1 and words[-2] in UNITS and words[-1] == "s":
+        return f"{words[-2]}/s", words[:-2]
+    return next((word for word in reversed(words) if word in UNITS), ""), words
 
 
 def _split_numbers(words: list[str]) -> list[str]:
@@ -209,26 +221,25 @@ def _split_numbers(words: list[str]) -> list[str]:
     found = []
     for place, word in enumerate(words):
         numbered = re.fullmatch(r"([a-z]+)(\d+)", word)
-        is_word = numbered is not None and numbered[1] in ROLE_WORDS and len(numbered[1]) > 1
-        is_first = numbered is not None and place == 0 and numbered[1] in ROLE_WORDS
-        is_apart = is_word or is_first or len(words) == 1
+        is_role = numbered is not None and numbered[1] in ROLE_WORDS
+        is_apart = len(words) == 1 or (is_role and (place == 0 or len(numbered[1]) > 1))
         found += numbered.groups() if numbered and is_apart else [word]
     return found
 
 
 def _find_role(words: list[str]) -> Role | None:
     """Return the role; a word for commands counts more: `target q` and libfranka's `q_d` are commands."""
-    is_desired = "d" in words and any(word in ("q", "dq", "tau") for word in words)
-    if is_desired or any(word in COMMAND_WORDS for word in words):
+    is_desired = "d" in words and not {"q", "dq", "tau"}.isdisjoint(words)
+    if is_desired or not COMMAND_WORDS.isdisjoint(words):
         return "command"
-    return "measured" if any(word in MEASURED_WORDS for word in words) else None
+    return None if MEASURED_WORDS.isdisjoint(words) else "measured"
 
 
 def _find_quantity(words: list[str]) -> Quantity:
     for quantity in ("effort", "velocity", "position"):
-        if any(word in QUANTITY_WORDS[quantity] for word in words):
+        if not QUANTITY_WORDS[quantity].isdisjoint(words):
             return quantity
-    return "position" if any(word in TARGET_WORDS for word in words) else "unknown"
+    return "unknown" if TARGET_WORDS.isdisjoint(words) else "position"
 
 
 def name_joint(text: str) -> str:
@@ -237,6 +248,3 @@ def name_joint(text: str) -> str:
     if not plain:
         return "joint"
     return f"joint_{plain}" if plain[0].isdigit() else plain
-
-
-UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
