@@ -21,6 +21,7 @@ import pyarrow.dataset as ds
 from scipy import io as matlab
 
 from actuators.recordings.log_tables import LogFile, LogRun, Table, Wanted
+from actuators.recordings.message_numbers import read_number
 from actuators.recordings.name_evidence import TIME_UNITS
 from brokk_rl.errors import RecordingError
 
@@ -96,7 +97,8 @@ class TableLog(LogFile):
             part = flatten_table(head.select([field]))
             for name, column in zip(part.column_names, part.columns, strict=True):
                 value = next(filter(None, column.to_pylist()), None)
-                if _is_number(column.type):
+                is_text = isinstance(value, str) and read_number(value) is not None
+                if is_text or _is_number(column.type):
                     is_index = name.startswith(INDEX) and pa.types.is_timestamp(column.type)
                     places["timestamp" if is_index else name] = (field, name, 0, 1)
                 elif _is_list(column.type) and _is_number(column.type.value_type) and value:

@@ -125,6 +125,13 @@ def unwrap(values: np.ndarray, modulus: float | None) -> np.ndarray:
     return found
 
 
+def put_near(values: np.ndarray, near: float, modulus: float) -> np.ndarray:
+    """Return unwrapped values moved by whole turns until their median lies next to `near`; same shape."""
+    if modulus < 0.0:  # a sign bit
+        return values
+    return values + modulus * round((near - float(np.median(values))) / modulus)
+
+
 def is_later(times: np.ndarray) -> np.ndarray:
     """Return where a time is a number and later than all before it, `(T,)`."""
     known = np.where(np.isfinite(times), times, -np.inf)

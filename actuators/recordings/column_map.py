@@ -24,7 +24,14 @@ from typing import Literal
 
 import numpy as np
 
-from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn, list_time_columns
+from actuators.recordings.clocks import (
+    AlignedTime,
+    Column,
+    RowTime,
+    TimeColumn,
+    list_time_columns,
+    put_near,
+)
 from actuators.recordings.guess import Damaged
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import (
@@ -92,15 +99,11 @@ class CommandColumn:
 
         Where commands go one way only, those of the other way come out beyond full: NaN.
         """
+        plus = np.nan if self.full_plus is None else self.full_plus - self.neutral
+        minus = np.nan if self.full_minus is None else self.neutral - self.full_minus
         away = values - self.neutral
-        if self.full_minus is None:
-            plus = away / (self.full_plus - self.neutral)  # type: ignore[operator]
-            return np.where(plus >= 0, plus, np.nan)
-        if self.full_plus is None:
-            minus = away / (self.full_minus - self.neutral)
-            return np.where(minus >= 0, -minus, np.nan)
-        plus = away / (self.full_plus - self.neutral)
-        return np.where(plus >= 0, plus, -away / (self.full_minus - self.neutral))
+        is_plus = away * (plus if self.full_minus is None else minus) > 0
+        return np.where(away == 0.0, 0.0, away / np.where(is_plus, plus, minus))
 
 
 @spec
@@ -337,7 +340,9 @@ class ColumnMap:
         wraps = column.wraps if isinstance(column, TargetColumn) else None
         signal = signals.read(column.column, wraps=wraps)
         if isinstance(column, TargetColumn) and wraps:
-            signal = self._align_turns(signal, column, position)
+            following = (position.interpolate(signal.t_s) - column.offset) / column.scale
+            values = put_near(signal.values, float(np.median(following)), wraps)
+            signal = replace(signal, values=values)
         if isinstance(column, TargetColumn) and column.full_speed is None:
             low, high = machine.lower[joint], machine.upper[joint]
             middle, half = (high + low) / 2.0, (high - low) / 2.0
@@ -370,13 +375,6 @@ class ColumnMap:
             )
         return replace(signal, values=np.clip(u, -1.0, 1.0))
 
-    def _align_turns(self, signal: Signal, column: TargetColumn, position: Signal) -> Signal:
-        """Return targets in the turn of the positions that follow them."""
-        targets = column.scale * signal.values + column.offset
-        turn = column.scale * abs(column.wraps or 0.0)
-        apart = float(np.median(position.interpolate(signal.t_s) - targets))
-        return replace(signal, values=signal.values + turn * round(apart / turn) / column.scale)
-
 
 def read_column(
     signals: RunSignals, column: Column, middle: float | None, empty: bool = False
@@ -390,8 +388,7 @@ def read_column(
         empty: Accept missing numbers.
     """
     signal = signals.read(column.column, empty, column.wraps)
-    values = column.scale * signal.values + column.offset
-    if column.wraps is not None and column.wraps > 0.0 and middle is not None:
-        turn = column.scale * column.wraps
-        values = values + turn * round((middle - float(np.median(values))) / turn)
-    return replace(signal, values=values)
+    values = signal.values
+    if column.wraps is not None and middle is not None:
+        values = put_near(values, (middle - column.offset) / column.scale, column.wraps)
+    return replace(signal, values=column.scale * values + column.offset)

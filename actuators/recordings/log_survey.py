@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from actuators.recordings.clock_evidence import TimeGuess
+from actuators.recordings.clocks import put_near
 from actuators.recordings.column_map import Column, ColumnMap, JointColumns, TargetColumn
 from actuators.recordings.guess import GivenColumns
 from actuators.recordings.log_signals import Signal
@@ -51,17 +52,13 @@ class JointSurvey:
     def add(self, command: Signal, position: Signal, joint: JointGuess) -> None:
         """Add a run; positions that begin again after a turn are put next to their targets, or to those before."""
         u, q, t_s = command.values, position.values, position.t_s
-        turn = joint.q.modulus or 0.0
-        if turn > 0.0:
-            middle = (
-                (self.lowest + self.highest) / 2 if self.lowest < np.inf else float(np.median(q))
-            )
+        if joint.q.modulus is not None:
+            near = np.median(q) if self.lowest == np.inf else (self.lowest + self.highest) / 2.0
             if joint.kind == "position" and joint.target_wraps is None:
-                target = joint.target_scale * float(np.median(u)) + joint.target_offset
-                middle = target / joint.scale
-            q = q + turn * round((middle - float(np.median(q))) / turn)
-            if joint.target_wraps is not None:
-                u = u + turn * round(float(np.median(np.interp(command.t_s, t_s, q) - u)) / turn)
+                near = (joint.target_scale * np.median(u) + joint.target_offset) / joint.scale
+            q = put_near(q, float(near), joint.q.modulus)
+        if joint.target_wraps is not None:
+            u = put_near(u, float(np.median(np.interp(command.t_s, t_s, q))), joint.target_wraps)
         self.lowest_command = min(self.lowest_command, float(u.min()))
         self.highest_command = max(self.highest_command, float(u.max()))
         self.lowest, self.highest = min(self.lowest, q.min()), max(self.highest, q.max())

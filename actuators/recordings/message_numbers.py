@@ -6,6 +6,7 @@ A stamp is one number, in s. The layout of a ROS MultiArray says how its data li
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -17,6 +18,8 @@ LABELS = ("name", "names", "joint_names", "joint_name")
 """Fields that name the items of the lists beside them."""
 TIMES = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
 """Fields of a time: whole seconds and nanoseconds."""
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+"""A number as text."""
 NO_NUMBERS = ("layout",)
 """Fields that describe their message."""
 
@@ -34,8 +37,8 @@ def list_numbers(message: Any, path: str = "") -> Iterator[tuple[str, float]]:
         time_s = read_time(value) if name.endswith("stamp") else None
         if time_s is not None:
             yield f"{path}{name}", time_s
-        elif _is_number(value):
-            yield f"{path}{name}", float(value)
+        elif (number := read_number(value)) is not None:
+            yield f"{path}{name}", number
         elif _is_sequence(value):
             yield from _list_items(value, f"{path}{name}", labels)
         elif name not in NO_NUMBERS:
@@ -47,10 +50,11 @@ def _list_items(
 ) -> Iterator[tuple[str, float]]:
     if len(items) > LONGEST_LIST:
         return
-    for number, item in enumerate(items):
-        label = labels[number] if labels and len(labels) == len(items) else str(number)
-        if _is_number(item):
-            yield f"{path}[{label}]", float(item)
+    for at, item in enumerate(items):
+        label = labels[at] if labels and len(labels) == len(items) else str(at)
+        number = read_number(item)
+        if number is not None:
+            yield f"{path}[{label}]", number
         elif not _is_sequence(item):
             own = [text for name, text in _list_fields(item) if name in LABELS and text]
             label = own[0] if own and isinstance(own[0], str) else label
@@ -72,17 +76,20 @@ def _list_fields(value: Any) -> Iterator[tuple[str, Any]]:
 
 def read_time(value: Any) -> float | None:
     """Return a time in s: a number, or seconds and nanoseconds; `None` for no time."""
-    if _is_number(value):
-        return float(value)
     fields = dict(_list_fields(value))
     for whole, part in TIMES:
-        if _is_number(fields.get(whole)) and _is_number(fields.get(part)):
-            return float(fields[whole]) + 1e-9 * float(fields[part])
-    return None
+        seconds, nanos = read_number(fields.get(whole)), read_number(fields.get(part))
+        if seconds is not None and nanos is not None:
+            return seconds + 1e-9 * nanos
+    return read_number(value)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+def read_number(value: Any) -> float | None:
+    """Return a number, also one that is written as text; `None` for anything else."""
+    if isinstance(value, str) and NUMBER.fullmatch(value):
+        return float(value)
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return float(value) if is_number else None
 
 
 def _is_sequence(value: Any) -> bool:

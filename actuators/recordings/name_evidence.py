@@ -27,7 +27,7 @@ COMMAND_WORDS = _split("""
     u cmd cmds command commands commanded control ctrl action actions target targets tgt
     goal set setpoint setpoints sp desired des ref reference demand request valve flow pwm duty
     soll sollwert sollwinkel sollposition stellwert vorgabe consigne consigna comando aspos input
-    joystick lever
+    joystick lever trajectory
 """)
 MEASURED_WORDS = _split("""
     q state states actual act meas measured ms feedback fb obs observation encoder enc

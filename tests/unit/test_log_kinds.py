@@ -122,6 +122,7 @@ def write_dates(form: str) -> list[str]:
         ("marked.dat", ["# " + " ".join(NAMES), *PLAIN], "utf-8"),
         ("quotes.csv", [",".join(NAMES), *QUOTED], "utf-8"),
         ("lines.jsonl", NESTED, "utf-8"),
+        ("texts.jsonl", [re.sub(r"(-?\d[-.e\d]*)", r'"\1"', line) for line in NESTED], "utf-8"),
         ("fortran.dat", [" ".join(NAMES), *FORTRAN], "utf-8"),
         ("grouped.csv", [";".join(GROUPED_NAMES), *GROUPED], "utf-8"),
         ("labview.lvm", [*LABVIEW, "\t".join([*NAMES, "Comment"]), *TABBED], "utf-8"),
@@ -162,15 +163,20 @@ def test_units_behind_names_are_read(names: tuple[str, ...], factor: float) -> N
 
 @pytest.mark.parametrize(
     ("unit", "factor", "text"),
-    [("furlong", 1.0, "its unit 'furlong' is not known"), ("rad", 57.3, "rad is 6.4 turns: degrees?")],
-)  # fmt: skip
+    [
+        ("furlong", 1.0, "its unit 'furlong' is not known"),
+        ("rad", 57.3, "rad is 6.4 turns: degrees?"),
+        ("deg", 1.0, "is the log in rad?"),
+        ("mm", 0.4, "is the log in m?"),
+        ("", 1.0 / math.tau, "no name has a unit"),
+        ("", 6.0, "no name has a unit"),
+    ],
+)
 def test_a_unit_that_is_not_known_or_cannot_be_is_never_sure(
     unit: str, factor: float, text: str
 ) -> None:
-    names = (
-        "t [s]",
-        *(f"{one} [{unit}]" for one in ("hip cmd", "hip pos", "knee cmd", "knee pos")),
-    )
+    end = f" [{unit}]" if unit else ""
+    names = ("t [s]", *(f"{one}{end}" for one in ("hip cmd", "hip pos", "knee cmd", "knee pos")))
     write_text("a.csv", make_rows() * [1.0, factor, factor, factor, factor], names)
     done = try_draft("log.input=a.csv")
     assert text in done.out
