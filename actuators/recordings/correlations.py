@@ -20,6 +20,9 @@ GRID_ROWS = 8000
 HIGH_CORRELATION, CLEAR_CORRELATION, NO_CORRELATION = 0.95, 0.8, 0.3
 """Correlations that leave a tenth, a third and nine tenths of the variance unexplained."""
 
+MARGIN = 0.1
+"""A partner that correlates better by so much contradicts a pair."""
+
 
 class Correlations:
     """Commands and positions of a run on one grid, and how they follow each other.

@@ -17,11 +17,12 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from actuators.recordings.clock_evidence import TimeGuess
+from actuators.recordings.column_assignment import read_columns
 from actuators.recordings.guess import GivenColumns, Guess
+from actuators.recordings.joint_evidence import JointGuess
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import RunSignals
 from actuators.recordings.log_survey import JointSurvey, LogSurvey, measure_logs
-from actuators.recordings.number_evidence import JointGuess, read_columns
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import RecordingError
 

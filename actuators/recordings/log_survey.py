@@ -14,8 +14,8 @@ from actuators.recordings.clock_evidence import TimeGuess
 from actuators.recordings.clocks import put_near
 from actuators.recordings.column_map import Column, ColumnMap, JointColumns, TargetColumn
 from actuators.recordings.guess import GivenColumns
+from actuators.recordings.joint_evidence import JointGuess
 from actuators.recordings.log_signals import Signal
-from actuators.recordings.number_evidence import JointGuess
 
 GAP_PERIODS = 4
 """Least number of periods without a sample that split a log; loggers without real time skip up to two."""
