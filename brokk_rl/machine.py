@@ -106,6 +106,14 @@ class Joint:
         return "rad" if self.kind == "hinge" else "m"
 
     def check(self) -> None:
+        if self.lower.value >= self.upper.value:
+            raise ConfigError(
+                f"joint {self.name}: expected upper above lower, got {self.upper.value} and {self.lower.value}"
+            )
+        if self.max_speed.value <= 0.0:
+            raise ConfigError(
+                f"joint {self.name}: expected max_speed above 0, got {self.max_speed.value}"
+            )
         if not self.lower.value <= self.home <= self.upper.value:
             raise ConfigError(
                 f"joint {self.name}: home {self.home} lies outside [{self.lower.value}, {self.upper.value}]"

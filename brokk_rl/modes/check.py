@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import logging
 import re
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from annotated_types import Interval
@@ -18,9 +19,10 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.kinematics import Gravity, compute_tool_kinematics
-from brokk_rl.machine import Dimension, Machine
+from brokk_rl.machine import Body, Dimension, Joint, Machine
 from brokk_rl.plain_files import parse_model
 from brokk_rl.session import Session, write_bytes, write_json, write_text
+from brokk_rl.sim.model_choices import ModelChoices
 from brokk_rl.spec import WorldCount, name_spec, spec
 
 if TYPE_CHECKING:
@@ -40,39 +42,29 @@ JOINT_COLUMNS = {
     "yield_force": "yield force",
 }
 """Figures of a joint in the table."""
+LARGEST_REACH_M = 80.0
+"""Reach beyond which lengths are doubted: the longest booms of concrete pumps have some 70 m."""
 JOINT_UNITS = "rad, rad/s, Nm; of a slide m, m/s, N. The yield force counts beyond the weight."
 
 
 @spec
-class CheckSubject:
+class CheckSubject(ModelChoices):
     """Subject and size of a check.
 
     Attributes:
         model: URDF or MJCF of a new machine; `None` checks `machine=…`.
         name: Name of the new machine; `None`: that of its file.
-        chain: Last joint or link of the arm in it, its first and last link, or all its joints; `None`
-            for the longest chain.
-        tip: Site or link of the tool point; `None`: a frame named so, else the far end.
-        gripper: Whether the first joint of the gripper is the last one of the machine.
-        drive: What moves the joints; `auto` reads it off the model.
-        command: Quantity that commands set; `auto`: that of the model's actuators.
-        packages: Folders in which meshes of `package://…` are searched first.
         num_poses: Random poses from which the reach is read.
         num_starts: Starts of the task that are drawn, and worlds that are simulated.
     """
 
     model: str | None
     name: str | None
-    chain: str | tuple[str, ...] | None
-    tip: str | None
-    gripper: bool
-    drive: Literal["auto", "electric", "hydraulic"]
-    command: Literal["auto", "valve", "velocity", "position", "torque"]
-    packages: tuple[str, ...]
     num_poses: Annotated[int, Interval(ge=1, le=10**7)]
     num_starts: WorldCount
 
     def check(self) -> None:
+        super().check()
         if self.model is not None:
             parse_model(Path(self.model))
         if self.model is None and (self.chain or self.tip or self.name):
@@ -81,13 +73,6 @@ class CheckSubject:
             raise ConfigError(
                 f"name: expected letters, digits and _, got '{self.name}'; it names files and recordings"
             )
-
-    @property
-    def chain_names(self) -> tuple[str, ...]:
-        """Names of `chain`; none for the longest."""
-        if isinstance(self.chain, str):
-            return (self.chain,)
-        return self.chain or ()
 
 
 @dataclass
@@ -119,21 +104,6 @@ class MachineCheck:
         if self.unfit:
             return "It can be simulated, but not trained with this task and actuator."
         return f"It can be simulated and trained. Missing, guessed or mended: {len(self.missing)}."
-
-    def group_remarks(self) -> dict[str, list[str]]:
-        """Return all findings by their kind, where there are some."""
-        kinds = {"problem": self.problems, "not fitting": self.unfit, "remark": self.missing}
-        return {kind: texts for kind, texts in kinds.items() if texts}
-
-    def list_joints(self) -> list[list[str | None]]:
-        """Return the rows of the table of joints."""
-        rows = []
-        for name, figures in self.joints.items():
-            values = [figures[key] for key in JOINT_COLUMNS]
-            rows.append(
-                [name, *(None if one is None else f"{round(one, 9):.4g}" for one in values)]
-            )
-        return rows
 
     def list_facts(self) -> dict[str, str]:
         """Return reach, contact and starts in words."""
@@ -182,7 +152,7 @@ class Check:
         found = check_machine(machine, self.subject.num_poses, self.session.generator("check"))
         found.missing += remarks
         drawn = None if is_new else self._draw_starts(machine, found)
-        if machine.has_bodies and not found.problems:
+        if machine.has_bodies and machine.mjcf is not None:
             self._try_simulation(machine, found, drawn)
         facts = {
             "schema": 1,
@@ -197,28 +167,19 @@ class Check:
             file = folder / f"{machine.name}.yaml"
             log.info("machine: %s, beside its MJCF and meshes", file)
             actuator = "servo" if machine.interface == "position" else "lag"
-            print_text(
-                f"next, with a task: brokk mode=check machine=@{file} task=… actuator={actuator}"
-            )
+            parts = f"machine=@{file} actuator={actuator}"
+            print_text("next, with the package of docs/tutorials/your_machine.md:")
+            print_text(f"brokk mode=check task=my_trace {parts}")
+            print_text(f"brokk experiment=my_trace {parts} session.out={folder}_trace")
         log.info("the same as data: %s", folder / "check.json")
 
     def _import_model(self) -> tuple[Machine, list[str]]:
         """Return the machine of the model and remarks about it; writes its files."""
-        from brokk_rl.sim.arm_model import ModelChoices
         from brokk_rl.sim.model_import import import_model
 
-        subject = self.subject
-        path = Path(subject.model or "")
-        name = subject.name or re.sub(r"\W+", "_", path.stem)
-        choices = ModelChoices(
-            chain=subject.chain_names,
-            tip=subject.tip,
-            gripper=subject.gripper,
-            drive=subject.drive,
-            command=subject.command,
-            packages=subject.packages,
-        )
-        imported = import_model(path, name, choices)
+        path = Path(self.subject.model or "")
+        name = self.subject.name or re.sub(r"\W+", "_", path.stem)
+        imported = import_model(path, name, self.subject)
         folder = self.session.folder
         for file, data in imported.meshes.items():
             write_bytes(folder / file, data)
@@ -252,6 +213,7 @@ class Check:
 
         from brokk_rl.commands import accept_speeds
         from brokk_rl.sim.machine_trial import try_machine
+        from brokk_rl.sim.model import list_touching
 
         num, cpu = self.subject.num_starts, torch.device("cpu")
         actuator: ActuatorModel | None = None
@@ -262,11 +224,18 @@ class Check:
         except BrokkError as error:
             found.unfit.append(str(error))
         try:
-            fault, is_endured = try_machine(machine, self.sim, actuator, num, drawn)
-            if fault:
-                (found.missing if is_endured else found.problems).append(fault)
-        except BrokkError as error:
+            world: Any = self.sim.build(machine, cpu, num)
+        except (BrokkError, ValueError) as error:
             found.problems.append(str(error))
+            return
+        found.contact = list_touching(world.model)
+        if not found.contact:
+            found.missing.append(
+                "no link can touch anything: contact forces stay 0; give the tool's geoms contype"
+            )
+        fault, is_endured = try_machine(machine, world, actuator, drawn)
+        if fault:
+            (found.missing if is_endured else found.problems).append(fault)
 
 
 def check_machine(machine: Machine, num_poses: int, generator: np.random.Generator) -> MachineCheck:
@@ -284,75 +253,39 @@ def check_machine(machine: Machine, num_poses: int, generator: np.random.Generat
             "lowest_m": float(height_m.min()),
             "share_above_ground": float((height_m > 0.0).mean()),
         }
+        if distance_m.max() > LARGEST_REACH_M:
+            found.missing.append(
+                f"a reach of {distance_m.max():.3g} m is doubted: lengths count in m, not mm"
+            )
         load = np.abs(Gravity(machine).load(q)).max(0)
-    _check_joints(machine, load, found)
-    _check_model(machine, found)
-    _list_missing(machine, found)
-    return found
-
-
-def _check_joints(machine: Machine, load: np.ndarray | None, found: MachineCheck) -> None:
-    """Fill in the joints, and name those whose limits, speed or force cannot be right."""
+        yields = np.array([body.yield_force.value for body in machine.bodies])
+        if weak := [
+            joint.name
+            for joint, is_weak in zip(machine.joints, yields < load, strict=True)
+            if is_weak
+        ]:
+            found.missing.append(
+                f"{', '.join(weak)}: the yield force is less than the weight in the worst pose. The drive counts it "
+                "beyond the weight, so this is allowed; look at masses (kg) and force limits"
+            )
     for j, joint in enumerate(machine.joints):
         travel, speed = joint.upper.value - joint.lower.value, joint.max_speed.value
-        yield_force = joint.body.yield_force.value if joint.body else None
         found.joints[joint.name] = {
             "lower": joint.lower.value,
             "upper": joint.upper.value,
             "home": joint.home,
             "max_speed": speed,
-            "travel_s": travel / speed if speed > 0 else None,
+            "travel_s": travel / speed,
             "largest_weight": None if load is None else float(load[j]),
-            "yield_force": yield_force,
+            "yield_force": joint.body.yield_force.value if joint.body else None,
         }
-        if travel <= 0:
-            found.problems.append(f"{joint.name}: upper must be above lower")
-        if speed <= 0:
-            found.problems.append(f"{joint.name}: max_speed must be above 0, got {speed:g}")
-        if load is not None and yield_force is not None and yield_force < load[j]:
-            found.missing.append(
-                f"{joint.name}: yield_force {yield_force:g} is less than the weight it carries in its "
-                f"worst pose, {load[j]:.3g}; the drive counts it beyond the weight, so this is allowed"
-            )
-
-
-def _check_model(machine: Machine, found: MachineCheck) -> None:
-    """Compile the MJCF with the machine's numbers, and list the links that touch."""
-    from brokk_rl.sim.model import compile_model, list_touching
-
     if not machine.has_bodies or machine.mjcf is None:
         found.missing.append(
             "without joints[].body, tool_m and mjcf it can be recorded and identified, not simulated"
         )
-        return
-    try:
-        model = compile_model(machine, machine.period_s / 10.0)
-    except (BrokkError, ValueError) as error:
-        found.problems.append(str(error))
-        return
-    found.contact = [model.body(body).name for body in list_touching(model)]
-    if not found.contact:
-        found.missing.append(
-            "no link can touch anything: contact forces stay 0; give the tool's geoms contype"
-        )
-
-
-def _list_missing(machine: Machine, found: MachineCheck) -> None:
-    """Name the numbers of low confidence, and the parts that only some modes need."""
-    guessed = []
+    guessed = [*_list_guesses(machine.tool_m, "tool_m")]
     for joint in machine.joints:
-        numbers = {"lower": joint.lower, "upper": joint.upper, "max_speed": joint.max_speed}
-        if body := joint.body:
-            numbers |= {
-                "mass_kg": body.mass_kg,
-                "yield_force": body.yield_force,
-                "stiffness": body.stiffness,
-            }
-            numbers |= {f"origin_m.{axis}": body.origin_m[i] for i, axis in enumerate("xyz")}
-        guessed += [f"{joint.name}.{name}" for name, one in numbers.items() if _is_guessed(one)]
-    for axis, one in zip("xyz", machine.tool_m or (), strict=False):
-        if _is_guessed(one):
-            guessed.append(f"tool_m.{axis}")
+        guessed += _list_guesses(joint, joint.name)
     if guessed:
         found.missing.append(
             f"{len(guessed)} numbers of low confidence, to measure or to randomise widely: {', '.join(guessed)}"
@@ -361,21 +294,36 @@ def _list_missing(machine: Machine, found: MachineCheck) -> None:
         found.missing.append(
             "levers: guidance of a person (mode=deploy) needs the lever of each joint"
         )
+    return found
 
 
-def _is_guessed(dimension: Dimension) -> bool:
-    return dimension.confidence == "low"
+def _list_guesses(value: object, name: str) -> Iterator[str]:
+    """Yield the numbers of low confidence by their keys in the machine's file."""
+    if isinstance(value, Dimension):
+        if value.confidence == "low":
+            yield name
+    elif isinstance(value, tuple):
+        for axis, one in zip("xyz", value, strict=False):
+            yield from _list_guesses(one, f"{name}.{axis}")
+    elif isinstance(value, Joint | Body):
+        for key, one in vars(value).items():
+            yield from _list_guesses(one, f"{name}.{key}")
 
 
 def _show(machine: Machine, found: MachineCheck) -> None:
     """Print the verdict, the joints, and every remark."""
     print_text(f"{machine.name}: {found.summarise()}")
-    print_table(["joint", *JOINT_COLUMNS.values()], found.list_joints())
+    rows = []
+    for name, figures in found.joints.items():
+        values = [figures[key] for key in JOINT_COLUMNS]
+        rows.append([name, *(None if one is None else f"{round(one, 9):.4g}" for one in values)])
+    print_table(["joint", *JOINT_COLUMNS.values()], rows)
     print_text(JOINT_UNITS)
     for name, text in found.list_facts().items():
         print_text(f"{name}: {text}")
+    kinds = {"problem": found.problems, "not fitting": found.unfit, "remark": found.missing}
     remarks = []
-    for kind, texts in found.group_remarks().items():
+    for kind, texts in kinds.items():
         remarks += [(kind, text) for text in texts]
     if remarks:
         print_table([], remarks)

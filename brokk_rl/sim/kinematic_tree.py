@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import mujoco
 
-from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.errors import list_choices
 from brokk_rl.sim.model_source import KINDS, ModelSource
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb|pincer", re.IGNORECASE)
@@ -53,7 +53,7 @@ class KinematicTree:
         self.has_cylinders = False
         self._passive: dict[int, str] = {}
         for joint in range(self.model.njnt):
-            leader = source.followers.get(self.model.joint(joint).name)
+            leader = source.followers.get(joint)
             if leader is not None:
                 self._passive[joint] = f"follows {leader}, so it is no joint of its own"
             elif int(self.model.jnt_type[joint]) not in KINDS:
@@ -67,7 +67,7 @@ class KinematicTree:
         """Return the arm: the one that is named, else the longest chain.
 
         Args:
-            chain: Last joint or link, first and last link, or all joints; empty for the longest.
+            chain: Last joint or link, or first and last; empty for the longest.
             tip: Site or link of the tool point, which the chain must move.
             with_gripper: Whether the first joint of the gripper is the last of the chain.
 
@@ -78,20 +78,20 @@ class KinematicTree:
         if chain:
             joints = self._choose_named(chain)
         else:
-            joints, gripper = self._choose_longest()
-            beyond = self.list_above(self._find_frame(tip)) if tip else []
-            if tip and not set(beyond) <= {*joints, *gripper}:
+            joints = self._choose_longest()
+            gripper = self._list_behind(joints)
+            beyond = self._list_up_to(tip) if tip else []
+            if not set(beyond) <= {*joints, *gripper}:
                 joints, gripper = beyond, []
         if with_gripper and gripper:
-            joints = [*joints, gripper[0]]
-            gripper = gripper[1:]
+            joints.append(gripper.pop(0))
         root = self._find_root(joints[0])
+        used = {*self._passive, *joints, *gripper}
         others = []
         for joint in range(self.model.njnt):
-            is_used = joint in self._passive or joint in joints or joint in gripper
-            if not is_used and self._find_root(joint) == root:
+            if joint not in used and self._find_root(joint) == root:
                 others.append(joint)
-        return ArmChain(list(joints), root, gripper, others)
+        return ArmChain(joints, root, gripper, others)
 
     def name(self, joint: int) -> str:
         """Return the name of a joint; one without is called by its body."""
@@ -112,27 +112,12 @@ class KinematicTree:
             body = int(self.model.body_parentid[body])
         return found
 
-    def _find_frame(self, name: str) -> int:
-        """Return the body of a site or body of this name."""
-        model = self.model
-        bodies = {model.body(body).name: body for body in range(1, model.nbody)}
-        for site in range(model.nsite):
-            bodies[model.site(site).name] = int(model.site_bodyid[site])
-        if name not in bodies:
-            raise ConfigError(
-                f"subject.tip={name}: {self._source.path.name} has no such site or link; "
-                f"{list_choices(name, bodies)}"
-            )
-        return bodies[name]
-
     def describe_held(self, chain: ArmChain) -> list[str]:
         """Return sentences about all joints that the machine does not have."""
         said = list(self.loops)
-        inside = self.list_above(int(self.model.jnt_bodyid[chain.joints[-1]]), driven=False)
         reasons: dict[str, list[int]] = {}
         for joint, why in self._passive.items():
-            same_robot = int(self.model.body_rootid[self.model.jnt_bodyid[joint]]) == chain.root
-            if same_robot and why != CLOSES_LOOP and not self._is_free(joint):
+            if self._find_root(joint) == chain.root and why != CLOSES_LOOP:
                 reasons.setdefault(why, []).append(joint)
         for why, joints in reasons.items():
             said.append(f"{self.list_names(joints)} {why}; held where drawn.")
@@ -146,26 +131,34 @@ class KinematicTree:
                 f"{self.list_names(chain.left_out)} are not part of the chain and are held where they are drawn; "
                 "subject.chain=<joint or link> chooses another."
             )
-        if any(self._is_free(joint) for joint in inside):
-            said.append(
-                f"The base ({self.model.body(chain.root).name}) floats in the model; here it stands still."
-            )
         return said
 
     def _list_chains(self) -> list[tuple[int, ...]]:
-        """Driven joints from the base to each end of the model, the shortest first."""
+        """Driven joints from the base to each end of the model."""
         paths = {tuple(self.list_above(body)) for body in range(1, self.model.nbody)}
         inner = {path[:place] for path in paths for place in range(len(path))}
-        return sorted(
-            paths - inner - {()}, key=lambda path: (len(path), [-joint for joint in path])
-        )
+        return sorted(paths - inner - {()})
 
-    def _is_free(self, joint: int) -> bool:
-        return int(self.model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_FREE
+    def _list_behind(self, joints: Sequence[int]) -> list[int]:
+        """Return the driven joints that are moved by all of `joints`."""
+        start = tuple(joints)
+        found: set[int] = set()
+        for chain in self._chains:
+            if chain[: len(start)] == start:
+                found.update(chain[len(start) :])
+        return sorted(found)
+
+    def _find_root(self, joint: int) -> int:
+        return int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
+
+    def _is_slide(self, joint: int) -> bool:
+        return int(self.model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
 
     def _is_locked(self, joint: int) -> bool:
         damping = self.model.dof_damping[self.model.jnt_dofadr[joint]]
         return bool(damping > LOCK and not self.model.jnt_limited[joint])
+
+    # loops
 
     def _cut_loops(self) -> None:
         """Take the passive side of each loop that `<equality>` closes out of the tree."""
@@ -177,65 +170,64 @@ class KinematicTree:
             if model.eq_objtype[number] == mujoco.mjtObj.mjOBJ_SITE:
                 ends = [int(model.site_bodyid[end]) for end in ends]
             paths = [self.list_above(end) for end in ends]
-            if not all(paths):  # a mocap body or the world
-                continue
             sides = [[joint for joint in paths[i] if joint not in paths[1 - i]] for i in range(2)]
             ranked = sorted(range(2), key=lambda i: self._rank_side(ends[i], sides[i]))
             passive, kept = sides[ranked[0]], sides[ranked[1]]
-            if not passive or not kept:
+            if not passive or not kept:  # also a mocap body or the world
                 continue
             self.has_cylinders |= any(self._is_slide(joint) for joint in passive)
             names = self.list_names(passive)
-            for joint in passive:
-                self._passive[joint] = CLOSES_LOOP
+            self._passive |= dict.fromkeys(passive, CLOSES_LOOP)
             self.loops.append(
                 f"<equality> closes a loop of {names} with {self.list_names(kept)}; {names} are left out, and "
                 f"{self.name(kept[-1])} is driven directly."
             )
 
-    def _rank_side(self, end: int, side: list[int]) -> tuple[bool, bool, float]:
-        """Return how much a side of a loop is the arm: joints go on behind it, no slide, mass."""
+    def _rank_side(self, end: int, side: list[int]) -> tuple[bool, bool, int, float]:
+        """Return how much a side of a loop is the arm: joints go on behind it, no slide, joints, mass."""
         path = tuple(self.list_above(end))
         goes_on = any(
             len(chain) > len(path) and chain[: len(path)] == path for chain in self._list_chains()
         )
         has_slide = any(self._is_slide(joint) for joint in side)
-        return goes_on, not has_slide, float(self.model.body_subtreemass[end])
+        return goes_on, not has_slide, len(side), float(self.model.body_subtreemass[end])
 
-    def _is_slide(self, joint: int) -> bool:
-        return int(self.model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
+    # the longest chain
 
-    def _choose_longest(self) -> tuple[tuple[int, ...], list[int]]:
-        """Return the joints of the longest chain, and those of the gripper at its end.
+    def _choose_longest(self) -> list[int]:
+        """Return the joints of the longest chain, without a gripper.
 
         Raises:
             ConfigError: Nothing moves, or several robots, legs or arms are alike.
         """
-        chains = self._list_standing()
-        arm: tuple[int, ...] = ()
-        while True:
-            roots = {self._find_root(chain[0]) for chain in chains}
-            branches: dict[int, tuple[int, ...]] = {}
-            for chain in chains:
-                if len(chain) > len(arm):
-                    root = self._find_root(chain[0])
-                    branches[chain[len(arm)] if len(roots) == 1 else root] = chain
-            ranked = sorted(branches.values(), key=lambda chain: (-len(chain), chain))
-            if not ranked:
-                return arm, []
-            if self._is_gripper(arm, ranked):
-                behind = sorted({joint for chain in chains for joint in chain[len(arm) :]})
-                return arm, behind
-            chosen = self._choose_branch(arm, ranked)
-            if len(roots) > 1:
-                root = self._find_root(chosen[0])
-                chains = [chain for chain in chains if self._find_root(chain[0]) == root]
-            else:
-                arm = chosen[: len(arm) + 1]
-                chains = [chain for chain in chains if chain[: len(arm)] == arm]
+        chains = self._list_candidates()
+        palms = {self._cut_gripper(chain) for chain in chains} - set(chains)
+        arms = []
+        for chain in chains:
+            above = [palm for palm in palms if chain[: len(palm)] == palm]
+            arms.append(min(above, key=len, default=chain))
+        arms = sorted(set(arms))
+        longest = max(arms, key=len)
+        alike = []
+        for arm in arms:
+            num_own = len(set(arm) - set(longest))
+            is_shorter = len(arm) == len(longest) - 1 and num_own > 1
+            if len(arm) == len(longest) or is_shorter:
+                alike.append(arm)
+        shared = [joint for joint in longest if all(joint in arm for arm in alike)]
+        num_apart = len(longest) - len(shared)
+        if len(alike) == 1 or _are_fingers(len(shared), num_apart):
+            return shared
+        ends = [self.name(arm[-1]) for arm in alike]
+        raise self._source.refuse(
+            f"{len(alike)} chains of {num_apart} joints are alike ({', '.join(ends)}): legs, arms, wheels, or robots of "
+            "a scene. A machine is one arm on a base that stands still, so a robot that walks cannot be trained "
+            "here (mjlab and Isaac Lab can). Name the last joint of an arm: subject.chain="
+            + " or subject.chain=".join(ends)
+        )
 
-    def _list_standing(self) -> list[tuple[int, ...]]:
-        """Return the chains of robots that stand, or of all where none has a chain of two joints."""
+    def _list_candidates(self) -> list[tuple[int, ...]]:
+        """Return chains of robots that stand and are driven, or all where there are none."""
         if not self._chains:
             passive = [f"{self.name(joint)} {why}" for joint, why in self._passive.items()]
             why = f" ({'; '.join(passive)})" if passive else ""
@@ -243,114 +235,72 @@ class KinematicTree:
                 f"it has no joint that moves{why}; a fragment that a scene includes has none either: "
                 "give the scene"
             )
-        standing = []
-        for chain in self._chains:
-            first = int(self.model.body_jntadr[self._find_root(chain[0])])
-            if first < 0 or not self._is_free(first):
-                standing.append(chain)
-        return standing if max(map(len, standing), default=0) > 1 else self._chains
-
-    def _find_root(self, joint: int) -> int:
-        return int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
-
-    def _is_gripper(self, arm: tuple[int, ...], ranked: list[tuple[int, ...]]) -> bool:
-        """Return whether the branches behind an arm are fingers: named so, or short and alike."""
-        depths = [len(chain) - len(arm) for chain in ranked]
-        if not arm or depths[0] >= max(len(arm), 2):
-            return False
-        first = ranked[0][len(arm)]
-        body = self.model.body(int(self.model.jnt_bodyid[first])).name
-        if GRIPPER.search(f"{self.name(first)} {body}"):
-            return len(arm) > 1 or len(ranked) > 1
-        return len(arm) > 1 and depths.count(depths[0]) > 1
-
-    def _choose_branch(
-        self, arm: tuple[int, ...], ranked: list[tuple[int, ...]]
-    ) -> tuple[int, ...]:
-        """Return the chain with which an arm goes on.
-
-        Raises:
-            ConfigError: Several are alike: robots, legs, fingers or two arms.
-        """
-        depths = [len(chain) - len(arm) for chain in ranked]
-        most = depths[0]
-        alike = []
-        for chain, depth in zip(ranked, depths, strict=True):
-            if depth == most or (depth == most - 1 and depth > 1):
-                alike.append(chain)
-        if most > 1:
-            alike = [chain for chain in alike if self._has_drive(arm, chain)] or alike
-        if len(alike) == 1:
-            return alike[0]
-        ends = [self.name(chain[-1]) for chain in alike]
-        roots = {self._find_root(chain[0]) for chain in alike}
-        if len(roots) > 1:
-            names = ", ".join(self.model.body(root).name for root in sorted(roots))
-            raise self._source.refuse(
-                f"{len(alike)} robots ({names}) have {most} joints each; name the last joint of "
-                f"one: subject.chain={' or subject.chain='.join(ends)}"
-            )
-        base = int(self.model.body_parentid[self.model.jnt_bodyid[alike[0][len(arm)]]])
-        where = self.model.body(base).name
-        if most == 1 and not arm:
-            raise self._source.refuse(
-                f"{len(alike)} single joints hang on '{where}' side by side ({', '.join(ends)}), such as wheels; "
-                "expected a chain of joints, an arm. Name one: subject.chain=" + ends[0]
-            )
-        kind = "two arms or legs" if len(alike) == 2 else "legs or fingers"
-        raise self._source.refuse(
-            f"{len(alike)} chains of {most} joints leave '{where}' ({', '.join(ends)}): {kind}. A machine is one "
-            f"arm on a base that stands still, so a robot that walks cannot be trained here (mjlab and Isaac Lab "
-            f"can). One of them as an arm: subject.chain={ends[0]}"
-        )
-
-    def _has_drive(self, arm: tuple[int, ...], chain: tuple[int, ...]) -> bool:
-        """Return whether an actuator moves a joint of a branch behind an arm."""
         model = self.model
         is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
         moved = set(model.actuator_trnid[is_joint, 0].tolist())
-        branch = chain[: len(arm) + 1]
-        behind = {
-            joint
-            for one in self._chains
-            if one[: len(branch)] == branch
-            for joint in one[len(arm) :]
-        }
-        return not moved.isdisjoint(behind)
+        standing, driven = [], []
+        for chain in self._chains:
+            if not self._floats(self._find_root(chain[0])):
+                standing.append(chain)
+        if max(map(len, standing), default=0) < 2:
+            standing = self._chains
+        for chain in standing:
+            if not moved.isdisjoint(chain):
+                driven.append(chain)
+        return driven or standing
+
+    def _floats(self, root: int) -> bool:
+        first = int(self.model.body_jntadr[root])
+        return first >= 0 and self.model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE
+
+    def _cut_gripper(self, chain: tuple[int, ...]) -> tuple[int, ...]:
+        """Return a chain up to the first joint that is named as one of a gripper."""
+        for place, joint in enumerate(chain):
+            link = self.model.body(int(self.model.jnt_bodyid[joint])).name
+            if GRIPPER.search(f"{self.name(joint)} {link}"):
+                is_end = _are_fingers(place, len(chain) - place)
+                return chain[:place] if is_end else chain
+        return chain
+
+    # a chain by name
 
     def _choose_named(self, names: Sequence[str]) -> list[int]:
-        """Return the joints of a chain that is named by its end, its ends, or its joints."""
-        model = self.model
-        by_name = {self.name(joint): joint for joint in range(model.njnt)}
-        found: list[tuple[int | None, int]] = []
-        for name in names:
-            if name in by_name:
-                joint = by_name[name]
-                if joint in self._passive:
-                    raise self._source.refuse(f"subject.chain: {name} {self._passive[joint]}")
-                found.append((joint, int(model.jnt_bodyid[joint])))
-                continue
-            bodies = [i for i in range(1, model.nbody) if model.body(i).name == name]
-            if not bodies:
-                listed = [*by_name, *(model.body(i).name for i in range(1, model.nbody))]
+        """Return the joints up to the one that is named, or between two."""
+        path = self._list_up_to(names[-1])
+        if len(names) > 1:
+            before = self._list_up_to(names[0])
+            if not set(before) <= set(path):
                 raise self._source.refuse(
-                    f"subject.chain: there is no joint or link '{name}'; {list_choices(name, listed)}"
+                    f"subject.chain: {names[0]} does not lie on the way to {names[-1]}"
                 )
-            found.append((None, bodies[0]))
-        joint, end = found[-1]
-        path = self.list_above(end)
-        if joint is not None:
-            path = path[: path.index(joint) + 1]
-        chosen = [one for one, _ in found]
-        if len(found) > 1 and None not in chosen:
-            if beside := [self.name(one) for one in chosen if one is not None and one not in path]:
-                raise self._source.refuse(
-                    f"subject.chain: {', '.join(beside)} do not lie on the way to {names[-1]}"
-                )
-            return [one for one in path if one in chosen]
-        if len(found) > 1:
-            before = self.list_above(found[0][1])
-            path = [one for one in path if one not in before]
+            if before and self.name(before[-1]) == names[0]:
+                before.pop()
+            path = path[len(before) :]
         if not path:
             raise self._source.refuse(f"subject.chain={','.join(names)}: no joint moves it")
         return path
+
+    def _list_up_to(self, name: str) -> list[int]:
+        """Return the joints up to a joint, or those that move a link or a site."""
+        model = self.model
+        joints = {self.name(joint): joint for joint in range(model.njnt)}
+        bodies = {model.body(body).name: body for body in range(1, model.nbody)}
+        bodies |= {
+            model.site(site).name: int(model.site_bodyid[site]) for site in range(model.nsite)
+        }
+        if name in bodies and name not in joints:
+            return self.list_above(bodies[name])
+        if name not in joints:
+            raise self._source.refuse(
+                f"there is no joint, link or site '{name}'; {list_choices(name, [*joints, *bodies])}"
+            )
+        joint = joints[name]
+        if joint in self._passive:
+            raise self._source.refuse(f"{name} {self._passive[joint]}")
+        path = self.list_above(int(model.jnt_bodyid[joint]))
+        return path[: path.index(joint) + 1]
+
+
+def _are_fingers(num_arm: int, num_behind: int) -> bool:
+    """Return whether joints behind an arm are few enough to be a gripper's."""
+    return num_arm > 1 and num_behind < num_arm

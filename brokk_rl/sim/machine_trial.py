@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from brokk_rl.contracts.actuator import ActuatorModel
-from brokk_rl.contracts.world import Simulator
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import FASTEST_MODE, find_fastest_mode
@@ -25,9 +24,8 @@ MOST_FAULTS = 5e-4
 
 def try_machine(
     machine: Machine,
-    sim: Simulator,
+    world: Any,
     actuator: ActuatorModel | None,
-    num_worlds: int,
     drawn: dict[str, torch.Tensor] | None,
 ) -> tuple[str | None, bool]:
     """Simulate a second; return what diverged and what to change, and whether a training endures it.
@@ -39,13 +37,12 @@ def try_machine(
 
     Args:
         machine: The machine.
-        sim: Builds the world.
+        world: Its world, as `sim=native` builds it.
         actuator: How speeds become motion; `None`: the joints move as they are asked to.
-        num_worlds: Worlds.
         drawn: Starts of the task; `None`: random poses with nothing to touch.
     """
     generator = torch.Generator().manual_seed(0)
-    world: Any = sim.build(machine, torch.device("cpu"), num_worlds)
+    num_worlds = world.num_worlds
     everywhere = torch.ones(num_worlds, dtype=torch.bool)
     if drawn is None:
         lower, upper = (torch.tensor(end) for end in (machine.lower, machine.upper))

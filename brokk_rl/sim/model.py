@@ -111,15 +111,12 @@ def mask_normal_forces(model: mujoco.MjModel) -> np.ndarray:
     return chosen
 
 
-def list_touching(model: mujoco.MjModel) -> list[int]:
-    """Return the bodies that move and may touch something."""
+def list_touching(model: mujoco.MjModel) -> list[str]:
+    """Return the names of the bodies that move and may touch something."""
     can_touch = (model.geom_contype | model.geom_conaffinity) != 0
-    moving = {
-        int(body)
-        for body in model.geom_bodyid[can_touch]
-        if model.body_dofnum[model.body_weldid[body]]
-    }
-    return sorted(moving)
+    bodies = np.unique(model.geom_bodyid[can_touch])
+    moves = model.body_dofnum[model.body_weldid[bodies]] > 0
+    return [model.body(body).name for body in bodies[moves]]
 
 
 def _read_mjcf(machine: Machine) -> mujoco.MjSpec:

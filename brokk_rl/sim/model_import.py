@@ -13,9 +13,10 @@ import numpy as np
 import yaml
 
 from brokk_rl.machine import Machine
-from brokk_rl.sim.arm_model import TIP, ArmModel, ModelChoices, normalise_axis
+from brokk_rl.sim.arm_model import LEAST_KG, TIP, ArmModel, normalise_axis
 from brokk_rl.sim.model import FASTEST_MODE, compute_inertia, find_fastest_mode
-from brokk_rl.sim.model_source import KINDS, UNITS, JointLimits
+from brokk_rl.sim.model_choices import ModelChoices
+from brokk_rl.sim.model_source import KINDS, UNITS
 
 HYDRAULIC_NAMES = re.compile("boom|stick|bucket|dipper|cylinder", re.IGNORECASE)
 """Names of joints and links of machines that are moved by cylinders."""
@@ -93,47 +94,46 @@ class ImportedMachine:
         return f"# {self.values['title']}.\n{text}"
 
 
-def import_model(path: Path, name: str, choices: ModelChoices | None = None) -> ImportedMachine:
+def import_model(path: Path, name: str, choices: ModelChoices) -> ImportedMachine:
     """Return the machine `name` of a URDF or MJCF.
 
     Raises:
         ConfigError: The file is missing or invalid, or has no serial chain of hinges and slides.
     """
-    return _MachineDescription(path, name, choices or ModelChoices()).read()
+    return _MachineDescription(path, name, choices).read()
 
 
 class _MachineDescription:
     """Numbers of a machine from an arm of a model."""
 
     def __init__(self, path: Path, name: str, choices: ModelChoices) -> None:
-        self._path, self._name, self._choices = path, name, choices
-        self._arm = ArmModel(path, choices)
-        self._remarks = self._arm.remarks
+        self._file, self._name, self._choices = path.name, name, choices
+        self._arm = ArmModel(path, name, choices)
+        self._made, self._remarks = self._arm.model, self._arm.remarks
+        self._model, self._joints = self._arm.source.model, self._arm.joints
         self._guesses: dict[tuple[str, str], list[str]] = {}
+        self._travel = np.array([self._read_travel(row) for row in range(self._made.nq)])
         self._drive_name = self._choose_drive()
         self._drive = DRIVES[self._drive_name]
 
     def read(self) -> ImportedMachine:
         """Return the machine."""
-        tool_m = self._arm.find_tool()
-        made, mjcf, meshes = self._arm.write(self._name, tool_m)
-        self._measure_poses(made)
-        joints = [self._describe_joint(row) for row in range(made.nq)]
+        self._measure_poses()
+        joints = [self._describe_joint(row) for row in range(self._made.nq)]
         for (what, guess), names in self._guesses.items():
             self._remarks.append(
-                f"No {what} in {self._path.name} of {', '.join(names)}; {guess} is a guess, measure it."
+                f"No {what} in {self._file} of {', '.join(names)}; {guess} is a guess, measure it."
             )
         self._describe_commands(joints)
-        source = self._path.name
         values = {
             "name": self._name,
-            "title": f"{self._name}, from {source}",
+            "title": f"{self._name}, from {self._file}",
             "mjcf": f"{self._name}.xml",
             "period_s": self._drive.period_s,
             "dead_time_s": self._drive.dead_time_s,
             "num_history": NUM_HISTORY,
             "joints": joints,
-            "tool_m": [_make_dimension(value, source, "high") for value in tool_m],
+            "tool_m": self._describe_place(self._made.site(TIP).pos),
             "exclusive": [],
             "levers": [],
         }
@@ -144,14 +144,15 @@ class _MachineDescription:
         self._remarks.append(
             "Only the last link touches anything; give other links contype in the MJCF."
         )
-        return ImportedMachine(values, mjcf, meshes, self._remarks)
+        return ImportedMachine(values, self._arm.mjcf, self._arm.meshes, self._remarks)
 
-    def _measure_poses(self, made: mujoco.MjModel) -> None:
+    def _measure_poses(self) -> None:
         """Measure weights and inertias of the arm, its home, and its fastest mode with equal drives."""
+        made = self._made
         data, generator = mujoco.MjData(made), np.random.default_rng(0)
-        lower, upper = np.array([self._get_travel(row) for row in range(made.nq)]).T
+        lower, upper = self._travel.T
         poses = generator.uniform(lower, upper, (NUM_POSES, made.nq))
-        poses[0] = self._read_home(lower, upper)
+        poses[0] = self._read_home()
         lowest_m = np.zeros(len(poses))
         self._weights = np.zeros(made.nv)
         touching = np.flatnonzero(made.geom_contype)
@@ -169,58 +170,54 @@ class _MachineDescription:
                 "At zero the arm reaches into the ground; home is the nearest of some random poses above it."
             )
         self._inertia = compute_inertia(made, self._home).diagonal()
+        carried_kg = made.body_mass[:0:-1].cumsum()[::-1]
+        for row in np.flatnonzero(carried_kg < LEAST_KG):
+            raise self._arm.source.refuse(
+                f"nothing that joint '{made.joint(row).name}' moves has a mass; give its link an <inertial>"
+            )
         self._mode_rad_s, _ = find_fastest_mode(made, self._inertia, poses)
 
-    def _read_home(self, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    def _read_home(self) -> np.ndarray:
         """Return the first keyframe of the model, else zero or the middle of the travel, `(J,)`."""
-        model, chain = self._arm.model, self._arm.chain
-        middle = np.where((lower <= 0.0) & (upper >= 0.0), 0.0, (lower + upper) / 2.0)
+        model, (lower, upper) = self._model, self._travel.T
         if not model.nkey:
-            return middle
-        places = model.jnt_qposadr[chain]
+            return np.where((lower <= 0.0) & (upper >= 0.0), 0.0, (lower + upper) / 2.0)
+        places = model.jnt_qposadr[self._joints]
         return np.clip(model.key_qpos[0, places] - model.qpos0[places], lower, upper)
 
-    def _get_travel(self, row: int) -> tuple[float, float]:
+    def _read_travel(self, row: int) -> tuple[float, float]:
         """Return the ends of travel of a joint seen from zero; a guess where the model has none."""
-        joint = self._arm.chain[row]
-        kind = KINDS[int(self._arm.model.jnt_type[joint])]
-        zero = float(self._arm.model.qpos0[self._arm.model.jnt_qposadr[joint]])
-        if travel := self._get_limits(row).travel:
-            return travel[0] - zero, travel[1] - zero
-        return GUESSED_TRAVEL[kind]
-
-    def _get_limits(self, row: int) -> JointLimits:
-        name = self._arm.model.joint(self._arm.chain[row]).name
-        return self._arm.source.limits.get(name, JointLimits())
+        model, joint = self._model, self._joints[row]
+        kind = KINDS[int(model.jnt_type[joint])]
+        if model.jnt_limited[joint]:
+            lower, upper = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
+            return float(lower), float(upper)
+        lower, upper = GUESSED_TRAVEL[kind]
+        self._guess("limits", row, f"{lower:.4g} to {upper:.4g} {UNITS[kind]}")
+        return lower, upper
 
     def _choose_drive(self) -> str:
         if self._choices.drive != "auto":
             return self._choices.drive
-        model, names = self._arm.model, []
-        for joint in self._arm.chain:
-            link = model.body(int(model.jnt_bodyid[joint])).name
-            names.append(f"{model.joint(joint).name} {link}")
-        is_named = sum(bool(HYDRAULIC_NAMES.search(name)) for name in names) > 1
-        return "hydraulic" if is_named or self._arm.tree.has_cylinders else "electric"
+        num_named = 0
+        for joint in self._joints:
+            link = self._model.body(int(self._model.jnt_bodyid[joint])).name
+            num_named += bool(HYDRAULIC_NAMES.search(f"{self._model.joint(joint).name} {link}"))
+        return "hydraulic" if num_named > 1 or self._arm.tree.has_cylinders else "electric"
 
     def _describe_joint(self, row: int) -> dict[str, Any]:
         """Return a joint and its link as plain data."""
-        model, joint, source = self._arm.model, self._arm.chain[row], self._path.name
-        name, kind = self._arm.names[row], KINDS[int(model.jnt_type[joint])]
-        limits = self._get_limits(row)
-        lower, upper = self._get_travel(row)
-        travel = (source, "low" if limits.is_doubted else "high")
-        if not limits.travel:
-            travel = (f"guess: {source} has no limits", "low")
-            self._guess("limits", name, f"{lower:.4g} to {upper:.4g} {UNITS[kind]}")
-        speed = limits.speed or self._drive.speed[kind]
-        if not limits.speed:
-            self._guess("speed at full command", name, f"{speed:g} {UNITS[kind]}/s")
-        force = self._describe_force(row, speed)
-        if not limits.effort:
-            self._guess("force limit", name, FORCE_GUESS)
-        mass_kg, com_m, _ = self._arm.sum_masses(row)
-        origin_m = self._arm.anchors[row] - (self._arm.anchors[row - 1] if row else 0.0)
+        made, source, joint = self._made, self._arm.source, self._joints[row]
+        name, kind = made.joint(row).name, KINDS[int(made.jnt_type[row])]
+        lower, upper = self._travel[row]
+        travel = (self._file, "low" if joint in source.doubted else "high")
+        if not self._model.jnt_limited[joint]:
+            travel = (f"guess: {self._file} has no limits", "low")
+        speed = source.speeds.get(self._model.joint(joint).name)
+        max_speed = (f"velocity limit in {self._file}", "medium")
+        if not speed:
+            speed, max_speed = self._drive.speed[kind], ("guess", "low")
+            self._guess("speed at full command", row, f"{speed:g} {UNITS[kind]}/s")
         return {
             "name": name,
             "part": None,
@@ -228,22 +225,25 @@ class _MachineDescription:
             "lower": _make_dimension(lower, *travel),
             "upper": _make_dimension(upper, *travel),
             "home": float(np.clip(float(f"{self._home[row]:.4g}"), lower, upper)),
-            "max_speed": _make_dimension(speed, f"velocity limit in {source}", "medium")
-            if limits.speed
-            else _make_dimension(speed, "guess", "low"),
+            "max_speed": _make_dimension(speed, *max_speed),
             "body": {
-                "axis": normalise_axis(self._arm.data.xaxis[joint]),
-                "origin_m": [_make_dimension(value, source, "high") for value in origin_m],
-                "mass_kg": _make_dimension(mass_kg, source, "medium"),
-                "com_m": [round(float(value), 6) for value in com_m],
-                "yield_force": force,
+                "axis": normalise_axis(made.jnt_axis[row]),
+                "origin_m": self._describe_place(made.body_pos[row + 1]),
+                "mass_kg": _make_dimension(made.body_mass[row + 1], self._file, "medium"),
+                "com_m": [round(float(value), 6) for value in made.body_ipos[row + 1]],
+                "yield_force": self._describe_force(row, speed),
                 "stiffness": self._describe_stiffness(row),
             },
         }
 
+    def _describe_place(self, place_m: np.ndarray) -> list[dict[str, Any]]:
+        return [_make_dimension(value, self._file, "high") for value in place_m]
+
     def _describe_force(self, row: int, speed: float) -> dict[str, Any]:
-        if effort := self._get_limits(row).effort:
-            return _make_dimension(effort, f"effort limit in {self._path.name}", "medium")
+        effort = self._read_effort(self._joints[row])
+        if effort:
+            return _make_dimension(effort, f"effort limit in {self._file}", "medium")
+        self._guess("force limit", row, FORCE_GUESS)
         weight = YIELD_FACTOR * self._weights[row]
         force = max(weight + self._inertia[row] * speed / ACCELERATION_S, 1.0)
         return _make_dimension(force, f"guess: {FORCE_GUESS}", "low")
@@ -260,48 +260,61 @@ class _MachineDescription:
 
     def _describe_commands(self, joints: list[dict[str, Any]]) -> None:
         """Add `command` to each joint: as asked, else that of the actuators, else of the drive."""
-        found = [self._read_command(joint) for joint in self._arm.chain]
-        commands = {command for command, _ in found}
+        found = {self._read_command(joint) for joint in self._joints}
         command = self._drive.command
         if self._choices.command != "auto":
             command = self._choices.command
-        elif len(commands) == 1 and None not in commands:
-            command = str(commands.pop())
-            if command == "torque":
-                command = "velocity"
-                self._remarks.append(
-                    "The model's actuators are torques, and a policy commands speeds: command: velocity stands for a "
-                    "controller of the joints; subject.command=torque keeps torques, for recordings."
-                )
+        elif found == {"torque"}:
+            command = "velocity"
+            self._remarks.append(
+                "The model's actuators are torques, and a policy commands speeds: command: velocity stands for a "
+                "controller of the joints; subject.command=torque keeps torques, for recordings."
+            )
+        elif len(found) == 1 and None not in found:
+            command = str(found.pop())
         else:
             self._remarks.append(
                 f"command: {command} is a guess; subject.command=… or the machine's file changes it."
             )
-        for values, (_, force) in zip(joints, found, strict=True):
-            values["command"] = command
+        for joint in joints:
+            joint["command"] = command
             if command == "torque":
-                force = force or float(values["body"]["yield_force"]["value"])
-                values["max_force"] = _make_dimension(force, self._path.name, "medium")
+                joint["max_force"] = joint["body"]["yield_force"]
 
-    def _read_command(self, joint: int) -> tuple[str | None, float]:
-        """Return what the actuator of a joint is commanded by, `None` without one, and its force."""
-        model = self._arm.model
-        for actuator in range(model.nu):
-            is_own = model.actuator_trnid[actuator, 0] == joint
-            if not is_own or model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-                continue
-            stiffness, damping = -model.actuator_biasprm[actuator, 1:3]
-            if stiffness > 0:
-                return "position", 0.0
-            if damping > 0:
-                return "velocity", 0.0
-            gain = model.actuator_gainprm[actuator, 0] * model.actuator_gear[actuator, 0]
-            return "torque", abs(gain) * float(model.actuator_ctrlrange[actuator, 1])
-        return None, 0.0
+    def _find_actuator(self, joint: int) -> int | None:
+        """Return the actuator of a joint."""
+        is_own = self._model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        is_own &= self._model.actuator_trnid[:, 0] == joint
+        return int(is_own.argmax()) if is_own.any() else None
 
-    def _guess(self, what: str, name: str, guess: str) -> None:
+    def _read_command(self, joint: int) -> str | None:
+        """Return what the actuator of a joint is commanded by."""
+        actuator = self._find_actuator(joint)
+        if actuator is None:
+            return None
+        stiffness, damping = -self._model.actuator_biasprm[actuator, 1:3]
+        if stiffness > 0:
+            return "position"
+        return "velocity" if damping > 0 else "torque"
+
+    def _read_effort(self, joint: int) -> float:
+        """Return the force limit of a joint, of its drive, or of a motor at full command; 0 without one."""
+        model, actuator = self._model, self._find_actuator(joint)
+        if model.jnt_actfrclimited[joint]:
+            return float(model.jnt_actfrcrange[joint, 1])
+        if actuator is None:
+            return 0.0
+        gear = abs(float(model.actuator_gear[actuator, 0]))
+        if model.actuator_forcelimited[actuator]:
+            return gear * float(model.actuator_forcerange[actuator, 1])
+        if self._read_command(joint) != "torque" or not model.actuator_ctrllimited[actuator]:
+            return 0.0
+        full = gear * model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[actuator]
+        return float(np.abs(full).max())
+
+    def _guess(self, what: str, row: int, guess: str) -> None:
         """Note a guess for a joint; one sentence tells of all joints that share it."""
-        self._guesses.setdefault((what, guess), []).append(name)
+        self._guesses.setdefault((what, guess), []).append(self._made.joint(row).name)
 
 
 def _make_dimension(value: float, source: str, confidence: str) -> dict[str, Any]:

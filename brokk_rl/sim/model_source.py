@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import unquote
 
 import mujoco
 import numpy as np
@@ -47,6 +48,11 @@ FASTEST = {"hinge": 30.0, "slide": 10.0}
 """Speed beyond which a limit is a placeholder, rad/s and m/s: no joint of an arm is as fast."""
 SMALLEST_KG, SMALLEST_KG_M2 = 1e-6, 1e-9
 """Mass and inertia of frames, which MuJoCo wants to be positive."""
+NEGATIVE_SHARE, NEGATIVE_KG_M2 = 0.01, 1e-6
+"""Size of a negative principal inertia that counts as rounding: share of the largest, and what the
+smallest parts have."""
+ROD_SHARE = 1e-3
+"""Inertia of a thin rod about its axis, as a share of the one across it: twenty times as long as thick."""
 DENSITY_KG_M3 = 2700.0
 """Density of aluminium, for the inertia of a link that has none."""
 LARGEST_M = 5.0
@@ -59,24 +65,14 @@ LIMITS = frozenset({"lower", "upper", "velocity", "effort"})
 NUMBERS = {*INERTIA, *LIMITS, "xyz", "rpy", "value", "radius", "length", "size", "scale"}
 NUMBERS |= {"multiplier", "offset"}
 """Attributes of a URDF that hold numbers."""
+MOVABLE = ("revolute", "continuous", "prismatic")
+JOINT_TYPES = (*MOVABLE, "fixed", "floating", "planar")
+"""Kinds of joints of a URDF."""
+VECTORS = {"xyz": 3, "rpy": 3}
+"""Attributes of a URDF that hold several numbers."""
+LARGEST_EFFORT = 1e7
+"""Torque or force beyond which a limit is a placeholder, Nm and N."""
 MESH_PREFIX = re.compile(r"^(package|model|file)://")
-
-
-@dataclass
-class JointLimits:
-    """Limits of a joint as a file has them; `None` where it has none.
-
-    Attributes:
-        travel: Lower and upper end, rad or m.
-        speed: Speed limit, rad/s or m/s.
-        effort: Torque or force limit, Nm or N.
-        is_doubted: Whether the numbers were converted from a unit that was guessed.
-    """
-
-    travel: tuple[float, float] | None = None
-    speed: float | None = None
-    effort: float | None = None
-    is_doubted: bool = False
 
 
 @dataclass
@@ -85,16 +81,20 @@ class ModelSource:
 
     Attributes:
         path: The file.
-        model: The compiled model; fixed frames keep their names.
-        limits: Of each joint, by name.
-        followers: Joint that a joint follows (`<mimic>`, or `<equality>` of joints), by name.
+        spec: The mended model, from which `model` was compiled.
+        model: The compiled model; fixed frames keep their names, and ends of travel are mended.
+        speeds: Speed limits of joints by name, rad/s or m/s.
+        doubted: Joints whose numbers were converted from a unit that was guessed.
+        followers: Name of the joint that a joint follows (`<mimic>`, or `<equality>` of joints).
         notes: Names of joints and links by what was mended at them.
     """
 
     path: Path
+    spec: Any = None
     model: Any = None
-    limits: dict[str, JointLimits] = field(default_factory=dict)
-    followers: dict[str, str] = field(default_factory=dict)
+    speeds: dict[str, float] = field(default_factory=dict)
+    doubted: set[int] = field(default_factory=set)
+    followers: dict[int, str] = field(default_factory=dict)
     notes: dict[str, list[str]] = field(default_factory=dict)
 
     @property
@@ -128,17 +128,19 @@ def read_source(path: Path, packages: Sequence[str] = ()) -> ModelSource:
             warnings.simplefilter("ignore")  # what MuJoCo will no longer read in a later version
             if root.tag == "robot":
                 _clean_urdf(root, source)
-                spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-                _mend_links(spec)
+                text = ElementTree.tostring(root, encoding="unicode")
+                source.spec = mujoco.MjSpec.from_string(text)
+                _mend_links(source.spec)
             else:
-                spec = mujoco.MjSpec.from_file(str(path))
-            _embed_meshes(spec, source, packages)
-            _mend_inertias(spec, source)
-            _mend_ranges(spec, source)
-            source.model = spec.compile()
+                source.spec = mujoco.MjSpec.from_file(str(path))
+            _embed_meshes(source, packages)
+            _mend_inertias(source)
+            _swap_limits(source)
+            source.model = source.spec.compile()
     except ValueError as error:
         raise source.refuse(f"MuJoCo cannot read it as URDF or MJCF: {error}") from error
-    _read_limits(source)
+    _mend_travels(source)
+    _list_followers(source)
     return source
 
 
@@ -158,7 +160,7 @@ def _clean_urdf(root: ElementTree.Element, source: ModelSource) -> None:
                     )
                 if key in NUMBERS and (key != "value" or element.tag == "mass"):
                     _clean_number(element, key, where, source)
-    _check_names(root, source)
+    _check_tree(root, source)
     for link in root.findall("link"):
         _complete_inertial(link)
     for joint in root.findall("joint"):
@@ -187,9 +189,9 @@ def _clean_number(element: ElementTree.Element, key: str, where: str, source: Mo
         values = [float(word) for word in element.attrib[key].split()]
     except ValueError:
         values = []
-    if not values:
+    if len(values) != VECTORS.get(key, len(values) or 1):
         raise source.refuse(
-            f"{said} is no number; expected numbers with a point, separated by spaces"
+            f"{said} is no number; expected {VECTORS.get(key, 1)} with a point, separated by spaces"
         )
     if not np.isfinite(values).all() and key not in LIMITS:
         raise source.refuse(f"{said} is not finite; change it")
@@ -197,23 +199,39 @@ def _clean_number(element: ElementTree.Element, key: str, where: str, source: Mo
         source.note(where, f'rpy="{text}" is doubted: expected rad; degrees?')
 
 
-def _check_names(root: ElementTree.Element, source: ModelSource) -> None:
-    """Raise an error where a name repeats, or a joint hangs on a link that there is not."""
+def _check_tree(root: ElementTree.Element, source: ModelSource) -> None:
+    """Raise an error that names the joint which makes no tree of joints and links."""
     links = [link.get("name", "") for link in root.findall("link")]
-    joints = root.findall("joint")
-    for names in (links, [joint.get("name", "") for joint in joints]):
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    movable = [name for name, joint in joints.items() if joint.get("type") in MOVABLE]
+    for names in (links, [joint.get("name", "") for joint in root.findall("joint")]):
         for name in names:
-            if names.count(name) > 1:
-                raise source.refuse(f"the name '{name}' repeats; rename one")
-    for joint in joints:
-        for end in ("parent", "child"):
-            element = joint.find(end)
-            name = "" if element is None else element.get("link", "")
-            if name not in links:
+            if names.count(name) > 1 or not name:
+                raise source.refuse(f"the name '{name}' repeats or is empty; rename one")
+    carriers: dict[str, str] = {}
+    for name, joint in joints.items():
+        where = f"joint '{name}'"
+        kind = joint.get("type", "")
+        if kind not in JOINT_TYPES:
+            raise source.refuse(f'{where} has type="{kind}"; {list_choices(kind, JOINT_TYPES)}')
+        for tag, key, known in (
+            ("parent", "link", links),
+            ("child", "link", links),
+            ("mimic", "joint", movable),
+        ):
+            element = joint.find(tag)
+            wanted = "" if element is None else element.get(key, "")
+            if wanted not in known and not (tag == "mimic" and element is None):
                 raise source.refuse(
-                    f"joint '{joint.get('name')}': there is no {end} link '{name}'; "
-                    f"{list_choices(name, links)}"
+                    f"{where}: there is no {tag} {key} '{wanted}'; {list_choices(wanted, known)}"
                 )
+        child = joint.find("child").get("link", "")
+        if child in carriers:
+            raise source.refuse(
+                f"link '{child}' is the child of two joints ({carriers[child]}, {name}): a URDF cannot close a loop; "
+                "leave one out, or give an MJCF with <equality>"
+            )
+        carriers[child] = name
 
 
 def _complete_inertial(link: ElementTree.Element) -> None:
@@ -241,7 +259,7 @@ def _clean_joint(joint: ElementTree.Element, source: ModelSource) -> None:
         return
     for key in ("velocity", "effort"):
         value = float(limit.get(key, "0"))
-        if not (value > 0.0 and math.isfinite(value)):
+        if not 0.0 < value < (LARGEST_EFFORT if key == "effort" else math.inf):
             if value != 0.0:
                 source.note(name, f'{key}="{value:g}" is no limit and counts as not given.')
             limit.attrib.pop(key, None)
@@ -251,8 +269,10 @@ def _clean_joint(joint: ElementTree.Element, source: ModelSource) -> None:
             source.note(name, f"limits of {lower:g} and {upper:g} are none.")
         limit.attrib.pop("lower", None)
         limit.attrib.pop("upper", None)
+    elif {"lower", "upper"} & limit.attrib.keys():  # one that is missing is 0
+        limit.attrib |= {"lower": str(lower), "upper": str(upper)}
     if "velocity" in limit.attrib:
-        source.limits[name] = JointLimits(speed=float(limit.attrib["velocity"]))
+        source.speeds[name] = float(limit.attrib["velocity"])
 
 
 # the spec of both kinds
@@ -270,9 +290,9 @@ def _mend_links(spec: mujoco.MjSpec) -> None:
             spec.delete(geom)
 
 
-def _embed_meshes(spec: mujoco.MjSpec, source: ModelSource, packages: Sequence[str]) -> None:
+def _embed_meshes(source: ModelSource, packages: Sequence[str]) -> None:
     """Give each mesh its file as an asset; delete those that cannot be read, and all textures."""
-    here = source.path.resolve().parent
+    spec, here = source.spec, source.path.resolve().parent
     folders = [Path(), *(Path(folder).expanduser() for folder in packages)]
     folders += [here / spec.meshdir, here, *here.parents[:3]]
     searched = os.environ.get("ROS_PACKAGE_PATH", "")
@@ -308,7 +328,7 @@ def _embed_meshes(spec: mujoco.MjSpec, source: ModelSource, packages: Sequence[s
 
 def _find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
     """Return a mesh of a name such as `package://arm/meshes/base.stl`."""
-    bare = Path(MESH_PREFIX.sub("", name))
+    bare = Path(unquote(MESH_PREFIX.sub("", name)).replace("\\", "/"))
     names = [bare]
     if MESH_PREFIX.match(name) and len(bare.parts) > 1:
         # beside a file that stands in the package itself, without its name
@@ -335,8 +355,9 @@ def _load_mesh(file: Path) -> bytes | None:
     return stream.getvalue()
 
 
-def _mend_inertias(spec: mujoco.MjSpec, source: ModelSource) -> None:
+def _mend_inertias(source: ModelSource) -> None:
     """Give each body an inertia that a body can have, or raise an error that names it."""
+    spec = source.spec
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
     spec.compiler.boundmass = SMALLEST_KG
@@ -358,11 +379,14 @@ def _mend_inertias(spec: mujoco.MjSpec, source: ModelSource) -> None:
                 where,
                 "no inertia; that of an aluminium ball of its mass is taken. Write <inertia>.",
             )
-        if principal[0] <= 0.0:
+        if principal[0] < -NEGATIVE_SHARE * principal[2] - NEGATIVE_KG_M2:
             raise source.refuse(
                 f"{where} has a principal inertia of {principal[0]:.3g} kg m²; expected values above 0, "
                 "check ixx to izz and their signs"
             )
+        if principal[0] <= 0.0:
+            source.note(where, "a principal inertia that is 0 or less; a thin rod's is taken.")
+            principal = np.maximum(principal, ROD_SHARE * principal[2])
         if principal[2] > (1.0 + 1e-6) * (principal[0] + principal[1]):
             source.note(
                 where,
@@ -393,8 +417,8 @@ def _set_inertia(body: mujoco.MjsBody, principal: np.ndarray, axes: np.ndarray) 
     body.fullinertia[0] = math.nan
 
 
-def _mend_ranges(spec: mujoco.MjSpec, source: ModelSource) -> None:
-    for joint in spec.joints:
+def _swap_limits(source: ModelSource) -> None:
+    for joint in source.spec.joints:
         lower, upper = joint.range
         if lower > upper:
             source.note(
@@ -407,53 +431,40 @@ def _mend_ranges(spec: mujoco.MjSpec, source: ModelSource) -> None:
 # what the compiled model says
 
 
-def _read_limits(source: ModelSource) -> None:
-    """Read ends of travel, efforts and followers of the joints."""
+def _mend_travels(source: ModelSource) -> None:
+    """Write ends of travel in rad or m, whatever unit they seem to have; drop speeds of no joint."""
     model = source.model
     for joint in range(model.njnt):
         name, kind = model.joint(joint).name, KINDS.get(int(model.jnt_type[joint]))
-        found = source.limits.setdefault(name, JointLimits())
         if kind is None:
             continue
-        if model.jnt_limited[joint]:
-            lower, upper = model.jnt_range[joint].tolist()
-            _read_travel(found, lower, upper, kind, name, source)
-        if model.jnt_actfrclimited[joint]:
-            found.effort = float(model.jnt_actfrcrange[joint, 1])
-        if found.speed and found.is_doubted:
-            found.speed *= DOUBTED[kind][2]
-        elif found.speed and found.speed > FASTEST[kind]:
+        (lower, upper), unit = model.jnt_range[joint].tolist(), UNITS[kind]
+        bound, wrong, factor = DOUBTED[kind]
+        if model.jnt_limited[joint] and max(-lower, upper) > bound:
+            source.doubted.add(joint)
+            model.jnt_range[joint] *= factor
             source.note(
                 name,
-                f"the speed limit of {found.speed:g} {UNITS[kind]}/s is doubted and counts as not given.",
+                f"limits of {lower:g} to {upper:g} {unit} are doubted and read as {wrong}: "
+                f"{factor * lower:.4g} to {factor * upper:.4g} {unit}. Write them in {unit}.",
             )
-            found.speed = None
-    for actuator in range(model.nu):
-        if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-            continue
-        found = source.limits[model.joint(int(model.actuator_trnid[actuator, 0])).name]
-        if model.actuator_forcelimited[actuator] and not found.effort:
-            found.effort = float(model.actuator_forcerange[actuator, 1])
+            if name in source.speeds:
+                source.speeds[name] *= factor
+        elif model.jnt_limited[joint] and kind == "hinge" and upper - lower < NARROW_RAD:
+            source.note(
+                name, f"limits of {lower:.3g} to {upper:.3g} rad are narrow: degrees or rad?"
+            )
+        if (speed := source.speeds.get(name, 0.0)) > FASTEST[kind]:
+            source.note(
+                name, f"the speed limit of {speed:g} {unit}/s is doubted and counts as not given."
+            )
+            del source.speeds[name]
+
+
+def _list_followers(source: ModelSource) -> None:
+    """List the joints that follow another one."""
+    model = source.model
     for number in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
-        follower, leader = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
+        leader = int(model.eq_obj2id[number])
         name = model.joint(leader).name if leader >= 0 else "a constant"
-        source.followers[model.joint(follower).name] = name
-
-
-def _read_travel(
-    found: JointLimits, lower: float, upper: float, kind: str, name: str, source: ModelSource
-) -> None:
-    """Write the ends of a joint's travel in rad or m, whatever unit they seem to have."""
-    bound, wrong, factor = DOUBTED[kind]
-    found.is_doubted = max(-lower, upper) > bound
-    if found.is_doubted:
-        unit = UNITS[kind]
-        source.note(
-            name,
-            f"limits of {lower:g} to {upper:g} {unit} are doubted and read as {wrong}: "
-            f"{factor * lower:.4g} to {factor * upper:.4g} {unit}. Write them in {unit}.",
-        )
-        lower, upper = factor * lower, factor * upper
-    elif kind == "hinge" and upper - lower < NARROW_RAD:
-        source.note(name, f"limits of {lower:.3g} to {upper:.3g} rad are narrow: degrees or rad?")
-    found.travel = (lower, upper)
+        source.followers[int(model.eq_obj1id[number])] = name

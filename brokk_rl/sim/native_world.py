@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar
 
 import mujoco
 import torch
@@ -12,9 +11,8 @@ from mujoco.batch import Batch, SimulationError
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.events import Event
-from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model, mask_normal_forces
-from brokk_rl.sim.properties import StoredWorld, WorldProperties, list_fields
-from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
+from brokk_rl.sim.model import check_simulated, compile_model, mask_normal_forces
+from brokk_rl.sim.properties import StoredWorld, list_fields
 
 WARNINGS = {
     mujoco.mjtWarning.mjWARN_INERTIA: "inertia near zero",
@@ -26,6 +24,8 @@ WARNINGS = {
     mujoco.mjtWarning.mjWARN_BADCTRL: "bad command of a drive",
 }
 """MuJoCo's warnings, in words."""
+ALARMS = {1 << int(kind): text for kind, text in WARNINGS.items()}
+"""The same by the bits of an alarm."""
 
 
 class NativeWorld(StoredWorld):
@@ -43,9 +43,6 @@ class NativeWorld(StoredWorld):
     """
 
     supports_graphs = False
-    alarm_names: ClassVar[dict[int, str]] = {
-        1 << int(kind): text for kind, text in WARNINGS.items()
-    }
 
     def __init__(
         self,
@@ -56,11 +53,10 @@ class NativeWorld(StoredWorld):
         events: tuple[Event, ...] = (),
         site: Path | None = None,
     ) -> None:
-        self.num_worlds, self.device = num_worlds, torch.device("cpu")
-        self.model = compile_model(machine, machine.period_s / substeps, site=site)
-        check_simulated(self.model, machine.name, is_warp=False)
+        model = compile_model(machine, machine.period_s / substeps, site=site)
+        check_simulated(model, machine.name, is_warp=False)
         try:
-            self._batch = Batch(self.model, num_worlds, num_threads)
+            self._batch = Batch(model, num_worlds, num_threads)
         except ValueError as error:
             if "bad_alloc" not in str(error):
                 raise
@@ -68,6 +64,7 @@ class NativeWorld(StoredWorld):
                 f"{num_worlds} worlds do not fit into the memory of this computer; take fewer: "
                 "rl.num_envs, evaluation.episodes, play.worlds or sim.num_worlds"
             ) from error
+        super().__init__(machine, num_worlds, model, torch.device("cpu"), torch.float64, ALARMS)
         self.substeps = substeps
         self._state, self._warning = (
             torch.from_numpy(self._batch.state),
@@ -85,27 +82,15 @@ class NativeWorld(StoredWorld):
         self.joint_load = torch.from_numpy(self._batch.bind("qfrc_applied"))
         # zeros would switch the equalities of the MJCF off
         self._first_state = self._state[0].clone()
-        self._placement = ScenePlacement(self.model, self.device, torch.float64)
-        self._drive = DriveReferences(self.model, machine, num_worlds, self.device, torch.float64)
-        fields = {}
-        for name in list_fields(events):
-            fields[name] = torch.from_numpy(self._batch.expand(name))
-        self._properties = (
-            WorldProperties(self.model, machine, self._drive, fields, events) if events else None
-        )
         # contacts are felt in every substep; recording them all catches a peak between two control
         # steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
         self._sensors = torch.from_numpy(self._recorded["sensordata"])
         self._is_normal = torch.from_numpy(mask_normal_forces(self.model))
-        self.q = torch.zeros(num_worlds, machine.num_joints)
-        self.contact_force_n = torch.zeros(num_worlds)
-        self.faults = torch.zeros(num_worlds, dtype=torch.bool)
-        self._machine = machine
-        self._alarms = torch.zeros(num_worlds, dtype=torch.int64)
-        self._fastest = torch.zeros(machine.num_joints, dtype=torch.float64)
-        home = torch.tensor(machine.home, dtype=torch.float32).expand(num_worlds, -1)
-        self.reset(~self.faults, home, make_nominal_scenes(num_worlds))
+        fields = {}
+        for name in list_fields(events):
+            fields[name] = torch.from_numpy(self._batch.expand(name))
+        self._begin(fields, events)
 
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
@@ -123,7 +108,7 @@ class NativeWorld(StoredWorld):
             self._warning.flatten(1).any(1)
         )
         if self.faults.any():
-            bits = torch.tensor(list(self.alarm_names))
+            bits = torch.tensor(list(ALARMS))
             self._note_faults(speeds, (self._warning[:, :, 1] > 0).long() @ bits)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
@@ -159,10 +144,6 @@ class NativeWorld(StoredWorld):
         return {
             "state": self._state,
             "warning": self._warning,
-            "reference": self._drive.reference,
             "geom_size": self._geom_size,
             "geom_pos": self._geom_pos,
-            "q": self.q,
-            "contact_force_n": self.contact_force_n,
-            "faults": self.faults,
         }

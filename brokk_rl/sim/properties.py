@@ -15,6 +15,7 @@ import torch
 from brokk_rl.machine import Machine
 from brokk_rl.sim.events import Event, Property
 from brokk_rl.sim.model import DriveReferences
+from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
 FIELDS: dict[Property, tuple[str, ...]] = {
     "mass": ("body_mass", "body_inertia", "body_subtreemass"),
@@ -153,18 +154,51 @@ class WorldProperties:
 
 
 class StoredWorld:
-    """Base of the worlds of both simulators: state that is stored, properties that vary, faults."""
+    """Base of the worlds of both simulators: results, state that is stored, properties that vary, faults.
 
-    alarm_names: dict[int, str]
-    """Meaning of each bit of an alarm of the simulator."""
-    faults: torch.Tensor
-    _machine: Machine
-    _alarms: torch.Tensor
-    """Alarms of worlds at fault since they were last explained, `(N,)`."""
-    _fastest: torch.Tensor
-    """Largest speed of each joint in worlds at fault since then, `(J,)`."""
-    _properties: WorldProperties | None
-    """Properties that vary from world to world, if any do."""
+    Args:
+        machine: The machine.
+        num_worlds: `N`.
+        model: As MuJoCo compiles it.
+        device: Where the results lie.
+        dtype: Type in which the simulator computes.
+        alarm_names: Meaning of each bit of an alarm of the simulator.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        num_worlds: int,
+        model: mujoco.MjModel,
+        device: torch.device,
+        dtype: torch.dtype,
+        alarm_names: dict[int, str],
+    ) -> None:
+        self.num_worlds, self.device, self.model = num_worlds, device, model
+        self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
+        self.contact_force_n = torch.zeros(num_worlds, device=device)
+        self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
+        self._machine, self._alarm_names = machine, alarm_names
+        # alarms of worlds at fault and their joints' largest speeds since they were last explained
+        self._alarms = torch.zeros(num_worlds, dtype=torch.int64, device=device)
+        self._fastest = torch.zeros(machine.num_joints, dtype=dtype, device=device)
+        self._placement = ScenePlacement(model, device, dtype)
+        self._drive = DriveReferences(model, machine, num_worlds, device, dtype)
+        self._properties: WorldProperties | None = None
+
+    def _begin(self, fields: dict[str, torch.Tensor], events: tuple[Event, ...]) -> None:
+        """Draw the properties that events change in `fields`, and put all machines at home."""
+        if events:
+            self._properties = WorldProperties(
+                self.model, self._machine, self._drive, fields, events
+            )
+        home = torch.tensor(self._machine.home, dtype=torch.float32, device=self.device)
+        scenes = make_nominal_scenes(self.num_worlds, self.device)
+        self.reset(~self.faults, home.expand(self.num_worlds, -1), scenes)
+
+    def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
+        """See `brokk_rl.contracts.world.World`."""
+        raise NotImplementedError
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return a copy of all that `load_state_dict` needs to go on exactly."""
@@ -179,9 +213,10 @@ class StoredWorld:
 
     def _list_tensors(self) -> dict[str, torch.Tensor]:
         """Return the simulator's tensors, and those of the events."""
-        tensors = self._stored()
+        tensors = self._stored() | {"reference": self._drive.reference, "q": self.q}
+        tensors |= {"contact_force_n": self.contact_force_n, "faults": self.faults}
         if self._properties:
-            tensors = tensors | {"event.left_s": self._properties.left_s}
+            tensors["event.left_s"] = self._properties.left_s
             for name, value in self._properties.factors.items():
                 tensors[f"event.{name}"] = value
         return tensors
@@ -191,7 +226,7 @@ class StoredWorld:
         alarms, speeds = self._alarms.unique().tolist(), self._fastest.tolist()
         self._alarms.zero_()
         self._fastest.zero_()
-        said = [text for bit, text in self.alarm_names.items() if any(bit & one for one in alarms)]
+        said = [text for bit, text in self._alarm_names.items() if any(bit & one for one in alarms)]
         speed, joint = max(zip(speeds, self._machine.joints, strict=True), key=lambda one: one[0])
         if math.isinf(speed):
             return "; ".join([*said, f"the motion of {joint.name} was not finite"])
@@ -206,4 +241,5 @@ class StoredWorld:
         self._alarms.bitwise_or_(alarms.masked_fill(~self.faults, 0))
 
     def _stored(self) -> dict[str, torch.Tensor]:
+        """Return the tensors of the state that only this simulator has."""
         raise NotImplementedError

@@ -21,9 +21,8 @@ import warp as wp
 
 from brokk_rl.machine import Machine
 from brokk_rl.sim.events import Event
-from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model
-from brokk_rl.sim.properties import StoredWorld, WorldProperties, list_fields
-from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
+from brokk_rl.sim.model import check_simulated, compile_model
+from brokk_rl.sim.properties import StoredWorld, list_fields
 from brokk_rl.sim.warp_dynamics import ArmDynamics
 from brokk_rl.sim.warp_solver import ContactSolver
 
@@ -94,16 +93,15 @@ class WarpWorld(StoredWorld):
         events: tuple[Event, ...] = (),
         site: Path | None = None,
     ) -> None:
-        self.num_worlds, self.device = num_worlds, device
-        self.supports_graphs = device.type == "cuda"
-        self.alarm_names: dict[int, str] = {}
+        compiled = compile_model(machine, machine.period_s / simulator.substeps, site=site)
+        check_simulated(compiled, machine.name, is_warp=True)
+        alarm_names = {}
         for kind in mjw.OverflowType:
             if kind & _LOST and kind != mjw.OverflowType.ALL:
-                name = kind.name or str(int(kind))
-                self.alarm_names[int(kind)] = BUFFERS.get(kind, f"the buffer {name} is full")
+                alarm_names[int(kind)] = BUFFERS.get(kind, f"the buffer {kind.name} is full")
+        super().__init__(machine, num_worlds, compiled, device, torch.float32, alarm_names)
+        self.supports_graphs = device.type == "cuda"
         self.substeps = simulator.substeps
-        self.model = compile_model(machine, machine.period_s / self.substeps, site=site)
-        check_simulated(self.model, machine.name, is_warp=True)
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(device)
@@ -133,22 +131,10 @@ class WarpWorld(StoredWorld):
         self._views |= {
             name: wp.to_torch(getattr(model, name)) for name in ("geom_size", "geom_pos")
         }
-        self._placement = ScenePlacement(self.model, device, torch.float32)
-        self._drive = DriveReferences(self.model, machine, num_worlds, device, torch.float32)
-        self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
-        self.contact_force_n = torch.zeros(num_worlds, device=device)
-        self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
-        self._machine = machine
-        self._alarms = torch.zeros_like(self._views["overflow"])
-        self._fastest = torch.zeros(machine.num_joints, device=device)
         peak = wp.from_torch(self.contact_force_n)
         self._substep = make_substep(self.model, model, data, peak)
         fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(events)}
-        self._properties = (
-            WorldProperties(self.model, machine, self._drive, fields, events) if events else None
-        )
-        home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
-        self.reset(torch.ones_like(self.faults), home, make_nominal_scenes(num_worlds, device))
+        self._begin(fields, events)
 
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
@@ -195,8 +181,7 @@ class WarpWorld(StoredWorld):
             view[name].index_copy_(1, ids, torch.where(rows[..., None], value, view[name][:, ids]))
 
     def _stored(self) -> dict[str, torch.Tensor]:
-        own = {"q": self.q, "contact_force_n": self.contact_force_n, "faults": self.faults}
-        return self._views | {"reference": self._drive.reference} | own
+        return dict(self._views)
 
     def _write_options(self, simulator: Any) -> None:
         option = self._model.opt

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,9 @@ from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.check import check_machine
-from brokk_rl.sim.arm_model import ModelChoices
 from brokk_rl.sim.machine_trial import try_machine
 from brokk_rl.sim.model import ASSETS
+from brokk_rl.sim.model_choices import ModelChoices
 from brokk_rl.sim.model_import import ImportedMachine, import_model
 from brokk_rl.sim.scene import make_empty_scenes
 
@@ -63,14 +64,20 @@ def urdf(tmp_path: Path) -> Path:
     return path
 
 
-def read(text: str, folder: Path, **choices: Any) -> ImportedMachine:
+def read(text: str, folder: Path, **changes: Any) -> ImportedMachine:
     path = folder / ("model.urdf" if "<robot" in text else "model.xml")
     path.write_text(text)
+    return import_file(path, **changes)
+
+
+def import_file(path: Path, **changes: Any) -> ImportedMachine:
+    choices = {"chain": None, "tip": None, "gripper": False, "packages": ()}
+    choices |= {"drive": "auto", "command": "auto"} | changes
     return import_model(path, "model", ModelChoices(**choices))
 
 
 def test_a_urdf_becomes_a_machine_that_moves_as_mujoco_moves_it(urdf: Path) -> None:
-    machine = import_model(urdf, "arm").build()
+    machine = import_file(urdf).build()
     assert machine.joint_names == ("slew", "lift", "reach")
     assert [one.kind for one in machine.joints] == ["hinge", "hinge", "slide"]
     spec = mujoco.MjSpec.from_file(str(urdf))
@@ -86,7 +93,7 @@ def test_a_urdf_becomes_a_machine_that_moves_as_mujoco_moves_it(urdf: Path) -> N
 
 
 def test_limits_masses_and_guesses_of_a_urdf_are_told(urdf: Path) -> None:
-    imported = import_model(urdf, "arm")
+    imported = import_file(urdf)
     slew, _, reach = imported.build().joints
     assert (slew.lower.value, slew.max_speed.value, slew.command) == (-2.0, 0.5, "velocity")
     assert slew.body and reach.body
@@ -99,7 +106,7 @@ def test_limits_masses_and_guesses_of_a_urdf_are_told(urdf: Path) -> None:
 
 
 def test_the_mjcf_of_an_import_has_the_inertia_of_its_source(urdf: Path, tmp_path: Path) -> None:
-    made = mujoco.MjModel.from_xml_string(import_model(urdf, "arm").mjcf)
+    made = mujoco.MjModel.from_xml_string(import_file(urdf).mjcf)
     source = mujoco.MjSpec.from_file(str(urdf)).compile()
     kept = [source.joint(name).dofadr[0] for name in ("slew", "lift", "reach")]
     full = []
@@ -117,7 +124,7 @@ def test_the_mjcf_of_an_import_has_the_inertia_of_its_source(urdf: Path, tmp_pat
 
 def test_our_own_mjcf_gives_our_own_machine(machine: Machine) -> None:
     assert machine.mjcf
-    made = import_model(ASSETS / machine.mjcf, "again").build()
+    made = import_file(ASSETS / machine.mjcf).build()
     for q in (machine.home, machine.lower, machine.upper):
         tips = [compute_tool_kinematics(one, q).tip_in_base_m for one in (machine, made)]
         assert tips[0] == pytest.approx(tips[1], abs=1e-5)
@@ -152,6 +159,10 @@ def edit(old: str, new: str) -> str:
         (edit(INERTIA, ""), -2.0, 2.0, 0.5, "'mast': no inertia"),
         (edit('upper="0.8"', 'upper="800"'), -2.0, 2.0, 0.5, "reach: limits of 0 to 800 m are doubted"),
         (edit('rpy="0.2 0 0"', 'rpy="0 90 0"'), -2.0, 2.0, 0.5, "joint 'lift': rpy"),
+        (edit('lower="-2" upper="2"', 'upper="2"'), 0.0, 2.0, 0.5, ""),
+        (edit('effort="3000"', 'effort="1e9"'), -2.0, 2.0, 0.5, 'effort="1e+09" is no limit'),
+        (edit(INERTIA, INERTIA.replace("1", "0")), -2.0, 2.0, 0.5, "'mast': a principal inertia"),
+        (edit('<mass value="30"/>', '<mass value="0"/>'), -2.0, 2.0, 0.5, "weigh nothing: beam"),
     ],
 )  # fmt: skip
 def test_odd_numbers_of_a_urdf_are_read_with_a_remark(
@@ -179,15 +190,22 @@ BALL = '<geom size="0.1"/>'
         (edit('name="lift"', 'name="slew"'), "the name 'slew' repeats"),
         (edit('<mass value="40"/>', '<mass value="-40"/>'), "link 'mast'.*mass of -40"),
         (edit(INERTIA, INERTIA.replace('"1"', '"-1"')), "link 'mast' has a principal inertia"),
-        (edit('<mass value="40"/>', "").replace('<mass value="2"/>', ""), "'mast'.*has no mass"),
+        (edit('<mass value="20"/>', ""), "nothing that joint 'reach' moves has a mass"),
+        (edit('type="prismatic"', 'type="linear"'), "joint 'reach' has type=\"linear\""),
+        (edit('xyz="0 0 0.3"', 'xyz="0 0"'), "joint 'slew'.*expected 3"),
+        (edit('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><mimic joint="slow"/>'), "no mimic joint 'slow'; did you mean 'slew'"),
+        (edit('child link="tool0"', 'child link="lamp"'), r"'lamp' is the child of two joints \(turn, flange\)"),
         (SCENE.format(f"<body><freejoint/>{BALL}</body>", ""), "neither a hinge"),
         (SCENE.format("", ""), "no joint that moves"),
-        (SCENE.format(2 * f'<body pos="0 0 1"><joint/>{BALL}<body pos="1 0 0"><joint/>{BALL}</body></body>', ""), "2 robots"),
+        (
+            SCENE.format(2 * f'<body pos="0 0 1"><joint/>{BALL}<body pos="1 0 0"><joint/>{BALL}</body></body>', ""),
+            "2 chains of 2 joints are alike",
+        ),
         (
             SCENE.format(f"<body name='trunk'><freejoint/>{BALL}" + 4 * (
                 f'<body pos="1 0 0"><joint axis="0 1 0"/>{BALL}<body pos="1 0 0"><joint axis="0 1 0"/>{BALL}</body></body>'
             ) + "</body>", ""),
-            "4 chains of 2 joints leave 'trunk'.*legs",
+            "4 chains of 2 joints are alike.*a robot that walks",
         ),
     ],
 )  # fmt: skip
@@ -211,6 +229,7 @@ def nest(*names: str, inside: str = "") -> str:
 
 FINGERS = nest("left_finger") + nest("right_finger")
 ARM = ("a", "b", "c")
+MOTORS = "<actuator>" + "".join(f'<motor joint="{name}"/>' for name in ARM) + "</actuator>"
 TABLE = '<joint name="x" type="slide"/><joint name="y" type="slide" axis="0 1 0"/>'
 LOOP = '<equality><connect body1="slide_link" body2="a_link" anchor="0 0 0"/></equality>'
 
@@ -222,7 +241,12 @@ LOOP = '<equality><connect body1="slide_link" body2="a_link" anchor="0 0 0"/></e
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"gripper": True}, (*ARM, "left_finger"), ""),
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"chain": ("b",)}, ("a", "b"), "c, left_finger"),
         (SCENE.format(nest(*ARM), ""), {"chain": ("a_link", "c_link")}, ("b", "c"), "a are not part"),
-        (SCENE.format(nest(*ARM), ""), {"chain": ("a", "c")}, ("a", "c"), "b are not part"),
+        (SCENE.format(nest(*ARM), ""), {"chain": ("b", "c")}, ("b", "c"), "a are not part"),
+        (
+            SCENE.format(nest(*ARM, inside=FINGERS + nest("t1", "t2")), ""),
+            {}, ARM, "The gripper (left_finger, right_finger, t1, t2)",
+        ),
+        (SCENE.format(nest(*ARM) + nest("door") + nest("drawer"), MOTORS), {}, ARM, "door_link, drawer_link are other"),
         (SCENE.format(nest(*ARM, inside='<site name="x" pos="1 0 0"/>'), ""), {"tip": "x"}, ARM, ""),
         (
             SCENE.format(nest(*ARM), '<equality><joint joint1="c" joint2="b"/></equality>'),
@@ -268,21 +292,34 @@ def test_a_robot_in_a_scene_stands_at_the_origin(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("actuator", "choices", "interface", "force"),
     [
-        ("", {}, "speed", np.nan),
-        ('<position joint="{}" kp="5"/>', {}, "position", np.nan),
-        ('<velocity joint="{}" kv="5"/>', {}, "speed", np.nan),
-        ('<motor joint="{}" gear="10" ctrlrange="-2 2"/>', {}, "speed", np.nan),
+        ('<position joint="{}" kp="5" forcerange="-3 3"/>', {}, "position", 3.0),
+        ('<velocity joint="{}" kv="5" forcerange="-3 3"/>', {}, "speed", 3.0),
+        ('<motor joint="{}" gear="10" ctrlrange="-2 2"/>', {}, "speed", 20.0),
         ('<motor joint="{}" gear="10" ctrlrange="-2 2"/>', {"command": "torque"}, "torque", 20.0),
     ],
 )
-def test_an_mjcf_says_what_commands_its_joints(
+def test_an_mjcf_says_what_commands_its_joints_and_how_strongly(
     actuator: str, choices: Any, interface: str, force: float, tmp_path: Path
 ) -> None:
     drives = "".join(actuator.format(name) for name in ("lift", "tilt"))
     text = SCENE.format(nest("lift", "tilt"), f"<actuator>{drives}</actuator>")
     machine = read(text, tmp_path, **choices).build()
     assert machine.interface == interface
-    assert machine.max_force == pytest.approx([force, force], nan_ok=True)
+    assert [body.yield_force.value for body in machine.bodies] == [force, force]
+    if interface == "torque":
+        assert machine.max_force.tolist() == [force, force]
+
+
+def test_joints_without_names_keep_their_own_limits_and_equal_names_are_told_apart(
+    tmp_path: Path,
+) -> None:
+    text = re.sub(' name="[^"]*"', "", nest("a", "b")).replace("-60 60", "-30 30", 1)
+    first, second = read(SCENE.format(text, ""), tmp_path).build().joints
+    assert (first.name, second.name) == ("q1", "q2")
+    assert first.upper.value == pytest.approx(np.pi / 6, rel=1e-4)
+    assert second.upper.value == pytest.approx(np.pi / 3, rel=1e-4)
+    clash = edit('name="lift"', 'name="a b"').replace('name="reach"', 'name="a_b"')
+    assert read(clash, tmp_path).build().joint_names == ("slew", "a_b", "a_b_")
 
 
 @pytest.mark.parametrize("where", ["package", "variable", "key"])
@@ -300,7 +337,7 @@ def test_meshes_of_a_package_are_found_and_kept(
     shape = '<visual><geometry><mesh filename="package://arm_description/meshes/mast.stl"/></geometry></visual>'
     file.write_text(edit('<link name="mast">', f'<link name="mast">{shape}'))
     packages = (str(folder.parent),) if where == "key" else ()
-    found = import_model(file, "arm", ModelChoices(packages=packages))
+    found = import_file(file, packages=packages)
     (name,) = found.meshes
     assert f'file="{name}"' in found.mjcf
     spec = mujoco.MjSpec.from_string(found.mjcf)
@@ -351,7 +388,8 @@ def test_drives_that_are_too_stiff_are_named_with_a_stiffness_that_is_not(machin
         strong = dataclasses.replace(machine, joints=tuple(joints))
         q = torch.tensor(machine.home, dtype=torch.float32).repeat(64, 1)
         drawn = {"q": q, "scene": make_empty_scenes(64)}
-        return try_machine(strong, option("sim", "native"), None, 64, drawn)[0]
+        world = option("sim", "native").build(strong, torch.device("cpu"), 64)
+        return try_machine(strong, world, None, drawn)[0]
 
     text = simulate(1e8)
     assert text and "q4 swings fastest" in text
