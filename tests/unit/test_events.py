@@ -85,14 +85,6 @@ def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> Non
         np.testing.assert_allclose(used.body_subtreemass[0], edited.body_mass.sum(), rtol=1e-6)
 
 
-def test_factors_of_one_change_nothing(machine: Machine) -> None:
-    plain = NATIVE.build(machine, "cpu")
-    varied: Any = NATIVE.build(machine, "cpu", None, events=FIXED)
-    varied._properties.apply()
-    paths = drive_into_the_ground(machine, [plain, varied])
-    np.testing.assert_allclose(paths[0], paths[1], atol=1e-7)
-
-
 def test_a_saturated_drive_accelerates_by_yield_force_over_mass(machine: Machine) -> None:
     world: Any = NATIVE.build(machine, "cpu", None, events=FIXED)
     world._properties.factors["yield_force"][:] = torch.tensor(

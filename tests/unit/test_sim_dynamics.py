@@ -108,20 +108,6 @@ def test_mass_matrix_and_forces_are_those_of_mujoco_c(arms):
     assert cut.any() and not cut.all()
 
 
-def test_the_motion_of_a_point_is_that_of_mujoco_c(arms):
-    """From `cdof` and the point that it is measured from, as contact Jacobians are made."""
-    arms.prepare()
-    last, root = arms.model.nbody - 1, arms.model.body_rootid[arms.model.nbody - 1]
-    motion = arms.data.cdof.numpy()
-    for world, data in enumerate(arms.reference):
-        point, expected = data.geom_xpos[-1], np.zeros((3, arms.model.nv))
-        mujoco.mj_jac(arms.model, data, expected, None, point, last)
-        to = point - arms.data.subtree_com.numpy()[world, root]
-        np.testing.assert_allclose(
-            (motion[world, :, 3:] + np.cross(motion[world, :, :3], to)).T, expected, atol=1e-5
-        )
-
-
 def test_a_hundred_substeps_with_servos_at_their_limit_and_contact_are_those_of_mujoco_c(arms):
     touched = 0
     for _ in range(100):

@@ -13,12 +13,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.sim.model import ASSETS, compile_model
-from brokk_rl.sim.scene import (
-    HOLE_RADIUS_M,
-    ScenePlacement,
-    build_collision_geoms,
-    make_nominal_scenes,
-)
+from brokk_rl.sim.scene import ScenePlacement, build_collision_geoms, make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator
 
 SMALL_MJCF = """
@@ -128,15 +123,6 @@ def test_a_second_machine_is_only_a_machine_and_an_mjcf(machine, tmp_path):
     tip = Kinematics(small).pose(world.q).tip_in_base_m
     torch.testing.assert_close(tip[0], torch.tensor([1.5, 0.0, -0.1]), atol=5e-3, rtol=0)
     assert not world.faults.any()
-
-
-def test_the_walls_of_the_hole_lie_exactly_at_its_radius():
-    block = build_collision_geoms(1.0, HOLE_RADIUS_M)
-    for name, size, pos, yaw in zip(block.names, block.size, block.pos, block.yaw_rad, strict=True):
-        if name.startswith(("slab", "post")):
-            outward = pos[:2] / np.linalg.norm(pos[:2])
-            axis = 0 if abs(outward @ [np.cos(yaw), np.sin(yaw)]) > 0.5 else 1
-            assert np.linalg.norm(pos[:2]) - size[axis] == pytest.approx(HOLE_RADIUS_M, abs=1e-12)
 
 
 @pytest.mark.parametrize(("scale", "radius_m"), [(1.0, 0.05), (1.1, 0.045), (0.9, 0.08)])

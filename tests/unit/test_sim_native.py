@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from brokk_rl.errors import DeviceError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import ASSETS
@@ -209,15 +208,6 @@ def _settle(world: NativeWorld) -> torch.Tensor:
     return world.contact_force_n.clone()
 
 
-def test_a_centred_chisel_goes_in_without_force(machine):
-    world, scene = _world(machine), make_nominal_scenes(1)
-    q = _above_hole(machine, scene, torch.zeros(1, 2))
-    world.reset(_all(1), q, scene)
-    peak = _lower(machine, world, q, depth_m=0.35)
-    depth = scene[0, 2] - Kinematics(machine).pose(world.q).tip_in_base_m[0, 2]
-    assert peak.item() == 0.0 and depth > 0.295
-
-
 @pytest.mark.parametrize("offset_mm", [8, 15, 20])
 def test_a_chisel_beside_the_middle_slides_in(machine, offset_mm):
     angles = torch.arange(8) * math.pi / 4
@@ -232,91 +222,16 @@ def test_a_chisel_beside_the_middle_slides_in(machine, offset_mm):
     assert not world.faults.any()
 
 
-def test_a_chisel_on_the_face_does_not_go_in(machine):
-    scene = make_nominal_scenes(3)
-    world = _world(machine, 3)
-    q = _above_hole(machine, scene, torch.tensor([[0.12, 0.0], [-0.2, 0.1], [0.0, -0.15]]))
-    world.reset(_all(3), q, scene)
-    peak = _lower(machine, world, q, depth_m=0.3)
-    depth = scene[:, 2] - Kinematics(machine).pose(world.q).tip_in_base_m[:, 2]
-    assert (depth < 0.01).all() and (peak > 1_000).all()
-
-
-def test_a_hole_that_goes_deeper_than_the_ground_can_be_entered(machine):
-    scene = make_nominal_scenes(1)
-    scene[:, 2] = 0.2
-    world = _world(machine)
-    q = _above_hole(machine, scene, torch.zeros(1, 2))
-    world.reset(_all(1), q, scene)
+def test_a_chisel_goes_in_where_the_hole_is_and_wide_enough_and_nowhere_else(machine):
+    """In the middle, in a hole deeper than the ground, in one that is too narrow, and beside it."""
+    offset_m = torch.tensor([[0, 0], [0, 0], [0, 0], [0.12, 0], [-0.2, 0.1], [0, -0.15]])
+    scene = make_nominal_scenes(6)
+    scene[1, 2] = 0.2
+    scene[2, 5] = 0.035
+    world = _world(machine, 6)
+    q = _above_hole(machine, scene, offset_m)
+    world.reset(_all(6), q, scene)
     peak = _lower(machine, world, q, depth_m=0.35)
-    assert peak.item() == 0.0
-    assert Kinematics(machine).pose(world.q).tip_in_base_m[0, 2] < -0.09
-
-
-def test_a_narrower_hole_is_narrower(machine):
-    scene = make_nominal_scenes(2)
-    scene[1, 5] = 0.035
-    world = _world(machine, 2)
-    q = _above_hole(machine, scene, torch.zeros(2, 2))
-    world.reset(_all(2), q, scene)
-    _lower(machine, world, q, depth_m=0.2)
     depth = scene[:, 2] - Kinematics(machine).pose(world.q).tip_in_base_m[:, 2]
-    assert depth[0] > 0.14 and depth[1] < 0.04
-
-
-def test_a_reset_touches_only_the_worlds_of_its_mask(machine):
-    world = _world(machine, 4)
-    for _ in range(5):
-        world.step(torch.full((4, 5), 0.01))
-    before = world.state_dict()
-    mask = torch.tensor([False, True, False, False])
-    scene = make_nominal_scenes(4)
-    scene[:, 0] += 0.3
-    world.reset(mask, torch.zeros(4, 5), scene)
-    after = world.state_dict()
-    for name, tensor in before.items():
-        assert torch.equal(tensor[~mask], after[name][~mask]), name
-    assert (world.q[1] == 0).all()
-    assert not torch.equal(before["state"][1], after["state"][1])
-
-
-def test_a_restored_state_goes_on_bit_for_bit(machine):
-    generator = torch.Generator().manual_seed(3)
-    increments = 0.02 * torch.randn(40, 4, 5, generator=generator)
-    scene = make_nominal_scenes(4)
-    scene[:, 4], scene[:, 5] = torch.linspace(0.9, 1.1, 4), torch.linspace(0.045, 0.055, 4)
-    world = _world(machine, 4)
-    world.reset(_all(4), world.q.clone(), scene)
-    for increment in increments[:20]:
-        world.step(increment)
-    state = world.state_dict()
-    other = _world(machine, 4)
-    other.load_state_dict(state)
-    for increment in increments[20:]:
-        world.step(increment)
-        other.step(increment)
-    assert all(
-        torch.equal(tensor, other.state_dict()[name]) for name, tensor in world.state_dict().items()
-    )
-
-
-def test_a_world_that_becomes_nan_is_a_fault_until_it_is_reset(machine):
-    world = _world(machine, 3)
-    start = world.q.clone()
-    increment = torch.zeros(3, 5)
-    increment[1, 2] = math.nan
-    world.step(increment)
-    assert world.faults.tolist() == [False, True, False]
-    world.step(torch.zeros(3, 5))
-    assert world.faults.tolist() == [False, True, False]
-    world.reset(world.faults.clone(), start, make_nominal_scenes(3))
-    world.step(torch.zeros(3, 5))
-    assert not world.faults.any()
-    torch.testing.assert_close(world.q, start, atol=1e-6, rtol=0)
-
-
-def test_a_gpu_asked_of_the_native_world_says_what_to_do(machine):
-    with pytest.raises(DeviceError, match="sim=warp"):
-        NativeSimulator(num_worlds=1, substeps=5, num_threads=0).build(
-            machine, torch.device("cuda")
-        )
+    assert (depth[:2] > 0.29).all() and (peak[:2] == 0.0).all()
+    assert depth[2] < 0.04 and (depth[3:] < 0.01).all() and (peak[2:] > 1_000).all()
