@@ -216,7 +216,7 @@ class KinematicTree:
                 alike.append(arm)
         shared = [joint for joint in longest if all(joint in arm for arm in alike)]
         num_apart = len(longest) - len(shared)
-        if len(alike) == 1 or _are_fingers(len(shared), num_apart):
+        if len(alike) == 1 or _is_gripper(len(shared), num_apart):
             return shared
         ends = [self.name(arm[-1]) for arm in alike]
         raise self._source.refuse(
@@ -240,7 +240,7 @@ class KinematicTree:
         moved = set(model.actuator_trnid[is_joint, 0].tolist())
         standing, driven = [], []
         for chain in self._chains:
-            if not self._floats(self._find_root(chain[0])):
+            if not self._is_floating(self._find_root(chain[0])):
                 standing.append(chain)
         if max(map(len, standing), default=0) < 2:
             standing = self._chains
@@ -249,7 +249,7 @@ class KinematicTree:
                 driven.append(chain)
         return driven or standing
 
-    def _floats(self, root: int) -> bool:
+    def _is_floating(self, root: int) -> bool:
         first = int(self.model.body_jntadr[root])
         return first >= 0 and self.model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE
 
@@ -258,7 +258,7 @@ class KinematicTree:
         for place, joint in enumerate(chain):
             link = self.model.body(int(self.model.jnt_bodyid[joint])).name
             if GRIPPER.search(f"{self.name(joint)} {link}"):
-                is_end = _are_fingers(place, len(chain) - place)
+                is_end = _is_gripper(place, len(chain) - place)
                 return chain[:place] if is_end else chain
         return chain
 
@@ -301,6 +301,6 @@ class KinematicTree:
         return path[: path.index(joint) + 1]
 
 
-def _are_fingers(num_arm: int, num_behind: int) -> bool:
+def _is_gripper(num_arm: int, num_behind: int) -> bool:
     """Return whether joints behind an arm are few enough to be a gripper's."""
     return num_arm > 1 and num_behind < num_arm
