@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from actuators.contracts import ActuatorFit
 from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
 from diagnosis.answer import ANSWER_FILE, Answer, parse_answer
 from exam import dataset, run_cases, score
+from exam.case_distribution import CaseDistribution
 from exam.dataset import end_on_interrupt
-from exam.examiner import examine_case
 from exam.metrics import compute_metrics
 
 log = logging.getLogger(__name__)
@@ -112,109 +110,83 @@ def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
     write_text(path, "".join(lines))
 
 
-@dataclass(frozen=True)
-class AnswerScoring:
-    """Everything that answers to an exam are scored by.
+def build_table(
+    labels: Sequence[Mapping[str, Any]],
+    given: Mapping[str, GivenAnswer],
+    examined: Mapping[str, Any],
+    mix: CaseDistribution,
+) -> dict[str, Any]:
+    """Return the figures of answers; cases that nobody began are left out and counted.
 
-    Attributes:
-        labels: Its opened labels.
-        classes: Effects that recordings of commands and positions cannot tell apart.
-        of_machine: Effects that all joints have together.
+    Args:
+        labels: Opened labels of the exam.
+        given: Answers by case.
+        examined: The examiner's figures by case.
+        mix: Says which effects cannot be told apart, and which ones all joints have together.
     """
-
-    labels: Sequence[Mapping[str, Any]]
-    classes: Sequence[Sequence[str]]
-    of_machine: Sequence[str]
-
-    def score_cases(
-        self, given: Mapping[str, GivenAnswer], examined: Mapping[str, Any]
-    ) -> list[score.CaseScore]:
-        """Return the score of each case that somebody began, with the examiner's figures by case."""
-        found = []
-        for label in self.labels:
-            case = label["case"]
-            if case not in given:
-                continue
-            one, examination = given[case], examined.get(case)
-            answer = one.parse(f"answer to case {case}")
-            found.append(
-                score.score_answer(
-                    label, answer, self.classes, self.of_machine, one.seconds, examination
-                )
+    scores, shared = [], mix.list_shared()
+    for label in labels:
+        case = label["case"]
+        if case in given:
+            answer, seconds = given[case].parse(f"answer to case {case}"), given[case].seconds
+            examination = examined.get(case)
+            scores.append(
+                score.score_answer(label, answer, mix.classes, shared, seconds, examination)
             )
-        return found
-
-    def build_table(
-        self, given: Mapping[str, GivenAnswer], examined: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        """Return the figures of answers; cases that nobody began are left out and counted."""
-        scores = self.score_cases(given, examined)
-        not_begun = len(self.labels) - len(scores)
-        if not_begun:
-            log.warning(
-                "%d of %d cases were not begun and are left out", not_begun, len(self.labels)
-            )
-        return compute_metrics(scores, not_begun)
+    not_begun = len(labels) - len(scores)
+    if not_begun:
+        log.warning("%d of %d cases were not begun and are left out", not_begun, len(labels))
+    return compute_metrics(scores, not_begun)
 
 
-@dataclass(frozen=True)
-class Examiners:
-    """The examiner's simulations of the answers of some candidates.
+def examine_answers(
+    exam: Path,
+    labels: Sequence[Mapping[str, Any]],
+    folders: Mapping[str, Path],
+    examine: Callable[[str, Sequence[Path]], list[dict[str, Any]]],
+    place: Path,
+    workers: int,
+) -> dict[str, dict[str, Any]]:
+    """Return the examiner's figures by candidate and case; empty without withheld recordings.
 
-    Attributes:
+    Args:
         exam: Folder of the exam.
         labels: Its opened labels.
-        machine: The machine.
-        fit: Fit of the examiner's simulator.
+        folders: Answers of each candidate. Of a published file the figures beside it are taken.
+        examine: Returns the figures of answers to a case.
+        place: File that keeps the figures, so that an interrupted score goes on.
+        workers: Processes.
     """
-
-    exam: Path
-    labels: Sequence[Mapping[str, Any]]
-    machine: Machine
-    fit: ActuatorFit
-
-    def examine(
-        self, folders: Mapping[str, Path], place: Path, workers: int
-    ) -> dict[str, dict[str, Any]]:
-        """Return the figures by candidate and case; empty without withheld recordings.
-
-        Args:
-            folders: Answers of each candidate. Of a published file the figures beside it are taken.
-            place: File that keeps the figures, so that an interrupted score goes on.
-            workers: Processes.
-        """
-        found: dict[str, dict[str, Any]] = {}
-        for name, folder in folders.items():
-            beside = folder.parent / EXAMINED_FILE
-            is_known = folder.is_file() and beside.is_file()
-            found[name] = json.loads(beside.read_text()).get(name, {}) if is_known else {}
-        if place.is_file():
-            found |= json.loads(place.read_text())
-        todo = []
-        for label in self.labels:
-            case = label["case"]
-            is_withheld = (self.exam / dataset.WITHHELD_FOLDER / case).is_dir()
-            if label["kind"] not in ("one", "several") or not is_withheld:
-                continue
-            begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
-            missing = [name for name in begun if case not in found[name]]
-            if missing:
-                todo.append((case, missing))
-        if not todo:
-            return found
-        with (
-            ItemProgress("repairs examined", len(todo)) as progress,
-            ProcessPoolExecutor(workers, initializer=end_on_interrupt) as pool,
-        ):
-            jobs = {}
-            for case, names in todo:
-                places = [folders[name] / case for name in names]
-                job = pool.submit(examine_case, self.exam, self.fit, self.machine, case, places)
-                jobs[job] = (case, names)
-            for job in as_completed(jobs):
-                case, names = jobs[job]
-                for name, result in zip(names, job.result(), strict=True):
-                    found[name][case] = result
-                write_json(place, found)
-                progress.advance()
+    found: dict[str, dict[str, Any]] = {}
+    for name, folder in folders.items():
+        beside = folder.parent / EXAMINED_FILE
+        is_known = folder.is_file() and beside.is_file()
+        found[name] = json.loads(beside.read_text()).get(name, {}) if is_known else {}
+    if place.is_file():
+        found |= json.loads(place.read_text())
+    todo = []
+    for label in labels:
+        case = label["case"]
+        is_withheld = (exam / dataset.WITHHELD_FOLDER / case).is_dir()
+        if label["kind"] not in ("one", "several") or not is_withheld:
+            continue
+        begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
+        missing = [name for name in begun if case not in found[name]]
+        if missing:
+            todo.append((case, missing))
+    if not todo:
         return found
+    with (
+        ItemProgress("repairs examined", len(todo)) as progress,
+        ProcessPoolExecutor(workers, initializer=end_on_interrupt) as pool,
+    ):
+        jobs = {}
+        for case, names in todo:
+            jobs[pool.submit(examine, case, [folders[name] / case for name in names])] = case, names
+        for job in as_completed(jobs):
+            case, names = jobs[job]
+            for name, result in zip(names, job.result(), strict=True):
+                found[name][case] = result
+            write_json(place, found)
+            progress.advance()
+    return found

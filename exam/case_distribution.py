@@ -187,11 +187,8 @@ class CaseDistribution:
         found: list[str] = []
         while len(found) < count:
             name = next(effects)
-            taken: set[str] = set()
-            for group in self.classes:
-                if not set(group).isdisjoint(found):
-                    taken.update(group)
-            if name not in found and name not in taken:
+            alike = [group for group in self.classes if name in group]
+            if name not in found and all(set(group).isdisjoint(found) for group in alike):
                 found.append(name)
         return found
 

@@ -24,26 +24,19 @@ class ConstantAnswer:
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
         """Write it."""
         out.mkdir(parents=True, exist_ok=True)
-        build_single_answer(self.effect, machine.joint_names, self.probability).write(
-            out / ANSWER_FILE
+        verdict: Verdict = "none"
+        joints: tuple[str, ...] = ()
+        selected: tuple[Selected, ...] = ()
+        if self.effect is not None:
+            verdict, joints = "effects", machine.joint_names
+            named = {"effect": self.effect, "joints": joints, "probability": self.probability}
+            selected = (Selected(**named, parameters={}, gap_closed=None),)
+        said = Answer(
+            verdict=verdict,
+            selected=selected,
+            ranking=(Ranked(self.effect or "none", joints, self.probability),),
+            where=Where({}, (), None),
+            gap=None,
+            next_experiment=None,
         )
-
-
-def build_single_answer(effect: str | None, joints: tuple[str, ...], probability: float) -> Answer:
-    """Return an answer that names one effect, or `none`, and nothing else."""
-    verdict: Verdict = "effects" if effect else "none"
-    selected = (
-        Selected(
-            effect=effect, joints=joints, probability=probability, parameters={}, gap_closed=None
-        )
-        if effect
-        else None
-    )
-    return Answer(
-        verdict=verdict,
-        selected=(selected,) if selected else (),
-        ranking=(Ranked(effect or "none", joints if effect else (), probability),),
-        where=Where({}, (), None),
-        gap=None,
-        next_experiment=None,
-    )
+        said.write(out / ANSWER_FILE)

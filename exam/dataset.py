@@ -26,6 +26,8 @@ from exam.generate import CaseRecorder, Half, HalfPlan
 LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
 OPENED_FILE = "labels.json"
 """The labels of an opened exam, beside its score: the same bytes."""
+PRIVATE = 0o600
+"""Mode of a file that only its owner can read."""
 
 
 def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
@@ -38,7 +40,7 @@ def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
     text = json.dumps({"salt": salt, **labels}, indent=1, allow_nan=False, sort_keys=True) + "\n"
     found = hashlib.sha256(text.encode()).hexdigest()
     try:
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, PRIVATE), "w") as file:
             file.write(text)
         write_text(folder / HASH_FILE, f"{found}  {LABELS_FILE}\n")  # as sha256sum writes it
         (folder / PARTIAL_FILE).unlink(missing_ok=True)
@@ -140,14 +142,16 @@ def write_cases(
     progress.skip(len(found))
     count = len(cases.questions)
     todo = [number for number in range(count) if f"{number:04d}" not in found]
+    # machines of one make run side by side
+    todo.sort(key=lambda number: cases.recorder.find_make(cases.questions[number]))
     # a block for each process at least, so that none is idle
     size = max(1, min(BLOCK_CASES, -(-len(todo) // workers)))
     blocks = [todo[begin : begin + size] for begin in range(0, len(todo), size)]
-    _append_private(path, [{"salt": salt}] if not found else [])
+    append_lines(path, [{"salt": salt}] if not found else [], PRIVATE)
 
     def keep(done: Future[list[dict[str, Any]]]) -> None:
         fresh = [label for label in done.result() if label["case"] not in found]
-        _append_private(path, fresh)
+        append_lines(path, fresh, PRIVATE)
         found.update({label["case"]: label for label in fresh})
         progress.advance(len(fresh))
 
@@ -190,10 +194,15 @@ def _read_partial(path: Path, salt: str) -> dict[str, dict[str, Any]]:
     return {line["case"]: line for line in lines[1:]}
 
 
-def _append_private(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
+def append_lines(path: Path, lines: Sequence[Mapping[str, Any]], mode: int = 0o644) -> None:
+    """Append a line of JSON each to a file that is made with this mode.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
     try:
-        with os.fdopen(os.open(path, flags, 0o600), "a") as file:
+        with os.fdopen(os.open(path, flags, mode), "a") as file:
             for line in lines:
                 file.write(json.dumps(line) + "\n")
     except OSError as error:

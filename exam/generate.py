@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -23,10 +22,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.case_distribution import CaseDesign
-from exam.plants.family import DrawnPlants, PlantRun
+from exam.plants.family import DrawnPlants, PlantLink, PlantRun
 
-SIDE_BY_SIDE = 240
-"""Runs simulated at once; their random numbers lie in memory."""
 NUM_PLANS = 4
 """Plans drawn before a file is said to be too short: now and then the ways between distant poses
 leave no room."""
@@ -76,18 +73,6 @@ class HalfPlan:
         return bool(self.other_hand) and question.chance % 2 == 1
 
 
-@contextmanager
-def _mute_runner() -> Iterator[None]:
-    """Mute the runner's warnings about slow ways to start poses: a faulty machine may be slow."""
-    logger = logging.getLogger(PlanPlayer.__module__)
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(before)
-
-
 class RecordingJob:
     """One file of one case.
 
@@ -129,23 +114,6 @@ class RecordingJob:
         return np.random.default_rng(
             [self.question.chance, self.number, STREAMS[self.name], *name.encode()]
         )
-
-
-def _split_by_make(makes: Sequence[str], size: int) -> list[list[int]]:
-    """Return the places of runs in batches of one make and at most `size` runs."""
-    by_make: dict[str, list[int]] = {}
-    for i, make in enumerate(makes):
-        by_make.setdefault(make, []).append(i)
-    batches = []
-    for make in sorted(by_make):
-        mine = by_make[make]
-        for begin in range(0, len(mine), size):
-            batches.append(mine[begin : begin + size])
-    return batches
-
-
-def _take(items: Sequence[Any], places: Sequence[int]) -> list[Any]:
-    return [items[i] for i in places]
 
 
 class CaseRecorder:
@@ -194,10 +162,17 @@ class CaseRecorder:
             jobs: The files. They are the same whatever is recorded beside them.
             folders: Where each case's files go.
         """
-        specimens = list(map(self._specimen, jobs))
-        makes = self._plants.makes(self._machine, specimens)
-        for batch in _split_by_make(makes, SIDE_BY_SIDE):
-            self._batch(_take(jobs, batch), _take(specimens, batch), folders)
+        # a faulty machine may be slow on its ways to start poses; this process only records
+        logging.getLogger(PlanPlayer.__module__).setLevel(logging.ERROR)
+        runs = list(map(self._specimen, jobs))
+        for places, link in self._plants.build(self._machine, runs, jobs[0].half.file_s):
+            mine = [jobs[i] for i in places]
+            self._batch(mine, [runs[i] for i in places], link, folders)
+
+    def find_make(self, question: CaseDesign) -> str:
+        """Return the make of a case's machine."""
+        run = PlantRun(question.machine_seed, self._roughness, chance=0, elapsed_s=0.0)
+        return self._plants.draw(self._machine, run)[0]
 
     def _specimen(self, job: RecordingJob) -> PlantRun:
         question = job.question
@@ -209,6 +184,7 @@ class CaseRecorder:
             roughness=self._roughness,
             chance=int(job.stream("chance").integers(2**62)),
             elapsed_s=job.elapsed_s,
+            day=int(job.is_field),
             faults=faults,
             outside_fault=question.outside_fault if job.is_field else None,
             tracked=question.tracked,
@@ -234,7 +210,11 @@ class CaseRecorder:
                 tried += 1
 
     def _batch(
-        self, jobs: Sequence[RecordingJob], specimens: Sequence[PlantRun], folders: Sequence[Path]
+        self,
+        jobs: Sequence[RecordingJob],
+        specimens: Sequence[PlantRun],
+        link: PlantLink,
+        folders: Sequence[Path],
     ) -> None:
         """Record files of one half, of machines of one make."""
         half = jobs[0].half
@@ -244,9 +224,8 @@ class CaseRecorder:
             run_s=half.file_s,
             names=tuple(self._excitations),
         )
-        link = self._plants.build(machine, specimens, half.file_s)
         runner = PlanPlayer(plan, machine, self._approach, self._guards)
-        with link as opened, _mute_runner():
+        with link as opened:
             samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
         track = PlanTrack(samples)
         extra = {}
@@ -300,7 +279,8 @@ class CaseRecorder:
         healthy = []
         for specimen in specimens:
             healthy.append(replace(specimen, faults={}, outside_fault=None, tracked=False))
-        link, path = self._plants.build(self._machine, healthy, half.file_s), []
+        ((_, link),) = self._plants.build(self._machine, healthy, half.file_s)
+        path = []
         with link as opened:
             for command in u:
                 path.append(opened.read().q)

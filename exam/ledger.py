@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from brokk_rl.errors import RecordingError, StorageError
+from brokk_rl.errors import RecordingError
 from brokk_rl.record import format_now
+from exam.dataset import append_lines
 
 LEDGER_FILE = "ledger.jsonl"
 BEGUN, OPENED = "answers begin", "labels opened"
@@ -36,12 +37,7 @@ def append_entry(exam: Path, event: str, facts: Mapping[str, Any]) -> None:
     Raises:
         StorageError: the ledger cannot be written.
     """
-    line = json.dumps({"when": format_now(), "event": event, **facts}) + "\n"
-    try:
-        with (exam / LEDGER_FILE).open("a") as file:
-            file.write(line)
-    except OSError as error:
-        raise StorageError(f"cannot write {exam / LEDGER_FILE}: {error.strerror}") from error
+    append_lines(exam / LEDGER_FILE, [{"when": format_now(), "event": event, **facts}])
 
 
 def describe_registration(exam: Path, answers: Path, run: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import secrets
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,14 +24,15 @@ from exam import dataset, ledger, report, run_cases
 from exam.answer_scoring import (
     EXAMINED_FILE,
     RUN_FILE,
-    AnswerScoring,
-    Examiners,
+    build_table,
+    examine_answers,
     publish_answers,
     read_answers,
     read_run,
 )
 from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.dataset import CaseSet
+from exam.examiner import examine_case
 from exam.generate import CaseRecorder, Half, HalfPlan
 from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
@@ -94,9 +96,9 @@ class ExamSettings:
         if self.workers < 1:
             raise ConfigError(f"exam.workers: expected 1 or more, got {self.workers}")
         for name in self.mix.troubles:
-            if name not in self.plants.effects:
+            if name not in self.plants.table:
                 raise ConfigError(
-                    f"exam.mix.troubles: no plant has '{name}'; {list_choices(name, self.plants.effects)}"
+                    f"exam.mix.troubles: no plant has '{name}'; {list_choices(name, self.plants.table)}"
                 )
 
 
@@ -171,7 +173,7 @@ class Exam:
         entropy = [self.session.seed, *(salt.encode() if settings.sealed else b"")]
         return settings.mix.questions(
             self.machine,
-            settings.plants.outside_faults,
+            settings.plants.causes,
             np.random.default_rng(entropy),
             settings.plants.outside_not_on,
         )
@@ -241,12 +243,13 @@ class Exam:
             hashes = {"labels_sha256": facts["labels_sha256"]}
             ledger.append_entry(self._folder, ledger.OPENED, hashes)
         out = self.session.folder
-        examiners = Examiners(self._folder, labels, self.machine, self.exam.fit)
-        examined = examiners.examine(answers, out / EXAMINED_FILE, self.exam.workers)
-        scoring = AnswerScoring(labels, self.exam.mix.classes, self.exam.mix.list_shared())
+        examine = partial(examine_case, self._folder, self.exam.fit, self.machine)
+        examined = examine_answers(
+            self._folder, labels, answers, examine, out / EXAMINED_FILE, self.exam.workers
+        )
         tables = {}
         for name, one in given.items():
-            tables[name] = scoring.build_table(one, examined[name])
+            tables[name] = build_table(labels, one, examined[name], self.exam.mix)
             tables[name]["commit"] = read_run(answers[name]).get("commit")
             # Answers and labels stand beside the score, so that anybody can score them again.
             publish_answers(one, out / f"answers_{name}.jsonl")

@@ -1,17 +1,18 @@
 """Plants of an exam, written apart from the library's models; some share the textbook equation.
 
 changes            table of effects as changes of numbers
-family             bases of a link to runs, and of a family of plants
+family             runs, a link to them, and a family of plants that draws them from seeds
 electronics        command frames on the bus, losses in bursts, encoders
 linkage            weight of an arm, tool point
-valve_parameters   one machine with valves, drawn from a seed; effects as changes of its parameters
-hydraulics         pilot pressure, spool, notches, compensators, load-sensing pump, cylinders on a linkage
+valve_parameters   numbers that only effects change, on machines with valves; effects as changes of them
 valve_causes       causes outside the library
-valve_arm          all parts at work in N runs side by side; the plant family
+valve_arm          bus, oil, stops, play and encoders around any hydraulics; the family with a load-sensing pump
+hydraulics         its pilot pressure, spool, notches, compensators, pump, cylinders on a linkage
+circuits           the family on the three circuits of `actuators.models.circuit`
 servo_…            the same for tabletop arms of position servos in MuJoCo C
 
-The plants share no code with `actuators.effects`, `actuators.models.hydraulic` or any fitted model, so
-that a right answer does not rest on an identical implementation. Axes: `N` runs, `J` joints.
+The plants share no code with `actuators.effects` or any fitted model, so that a right answer does not
+rest on an identical implementation. Axes: `N` runs, `J` joints.
 
 Sources of the hydraulics:
 Merritt, Hydraulic Control Systems (1967): orifices and leakage (ch. 3), flow forces and spools

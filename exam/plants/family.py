@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -11,7 +11,8 @@ import numpy as np
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
-from exam.plants.changes import Change, PlantParameters
+from brokk_rl.spec import NonNegative, Range, spec
+from exam.plants.changes import Change, PlantParameters, apply_changes
 from exam.plants.linkage import Arm
 
 TRACKER_SPREAD = (0.0015, 0.0015, 0.0015, 0.001)
@@ -41,6 +42,7 @@ class PlantRun:
         roughness: Name of how much of the machine no tidy model has (`mild`, `strong`).
         chance: Seed of the run's own chance.
         elapsed_s: Time the machine has run before.
+        day: Number of the day of the run; the machine ages from day to day.
         faults: Effects it has, by name: parameters in the library's words, `(J,)` each.
         outside_fault: Its fault outside the library.
         tracked: Whether its tool point is measured.
@@ -50,33 +52,69 @@ class PlantRun:
     roughness: str
     chance: int
     elapsed_s: float
+    day: int = 0
     faults: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     outside_fault: UnknownFault | None = None
     tracked: bool = False
+
+
+@dataclass(frozen=True)
+class PlantBatch:
+    """Runs of machines of one make, side by side.
+
+    Attributes:
+        machine: Geometry, masses, limits.
+        make: Of all machines.
+        runs: The runs.
+        numbers: Of each run's machine.
+        steps: Control periods of the longest run.
+    """
+
+    machine: Machine
+    make: str
+    runs: Sequence[PlantRun]
+    numbers: Sequence[PlantParameters]
+    steps: int
+
+
+@dataclass(frozen=True)
+class PlantDraw:
+    """A machine that is being drawn.
+
+    Attributes:
+        machine: Geometry, masses, limits.
+        make: Of the machine.
+        chance: Draws its numbers.
+        numbers: Those drawn so far.
+    """
+
+    machine: Machine
+    make: str
+    chance: np.random.Generator
+    numbers: PlantParameters
+
+    def share(self, values: Mapping[str, float]) -> None:
+        """Add numbers that all joints share."""
+        for name, value in values.items():
+            self.numbers[name] = np.full(self.machine.num_joints, value)
 
 
 class PlantLink:
     """A `Link` to simulated machines, `N` runs side by side.
 
     Args:
-        machine: Geometry, masses, limits.
-        parameters: Of each run's machine.
-        runs: The runs.
+        batch: The runs and their machines.
         chance: Random numbers of each run, arrays by attribute.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        parameters: Sequence[PlantParameters],
-        runs: Sequence[PlantRun],
-        chance: Sequence[Any],
-    ) -> None:
-        self._machine, self._chance, self._k = machine, chance, 0
-        self._n = {name: np.stack([one[name] for one in parameters]) for name in parameters[0]}
-        self._elapsed_s = np.array([run.elapsed_s for run in runs], dtype=float)
-        self._tracked = np.array([run.tracked for run in runs])
-        self._kinds = [run.outside_fault.kind if run.outside_fault else None for run in runs]
+    def __init__(self, batch: PlantBatch, chance: Sequence[Any]) -> None:
+        self._machine, self._chance, self._k = batch.machine, chance, 0
+        names = batch.numbers[0]
+        self._n = {name: np.stack([one[name] for one in batch.numbers]) for name in names}
+        self._arm: Arm | None = None  # whose tool is measured
+        self._elapsed_s = np.array([run.elapsed_s for run in batch.runs], dtype=float)
+        self._tracked = np.array([run.tracked for run in batch.runs])
+        self._kinds = [run.outside_fault and run.outside_fault.kind for run in batch.runs]
 
     @property
     def q(self) -> np.ndarray:
@@ -93,10 +131,9 @@ class PlantLink:
 
     def extra(self) -> Mapping[str, np.ndarray]:
         """Return the measured tool, NaN in runs without a tracker; empty where none has one."""
-        arm = self._find_arm()
-        if arm is None or not self._tracked.any():
+        if self._arm is None or not self._tracked.any():
             return {}
-        tip_m, pitch_rad = arm.tool(self.q)
+        tip_m, pitch_rad = self._arm.tool(self.q)
         seen = np.concatenate([tip_m, pitch_rad[:, None]], 1)
         noise = np.stack([chance.tool[self._k] for chance in self._chance])
         seen = np.where(self._tracked[:, None], seen + noise * TRACKER_SPREAD, np.nan)
@@ -105,10 +142,6 @@ class PlantLink:
     def _measure(self) -> np.ndarray:
         """Return the readings of the encoders, `(N, J)`."""
         raise NotImplementedError
-
-    def _find_arm(self) -> Arm | None:
-        """Return the geometry whose tool is measured; `None` where it never is."""
-        return None
 
     def _stack_chance(self, name: str) -> np.ndarray:
         """Return random numbers of all runs, the runs on the second axis."""
@@ -121,22 +154,33 @@ class PlantLink:
         pass
 
 
+@spec
 class DrawnPlants:
     """Base of the specs in `conf/exam_plants`: machines of many makes, each drawn from its seed.
 
     Attributes:
-        roughness: By name, size of the nuisances.
+        roughness: By name, size of the nuisances and of the ageing.
+        ranges: Range of each number of a machine, uniform and by joint.
+        nuisances: The same for numbers that the library has no model of; they grow with the roughness.
+        shared: The same for numbers of pump and bus.
+        ageing: By number, standard deviation of its relative change from day to day.
         outside_not_on: Joints on which nothing of a fault outside the library would be seen, by its name.
-        table: Change of the parameters by effect.
+        makes: Names of its makes.
+        stream: Word of the stream of chance that draws machines.
+        table: Change of the numbers by effect.
         causes: Faults outside the library.
-        link: Builds the link to runs of one make.
     """
 
     roughness: dict[str, float]
+    ranges: dict[str, Range]
+    nuisances: dict[str, Range]
+    shared: dict[str, Range]
+    ageing: dict[str, NonNegative]
     outside_not_on: dict[str, tuple[str, ...]]
+    makes: ClassVar[tuple[str, ...]]
+    stream: ClassVar[str]
     table: ClassVar[Mapping[str, Change]]
     causes: ClassVar[tuple[str, ...]]
-    link: ClassVar[Callable[..., PlantLink]]
 
     def check(self) -> None:
         for name in self.outside_not_on:
@@ -145,43 +189,58 @@ class DrawnPlants:
                     f"exam.plants.outside_not_on: no cause '{name}'; {list_choices(name, self.causes)}"
                 )
 
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of the effects that its plants can have."""
-        return tuple(self.table)
-
-    @property
-    def outside_faults(self) -> tuple[str, ...]:
-        """Names of the faults outside the library that its plants can have."""
-        return self.causes
-
-    def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
-        """Return the make of each run."""
-        return [self.draw(machine, run, 1.0)[0] for run in runs]
-
-    def draw(
-        self, machine: Machine, run: PlantRun, roughness: float
-    ) -> tuple[str, PlantParameters]:
-        """Return make and parameters of a run's machine, with its faults."""
-        raise NotImplementedError
-
-    def build(self, machine: Machine, runs: Sequence[PlantRun], run_s: float) -> PlantLink:
-        """Return runs of one make, side by side.
+    def draw(self, machine: Machine, run: PlantRun) -> tuple[str, PlantParameters]:
+        """Return make and numbers of a run's machine, aged and with its faults.
 
         Raises:
             ConfigError: an effect or a roughness is unknown, or the family cannot be drawn here.
         """
-        makes, parameters = set(), []
-        for run in runs:
-            if run.roughness not in self.roughness:
-                raise ConfigError(
-                    f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
-                    f"{list_choices(run.roughness, self.roughness)}"
-                )
-            make, numbers = self.draw(machine, run, self.roughness[run.roughness])
-            if run.outside_fault is not None:
-                numbers["outside_severity"] = run.outside_fault.severity
-            makes.add(make)
-            parameters.append(numbers)
-        (make,) = makes
-        return self.link(machine, make, parameters, runs, round(run_s / machine.period_s))
+        if run.roughness not in self.roughness:
+            raise ConfigError(
+                f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
+                f"{list_choices(run.roughness, self.roughness)}"
+            )
+        roughness, count = self.roughness[run.roughness], machine.num_joints
+        generator = np.random.default_rng([run.seed, *self.stream.encode()])
+        make = self.makes[int(generator.integers(len(self.makes)))]
+        numbers: PlantParameters = {}
+        for name, span in self.ranges.items():
+            numbers[name] = generator.uniform(*span, count)
+        for name, span in self.nuisances.items():
+            numbers[name] = roughness * generator.uniform(*span, count)
+        self.complete(PlantDraw(machine, make, generator, numbers))
+        of_day = np.random.default_rng([run.seed, run.day, *b"ageing"])
+        for name, spread in self.ageing.items():
+            numbers[name] = numbers[name] * np.exp(
+                roughness * spread * of_day.standard_normal(count)
+            )
+        if run.outside_fault is not None:
+            numbers["outside_severity"] = run.outside_fault.severity
+        return make, apply_changes(numbers, run.faults, self.table, f"a machine of make '{make}'")
+
+    def complete(self, drawn: PlantDraw) -> None:
+        """Add the numbers that are not drawn from a range by joint.
+
+        Raises:
+            ConfigError: the family cannot be drawn for this machine.
+        """
+        raise NotImplementedError
+
+    def link(self, batch: PlantBatch) -> PlantLink:
+        """Return the link to runs of one make."""
+        raise NotImplementedError
+
+    def build(
+        self, machine: Machine, runs: Sequence[PlantRun], run_s: float
+    ) -> list[tuple[list[int], PlantLink]]:
+        """Return the runs of each make, side by side: their places and the link; raises as `draw`."""
+        numbers, places = [], {}
+        for place, run in enumerate(runs):
+            make, of_run = self.draw(machine, run)
+            numbers.append(of_run)
+            places.setdefault(make, []).append(place)
+        steps, found = round(run_s / machine.period_s), []
+        for make, mine in sorted(places.items()):
+            parts = ([runs[i] for i in mine], [numbers[i] for i in mine])
+            found.append((mine, self.link(PlantBatch(machine, make, *parts, steps))))
+        return found

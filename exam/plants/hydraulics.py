@@ -23,6 +23,8 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from exam.plants.changes import PlantParameters
+from exam.plants.linkage import Arm
+from exam.plants.valve_causes import OutsideCauses
 from exam.plants.valve_parameters import compute_notch_area
 
 STEP_S = 0.0025
@@ -43,6 +45,8 @@ OUTLET_PRESSURE = 0.02
 """Pressure at which the outlet regulator begins to regulate: 5 of 250 bar."""
 OPEN = 1e-4
 """Area from which a valve counts as open."""
+SPOOL_STEP = 1e-5
+"""Movement of a spool in a step, of full stroke, that counts as one."""
 STILL = 0.004
 """Speed, of full speed, below which a joint rests. Chosen by hand; not searched."""
 STRIBECK = 0.02
@@ -56,32 +60,6 @@ EPSILON = 1e-4
 def compute_orifice(drop: np.ndarray, nominal: float | np.ndarray) -> np.ndarray:
     """Return flow over area, 1 at the nominal drop: the root of the drop, linear close to 0."""
     return drop / np.sqrt((np.abs(drop) + EPSILON) * nominal)
-
-
-class Linkage:
-    """Lever arms and strokes of cylinders that are a side of a triangle.
-
-    Args:
-        numbers: `linkage_rad`, `linkage_swing_rad`, `(N, J)`.
-        machine: Limits.
-        added_rad: Further turn of the triangle to either end, by a moved mounting, `(N, J)`.
-    """
-
-    def __init__(self, numbers: PlantParameters, machine: Machine, added_rad: np.ndarray) -> None:
-        self._middle = 0.5 * (machine.lower + machine.upper)
-        self._half = 0.5 * (machine.upper - machine.lower)
-        self._at_rad = numbers["linkage_rad"]
-        self._swing_rad = numbers["linkage_swing_rad"] + added_rad
-
-    def compute_lever(self, q: np.ndarray) -> np.ndarray:
-        """Return the lever arm at `q` over that in the middle of the travel, `(N, J)`."""
-        share = (q - self._middle) / self._half
-        angle = self._at_rad + self._swing_rad * share
-        return _compute_arm(angle) / _compute_arm(self._at_rad)
-
-    def compute_stroke(self, q: np.ndarray) -> np.ndarray:
-        """Return the stroke of the cylinder, 0 to 1, `(N, J)`."""
-        return np.clip(0.5 + 0.5 * (q - self._middle) / self._half, 0.0, 1.0)
 
 
 SIDE_RATIO = 0.3
@@ -136,26 +114,24 @@ class PilotedSpools:
         return np.sign(stroke) * edge * compute_notch_area(beyond, n["notch"])
 
 
-class SensingHydraulics:
-    """Chambers, joints and pump.
+class SensingValves:
+    """Spools, chambers, joints and a pump that senses the highest load.
 
     Args:
         numbers: The machine's, `(N, J)`.
-        machine: Full speeds, yield forces, stiffness.
-        back_flow: Share of an oil flow from the cylinder back to the pump that the check valves let
-            pass, `(N, J)`.
-        pump_lag: Factor on the time constant of the pump, `(N, 1)`.
+        machine: Limits, masses, full speeds, yield forces, stiffness.
+        causes: What it has outside the library.
     """
 
-    def __init__(
-        self,
-        numbers: PlantParameters,
-        machine: Machine,
-        back_flow: np.ndarray,
-        pump_lag: np.ndarray,
-    ) -> None:
-        self._n, self._back_flow, self._pump_lag = numbers, back_flow, pump_lag
+    def __init__(self, numbers: PlantParameters, machine: Machine, causes: OutsideCauses) -> None:
+        self._n, self._causes, self._full_speed = numbers, causes, machine.max_speed
+        self._spools = PilotedSpools(numbers)
+        self._middle = 0.5 * (machine.lower + machine.upper)
+        self._half = 0.5 * (machine.upper - machine.lower)
+        self._swing_rad = numbers["linkage_swing_rad"] + causes.mounting_rad
+        self._weight = Arm(machine, numbers)
         shape = numbers["notch"].shape
+        self._sticking = causes.stick(np.zeros(shape, dtype=bool))
         self.speed = np.zeros(shape)
         self._bore, self._rod = np.zeros(shape), np.zeros(shape)
         self._supply = np.full((shape[0], 1), STANDBY)
@@ -172,41 +148,39 @@ class SensingHydraulics:
         self._viscous = np.where(is_soft, np.minimum(soft, numbers["viscous"]), numbers["viscous"])
         # a soft joint rings: dry friction of full size would end that after one swing
         self._coulomb = numbers["coulomb"] * np.where(is_soft, 0.4, 1.0)
-        self._sink = 0.4 * numbers["leak"] / machine.max_speed
+        self._sink = 0.4 * numbers["sink_rad_s"] / machine.max_speed
+        # resting cylinders bear the weight
+        home = np.tile(machine.home, (shape[0], 1))
+        self.take_pose(home, home)
+        self._bore = np.maximum(-self._force, 0.0) + 0.1
+        self._rod = (self._bore + self._force) / numbers["rod_area"]
 
-    def hold(self, load: np.ndarray) -> None:
-        """Let resting cylinders bear their load, over the yield force, `(N, J)`."""
-        area, force = self._n["rod_area"], load / FORCE_RATIO
-        self._bore = np.maximum(-force, 0.0) + 0.1
-        self._rod = (self._bore + force) / area
+    def take_pose(self, q: np.ndarray, link: np.ndarray) -> None:
+        """Take the pose of cylinders and links, `(N, J)`, for the steps of a control period."""
+        share, at_rad = (q - self._middle) / self._half, self._n["linkage_rad"]
+        arm = _compute_arm(at_rad + self._swing_rad * share)
+        self._lever = arm / _compute_arm(at_rad)  # over that in the middle of the travel
+        self._stroke = np.clip(0.5 + 0.5 * share, 0.0, 1.0)
+        self._force = self._weight.load(link) / FORCE_RATIO
 
-    @property
-    def drop(self) -> np.ndarray:
-        """Drop over the metering edges if they open now, over the nominal one, `(N, J)`."""
+    def open(self, u: np.ndarray) -> np.ndarray:
+        """Return which valves are open, `(N, J)`, a step after commands `u`."""
+        before = self._spools.spool
         head = self._supply - np.minimum(self._bore, self._rod)
-        return np.clip(head / NOMINAL_DROP, 0.0, 1.0)
+        drop = np.clip(head / NOMINAL_DROP, 0.0, 1.0)
+        self._area = self._spools.step(u, self._sticking, drop)
+        self._sticking = self._causes.stick(np.abs(self._spools.spool - before) > SPOOL_STEP)
+        return np.abs(self._area) > OPEN
 
-    def step(
-        self,
-        area: np.ndarray,
-        lever: np.ndarray,
-        stroke: np.ndarray,
-        load: np.ndarray,
-        spring: np.ndarray,
-        leak: np.ndarray,
-    ) -> np.ndarray:
-        """Return the speeds after a step, of full speed, `(N, J)`.
+    def move(self, flow: np.ndarray) -> np.ndarray:
+        """Return the speeds after a step, rad/s or m/s, `(N, J)`.
 
         Args:
-            area: Signed metering areas.
-            lever: Lever arms over those in the middle of the travel.
-            stroke: Strokes, 0 to 1.
-            load: Weight in the positive direction over the yield force.
-            spring: Factor on the drops that the compensators keep.
-            leak: Further leak of the closed valves, as a speed under two fifths of the yield force.
+            flow: Factor on the flows at the same opening, `(N, J)`.
         """
-        n, dt, extends = self._n, STEP_S, area > 0
-        opened, ratio, force = np.abs(area), n["rod_area"], load / FORCE_RATIO
+        n, dt, area, lever, force = self._n, STEP_S, self._area, self._lever, self._force
+        extends, opened, ratio = area > 0, np.abs(area), n["rod_area"]
+        spring = flow**2  # flow grows with the root of the drop
         p_in, p_out = (
             np.where(extends, self._bore, self._rod),
             np.where(extends, self._rod, self._bore),
@@ -220,17 +194,16 @@ class SensingHydraulics:
         drop = np.minimum(NOMINAL_DROP * relaxed, head)
         side = np.where(extends, 1.0, ratio)  # both edges give the same speed
         inlet = side * opened * compute_orifice(drop, NOMINAL_DROP)
-        inlet = np.where(inlet < 0, self._back_flow * inlet, inlet)
+        back_flow = self._causes.back_flow
+        inlet = np.where(inlet < 0, back_flow * inlet, inlet)
         throttled = head < NOMINAL_DROP * relaxed
         slope_in = np.where(
-            throttled & ((head > 0) | (self._back_flow > 0)),
+            throttled & ((head > 0) | (back_flow > 0)),
             side * opened * 0.5 / np.sqrt(NOMINAL_DROP * (np.abs(head) + EPSILON)),
             0.0,
         )
         # the outlet regulator: with the same loose spring it passes more under more pressure
-        passed = (
-            n["outlet"] * np.where(extends, ratio, 1.0) * opened * np.sqrt(np.maximum(spring, 0.0))
-        )
+        passed = n["outlet"] * np.where(extends, ratio, 1.0) * opened * flow
         passed = passed * np.sqrt(
             np.clip(1.0 + FORCE_RATIO * n["sensitivity"] * (p_out - 0.12), 0.05, 2.0)
         )
@@ -244,7 +217,7 @@ class SensingHydraulics:
         )
         bled = np.where(is_open, n["bleed"] * np.sqrt(np.maximum(p_in, 0.0)), 0.0)
         inlet = inlet - bled
-        sink = self._sink + leak
+        sink = self._sink + self._causes.leak(is_open)
         lost_bore = sink * np.sqrt(np.maximum(self._bore, 0.0) / TYPICAL_HOLDING)
         lost_rod = ratio * sink * np.sqrt(ratio * np.maximum(self._rod, 0.0) / TYPICAL_HOLDING)
         to_bore = np.where(extends, inlet, -outlet) - lost_bore
@@ -252,8 +225,8 @@ class SensingHydraulics:
         slope_bore = np.where(extends, slope_in, slope_out)
         slope_rod = np.where(extends, slope_out, slope_in)
         # volumes: a tenth of the stroke is dead; the rod side is smaller by its area
-        k_bore = dt * self._stiffness * 0.6 / (0.1 + stroke)
-        k_rod = dt * self._stiffness * 0.6 / (ratio * (1.1 - stroke))
+        k_bore = dt * self._stiffness * 0.6 / (0.1 + self._stroke)
+        k_rod = dt * self._stiffness * 0.6 / (ratio * (1.1 - self._stroke))
         k_bore = k_bore / (1.0 + k_bore * slope_bore)
         k_rod = k_rod / (1.0 + k_rod * slope_rod)
         bore = self._bore + k_bore * to_bore
@@ -267,7 +240,7 @@ class SensingHydraulics:
         self._bore = np.clip(bore - k_bore * lever * self.speed, 0.0, 1.0)
         self._rod = np.clip(rod + k_rod * ratio * lever * self.speed, 0.0, 1.0)
         self._follow_load(np.where(is_open, p_in, 0.0), inlet + bled, slope_in)
-        return self.speed
+        return self.speed * self._full_speed
 
     def _compute_friction(self, force: np.ndarray) -> np.ndarray:
         """Return dry friction, over the cylinder's force: larger at rest, and under load."""
@@ -283,7 +256,7 @@ class SensingHydraulics:
     def _follow_load(self, sensed: np.ndarray, flow: np.ndarray, slope: np.ndarray) -> None:
         """Move the pump's pressure on by a step."""
         n, dt = self._n, STEP_S
-        lag_s, power = n["pump_s"][:, :1] * self._pump_lag, n["power"][:, :1]
+        lag_s, power = n["pump_s"][:, :1] * self._causes.pump_lag, n["power"][:, :1]
         wanted = np.clip(sensed.max(1, keepdims=True) + MARGIN, STANDBY, 1.0)
         rise = (wanted - self._supply) * (1.0 - np.exp(-dt / lag_s))
         asked = (n["demand"] * flow).sum(1, keepdims=True)
@@ -291,6 +264,6 @@ class SensingHydraulics:
         softness = LINE_SOFTNESS + dt * (n["demand"] * slope).sum(1, keepdims=True)
         self._supply = np.clip(self._supply + np.minimum(rise, dt * spare / softness), 0.0, 1.0)
 
-    def stop(self, where: np.ndarray) -> None:
-        """Take the speed from joints at their stops, `(N, J)` bool."""
+    def stop(self, where: np.ndarray, q: np.ndarray) -> None:
+        """Take the speed from joints at their stops `q`; both `(N, J)`, `where` bool."""
         self.speed = np.where(where, 0.0, self.speed)

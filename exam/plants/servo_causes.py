@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Machine
+from exam.plants.changes import place_severities
 from exam.plants.servo_drive import STEP_S
 
 CAUSES = (
@@ -44,10 +45,7 @@ class ServoCauses:
     def __init__(self, machine: Machine, kinds: list[str | None], severity: np.ndarray) -> None:
         self._period_s, self._lower = machine.period_s, machine.lower
         self._travel = machine.upper - machine.lower
-        self._of: dict[str, np.ndarray] = {}
-        for kind in CAUSES:
-            has = np.array([other == kind for other in kinds])
-            self._of[kind] = severity * has[:, None]
+        self._of = place_severities(CAUSES, kinds, severity)
         none = np.zeros_like(severity)
         self._heat, self._strained_s, self._away_s = none.copy(), none.copy(), none.copy()
         self._wound_rad = none.copy()

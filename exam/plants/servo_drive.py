@@ -39,7 +39,7 @@ class TargetFilter:
         stroke_s = numbers["stroke_s"]
         limited = self._half * STEP_S / np.maximum(stroke_s, 1e-9)
         self._reach = np.where(stroke_s > 0, limited, np.inf)
-        filter_s = numbers["filter_s"]
+        filter_s = 0.5 * numbers["filter_s"]  # of each stage
         kept = np.exp(-STEP_S / np.maximum(filter_s, 1e-9))
         self._share = 1.0 - np.where(filter_s > 0, kept, 0.0)
         self._slow = np.stack([q, q, q])

@@ -7,7 +7,6 @@ quantised reading drives motors with back EMF against friction, and weight comes
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,8 @@ from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from diagnosis.mjcf.plant import MjcfPlant
 from exam.plants import servo_parameters
-from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus
-from exam.plants.family import DrawnPlants, PlantLink, PlantRun
+from exam.plants.family import DrawnPlants, PlantBatch, PlantDraw, PlantLink
 from exam.plants.servo_causes import CAUSES, ServoCauses
 from exam.plants.servo_drive import FRICTIONS, STEP_S, PositionLoop, TargetFilter
 
@@ -51,39 +49,29 @@ class ServoArm(PlantLink):
     """A `Link` to simulated arms of one make.
 
     Args:
-        machine: Limits, travel, period.
-        make: See `servo_parameters.MAKES`.
-        parameters: Of each run's arm.
-        runs: The runs.
-        steps: Control periods of the longest run.
+        batch: The runs and their arms.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        make: str,
-        parameters: Sequence[PlantParameters],
-        runs: Sequence[PlantRun],
-        steps: int,
-    ) -> None:
-        chance = [_RunChance(run.chance, machine, steps) for run in runs]
-        super().__init__(machine, parameters, runs, chance)
+    def __init__(self, batch: PlantBatch) -> None:
+        machine = batch.machine
+        chance = [_RunChance(run.chance, machine, batch.steps) for run in batch.runs]
+        super().__init__(batch, chance)
         n = self._n
         self._plant = MjcfPlant(ARM, restrict_to_torques(machine))
         self._noise, self._wander = self._stack_chance("noise"), self._stack_chance("wander")
         self._luck = self._stack_chance("luck")
         self._causes = ServoCauses(machine, self._kinds, n["outside_severity"])
-        q = np.tile(machine.home, (len(runs), 1))
+        q = np.tile(machine.home, (len(chance), 1))
         self._state = self._plant.start(q, np.zeros_like(q))
         self._bus = CommandBus(n, machine.period_s)
         # the servos held their pose before; a second is more than any delay
         rest = find_rest(q, machine)
-        luck = np.ones((len(runs), 1))
+        luck = np.ones((len(chance), 1))
         self._bus.send(rest, -1.0 - float(n["jitter_s"].max()), luck, 0.0 * luck, 0.0 * rest)
         self._bus.at(0.0)
         self._targets = TargetFilter(n, machine, q.copy())
         self._loop = PositionLoop(n)
-        self._friction = FRICTIONS[make](n)
+        self._friction = FRICTIONS[batch.make](n)
         self._changes = dict(self._friction.changes)
         if n["added_armature"].any():
             self._changes["armature"] = n["added_armature"]
@@ -153,33 +141,34 @@ class _RunChance:
 
 @spec
 class ServoPlants(DrawnPlants):
-    """Tabletop arms of position servos in two makes of friction, each arm unique.
+    """Tabletop arms of position servos in two makes of friction, each arm unique."""
 
-    Attributes:
-        roughness: By name, size of the nuisances.
-        outside_not_on: Joints on which nothing of an outside cause would be seen.
-    """
-
-    roughness: dict[str, float]
-    outside_not_on: dict[str, tuple[str, ...]]
-
+    makes = servo_parameters.MAKES
+    stream = "servos"
     table = servo_parameters.FAULTS
     causes = CAUSES
 
-    def draw(
-        self, machine: Machine, run: PlantRun, roughness: float
-    ) -> tuple[str, PlantParameters]:
-        """Return make and parameters of a run's arm, with its faults.
+    def complete(self, drawn: PlantDraw) -> None:
+        """Add supply, bus and firmware, and what only a fault changes.
 
         Raises:
-            ConfigError: the machine is not commanded by position, or an effect is unknown.
+            ConfigError: the machine is not commanded by position.
         """
+        numbers, chance, machine = drawn.numbers, drawn.chance, drawn.machine
         if machine.interface != "position":
             raise ConfigError(
                 f"exam_plants=servos: machine '{machine.name}' is commanded by {machine.interface}; expected a machine of "
                 "position servos, e.g. machine=so101"
             )
-        make, numbers = servo_parameters.draw_servos(machine, run.seed, roughness)
-        return make, servo_parameters.change_servos(numbers, run.faults, machine)
+        drawn.share(servo_parameters.NEUTRAL | {"supply_drop": numbers["supply_drop"][0]})
+        numbers["cogging_phase"] = chance.uniform(0.0, 2.0 * np.pi, machine.num_joints)
+        drawn.share({"transport_s": chance.uniform(*self.shared["transport_s"])})
+        # time steps between two of the firmware's loop
+        drawn.share({"ticks": float(chance.integers(1, 4))})
+        # as `diagnosis.mjcf.plant` counts: an error of 5 % of the travel, and full speed
+        numbers["full_n_m"] = 0.05 * numbers["stiffness"] * (machine.upper - machine.lower)
+        numbers["full_rad_s"] = machine.max_speed
 
-    link = staticmethod(ServoArm)
+    def link(self, batch: PlantBatch) -> ServoArm:
+        """Return the link to arms of one make."""
+        return ServoArm(batch)

@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.hydraulics import STEP_S
+from exam.plants.changes import place_severities
 
 CAUSES = (
     "silted_spool", "ajar_check", "supply_voltage", "moved_stop", "back_flow", "stale_readings", "coarse_driver",
@@ -52,6 +52,7 @@ class OutsideCauses:
         severity: `(N, J)`.
         phase: Uniform random number of each run, `(N,)`: when its charger begins.
         luck: Uniform random numbers, `(T, N)`, one a control period.
+        step_s: Time step of the valves.
     """
 
     def __init__(
@@ -61,16 +62,14 @@ class OutsideCauses:
         severity: np.ndarray,
         phase: np.ndarray,
         luck: np.ndarray,
+        step_s: float,
     ) -> None:
+        self._step_s = step_s
         self._period_s, self._luck, self._phase = machine.period_s, luck, phase
-        self._of: dict[str, np.ndarray] = {}
-        for kind in CAUSES:
-            if kind in kinds:
-                has = np.array([other == kind for other in kinds])
-                self._of[kind] = severity * has[:, None]
+        self._of = place_severities(CAUSES, kinds, severity)
         none = np.zeros_like(severity)
         travel = machine.upper - machine.lower
-        cut = STOP_TRAVEL * travel * self._of.get("moved_stop", none)
+        cut = STOP_TRAVEL * travel * self._of["moved_stop"]
         # the stop that is farther from home: the machine must reach its home
         is_upper = machine.upper - machine.home >= machine.home - machine.lower
         upper = np.where(is_upper, np.maximum(machine.upper - cut, machine.home), machine.upper)
@@ -79,9 +78,9 @@ class OutsideCauses:
             np.broadcast_to(lower, none.shape),
             np.broadcast_to(upper, none.shape),
         )
-        self.mounting_rad = MOUNTING_RAD * self._of.get("moved_mounting", none)
-        self.back_flow = BACK_FLOW * self._of.get("back_flow", none)
-        self.pump_lag = 1.0 + WAKING * self._of.get("back_flow", none).max(1, keepdims=True)
+        self.mounting_rad = MOUNTING_RAD * self._of["moved_mounting"]
+        self.back_flow = BACK_FLOW * self._of["back_flow"]
+        self.pump_lag = 1.0 + WAKING * self._of["back_flow"].max(1, keepdims=True)
         self._rest_s, self._since_s = none.copy(), none + 1e3
         self._direction, self._pause_s = none.copy(), none.copy()
         self._stale_s, self._held = none[:, 0].copy(), none.copy()
@@ -89,24 +88,21 @@ class OutsideCauses:
         # a joint is levelled by the next one, the last by the one before
         self._master = np.minimum(np.arange(machine.num_joints) + 1, machine.num_joints - 1)
         self._master[-1] = max(machine.num_joints - 2, 0)
-        self._full_speed = machine.max_speed
 
     def drive(self, u: np.ndarray, t_s: np.ndarray) -> np.ndarray:
         """Return the commands that the drivers give at the running times `t_s`, `(N,)`."""
-        if (size := self._of.get("supply_voltage")) is not None:
-            part = np.mod(t_s / CHARGER_S + self._phase, 1.0)
-            low = (part < CHARGER_SHARE)[:, None]
-            u = u * (1.0 - VOLTAGE_LOSS * size.max(1, keepdims=True) * low)
-        if (size := self._of.get("coarse_driver")) is not None:
-            levels = DRIVER_LEVELS / np.maximum(size, 1e-3)
-            u = np.where(size > 0, np.round(u * levels) / levels, u)
-        if (size := self._of.get("reversal_pause")) is not None:
-            heads = np.sign(u) * (np.abs(u) > 0.05)
-            turned = (heads * self._direction < 0) & (size > 0)
-            self._pause_s = np.where(turned, PAUSE_S * size, self._pause_s - self._period_s)
-            self._direction = np.where(heads != 0, heads, self._direction)
-            u = np.where(self._pause_s > 0, 0.0, u)
-        return u
+        part = np.mod(t_s / CHARGER_S + self._phase, 1.0)
+        low = (part < CHARGER_SHARE)[:, None]
+        u = u * (1.0 - VOLTAGE_LOSS * self._of["supply_voltage"].max(1, keepdims=True) * low)
+        size = self._of["coarse_driver"]
+        levels = DRIVER_LEVELS / np.maximum(size, 1e-3)
+        u = np.where(size > 0, np.round(u * levels) / levels, u)
+        size = self._of["reversal_pause"]
+        heads = np.sign(u) * (np.abs(u) > 0.05)
+        turned = (heads * self._direction < 0) & (size > 0)
+        self._pause_s = np.where(turned, PAUSE_S * size, self._pause_s - self._period_s)
+        self._direction = np.where(heads != 0, heads, self._direction)
+        return np.where(self._pause_s > 0, 0.0, u)
 
     def stick(self, moved: np.ndarray) -> np.ndarray:
         """Return the further friction of the spools, of full stroke, `(N, J)`.
@@ -114,32 +110,22 @@ class OutsideCauses:
         Args:
             moved: Whether each spool moved in the last step.
         """
-        size = self._of.get("silted_spool")
-        if size is None:
-            return np.zeros_like(moved, dtype=float)
-        self._rest_s = np.where(moved, 0.0, self._rest_s + STEP_S)
-        return SILT_STROKE * size * (1.0 - np.exp(-self._rest_s / SILT_S))
+        self._rest_s = np.where(moved, 0.0, self._rest_s + self._step_s)
+        return SILT_STROKE * self._of["silted_spool"] * (1.0 - np.exp(-self._rest_s / SILT_S))
 
     def leak(self, is_open: np.ndarray) -> np.ndarray:
         """Return the further leak of the closed valves, of full speed, `(N, J)`."""
-        size = self._of.get("ajar_check")
-        if size is None:
-            return np.zeros_like(is_open, dtype=float)
-        self._since_s = np.where(is_open, 0.0, self._since_s + STEP_S)
+        size = self._of["ajar_check"]
+        self._since_s = np.where(is_open, 0.0, self._since_s + self._step_s)
         return AJAR_SPEED * size * np.exp(-self._since_s / AJAR_S) * ~is_open
 
     def move_others(self, speed: np.ndarray) -> np.ndarray:
         """Return the speeds, rad/s or m/s, with what other joints add, `(N, J)`."""
-        size = self._of.get("levelling")
-        if size is None:
-            return speed
-        return speed - LEVELLING_SHARE * size * speed[:, self._master]
+        return speed - LEVELLING_SHARE * self._of["levelling"] * speed[:, self._master]
 
     def show(self, k: int, reading: np.ndarray) -> np.ndarray:
         """Return the readings of period `k` as they are sent, `(N, J)`."""
-        size = self._of.get("stale_readings")
-        if size is None:
-            return reading
+        size = self._of["stale_readings"]
         begins = (self._luck[k] < self._period_s / STALE_EVERY_S) & (self._stale_s <= 0)
         length_s = STALE_S * size.max(1)
         self._stale_s = np.where(begins, length_s, self._stale_s - self._period_s)

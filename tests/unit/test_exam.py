@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from diagnosis.answer import ANSWER_FILE
 from exam import dataset, run_cases
-from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
+from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.constant_answer import ConstantAnswer
 from exam.generate import UNCHANGED_FOLDER, CaseRecorder
 from exam.ledger import BEGUN, read_ledger
@@ -35,62 +37,31 @@ def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDe
     return mix.questions(machine, ("fading", "interlock"), np.random.default_rng(seed))
 
 
-@pytest.fixture(scope="module")
-def mix() -> CaseDistribution:
-    return option("exam_mix", "main")
-
-
-def test_kinds_have_their_shares_and_effects_come_round_evenly(
-    mix: CaseDistribution, machine: Machine
-) -> None:
+def test_cases_have_the_shares_effects_and_sizes_of_their_kinds(machine: Machine) -> None:
+    mix = option("exam_mix", "main")
     found = questions(mix, machine, 3)
-    assert {kind: sum(one.kind == kind for one in found) for kind in KINDS} == {
-        "none": 15, "faint": 10, "one": 35, "several": 20, "outside": 20,
-    }  # fmt: skip
+    counts = {"none": 15, "faint": 10, "one": 35, "several": 20, "outside": 20}
+    assert Counter(one.kind for one in found) == counts
     single = Counter(one.faults[0].effect for one in found if one.kind == "one")
     assert set(single.values()) <= {1, 2, 3} and len(single) >= 20
-    assert Counter(one.outside_fault.kind for one in found if one.outside_fault) == {
-        "fading": 10,
-        "interlock": 10,
-    }
-
-
-def test_a_case_holds_what_its_kind_says(mix: CaseDistribution, machine: Machine) -> None:
-    for one in questions(mix, machine, 4):
-        sizes, count = [fault.size for fault in one.faults], len(one.faults)
-        assert count == {"none": 0, "faint": 1, "one": 1, "several": count, "outside": 0}[one.kind]
-        if one.kind == "several":
-            assert count in (2, 3)
-            names = {fault.effect for fault in one.faults}
-            assert len(names) == count and not any(
-                len(names & set(group)) > 1 for group in mix.classes
-            )
-        assert all(
-            (0.03 <= size <= 0.1) if one.kind == "faint" else (0.4 <= size <= 1.0) for size in sizes
-        )
-        assert one.tracked or not any(mix.troubles[fault.effect].needs_tool for fault in one.faults)
-
-
-def test_the_same_seed_gives_the_same_cases_and_another_one_others(
-    mix: CaseDistribution, machine: Machine
-) -> None:
-    first, again, other = (repr(questions(mix, machine, seed)) for seed in (5, 5, 6))
-    assert first == again != other
-
-
-def test_parameters_lie_at_their_size_between_nothing_and_typical(
-    mix: CaseDistribution, machine: Machine
-) -> None:
-    for one in questions(mix, machine, 7):
+    strange = Counter(one.outside_fault.kind for one in found if one.outside_fault)
+    assert strange == {"fading": 10, "interlock": 10}
+    for one in found:
+        names = {fault.effect for fault in one.faults}
+        allowed = {"faint": {1}, "one": {1}, "several": {2, 3}}.get(one.kind, {0})
+        assert len(one.faults) == len(names) and len(names) in allowed
+        assert not any(len(names & set(group)) > 1 for group in mix.classes)
+        low, high = mix.faint_sizes if one.kind == "faint" else mix.sizes
         for fault in one.faults:
+            assert low <= fault.size <= high
+            assert one.tracked or not mix.troubles[fault.effect].needs_tool
+            has = np.isin(machine.joint_names, fault.joints)
             for name, nothing in fault.drawn.items():
-                typical = mix.troubles[fault.effect].numbers[name][1]
-                values = fault.parameters[name][
-                    [joint in fault.joints for joint in machine.joint_names]
-                ]
-                assert np.abs(values - nothing) == pytest.approx(
-                    np.full(len(values), fault.size * abs(typical - nothing))
-                )
+                away = abs(mix.troubles[fault.effect].numbers[name][1] - nothing)
+                values = np.abs(fault.parameters[name][has] - nothing)
+                np.testing.assert_allclose(values, fault.size * away)
+    again, other = questions(mix, machine, 3), questions(mix, machine, 4)
+    assert repr(again) == repr(found) != repr(other)
 
 
 @pytest.fixture(scope="module")
@@ -128,13 +99,9 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
         exclusive = machine.is_exclusive
         assert not (moving[:, exclusive].any(1) & moving[:, ~exclusive].any(1)).any()
         assert (found.q >= machine.lower - 0.05).all() and (found.q <= machine.upper + 0.05).all()
-    names = {
-        name
-        for case in json.loads(labels.read_text())["cases"]
-        for one in case["effects"]
-        for name in [one["effect"]]
-    }
-    assert names and not any(name.encode() in file.read_bytes() for file in files for name in names)
+    told = json.loads(labels.read_text())["cases"]
+    (name,) = [case["effects"][0]["effect"] for case in told if case["effects"]]
+    assert not any(name.encode() in file.read_bytes() for file in files)
 
 
 def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
@@ -214,38 +181,27 @@ def test_a_make_that_was_interrupted_goes_on_and_gives_the_cases_of_its_salt(
         assert path.read_bytes() == (part / path.relative_to(made)).read_bytes()
 
 
+def sit(candidate: run_cases.Candidate, cases: list[Path], answers: Path, machine: Machine) -> int:
+    """Returns how many cases have no answer."""
+    progress = ItemProgress("", len(cases))
+    return run_cases.answer_cases(candidate, cases, answers, machine, 1, progress)
+
+
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
-    exam: Path,
-    machine: Machine,
-    brokk: Callable[..., Any],
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
+    exam: Path, machine: Machine, brokk: Callable[..., Any], tmp_path: Path, caplog: Any
 ) -> None:
     first, second = sorted((exam / dataset.CASES_FOLDER).iterdir())
-    answers, marks = tmp_path / "answers", tmp_path / "marks"
+    answers = tmp_path / "answers"
     answers.mkdir()
-    assert (
-        run_cases.answer_cases(
-            Recorder(ValueError("ran away")), [first], answers, machine, 1, ItemProgress("", 1)
-        )
-        == 1
-    )
-    run_cases.answer_cases(
-        ConstantAnswer(effect=None, probability=0.5),
-        [second],
-        answers,
-        machine,
-        1,
-        ItemProgress("", 1),
-    )
+    assert sit(Recorder(ValueError("ran away")), [first], answers, machine) == 1
+    assert sit(ConstantAnswer(effect=None, probability=0.5), [second], answers, machine) == 0
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
-    for expected, missed in (({"value": 2, "of": 2}, 1), ({"value": 1, "of": 2}, 0)):
-        done = brokk(*score, f"session.out={marks}_{missed}")
+    for sat, missed in ((2, 1), (1, 0)):
+        marks = tmp_path / f"marks_{missed}"
+        done = brokk(*score, f"session.out={marks}")
         assert done.code == 0, done.err
-        found = json.loads((tmp_path / f"marks_{missed}" / "marks.json").read_text())["candidates"][
-            "it"
-        ]
-        assert found["sat"] == expected and found["failed"] == missed
+        found = json.loads((marks / "marks.json").read_text())["candidates"]["it"]
+        assert found["sat"] == {"value": sat, "of": 2} and found["failed"] == missed
         assert ("1 of 2 cases were not begun" in caplog.text) is (missed == 0)
         shutil.rmtree(answers / first.name, ignore_errors=True)  # from then on nobody has begun it
 
@@ -294,35 +250,42 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     (case / "field" / "00.parquet").touch()
     dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
     first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
-    assert run_cases.answer_cases(first, [case], answers, machine, 1, ItemProgress("", 1)) == 1
+    assert sit(first, [case], answers, machine) == 1
     assert run_cases.read_note(answers / "0000")["error"]
-    assert run_cases.answer_cases(second, [case], answers, machine, 1, ItemProgress("", 1)) == 0
-    assert run_cases.answer_cases(third, [case], answers, machine, 1, ItemProgress("", 1)) == 0
-    given, content = second.given[0]
-    assert (
-        content == ["field", "field/00.parquet"]
-        and tmp_path not in given.parents
-        and "0000" not in str(given)
-    )
-    assert (
-        third.given == []
-        and (answers / "0000" / ANSWER_FILE).is_file()
-        and run_cases.read_note(answers / "0000")["error"] is None
-    )
+    assert sit(second, [case], answers, machine) == sit(third, [case], answers, machine) == 0
+    ((given, content),) = second.given
+    assert content == ["field", "field/00.parquet"] and third.given == []
+    assert tmp_path not in given.parents and "0000" not in str(given)
+    assert (answers / "0000" / ANSWER_FILE).is_file()
+    assert run_cases.read_note(answers / "0000")["error"] is None
 
 
 def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_path: Path) -> None:
-    for words, limit_s, message in (
-        (("false", "{case}", "{out}"), 10.0, "exit status 1"),
-        (("sleep", "9", "#{case}{out}"), 0.2, "within"),
-    ):
+    for words, limit_s, message in (("exit 1", 10.0, "exit status 1"), ("sleep 9", 0.2, "within")):
         command = run_cases.CommandCandidate(
-            command=words if words[0] == "false" else ("sh", "-c", "sleep 9 #{case}{out}"),
-            limit_s=limit_s,
-            threads=1,
+            command=("sh", "-c", f"{words} #{{case}}{{out}}"), limit_s=limit_s, threads=1
         )
         with pytest.raises(RecordingError, match=message):
             command.answer(tmp_path, tmp_path / "out", machine)
+
+
+def test_an_interrupted_program_leaves_no_note_and_sits_again(
+    machine: Machine, tmp_path: Path
+) -> None:
+    case, answers = tmp_path / "case", tmp_path / "answers"
+    case.mkdir()
+    (case / "a").touch()
+    # A job in the background of a shell inherits an ignored SIGINT, so the program restores it first.
+    program = "from signal import *; signal(SIGINT, SIG_DFL); raise_signal(SIGINT)"
+    command = run_cases.CommandCandidate(
+        command=(sys.executable, "-c", program, "{case}", "{out}"), limit_s=10.0, threads=1
+    )
+    with pytest.raises(KeyboardInterrupt):
+        sit(command, [case], answers, machine)
+    assert not run_cases.is_begun(answers / "case")
+    failing = replace(command, command=("sh", "-c", "exit 3 #{case}{out}"))
+    sit(failing, [case], answers, machine)
+    assert run_cases.is_begun(answers / "case")
 
 
 def test_another_hand_drives_the_field_of_half_of_the_cases_and_never_the_reference(

@@ -1,29 +1,43 @@
-"""Plants of an exam with valves: physics worked by hand, effects as their numbers say, causes that show."""
+"""Plants of an exam: physics worked by hand, effects as their numbers say, causes that show."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from composed import option
 
+from brokk_rl.commands import find_rest, read_targets
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
 from brokk_rl.kinematics import Gravity, Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
-from exam.plants import valve_causes, valve_parameters
-from exam.plants.changes import PlantParameters
+from diagnosis.effect_library import load_effects
+from exam.plants import servo_parameters
+from exam.plants.changes import PlantParameters, apply_changes
 from exam.plants.electronics import CommandBus, SteppedEncoders, draw_bursts
-from exam.plants.family import PlantRun, UnknownFault
+from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, PlantRun, UnknownFault
+from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
-from exam.plants.valve_arm import SensingArm
-from exam.plants.valve_parameters import change_machine, draw_machine
+from exam.plants.valve_arm import ValveArm
+from exam.plants.valve_parameters import CHANGES, compute_notch_area
 
-Q1, Q3, Q4 = 0, 2, 3
+Q1, Q3 = 0, 2
+RUN = PlantRun(seed=3, roughness="mild", chance=1, elapsed_s=900.0)
+
+
+def smooth(name: str) -> DrawnPlants:
+    """A family without nuisances."""
+    return replace(option("exam_plants", name), roughness={"mild": 0.0})
 
 
 def clean(machine: Machine) -> PlantParameters:
     """A machine without nuisances, noise or change of lever, so that numbers can be worked by hand."""
-    numbers = draw_machine(machine, 5, 0.0)
+    _, numbers = smooth("valves").draw(machine, replace(RUN, seed=5))
     for name, value in {
         "noise_rad": 0.0, "overlap_extend": 0.1, "overlap_retract": 0.1, "notch": 0.2, "flow_force": 0.0,
         "extend": 1.0, "retract": 1.0, "linkage_rad": 1.57, "demand": 0.2, "transport_s": 0.4,
@@ -33,21 +47,32 @@ def clean(machine: Machine) -> PlantParameters:
     return numbers
 
 
+def change(numbers: PlantParameters, effect: str, **sizes: np.ndarray) -> PlantParameters:
+    return apply_changes(numbers, {effect: sizes}, CHANGES, "a machine")
+
+
 def played(
-    machine: Machine,
-    runs: list[tuple[PlantParameters, np.ndarray]],
-    kinds: list[str | None] | None = None,
-    elapsed_s: float = 900.0,
+    machine: Machine, runs: list[tuple[PlantParameters, np.ndarray]], elapsed_s: float = 900.0
 ) -> np.ndarray:
     """Positions of machines side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
-    steps, made = len(runs[0][1]), []
-    for kind in kinds or [None] * len(runs):
-        cause = None if kind is None else UnknownFault(kind, np.ones(machine.num_joints))
-        made.append(PlantRun(0, "mild", 0, elapsed_s, outside_fault=cause))
-    plant = SensingArm(machine, "sensing", [numbers for numbers, _ in runs], made, steps)
+    numbers, u = [one for one, _ in runs], np.stack([given for _, given in runs], 1)
+    made = [replace(RUN, elapsed_s=elapsed_s)] * len(runs)
+    return follow(
+        ValveArm(PlantBatch(machine, "sensing", made, numbers, len(u)), STEP_S, SensingValves), u
+    )
+
+
+def built(plants: DrawnPlants, machine: Machine, runs: list[PlantRun], run_s: float) -> PlantLink:
+    """Runs of one make side by side."""
+    ((_, link),) = plants.build(machine, runs, run_s)
+    return link
+
+
+def follow(plant: PlantLink, u: np.ndarray) -> np.ndarray:
+    """Positions under commands, `(T + 1, N, J)`."""
     path = [plant.read().q]
-    for k in range(steps):
-        plant.send(Command(np.stack([u[k] for _, u in runs])))
+    for row in u:
+        plant.send(Command(row))
         path.append(plant.read().q)
     return np.array(path)
 
@@ -90,13 +115,9 @@ def test_an_effect_changes_the_steady_speed_as_its_number_says(machine: Machine)
     well, runs, expected = clean(machine), [], []
     for effect, (sizes, level, value) in STEADY.items():
         numbers = {name: on_q3(machine, *pair) for name, pair in sizes.items()}
-        runs.append((change_machine(well, {effect: numbers}), level))
+        runs.append((change(well, effect, **numbers), level))
         by_area = effect in ("dead_band", "saturation")
-        expected.append(
-            float(valve_parameters.compute_notch_area(np.array(value), np.array(0.2)))
-            if by_area
-            else value
-        )
+        expected.append(compute_notch_area(np.array(value), np.array(0.2)) if by_area else value)
     found = find_speeds(machine, [*runs, (well, 1.0)])
     assert found[:-1] / found[-1] == pytest.approx(expected, abs=0.04)
 
@@ -108,7 +129,7 @@ def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine) -> None:
     runs = [(well, push(machine, 1.0))]
     for effect, (name, value, _) in late.items():
         runs.append(
-            (change_machine(well, {effect: {name: on_q3(machine, 0.0, value)}}), push(machine, 1.0))
+            (change(well, effect, **{name: on_q3(machine, 0.0, value)}), push(machine, 1.0))
         )
     q = played(machine, runs)[:, :, Q3]
     lost_s = (q[-1, 0] - q[-1, 1:]) / ((q[50, 0] - q[40, 0]) / (10 * machine.period_s))
@@ -118,7 +139,7 @@ def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine) -> None:
 
 def test_a_leak_lets_a_heavy_joint_sink_and_the_slew_not(machine: Machine) -> None:
     size = np.full(machine.num_joints, 0.05)
-    numbers = change_machine(clean(machine), {"creep": {"sink_rad_s": size}})
+    numbers = change(clean(machine), "creep", sink_rad_s=size)
     weight = Arm(machine, {name: value[None] for name, value in numbers.items()})
     load = weight.load(machine.home[None])[0]
     q = played(machine, [(numbers, push(machine, 0.0, 200))])[:, 0]
@@ -130,7 +151,7 @@ def test_a_leak_lets_a_heavy_joint_sink_and_the_slew_not(machine: Machine) -> No
 
 
 def test_a_worn_pump_slows_joints_that_move_together_only(machine: Machine) -> None:
-    numbers = change_machine(clean(machine), {"flow_sharing": {"demand": np.full(5, 0.5)}})
+    numbers = change(clean(machine), "flow_sharing", demand=np.full(5, 0.5))
     together = np.ones((50, 5)) * [1.0, 0.0, 1.0, 1.0, 1.0]
     q = played(machine, [(numbers, together), (numbers, push(machine, 1.0))])
     flow, alone = (q[50] - q[40]) / 0.5 / machine.max_speed
@@ -147,76 +168,22 @@ def test_frames_are_lost_in_bursts_at_the_stated_share() -> None:
     assert not draw_bursts(np.random.default_rng(0).random(1000), 0.0).any()
 
 
-def test_a_coarse_encoder_keeps_its_reading_within_its_band(machine: Machine) -> None:
-    numbers = {name: np.zeros((1, 1)) for name in ("noise_rad", "extra_noise_rad", "bias_rad")}
-    numbers |= {"scale": np.ones((1, 1)), "step_rad": np.full((1, 1), 0.01)}
-    encoder = SteppedEncoders(numbers)
-    shown = [
-        float(encoder.read(np.full((1, 1), q), np.zeros((1, 1)))[0, 0])
-        for q in (0.0, 0.0055, 0.0061, 0.0045)
-    ]
+def one(value: float) -> np.ndarray:
+    return np.full((1, 1), value)
+
+
+def test_a_coarse_encoder_keeps_its_reading_within_its_band() -> None:
+    numbers = {name: one(0.0) for name in ("noise_rad", "extra_noise_rad", "bias_rad")}
+    encoder = SteppedEncoders(numbers | {"scale": one(1.0), "step_rad": one(0.01)})
+    shown = [encoder.read(one(q), one(0.0)).item() for q in (0.0, 0.0055, 0.0061, 0.0045)]
     # steps of 10 mrad: at 5.5 it stays, beyond 6 it goes, back at 4.5 it stays
     assert shown == pytest.approx([0.0, 0.0, 0.01, 0.01])
-
-
-def test_each_cause_shows_on_its_joint_and_a_machine_of_severity_zero_is_well(
-    machine: Machine,
-) -> None:
-    well = draw_machine(machine, 3, 0.0)
-    ill = change_machine(well, {})
-    ill["outside_severity"] = on_q3(machine, 0.0, 1.0)
-    levels = (0.8, 0.8, 0.0, -0.8, 0.0, 0.25, -0.9, -0.9, -0.9, 0.7, 0.7, 0.7)
-    u = np.concatenate([push(machine, level, 50) for level in levels])
-    u[:, Q4] = np.where(np.arange(len(u)) % 150 > 109, 0.4, 0.0)  # q3 lifts alone at first
-    u[-150:] = push(machine, 1.0, 150)  # to the end of the travel
-    kinds: list[str | None] = list(valve_causes.CAUSES)
-    runs = [(ill, u)] * len(kinds) + [(well, u)] * (len(kinds) + 1)
-    q = played(machine, runs, [*kinds, *kinds, None])[:, :, Q3]
-    apart = np.abs(q - q[:, -1:]).max(0)
-    assert dict(zip(kinds, apart[: len(kinds)] > 0.01, strict=True)) == dict.fromkeys(kinds, True)
-    assert not apart[len(kinds) :].any()
-
-
-def test_a_moved_stop_ends_the_travel_and_home_can_be_reached(machine: Machine) -> None:
-    ill = change_machine(draw_machine(machine, 3, 0.0), {})
-    ill["outside_severity"] = np.ones(machine.num_joints)
-    q = played(machine, [(ill, push(machine, 1.0, 200))], ["moved_stop"])[:, 0, Q3]
-    # 0.4 of 2.7 rad are cut off the side that is farther from home
-    assert q.max() == pytest.approx(machine.upper[Q3] - 0.4 * 2.7, abs=0.003)
-    assert (machine.home <= machine.upper).all()
-
-
-def test_a_run_is_the_same_whatever_runs_beside_it(machine: Machine) -> None:
-    drawn = [draw_machine(machine, seed, 1.0) for seed in range(3)]
-    u = push(machine, 0.7, 40)
-    alone, together = played(machine, [(drawn[0], u)]), played(machine, [(one, u) for one in drawn])
-    assert np.array_equal(alone[:, 0], together[:, 0])
-    assert np.abs(together[-1, 0] - together[-1, 1]).max() > 0.005
-
-
-def test_every_effect_of_the_mix_is_neutral_where_a_joint_lacks_it(machine: Machine) -> None:
-    mix, numbers = option("exam_mix", "main"), draw_machine(machine, 3, 1.0)
-    assert set(mix.troubles) <= set(valve_parameters.CHANGES)
-    for effect, trouble in mix.troubles.items():
-        if trouble.joints == "all":
-            continue
-        sizes = {name: np.full(5, value) for name, value in trouble.shape.items()}
-        for name, (none, typical) in trouble.numbers.items():
-            sizes[name] = on_q3(machine, none if none in (0.0, 1.0) else 0.0, typical)
-        found = change_machine(numbers, {effect: sizes})
-        differing = {
-            name for name in numbers if not np.array_equal(found[name][:2], numbers[name][:2])
-        }
-        # the damping of a soft hose counts only where there is one
-        assert not differing - {"soft_damping"}, effect
-        assert any(not np.array_equal(found[name], numbers[name]) for name in numbers), effect
 
 
 def test_thermal_drift_rises_earlier_than_the_library(machine: Machine) -> None:
     well = clean(machine)
     well["warm_change"] = np.zeros(5)
-    size = {"change": np.full(5, 0.3), "time_s": np.full(5, 600.0)}
-    ill = change_machine(well, {"thermal_drift": size})
+    ill = change(well, "thermal_drift", change=np.full(5, 0.3), time_s=np.full(5, 600.0))
     u, ratio = push(machine, 1.0, 50), []
     for elapsed_s in (150.0, 6000.0):
         q = played(machine, [(ill, u), (well, u)], elapsed_s=elapsed_s)[:, :, Q3]
@@ -228,47 +195,25 @@ def test_thermal_drift_rises_earlier_than_the_library(machine: Machine) -> None:
 
 
 def test_lost_frames_hold_the_command_before_and_late_ones_keep_their_order() -> None:
-    numbers = {
-        "transport_s": np.full((1, 1), 0.1),
-        "jitter_s": np.full((1, 1), 0.1),
-        "loss": np.full((1, 1), 0.5),
-    }
-    line = CommandBus(numbers, 0.05)
-    frames = [
-        (1.0, 0.9, 0.0),
-        (2.0, 0.4, 0.0),
-        (3.0, 0.9, 1.0),
-        (4.0, 0.9, 0.0),
-    ]  # command, luck, lateness
-    seen = []
+    line = CommandBus({"transport_s": one(0.1), "jitter_s": one(0.1), "loss": one(0.5)}, 0.05)
+    # command, luck, lateness
+    frames = [(1.0, 0.9, 0.0), (2.0, 0.4, 0.0), (3.0, 0.9, 1.0), (4.0, 0.9, 0.0)]
     for k, (u, luck, late) in enumerate(frames):
-        line.send(
-            np.full((1, 1), u),
-            0.05 * k,
-            np.full((1, 1), luck),
-            np.full((1, 1), late),
-            np.zeros((1, 1)),
-        )
-    for i in range(31):
-        seen.append(float(line.at(0.01 * i + 1e-9)[0, 0]))
-    # 1 arrives at 0.10; 2 is lost; 3 is sent at 0.10 and comes at 0.30; 4 would come at 0.25 and
-    # waits for it
+        line.send(one(u), 0.05 * k, one(luck), one(late), one(0.0))
+    seen = [line.at(0.01 * i + 1e-9).item() for i in range(31)]
+    # 1 arrives at 0.10; 2 is lost; 3 is sent at 0.10 and comes at 0.30; 4 would come at 0.25 and waits
     assert seen[:10] == [0.0] * 10 and set(seen[10:30]) == {1.0}
     line.at(0.301)
-    assert float(line.at(0.302)[0, 0]) == 4.0
+    assert line.at(0.302).item() == 4.0
 
 
-def test_weight_and_tool_are_those_of_the_machine(machine: Machine) -> None:
+@pytest.mark.parametrize("name", ["brokk170", "crane"])
+def test_weight_and_tool_are_those_of_the_machine(name: str) -> None:
+    machine = option("machine", name)
     q = np.random.default_rng(0).uniform(machine.lower, machine.upper, (6, machine.num_joints))
-    arm = Arm(
-        machine,
-        {name: np.zeros((6, machine.num_joints)) for name in ("extra_m", "roll_rad", "pitch_rad")},
-    )
+    arm = Arm(machine, dict.fromkeys(("extra_m", "roll_rad", "pitch_rad"), np.zeros_like(q)))
     yields = np.array([body.yield_force.value for body in machine.bodies])
-    torque = (
-        Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
-    )
-    assert arm.load(q) == pytest.approx(torque / yields, abs=1e-4)
+    assert arm.load(q) == pytest.approx(Gravity(machine).load(q) / yields, abs=1e-9)
     tip_m, pitch_rad = arm.tool(q)
     pose = Kinematics(machine).pose(torch.as_tensor(q, dtype=torch.float32))
     assert tip_m == pytest.approx(pose.tip_in_base_m.numpy(), abs=1e-4)
@@ -276,27 +221,21 @@ def test_weight_and_tool_are_those_of_the_machine(machine: Machine) -> None:
 
 
 def test_a_longer_link_and_a_tilted_base_move_the_tool_as_geometry_says(machine: Machine) -> None:
-    zero = np.zeros((1, machine.num_joints))
-    straight = np.zeros((1, machine.num_joints))  # all along x
+    zero, longer = np.zeros((1, 5)), np.array([[0.0, 0.0, 0.02, 0.0, 0.0]])
     tips = []
-    for change in (
-        {},
-        {"extra_m": np.array([[0.0, 0.0, 0.02, 0.0, 0.0]])},
-        {"pitch_rad": zero + 0.03},
-    ):
+    for change in ({}, {"extra_m": longer}, {"pitch_rad": zero + 0.03}):
         numbers = dict.fromkeys(("extra_m", "roll_rad", "pitch_rad"), zero) | change
-        tips.append(Arm(machine, numbers).tool(straight)[0][0])
+        tips.append(Arm(machine, numbers).tool(zero)[0][0])  # stretched along x
     assert tips[1] - tips[0] == pytest.approx([0.02, 0.0, 0.0], abs=1e-9)
     x, y, z = tips[0]
     cos, sin = np.cos(0.03), np.sin(0.03)
-    assert tips[2] == pytest.approx(
-        [cos * x + sin * z, y, -sin * x + cos * z], abs=1e-9
-    )  # the front goes down
+    # the front goes down
+    assert tips[2] == pytest.approx([cos * x + sin * z, y, -sin * x + cos * z], abs=1e-9)
 
 
 def test_backlash_takes_its_gap_at_each_reversal(machine: Machine) -> None:
     u, well = np.concatenate([push(machine, 0.6, 30), push(machine, -0.6, 30)]), clean(machine)
-    worn = change_machine(well, {"backlash": {"gap_rad": on_q3(machine, 0.0, 0.02)}})
+    worn = change(well, "backlash", gap_rad=on_q3(machine, 0.0, 0.02))
     before, after = played(machine, [(well, u), (worn, u)])[:, :, Q3].T
     assert before.max() - after.max() == pytest.approx(0.01, abs=0.001)  # half, from the middle
     assert after[-1] - before[-1] == pytest.approx(0.01, abs=0.001)  # the other half
@@ -304,7 +243,7 @@ def test_backlash_takes_its_gap_at_each_reversal(machine: Machine) -> None:
 
 def test_stiction_asks_for_more_command_to_start(machine: Machine) -> None:
     well = clean(machine)
-    stuck = change_machine(well, {"stiction": {"start": on_q3(machine, 0.0, 0.25)}})
+    stuck = change(well, "stiction", start=on_q3(machine, 0.0, 0.25))
     runs = [(stuck, push(machine, 0.18)), (well, push(machine, 0.18)), (stuck, push(machine, 0.6))]
     moved = np.ptp(played(machine, runs)[:, :, Q3], axis=0)
     assert moved[0] < 0.002 and moved[1] > 0.005 and moved[2] > 0.1
@@ -312,8 +251,8 @@ def test_stiction_asks_for_more_command_to_start(machine: Machine) -> None:
 
 def test_what_is_soft_rings_and_what_is_not_does_not(machine: Machine) -> None:
     u = np.concatenate([push(machine, 0.8, 30), push(machine, 0.0, 50)])
-    size = {"ringing_s": on_q3(machine, 0.0, 0.5), "damping": on_q3(machine, 0.1, 0.1)}
-    soft = change_machine(clean(machine), {"compliance": size})
+    ringing_s, damping = on_q3(machine, 0.0, 0.5), on_q3(machine, 0.1, 0.1)
+    soft = change(clean(machine), "compliance", ringing_s=ringing_s, damping=damping)
     q = played(machine, [(clean(machine), u), (soft, u)])[42:, :, Q3]
     stiff, ringing = np.abs(np.diff(q, axis=0)).sum(0) - np.abs(q[-1] - q[0])
     assert ringing > 5.0 * stiff and ringing > 0.004
@@ -321,7 +260,182 @@ def test_what_is_soft_rings_and_what_is_not_does_not(machine: Machine) -> None:
 
 def test_a_loose_compensator_lifts_slower_than_it_lowers(machine: Machine) -> None:
     well = clean(machine)
-    loose = change_machine(well, {"load_dependence": {"sensitivity": on_q3(machine, 0.0, 0.6)}})
+    loose = change(well, "load_dependence", sensitivity=on_q3(machine, 0.0, 0.6))
     runs = [(numbers, level) for numbers in (loose, well) for level in (1.0, -1.0)]
     down, up, *even = np.abs(find_speeds(machine, runs))
     assert down / up > 1.05 * even[0] / even[1]  # positive lowers
+
+
+FAMILIES = {
+    "valves": ("brokk170", "main", [3]),
+    "circuits": ("crane", "circuits", [1, 0, 7]),
+    "servos": ("so101", "servos", [3, 0]),
+}
+"""Machine, mix, and a seed of each make."""
+MAKES = [(name, seed) for name, (_, _, seeds) in FAMILIES.items() for seed in seeds]
+HEAVY = {"heat", "overload_trip"}
+"""Causes that need longer or heavier work."""
+OF_FILES = {"joint_friction": 0.3, "joint_damping": 0.4, "joint_armature": 1.0}
+"""Parts of effects on numbers of an MJCF file, which no mix has."""
+
+
+def wave(machine: Machine, num_periods: int) -> np.ndarray:
+    """A pose, or motion of all joints in turn with pauses, `(T, J)`."""
+    t_s = machine.period_s * np.arange(num_periods)[:, None]
+    if machine.interface == "position":
+        swing = 0.8 * np.sin(2 * np.pi * t_s / [1.9, 1.5, 1.2, 1.3, 1.1])
+        return np.clip(find_rest(machine.home, machine) + swing * np.minimum(t_s / 0.3, 1.0), -1, 1)
+    levels = np.array([0.8, 0.8, 0.0, -0.8, 0.25, -0.9, 0.6])
+    u = np.zeros((num_periods, machine.num_joints))
+    u[:, Q3] = levels[(t_s[:, 0] / 2.0).astype(int) % len(levels)]
+    u[:, Q3 + 1] = np.where(np.mod(t_s[:, 0], 7.0) > 5.0, 0.4, 0.0)  # q3 moves alone at first
+    return u
+
+
+@pytest.mark.parametrize(("name", "seed"), MAKES)
+def test_each_fault_and_cause_shows_on_the_joint_that_has_it_and_a_run_stands_alone(
+    name: str, seed: int
+) -> None:
+    machine_name, mix_name, seeds = FAMILIES[name]
+    machine, plants = option("machine", machine_name), smooth(name)
+    well, only = replace(RUN, seed=seed), np.arange(machine.num_joints) == Q3
+    assert len({plants.draw(machine, replace(RUN, seed=one))[0] for one in seeds}) == len(seeds)
+    runs, names = [well], ["none"]
+    for effect, trouble in option("exam_mix", mix_name).troubles.items():
+        if trouble.needs_tool or trouble.joints == "all":
+            continue
+        sizes: dict[str, Any] = {
+            key: np.where(only, value, value) for key, value in trouble.shape.items()
+        }
+        for key, (none, typical) in trouble.numbers.items():
+            sizes[key] = np.where(only, typical, none if none in (0.0, 1.0) else 0.0)
+        runs.append(replace(well, faults={effect: sizes}))
+        names.append(effect)
+    for effect, part in OF_FILES.items() if name == "servos" else ():
+        runs.append(replace(well, faults={effect: {"part": part * only}}))
+        names.append(effect)
+    for cause in sorted({*plants.causes} - HEAVY):
+        runs.append(replace(well, outside_fault=UnknownFault(cause, 1.0 * only)))
+        names.append(cause)
+    runs.append(replace(well, outside_fault=UnknownFault(plants.causes[0], 0.0 * only)))
+    u = wave(machine, 90 if name == "servos" else round(14.0 / machine.period_s))
+    run_s = len(u) * machine.period_s
+    path = follow(built(plants, machine, runs, run_s), np.repeat(u[:, None], len(runs), 1))
+    alone = follow(built(plants, machine, [well], run_s), u[:40, None])
+    np.testing.assert_array_equal(alone[:, 0], path[: len(alone), 0])
+    apart = np.abs(path - path[:, :1])
+    assert not apart[:, -1].any(), "a machine of severity 0 is well"
+    moved = np.sqrt(np.square(apart).mean(0))
+    for effect, row, most in zip(names[1:], moved[1:], apart[:, 1:].max(0), strict=False):
+        assert most[Q3] > 3e-3, effect
+        # weight and mass couple joints, and what q3 leaves of the oil speeds q4 up
+        assert np.delete(row, [Q3, Q3 + 1]).max() < 0.4 * row[Q3], effect
+
+
+def test_a_machine_ages_from_day_to_day_by_its_spread_alone() -> None:
+    machine, plants = option("machine", "crane"), option("exam_plants", "circuits")
+    apart: dict[str, list[float]] = {name: [] for name in plants.ageing}
+    for seed in range(40):
+        days = [plants.draw(machine, replace(RUN, seed=seed, day=day))[1] for day in (0, 1)]
+        for name, first in days[0].items():
+            ratio = np.log(np.maximum(days[1][name], 1e-9) / np.maximum(first, 1e-9))
+            assert name in apart or not ratio.any(), name
+            if name in apart:
+                apart[name] += ratio.tolist()
+    for name, spread in plants.ageing.items():
+        # two days differ by the root of two
+        assert np.std(apart[name]) == pytest.approx(np.sqrt(2.0) * spread, rel=0.25), name
+
+
+def test_a_circuit_that_nothing_changes_moves_as_the_library_has_it() -> None:
+    machine, family = option("machine", "crane"), option("exam_plants", "circuits")
+    still = dict.fromkeys({**family.ranges, **family.nuisances}, (0.0, 0.0))
+    plants = replace(
+        family, ranges=still, nuisances={}, ageing={}, spread=dict.fromkeys(family.spread, 0.0)
+    )
+    u = wave(machine, 200)
+    q = follow(built(plants, machine, [replace(RUN, seed=2)], 5.0), u[:, None])[:, 0]
+    model = option("actuator", plants.draw(machine, replace(RUN, seed=2))[0]).build(
+        machine, 1, torch.device("cpu")
+    )
+    shape = (1, machine.num_history, machine.num_joints)
+    history = History(torch.zeros(shape), torch.zeros(shape))
+    history.reset(
+        torch.ones(1, dtype=torch.bool), torch.as_tensor(machine.home, dtype=torch.float32)[None]
+    )
+    expected = [machine.home]
+    for row in u:
+        history.push_u(torch.as_tensor(row, dtype=torch.float32))
+        history.push_q(model.step(history))
+        expected.append(history.q[0, -1].numpy().copy())
+    # the library follows the lever arm once a period, the plant once a step
+    moving = np.array(machine.joint_names) != "q4"  # the library has a triangle on the telescope
+    assert np.ptp(q[:, Q3]) > 0.3
+    np.testing.assert_allclose(q[:, moving], np.array(expected)[:, moving], atol=4e-3)
+
+
+def test_an_arm_sags_by_its_weight_over_the_stiffness(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Masses and levers by hand: forearm 0.104 kg, wrist 0.079 kg, gripper 0.099 kg."""
+    arm, family = option("machine", "so101"), option("exam_plants", "servos")
+    monkeypatch.setitem(servo_parameters.NEUTRAL, "step_rad", 1e-9)
+    tiny = (1e-6, 1e-6)
+    plants = replace(
+        family,
+        ranges=family.ranges | {"coulomb_n_m": tiny, "noise_rad": tiny},
+        nuisances=dict.fromkeys(family.nuisances, tiny),
+    )
+    rest = find_rest(arm.home, arm)
+    path = follow(built(plants, arm, [RUN], 3.0), np.tile(rest, (120, 1, 1)))[-1, 0]
+    pitch, elbow, wrist = path[1], path[1] + path[2], path[1] + path[2] + path[3]
+
+    def turn(x: float, z: float, angle: float) -> float:
+        """Returns how far forward a point comes, m."""
+        return x * np.cos(angle) + z * np.sin(angle)
+
+    forearm = turn(0.098, 0.003, elbow)
+    hand = turn(0.135, 0.005, elbow)
+    weight = 0.104 * forearm + 0.079 * (hand + 0.039 * np.cos(wrist))
+    weight += 0.099 * (hand + 0.086 * np.cos(wrist))
+    below = read_targets(rest, arm)[Q3] - path[Q3]
+    stiffness = plants.draw(arm, RUN)[1]["stiffness"][Q3]
+    assert pitch == pytest.approx(arm.home[1], abs=0.03)
+    assert -below * stiffness == pytest.approx(9.81 * weight, rel=0.03)
+
+
+def test_a_torque_limit_is_a_cap_of_the_duty() -> None:
+    """5 % of 0.7 rad at the elbow's stiffness, over a shortage of 2, over its torque at standstill."""
+    arm, plants = option("machine", "so101"), option("exam_plants", "servos")
+    limited = {"torque_limit": {"shortage": on_q3(arm, 0.0, 2.0)}}
+    _, n = plants.draw(arm, replace(RUN, faults=limited))
+    assert n["duty_cap"][Q3] == pytest.approx(0.0175 * n["stiffness"][Q3] / n["stall_n_m"][Q3])
+    assert np.delete(n["duty_cap"], Q3).tolist() == [1.0] * 4
+    # the neutral value of the mix reaches no joint
+    least = option("exam_mix", "servos").troubles["torque_limit"].numbers["shortage"][0]
+    runs = [RUN, replace(RUN, faults={"torque_limit": {"shortage": np.full(5, least)}})]
+    u = np.repeat(wave(arm, 90)[:, None], 2, 1)
+    path = follow(built(plants, arm, runs, 2.0), u)
+    assert np.abs(path[:, 1] - path[:, 0]).max() < 2e-3
+
+
+def test_a_firmware_that_winds_up_overshoots_and_takes_the_sag_away() -> None:
+    arm, plants = option("machine", "so101"), option("exam_plants", "servos")
+    wound = replace(RUN, outside_fault=UnknownFault("wind_up", on_q3(arm, 0.0, 1.0)))
+    u = np.tile(find_rest(arm.home, arm), (200, 2, 1))
+    u[40:, :, Q3] += 0.6
+    path = follow(built(plants, arm, [RUN, wound], 4.5), u)[:, :, Q3]
+    target = read_targets(u[-1, :1], arm)[0, Q3]
+    assert path[40:, 0].max() < target + 0.02 < path[40:, 1].max()
+    assert abs(path[-1, 1] - target) < 0.5 * abs(path[-1, 0] - target)
+
+
+def test_servos_are_refused_on_valves(machine: Machine) -> None:
+    with pytest.raises(ConfigError, match="machine=so101"):
+        option("exam_plants", "servos").build(machine, [RUN], 1.0)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_mix_asks_for_effects_that_plants_and_library_have(name: str) -> None:
+    machine_name, mix_name, _ = FAMILIES[name]
+    library = {kind.name for kind in load_effects(option("machine", machine_name))}
+    asked = set(option("exam_mix", mix_name).troubles)
+    assert asked <= {*option("exam_plants", name).table} & library

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,9 @@ from composed import option
 from brokk_rl.errors import RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.progress import ItemProgress
 from brokk_rl.record import make_motion, write_recording
 from diagnosis.answer import Answer, Estimate, Gap, Where
-from exam import dataset, examiner, run_cases
+from exam import dataset, examiner
 from exam.examiner import ExaminerSimulator, compute_closed, read_effects
 from exam.generate import UNCHANGED_FOLDER
 
@@ -115,22 +113,3 @@ def test_the_closed_share_is_that_worked_by_hand() -> None:
     assert interval == pytest.approx((0.75 + 0.025 * 0.25, 1.0 - 0.025 * 0.25))  # of 1 and 0.75
     assert compute_closed(1.04 * floor, floor, floor) == (None, None)
     assert examiner.MAX_DIFFERENCE == 0.2
-
-
-def test_an_interrupted_program_leaves_no_note_and_sits_again(
-    machine: Machine, tmp_path: Path
-) -> None:
-    case, answers = tmp_path / "case", tmp_path / "answers"
-    case.mkdir()
-    (case / "a").touch()
-    # A job in the background of a shell inherits an ignored SIGINT, so the program restores it first.
-    program = "from signal import *; signal(SIGINT, SIG_DFL); raise_signal(SIGINT)"
-    command = run_cases.CommandCandidate(
-        command=(sys.executable, "-c", program, "{case}", "{out}"), limit_s=10.0, threads=1
-    )
-    with pytest.raises(KeyboardInterrupt):
-        run_cases.answer_cases(command, [case], answers, machine, 1, ItemProgress("", 1))
-    assert not run_cases.is_begun(answers / "case")
-    failing = replace(command, command=("sh", "-c", "exit 3 #{case}{out}"))
-    run_cases.answer_cases(failing, [case], answers, machine, 1, ItemProgress("", 1))
-    assert run_cases.is_begun(answers / "case")
