@@ -20,6 +20,7 @@ import torch
 import yaml
 
 from actuators.contracts import PlannedRun
+from actuators.models.linear import Hold
 from actuators.open_loop import FreeRunWindows
 from brokk_rl import registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
@@ -215,29 +216,10 @@ def _check_simulable(kind: EffectType, machine: Machine) -> None:
     rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(
         1, machine.num_history, -1
     )
-    model = kind.wrap(StationaryModel(), machine, 1, device)
+    model = kind.wrap(Hold(), machine, 1, device)
     with torch.inference_mode():
         model.step(History(q=rest.clone(), u=torch.zeros_like(rest)))
         model.misplacement(rest[:, -1]) if kind.target.side == "kinematics" else None
-
-
-class StationaryModel:
-    """A machine that does not move; changes of a drive do nothing to it."""
-
-    def __init__(self) -> None:
-        self.drive_changes: dict[str, torch.Tensor] = {}
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """Nothing."""
-        return {}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Nothing to forget."""
-
-    def step(self, history: Any) -> torch.Tensor:
-        """Return the positions as they are."""
-        return history.q[:, -1]
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,13 @@ from itertools import combinations
 import numpy as np
 import torch
 
+from actuators.models.linear import Hold
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase
-from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
+from diagnosis.effect_library import DetectedEffect, EffectType
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SECONDS = 40
@@ -345,7 +346,7 @@ def _compute_tool_points(
     kinematics = Kinematics(machine, device)
     if kind is None:
         return kinematics.pose(at).tip_in_base_m.numpy().astype(float)
-    model = kind.wrap(StationaryModel(), machine, len(q), device)
+    model = kind.wrap(Hold(), machine, len(q), device)
     for name, value in values.items():
         model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
     true = model.truth(at)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy.signal import savgol_filter
 
+from actuators.models.linear import Hold
 from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.history import History
@@ -24,7 +25,7 @@ from diagnosis import gates, geometry, sensors
 from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
-from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
+from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.engine.decide import Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import SIGMAS, describe_numbers
@@ -303,7 +304,7 @@ def correct_positions(
     for one in detected:
         if one.kind.target.side != "measurement" or one.kind.target.stochastic:
             continue
-        model = one.kind.wrap(StationaryModel(), machine, 2, torch.device("cpu"))
+        model = one.kind.wrap(Hold(), machine, 2, torch.device("cpu"))
         for name, value in one.values().items():
             model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
         ends = torch.tensor(np.stack([machine.lower, machine.upper]), dtype=torch.float32)

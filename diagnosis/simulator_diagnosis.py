@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
+from actuators.models.linear import Hold
 from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.contracts.actuator import Actuator
@@ -21,7 +21,7 @@ from diagnosis import gates, geometry
 from diagnosis.answer import Answer, Outcome, Ranked, Selected, Where
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
-from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
+from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.engine.sizes import SIGMAS
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import describe_joints
@@ -287,7 +287,7 @@ def describe_doubts(case: GapCase, why: str) -> Outcome:
     Raises:
         RecordingError: no recording is long enough for a free run.
     """
-    runs = cut_simulator_runs(StandStill(), case.field, case.machine, 0)
+    runs = cut_simulator_runs(Hold(), case.field, case.machine, 0)
     answer = Answer(
         verdict="unknown",
         selected=(),
@@ -299,14 +299,6 @@ def describe_doubts(case: GapCase, why: str) -> Outcome:
         reason=f"cannot tell, because {why}",
     )
     return Outcome(answer, runs.view(runs.simulator.plain_runs), None, None)
-
-
-class StandStill:
-    """An actuator that does not move."""
-
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> StationaryModel:
-        """Return a model whose joints stay where they are."""
-        return StationaryModel()
 
 
 def _explain(verdict: str, selected: Sequence[Selected], failed: str) -> str:

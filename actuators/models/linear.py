@@ -21,7 +21,12 @@ from brokk_rl.spec import NonNegative, spec
 
 @spec
 class Hold(MemorylessModel):
-    """Never moves, `q' = q`: the error that any model must beat."""
+    """Never moves, `q' = q`: the error that any model must beat. Effects on a drive do nothing to it."""
+
+    @property
+    def drive_changes(self) -> dict[str, torch.Tensor]:
+        """Nothing of an effect on a drive is kept."""
+        return {}
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> Hold:
         """Return itself: there is nothing to build."""
