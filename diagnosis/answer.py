@@ -133,7 +133,7 @@ class Answer:
         rivals: Errors of simple rivals on the windows of the gap, by name.
         gates: Conditions of the verdict.
         reason: One sentence in words.
-        more: Further plain JSON: `sanity`, `horizons`, `evidence`, `remainder`, …
+        more: Further plain JSON: `sanity`, `evidence`, `unseen`
     """
 
     verdict: Verdict

@@ -108,15 +108,6 @@ def describe_class(one: Selected) -> str:
     return f"{text} What would decide: {one.decided_by}." if one.decided_by else text
 
 
-def describe_remainder(answer: Answer) -> str:
-    """Return the error that remains above the floor after the selected effects."""
-    gap = answer.gap
-    if gap is None or gap.floor is None or not answer.selected:
-        return ""
-    beyond = max(gap.after**2 - gap.floor**2, 0.0) ** 0.5
-    return f"What is left beyond the floor is {format_error(beyond, gap.unit)}."
-
-
 def list_failed_gates(gates: Sequence[Gate]) -> list[str]:
     """Return a line for each gate that failed."""
     lines = []
@@ -231,7 +222,6 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "max_listed": MAX_LISTED,
         "max_changes": MAX_CHANGES,
         "earned": _rank_rivals(more.get("evidence")),
-        "remainder": describe_remainder(answer),
         "describe_class": describe_class,
         "describe_bounds": describe_bounds,
         "describe_edit": describe_edit,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from brokk_rl.errors import CheckpointError, StorageError
+from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
+from brokk_rl.session import write_bytes
 
 SCHEMA = 1
 """Version of the format; another one is refused."""
@@ -66,18 +66,8 @@ def write_checkpoint(
         "num_history": machine.num_history,
         **facts,
     }
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     copies = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(save(copies, metadata={"brokk": json.dumps(header)}))
-        part.replace(path)
-    except OSError as error:
-        raise StorageError(
-            f"cannot write checkpoint {path}: {error.strerror or error}; the one before it is untouched"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)
+    write_bytes(path, save(copies, metadata={"brokk": json.dumps(header)}))
 
 
 def read_checkpoint(
