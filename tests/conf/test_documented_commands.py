@@ -103,7 +103,7 @@ def explain_fault(overrides: list[str], whole: bool) -> str | None:
     """Returns why a command does not compose, `None` if it does."""
     # a policy's folder is there only after a run
     chosen = [
-        re.sub(r"^policy=(?!(classical|shipped|trained)$).*", "policy=trained", line)
+        re.sub(r"^(\+?policy(@[\w.]+)?)=(?!(classical|shipped|trained)$).*", r"\1=trained", line)
         for line in overrides
     ]
     try:
