@@ -218,11 +218,8 @@ def read_clock(
         )
     if isinstance(time, RowTime):
         return np.arange(num_rows) / time.rate_hz
-    t_s = time.scale * unwrap(
-        _read_column(table.columns, time.column), getattr(time, "wraps", None)
-    )
-    if isinstance(time, Column):
-        t_s = t_s + time.offset
+    wraps, offset_s = (time.wraps, time.offset) if isinstance(time, Column) else (None, 0.0)
+    t_s = time.scale * unwrap(_read_column(table.columns, time.column), wraps) + offset_s
     known = np.isfinite(t_s)
     if not known.all() and not skip:
         row = int(np.argmin(known))
@@ -239,21 +236,16 @@ def read_clock(
             raise RecordingError(
                 f"{place}: time does not increase ({before_s:g} s, then {t_s[row]:g} s): {fault.text}; {fault.advice}"
             )
-        if fault.kind == "back":
-            shift_s = np.zeros(num_rows)
-            for at in fault.rows:
-                shift_s[at:] += t_s[at - 1] - t_s[at] + 2.0 * gap_s
-            t_s = t_s + shift_s
+        for at in fault.rows if fault.kind == "back" else ():
+            t_s[at:] += t_s[at - 1] - t_s[at] + 2.0 * gap_s
         later = is_later(t_s)
-        num_out = int((~later).sum())
         if not quiet:
-            warn_once(f"{place}: {fault.text}; {num_out} of {num_rows} rows left out")
+            warn_once(f"{place}: {fault.text}; {np.sum(~later)} of {num_rows} rows left out")
         t_s = np.where(later, t_s, np.nan)
     if isinstance(time, AlignedTime):
         kept = np.isfinite(t_s)
         anchor = _read_column(table.columns, time.anchor.column)
         anchor_s = time.anchor.scale * anchor + time.anchor.offset
-        t_s = t_s.copy()
         t_s[kept] = time.align(t_s[kept], anchor_s[kept])
     return t_s
 

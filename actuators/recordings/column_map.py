@@ -39,12 +39,11 @@ from actuators.recordings.log_signals import (
     RunSignals,
     Signal,
     describe_source,
+    list_names,
     list_ticks,
     locate,
-    refuse_missing,
-    resolve_column,
 )
-from actuators.recordings.log_tables import index_columns, join_names
+from actuators.recordings.log_tables import index_columns
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -266,19 +265,13 @@ class ColumnMap:
             texts += [joint.command.column, joint.position.column]
         wanted: dict[str, dict[str, None]] = {}
         for text in texts:
-            source = resolve_column(text, places, where)
-            for name in (source,) if isinstance(source, str) else source.names:
+            for name in list_names(text, places, where):
                 table, column = places[name]
                 wanted.setdefault(table, {})[column] = None
         for table, columns in wanted.items():
+            inside = {column: (table, column) for one, column in places.values() if one == table}
             for text in list_time_columns(self.find_time(table, where)):
-                inside = {
-                    column: (table, column) for one, column in places.values() if one == table
-                }
-                source = resolve_column(text, inside, where)
-                for name in (source,) if isinstance(source, str) else source.names:
-                    refuse_missing(join_names(table, name), places, where)
-                    columns[name] = None
+                columns |= dict.fromkeys(list_names(text, inside, where))
         return {table: [*columns] for table, columns in wanted.items()}
 
     def _read_run(self, signals: RunSignals, machine: Machine) -> list[Recording]:

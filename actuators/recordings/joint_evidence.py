@@ -39,6 +39,8 @@ NAMED_KINDS: dict[str, CommandKind] = {
 }
 TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
+SAME_SHARE = 0.1
+"""Part by which slope and offset of the line may differ from 1 : 1 for a target in the unit of the position."""
 MOST_TURNS = 2.0
 """Turns beyond which a joint with a target is in doubt: joints of arms and legs stop before, winches do not."""
 LAST_LAG = 0.95
@@ -151,7 +153,7 @@ class JointJudge:
         weights = {}
         for kind in KIND_TEXTS:
             weights[kind] = 2.5 * (kind == named) - math.log(max(1.0 - r[kind], 0.005))
-        weights["position"] += 0.5 if TARGET_SLOPE[0] <= self._slope <= TARGET_SLOPE[1] else -0.5
+        weights["position"] += self._weigh_line()
         if named != "torque":  # an acceleration that follows a target is that of a servo
             weights["torque"] = -math.inf
         chosen = given or max(weights, key=lambda kind: weights[kind])
@@ -170,6 +172,13 @@ class JointJudge:
             elif r[chosen] < CLEAR_CORRELATION:
                 evidence.append(("", -1.0))
         self._add("kind", "command", KIND_TEXTS[chosen], evidence, given is not None)
+
+    def _weigh_line(self) -> float:
+        """Return the log odds of a target by the line from commands to positions: one of 1 : 1 is no coincidence."""
+        is_through = abs(self._rest) <= SAME_SHARE * float(np.ptp(self._joint.q.values))
+        if abs(self._slope - 1.0) <= SAME_SHARE and is_through:
+            return 3.0
+        return 0.5 if TARGET_SLOPE[0] <= self._slope <= TARGET_SLOPE[1] else -0.5
 
     def judge_motion(self, commands: list[str]) -> None:
         """Add the evidence of correlations, of another command that fits better, and of odd steps."""

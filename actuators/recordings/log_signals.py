@@ -11,7 +11,7 @@ import numpy as np
 
 from actuators.recordings.advice import advise
 from actuators.recordings.clocks import TimeColumn, read_clock, unwrap
-from actuators.recordings.expression import Expression, parse_expression
+from actuators.recordings.expression import parse_expression
 from actuators.recordings.log_tables import LogRun
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
@@ -113,17 +113,16 @@ class RunSignals:
         Raises:
             RecordingError: It holds what is no number; names row and column.
         """
-        source = resolve_column(text, self._places, self.run.where)
-        if isinstance(source, str):
-            signal = self._read_column(source, empty)
-            return replace(signal, values=unwrap(signal.values, wraps))
-        parts = {name: self._read_column(name, empty) for name in source.names}
-        first = parts[source.names[0]]
+        names = list_names(text, self._places, self.run.where)
+        parts = {name: self._read_column(name, empty) for name in names}
+        first = parts[names[0]]
+        if names == (text,):
+            return replace(first, values=unwrap(first.values, wraps))
         columns = {}
         for name, part in parts.items():
             is_same = part.table == first.table and np.array_equal(part.rows, first.rows)
             columns[name] = part.values if is_same else part.interpolate(first.t_s)
-        values = source.evaluate(columns)
+        values = parse_expression(text).evaluate(columns)
         bad = ~np.isfinite(values)
         if bad.any() and not empty:
             row = int(np.argmax(bad))
@@ -163,26 +162,26 @@ class RunSignals:
         return Signal(table, t_s[rows], values[rows], rows, name)
 
 
-def resolve_column(text: str, places: Places, where: object) -> Expression | str:
-    """Return the column that a text names, or its arithmetic.
+def list_names(text: str, places: Places, where: object) -> tuple[str, ...]:
+    """Return the columns that a text names: itself, or those of its arithmetic.
 
     Raises:
         RecordingError: A column is missing.
         ConfigError: It is neither.
     """
     if text in places:
-        return text
+        return (text,)
     try:
-        expression = parse_expression(text)
+        names = parse_expression(text).names
     except ConfigError:
-        refuse_missing(text, places, where)
+        _refuse_missing(text, places, where)
         raise
-    for name in expression.names:
-        refuse_missing(name, places, where)
-    return expression
+    for name in names:
+        _refuse_missing(name, places, where)
+    return names
 
 
-def refuse_missing(name: str, places: Places, where: object) -> None:
+def _refuse_missing(name: str, places: Places, where: object) -> None:
     """Raise a `RecordingError` where a column is missing."""
     if f"{name}#1" in places:
         raise RecordingError(

@@ -191,6 +191,8 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     speed_unit = UNITS[length][1] if length in UNITS and second == "s" else None
     if speed_unit is not None:
         quantity = "velocity"
+    elif quantity == "unknown" and stated in UNITS:
+        quantity = "position"
     elif quantity == "unknown" and stated in EFFORT_UNITS:
         quantity = "effort"
     is_si = any(name <= {*words, *outer} for name in SI_NAMES)
@@ -228,9 +230,11 @@ def _split_numbers(words: list[str]) -> list[str]:
 
 
 def _find_role(words: list[str]) -> Role | None:
-    """Return the role; a word for commands counts more: `target q` and libfranka's `q_d` are commands."""
+    """Return the role; a word for commands counts more: `target q` and libfranka's `q_d` are commands, `enc_u` is none."""
     is_desired = "d" in words and not {"q", "dq", "tau"}.isdisjoint(words)
-    if is_desired or not COMMAND_WORDS.isdisjoint(words):
+    is_measured = not (MEASURED_WORDS - {"q"}).isdisjoint(words)
+    commands = COMMAND_WORDS - {"u"} if is_measured else COMMAND_WORDS
+    if is_desired or not commands.isdisjoint(words):
         return "command"
     return None if MEASURED_WORDS.isdisjoint(words) else "measured"
 

@@ -140,34 +140,34 @@ class TextLog(LogFile):
     def _read_cells(self, places: list[int], max_rows: int | None) -> dict[int, Any]:
         """Return the cells of some columns; numbers are numbers already where all of them are."""
         layout, width = self.layout, len(self.layout.samples[0])
-        options: dict[str, Any] = {
-            "sep": r"\s+" if layout.delimiter == " " else layout.delimiter,
-            "decimal": layout.decimal,
-            "header": None,
-            "names": range(width),
-            "usecols": sorted({*places, width - 1}),
-            "dtype": {at: str for at in places if layout.kinds[at] != "number"},
-            "na_values": MISSING,
-            "keep_default_na": False,
-            "encoding": layout.encoding,
-            "skiprows": layout.first_line,
-            "low_memory": False,
-            "skipinitialspace": True,
-            "nrows": max_rows,
-            "index_col": False,
-        }
+        read = functools.partial(
+            pd.read_csv,
+            self.path,
+            sep=r"\s+" if layout.delimiter == " " else layout.delimiter,
+            decimal=layout.decimal,
+            header=None,
+            names=range(width),
+            usecols=sorted({*places, width - 1}),
+            dtype={at: str for at in places if layout.kinds[at] != "number"},
+            na_values=MISSING,
+            keep_default_na=False,
+            encoding=layout.encoding,
+            skiprows=layout.first_line,
+            low_memory=False,
+            skipinitialspace=True,
+            nrows=max_rows,
+            index_col=False,
+        )
         frame: Any
         try:
-            frame = pd.read_csv(self.path, on_bad_lines="error", **options)
+            frame = read(on_bad_lines="error")
         except pd.errors.ParserError as error:
             self._report_bad_line(width, error)
-            frame = pd.read_csv(self.path, on_bad_lines="skip", **options)
-        except (OSError, UnicodeDecodeError, ValueError) as error:
-            raise RecordingError(
-                f"{self.path}: not a text file that can be read ({error})"
-            ) from error
-        if max_rows is None or len(frame) < max_rows:
-            frame = self._drop_cut_line(frame, width)
+            frame = read(on_bad_lines="skip")
+        except (OSError, ValueError) as error:
+            raise RecordingError(f"{self.path}: cannot be read as text ({error})") from error
+        if (max_rows is None or len(frame) < max_rows) and self._is_cut_off(width):
+            frame = frame.iloc[:-1]
         if len(frame) < 2:
             raise RecordingError(
                 f"{self.path}: {len(frame)} rows of data below the header; a log has at least 2"
@@ -184,17 +184,17 @@ class TextLog(LogFile):
                 self.report_damage(f"line {number} (row {row}): {text}", error)
                 return
 
-    def _drop_cut_line(self, frame: pd.DataFrame, width: int) -> pd.DataFrame:
-        """Leave out a last line that a crash cut off: a number may be cut off too, and still look like one."""
+    def _is_cut_off(self, width: int) -> bool:
+        """Return whether a crash cut off the last line, and warn: a number may be cut off too, and still look like one."""
         with self.path.open("rb") as file:
             file.seek(-min(self.path.stat().st_size, SNIFFED_BYTES), 2)
             tail = file.read().decode(self.layout.encoding, errors="replace")
         cells = split_line((tail.splitlines() or [""])[-1], self.layout.delimiter)
-        if not len(frame) or (len(cells) >= width and tail.endswith(("\n", "\r"))):
-            return frame
+        if len(cells) >= width and tail.endswith(("\n", "\r")):
+            return False
         text = f"is cut off or lacks its end ({len(cells)} of {width} cells): left out"
         log.warning("%s: the last line %s", self.path, text)
-        return frame.iloc[:-1]
+        return True
 
     def _convert(self, cells: pd.Series, at: int) -> np.ndarray:
         """Return the numbers of a column, `(T, K)`, with one for each item of a list; NaN for an empty cell."""
@@ -205,9 +205,8 @@ class TextLog(LogFile):
         if bad.any() and not self.keep_whole:
             row = int(np.argmax(bad))
             what = {"list": f"a list of {length} numbers", "time": "a time"}.get(kind, "a number")
-            number, _, _ = next(itertools.islice(self._iterate_lines(), row, None))
             raise RecordingError(
-                f"{self.path}: line {number} (row {row}), column '{self.layout.names[at]}': "
+                f"{self.path}: line {self.find_line(row)[0]} (row {row}), column '{self.layout.names[at]}': "
                 f"'{str(cells.iloc[row]).strip()}' is not {what}; {advise('damaged')}"
             )
         return values
@@ -261,22 +260,17 @@ def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayou
     candidates = []
     for delimiter, decimal in [signs] if signs else _list_signs(head):
         rows = [split_line(line, delimiter) for line in head]
-        good = [i for i, row in enumerate(rows) if _is_data(row, decimal)]
+        good = [at for at, row in enumerate(rows) if _is_data(row, decimal)]
         if not good:
             continue
-        width = Counter(len(rows[i]) for i in good).most_common(1)[0][0]
-        samples = [rows[i] for i in good if len(rows[i]) == width]
-        for line in tail:
-            row = split_line(line, delimiter)
-            if len(row) == width and _is_data(row, decimal):
-                samples.append(row)
-        score = sum(
-            tell_kind(cell, decimal) != "text" and cell not in MISSING
-            for row in samples
-            for cell in row
-        )
-        fitting = {i for i in good if len(rows[i]) == width}
-        begins = [i for i in fitting if all(i + k in fitting for k in range(FIRST_ROWS))]
+        width = Counter(len(rows[at]) for at in good).most_common(1)[0][0]
+        fitting = {at: rows[at] for at in good if len(rows[at]) == width}
+        samples = [*fitting.values()]
+        ends = [split_line(line, delimiter) for line in tail]
+        samples += [row for row in ends if len(row) == width and _is_data(row, decimal)]
+        cells = itertools.chain.from_iterable(samples)
+        score = sum(cell not in MISSING and tell_kind(cell, decimal) != "text" for cell in cells)
+        begins = [at for at in fitting if all(at + k in fitting for k in range(FIRST_ROWS))]
         first = min(begins or fitting)
         candidates.append((score, delimiter, decimal, first, width, samples))
     if not candidates:
@@ -299,10 +293,7 @@ def _list_signs(head: list[str]) -> list[tuple[str, str]]:
     """Return delimiters and decimal signs to try; Excel writes the delimiter into a line of its own."""
     stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
     delimiters = (stated[1],) if stated else DELIMITERS
-    signs = []
-    for delimiter in delimiters:
-        signs += [(delimiter, decimal) for decimal in ".,"]  # quotes hold 0,5 between commas
-    return signs
+    return [*itertools.product(delimiters, ".,")]  # quotes hold 0,5 between commas
 
 
 def _read_ends(path: Path) -> tuple[list[str], list[str], str]:
@@ -314,7 +305,7 @@ def _read_ends(path: Path) -> tuple[list[str], list[str], str]:
             file.seek(max(len(head), size - SNIFFED_BYTES) // 2 * 2)
             tail = file.read()
     except OSError as error:
-        raise RecordingError(f"{path}: not a text file that can be read ({error})") from error
+        raise RecordingError(f"{path}: cannot be read as text ({error})") from error
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
         first = head.decode(encoding, errors="strict" if size <= SNIFFED_BYTES else "ignore")
