@@ -29,7 +29,6 @@ from diagnosis.engine.side import Side, choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
-from diagnosis.gates import MAX_RIVAL_RATIO
 from diagnosis.rivals import measure_rivals
 
 BLOCK_WINDOWS = 4
@@ -210,7 +209,6 @@ class RepairProof(ABC):
             found.append(Gate(f"beats_hold_{name}", passed, float(after[j]), still[name], text))
         if self.moves:
             found.append(self._judge_reduction())
-            found += self.judge_beside_arx()
         return found
 
     def _judge_reduction(self) -> Gate:
@@ -219,20 +217,6 @@ class RepairProof(ABC):
         most = float(np.quantile(before - after, SURE_QUANTILE))
         text = f"the error is {after[0]:.3g} with the effects, {before[0]:.3g} without"
         return Gate("reduces_error", most > 0.0, float(after[0]), float(before[0]), text)
-
-    def judge_beside_arx(self) -> list[Gate]:
-        """Return whether the repaired simulator keeps up with a linear ARX that was fitted to the field."""
-        least = self.rivals["arx"].rmse
-        if least is None:
-            return []
-        after = float(self.measure_errors(self.after)[0])
-        noise = np.square(sensors.estimate_sensor_noise(self._case.reference or self._case.field))
-        ratio = after / max(least, 1e-12)
-        # What errs by its sensors only cannot be improved.
-        is_noise = after <= NOISE_FACTOR * float(combine_joints(noise, self.machine))
-        text = f"the error with the effects is {ratio:.2f} times that of an ARX fitted to the field"
-        passed = is_noise or ratio <= MAX_RIVAL_RATIO
-        return [Gate("near_arx", passed, ratio, MAX_RIVAL_RATIO, text)]
 
 
 def judge_edit(reduced: Estimate, rise: Estimate) -> tuple[float, bool]:

@@ -17,11 +17,11 @@ from typing import Any, Literal
 import yaml
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.report import Tone, embed_picture, render_page
+from brokk_rl.report import Tone, render_page
 from brokk_rl.session import write_text
 from diagnosis import answer, effects_file, report
 from diagnosis.answer import Answer
-from diagnosis.deployment.page import EVIDENCE_FILE, PAGE_FILE, REMEDIES
+from diagnosis.deployment.page import PAGE_FILE, REMEDIES
 from diagnosis.story import HANDED_ON_FOLDER
 
 WHY_FILE, WHY_PAGE = "why.json", "why.html"
@@ -247,7 +247,6 @@ def write_page(result: WhyResult) -> None:
         StorageError: it could not be written.
     """
     title, tone = result.title
-    picture = result.folder / DOCTOR / EVIDENCE_FILE
     places = [f"{DOCTOR}/{PAGE_FILE}: code, task and motion"]
     if result.diagnosis is not None:
         places.append(f"{DIAGNOSIS}/{report.REPORT_FILE}: where the simulator errs, and which effects it lacks")  # fmt: skip
@@ -256,7 +255,6 @@ def write_page(result: WhyResult) -> None:
         "title": title,
         "tone": tone,
         "summary": write_summary(result),
-        "evidence": embed_picture(picture) if picture.is_file() else "",
         "result": result,
         "often_fails": before is not None and before["mean"] < LOW_SUCCESS,
         "next_steps": {

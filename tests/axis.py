@@ -1,4 +1,4 @@
-"""A single servo axis and recordings of it, for tests of what is read off recordings."""
+"""A single axis that follows speeds, and recordings of it, for tests of what is read off recordings."""
 
 from __future__ import annotations
 
@@ -26,10 +26,17 @@ def make_axis(machine: Machine) -> Machine:
     )
 
 
-def driven(machine: Machine, count: int, seconds: float, seed: int) -> list[Recording]:
-    """Returns recordings of the plant under levels and rests, its speed wandering by a percent or two."""
+def driven(
+    machine: Machine,
+    count: int,
+    seconds: float,
+    seed: int,
+    plant: FirstOrderLag = PLANT,
+    wandering: float = 0.003,
+) -> list[Recording]:
+    """Returns recordings of a plant under levels and rests, its speed wandering by a percent or two."""
     random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
-    model = PLANT.build(machine, count, CPU)
+    model = plant.build(machine, count, CPU)
     shape = (count, machine.num_history, machine.num_joints)
     history = History(q=torch.zeros(shape), u=torch.zeros(shape))
     history.reset(
@@ -48,7 +55,7 @@ def driven(machine: Machine, count: int, seconds: float, seed: int) -> list[Reco
         commands.append(level)
         positions.append(q + 2e-4 * random.standard_normal(q.shape))
         history.push_u(torch.as_tensor(level, dtype=torch.float32))
-        wander = 0.99 * wander + 0.003 * random.standard_normal(wander.shape)
+        wander = 0.99 * wander + wandering * random.standard_normal(wander.shape)
         before = history.q[:, -1].clone()
         moved = model.step(history) - before
         history.push_q(before + moved * torch.as_tensor(1.0 + wander, dtype=torch.float32))

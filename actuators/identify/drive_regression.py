@@ -25,26 +25,18 @@ TERMS: dict[str, tuple[str, ...]] = {
     "pose": ("pose_sin_n", "pose_cos_n"),
     "stribeck": ("stribeck_n", "stribeck_m_s"),
     "load": ("motor_load",),
-    "load_at_rest": ("motor_load_at_rest",),
     "direction": ("outside_load",),
-    "direction_at_rest": ("outside_load_at_rest",),
-    "square": ("motor_load_square", "outside_load_square"),
 }
-"""Numbers of each term. Without the first they lead to BAM's models M2 to M6, one after the other."""
-NEEDS = {
-    "load_at_rest": {"stribeck", "load"},
-    "direction": {"pose", "load"},
-    "direction_at_rest": {"direction", "load_at_rest"},
-    "square": {"stribeck", "direction"},
-}
+"""Numbers of each term. Without the first they are those of BAM's models M2, M3 and M5 in motion."""
+NEEDS = {"direction": {"pose", "load"}}
 """Terms without which another is not tried. A weight that never changes tells no direction."""
+FITTED_LOADS = ("motor_load", "outside_load")
+"""The second one equals the first until it is fitted itself."""
 NEUTRAL = dict.fromkeys((*LINEAR, "stribeck_n", *LOADS), 0.0) | {
     "stribeck_m_s": 1.0,
     "stribeck_power": 1.0,
 }
 """Numbers of terms that are not taken."""
-TIED = {"outside_load": "motor_load", "outside_load_at_rest": "motor_load_at_rest"}
-"""Numbers that equal another one until they are fitted themselves."""
 LEAST_ROWS = 20
 """Fewest rows after decimation for four numbers with standard errors."""
 MAX_SAMPLES = 40_000
@@ -144,9 +136,9 @@ def fit_drive(
         if names != ALWAYS:
             fit, found = moving, moving.solve(names, moving.start() | found)
     error = fit.estimate_errors(found)
-    for name, other in TIED.items():
-        if other in found and name not in found:
-            found[name], error[name] = found[other], error[other]
+    for told in (found, error):
+        if "motor_load" in told:
+            told.setdefault("outside_load", told["motor_load"])
     return DriveNumbers(found, error, tried)
 
 
@@ -222,14 +214,14 @@ class _JointRegression:
         self._size = dict(zip(LINEAR, sizes.tolist(), strict=True))
         self._size |= {"stribeck_n": force, "stribeck_m_s": STRIBECK_SPEED * self._max_speed}
         self._full = torch.tensor(float(machine.max_force[j]), dtype=torch.float64)
-        self._size |= dict.fromkeys(LOADS, 1.0)
+        self._size |= dict.fromkeys(FITTED_LOADS, 1.0)
 
     def start(self) -> dict[str, float]:
         """Return numbers to begin at: those by linear least squares, a tenth of the friction for other terms."""
         some = 0.1 * abs(self._least_squares["coulomb_n"])
         found = dict.fromkeys(("pose_sin_n", "pose_cos_n"), 0.0)
         found |= {"stribeck_n": some, "stribeck_m_s": self._size["stribeck_m_s"]}
-        return found | {name: 0.05 * self._size[name] for name in LOADS} | self._least_squares
+        return found | dict.fromkeys(FITTED_LOADS, 0.05) | self._least_squares
 
     def solve(
         self,
@@ -284,7 +276,7 @@ class _JointRegression:
         if name == "stribeck_m_s":
             low, high = STRIBECK_RANGE
             return low * self._size[name], high * self._size[name]
-        if name in LOADS and "square" not in name:
+        if name in FITTED_LOADS:
             return 0.0, 1.0
         return 0.0, np.inf
 
@@ -295,8 +287,8 @@ class _JointRegression:
 
     def _filter_dry(self, numbers: dict[str, float]) -> np.ndarray:
         """Return the dry friction beyond Coulomb's at all rows."""
-        tied = {name: numbers[other] for name, other in TIED.items() if other in numbers}
-        given = {**NEUTRAL, **tied, **numbers, "coulomb_n": 0.0}
+        given = {**NEUTRAL, **numbers, "coulomb_n": 0.0}
+        given["outside_load"] = numbers.get("outside_load", given["motor_load"])
         value = {name: torch.tensor(one, dtype=torch.float64) for name, one in given.items()}
         parts = []
         for motion, (sin, cos) in zip(self._motions, self._poses, strict=True):

@@ -20,28 +20,25 @@ TEMPLATE = Path(__file__).with_name("identification.html.jinja")
 
 
 def write_page(
-    folder: Path, result: Mapping[str, Any], drawings: Mapping[str, Figure], machine: Machine
+    folder: Path, result: Mapping[str, Any], prediction: Figure, machine: Machine
 ) -> None:
-    """Write the pictures as `<stem>.png` and the page `identification.html` into `folder`.
+    """Write the page `identification.html` and its picture `prediction.png`.
 
     Args:
         folder: Where to.
         result: Fields of `identification.json`.
-        drawings: Pictures by file stem.
+        prediction: The picture.
         machine: The machine.
 
     Raises:
         StorageError: something could not be written.
     """
-    pictures = {}
-    for stem, figure in drawings.items():
-        path = folder / f"{stem}.png"
-        save_figure(figure, path)
-        pictures[stem] = report.embed_picture(path)
+    path = folder / "prediction.png"
+    save_figure(prediction, path)
     values = {
         **result,
         "title": f"{result['model']}, actuator model of {machine.name}",
-        "pictures": pictures,
+        "prediction": report.embed_picture(path),
         "headings": [f"{horizon} s" for horizon in result["overall"][result["model"]]],
         "units": {joint.name: joint.unit for joint in machine.joints},
         "rivals": sorted(result["against"], key=lambda name: name == HOLD),

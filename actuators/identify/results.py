@@ -10,7 +10,7 @@ import numpy as np
 
 from actuators import open_loop
 from actuators.identify import dead_time, pictures
-from actuators.identify.scores import FreeRunScores, average_joints, bound_interval
+from actuators.identify.scores import FreeRunScores, average_joints
 from actuators.identify.stages import FitStage, FittedModel, list_recordings
 from actuators.identify.training_data import list_sources
 from actuators.recordings.split import measure_commanded_s
@@ -182,8 +182,8 @@ class IdentificationRun:
 
 def build_results(
     identified: IdentificationRun, resampling: np.random.Generator, delaying: np.random.Generator
-) -> tuple[dict[str, Any], list[VerdictSentence], dict[str, Figure]]:
-    """Return `identification.json`, the verdict, and the pictures by file stem.
+) -> tuple[dict[str, Any], list[VerdictSentence], Figure]:
+    """Return `identification.json`, the verdict, and the picture of the predictions.
 
     Args:
         identified: All fits.
@@ -204,15 +204,11 @@ def build_results(
         "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
     }  # fmt: skip
     result |= _tabulate_errors(scores, identified)
-    result["delay_s"] = {joint: _tabulate_delay(delay) for joint, delay in delays.items()}
+    result["delay_s"] = {joint: delay and delay.plain() for joint, delay in delays.items()}
     result["data"] = _describe_data(identified, fitted_to, scores)
     findings = write_verdict(result, machine)
     result["verdict"] = [{"tone": finding.tone, "text": finding.text} for finding in findings]
-    drawings = {
-        "prediction": pictures.draw_prediction(scores, model),
-        "error_over_horizon": pictures.draw_error_over_horizon(scores, model),
-    }
-    return result, findings, drawings
+    return result, findings, pictures.draw_prediction(scores, model)
 
 
 def _join_stages(identified: IdentificationRun, resampling: np.random.Generator) -> FreeRunScores:
@@ -228,38 +224,20 @@ def _join_stages(identified: IdentificationRun, resampling: np.random.Generator)
     return FreeRunScores(predicted, open_loop.join_windows(cuts), identified.machine, resampling)
 
 
-def _tabulate_delay(delay: dead_time.DeadTimeEstimate | None) -> dict[str, Any] | None:
-    if delay is None:
-        return None
-    return {
-        "value": delay.value_s,
-        "ci95": list(delay.ci95_s),
-        "explained": delay.explained,
-        "found": delay.is_found,
-    }
-
-
 def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> dict[str, Any]:
-    """Return `joints`, `overall`, `one_step`, `against` and `missing`."""
+    """Return `joints`, `overall`, `against` and `missing`."""
     machine, model = identified.machine, identified.model
     names, units = machine.joint_names, [joint.unit for joint in machine.joints]
     horizons = {f"{horizon_s:g}": horizon_s for horizon_s in identified.wanted_s}
     fitting = {key: h for key, h in horizons.items() if h in identified.horizons_s}
     absent = dict.fromkeys(horizons)
     joints: dict[str, Any] = {joint: {} for joint in names}
-    one_step: dict[str, Any] = {joint: {} for joint in names}
     overall, against = {}, {}
     for name in scores.predicted:
         rows = {key: scores.at(name, h) for key, h in fitting.items()}
         overall[name] = absent | {key: average_joints(row, units) for key, row in rows.items()}
-        first, again = scores.rmse(name)
         for j, joint in enumerate(names):
             joints[joint][name] = absent | {key: row[j] for key, row in rows.items()}
-            one_step[joint][name] = {
-                "rmse": float(first[0, j]),
-                "ci95": bound_interval(again[:, 0, j]),
-                "percent": float(100 * first[0, j] / scores.travel[j]),
-            }
         if name != model:
             compared = {key: scores.against(model, name, h) for key, h in fitting.items()}
             against[name] = {}
@@ -271,7 +249,6 @@ def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> di
     return {
         "joints": joints,
         "overall": overall,
-        "one_step": one_step,
         "against": against,
         "missing": {key: reason for key in horizons if key not in fitting},
     }

@@ -73,7 +73,7 @@ class Identify:
             )
 
     def run(self) -> float:
-        """Write model, `identification.json`, pictures and report; return the final error.
+        """Write model, `identification.json`, picture and report; return the final error.
 
         Returns:
             Root mean square error at 10 s (or the longest horizon that fits), % of travel, mean
@@ -106,13 +106,13 @@ class Identify:
         identified = IdentificationRun(
             self.machine, self.fit.name, stages, cuts, done, tuple(horizons_s), HORIZONS_S
         )
-        result, findings, drawings = build_results(
+        result, findings, prediction = build_results(
             identified, self.session.generator("resample"), self.session.generator("delay")
         )
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
         folder = self.session.folder
         write_json(folder / "identification.json", result)
-        page.write_page(folder, result, drawings, self.machine)
+        page.write_page(folder, result, prediction, self.machine)
         _print_results(result, findings, folder)
         return result["overall"][self.fit.name][f"{horizons_s[-1]:g}"]["percent"]
 

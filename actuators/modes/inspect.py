@@ -21,12 +21,15 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import track_items
 from brokk_rl.record import Breach, Recording
-from brokk_rl.report import Report
-from brokk_rl.session import Session, write_json
+from brokk_rl.report import embed_picture, render_page
+from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import Index, spec
 
 log = logging.getLogger(__name__)
 
+PAGE_FILE = "inspection.html"
+TEMPLATE = Path(__file__).with_name("inspection.html.jinja")
+JOINTS = ["joint", "measured", "limits", "commanded", "at limit", "noise", "step", "dead time"]
 FILES = ["file", "minutes", "rate", "jitter", "breaches", "findings"]
 
 
@@ -55,6 +58,11 @@ class InspectedFile:
     recording: Recording | None
     breaches: list[Breach]
     inspection: Inspection | None
+
+    @property
+    def minutes(self) -> float:
+        """Length of the recording."""
+        return (self.inspection.timing["duration_s"] or 0.0) / 60.0 if self.inspection else 0.0
 
     @property
     def num_remarks(self) -> int:
@@ -109,17 +117,36 @@ class Inspect:
             "recordings": [one.plain() for one in inspected],
         }
         write_json(folder / "inspection.json", result)
-        pictures: dict[str, Path] = {}
+        tables = {
+            "recordings": (FILES, [_format_file_row(one) for one in inspected]),
+            "joints, all recordings": self._figures(result),
+            "findings": self._counts(result),
+        }
+        pictures: dict[str, str] = {}
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
             if one.recording and one.inspection:
                 path = folder / f"{one.path.stem}.png"
                 inspection_picture.draw_recording(
                     path, one.recording, self.machine, one.inspection, one.breaches
                 )
-                pictures[one.path.name] = path
-        self._page(result, inspected, pictures).write(folder / "inspection.html")
-        self._show(result, inspected)
-        log.info("report: %s", folder / "inspection.html")
+                pictures[one.path.name] = embed_picture(path)
+        values = {
+            "title": f"Recordings of {self.machine.name}",
+            "inspected": inspected,
+            "tables": tables,
+            "remarks": result["remarks"],
+            "pictures": pictures,
+            "kinds": FINDINGS,
+        }
+        write_text(folder / PAGE_FILE, render_page(TEMPLATE, values))
+        for title, (head, rows) in tables.items():
+            print_table(head, rows, title)
+        for one in inspected:
+            for breach in one.breaches:
+                print_text(f"{one.path}: {breach}")
+        for remark in result["remarks"]:
+            print_text(remark)
+        log.info("report: %s", folder / PAGE_FILE)
 
     def _look(self, path: Path) -> InspectedFile:
         recording, breaches = record.examine_recording(path, self.machine)
@@ -137,12 +164,7 @@ class Inspect:
             found = dead_time.estimate_dead_times(recordings, self.machine, generator)
         except RecordingError:
             return dict.fromkeys(self.machine.joint_names)
-        delays: dict[str, Any] = {}
-        for name, one in found.items():
-            delays[name] = one and {
-                "value": one.value_s, "ci95": list(one.ci95_s), "explained": one.explained
-            }  # fmt: skip
-        return delays
+        return {name: one and one.plain() for name, one in found.items()}
 
     def _overall(self, inspected: Sequence[InspectedFile]) -> dict[str, dict[str, float | None]]:
         """Return figures of each joint over all recordings: extremes, medians and weighted means."""
@@ -158,25 +180,11 @@ class Inspect:
             for key in rows[0] if rows else ():
                 values = np.array([row[key] for row in rows], dtype=float)  # None becomes NaN
                 entry[key] = _combine(key, values, np.array(seconds))
-            counts = Counter(
-                one.kind for several in known for one in several.findings if one.joint == joint.name
-            )
-            entry |= {f"num_{kind.replace(' ', '_')}": counts[kind] for kind in FINDINGS}
             table[joint.name] = entry
         return table
 
     def _figures(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         """Return heading and cells of the table of joints."""
-        head = [
-            "joint",
-            "measured",
-            "limits",
-            "commanded",
-            "at limit",
-            "noise",
-            "step",
-            "dead time",
-        ]
         rows = []
         for joint in self.machine.joints:
             entry, delay = result["joints"][joint.name], result["delay_s"][joint.name]
@@ -188,7 +196,7 @@ class Inspect:
                 _format_number(entry.get("noise"), 2), _format_number(entry.get("step"), 2),
                 "–" if delay is None else f"{delay['value']:.2f} s",
             ])  # fmt: skip
-        return head, rows
+        return JOINTS, rows
 
     def _counts(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         """Return heading and cells of the table of findings: a row a kind that occurs, a column a joint."""
@@ -201,69 +209,6 @@ class Inspect:
             if any(counts[name, kind] for name in names):
                 rows.append([kind, *(str(counts[name, kind] or "–") for name in names)])
         return ["finding", *self.machine.joint_names, "all at once"], rows
-
-    def _show(self, result: dict[str, Any], inspected: Sequence[InspectedFile]) -> None:
-        tables = {
-            "recordings": (FILES, [_format_file_row(one) for one in inspected]),
-            "joints, all recordings": self._figures(result),
-            "findings": self._counts(result),
-        }
-        for title, (head, rows) in tables.items():
-            print_table(head, rows, title)
-        for one in inspected:
-            for breach in one.breaches:
-                print_text(f"{one.path}: {breach}")
-        for remark in result["remarks"]:
-            print_text(remark)
-
-    def _page(
-        self, result: dict[str, Any], inspected: Sequence[InspectedFile], pictures: dict[str, Path]
-    ) -> Report:
-        broken = sum(bool(one.breaches) for one in inspected)
-        minutes = (
-            sum((one.inspection.timing["duration_s"] or 0.0) for one in inspected if one.inspection)
-            / 60.0
-        )
-        counts = Counter(
-            f.kind for one in inspected if one.inspection for f in one.inspection.findings
-        )
-        told = (
-            ", ".join(f"{count} × {kind}" for kind, count in counts.most_common())
-            or "nothing that wants an explanation"
-        )
-        summary = f"{len(inspected)} recordings, {minutes:.1f} minutes; {broken} break the format. Found: {told}."
-        page = Report(f"Recordings of {self.machine.name}", summary, "bad" if broken else "plain")
-        page.add_heading("Joints")
-        page.add_table(
-            *self._figures(result),
-            "Shares are of the time; noise and step in the unit of the joint.",
-        )
-        page.add_heading("Findings")
-        head, rows = self._counts(result)
-        page.add_table(head, rows)
-        page.add_list([f"{kind}: {FINDINGS[kind].meaning}" for kind, *_ in rows])
-        page.add_heading("Recordings")
-        page.add_table(FILES, [_format_file_row(one) for one in inspected])
-        if result["remarks"]:
-            page.add_list(result["remarks"])
-        for name, path in pictures.items():
-            page.add_picture(
-                path, f"{name}: findings are shaded, breaches of the format are vertical lines"
-            )
-        for one in inspected:
-            if one.num_remarks:
-                page.add_heading(one.path.name, 3)
-            if one.breaches:
-                page.add_list([str(breach) for breach in one.breaches])
-            if one.inspection and one.inspection.findings:
-                rows = []
-                for f in one.inspection.findings:
-                    numbers = [str(f.row), str(f.num_rows), f"{f.t_s:.2f}", f"{f.duration_s:.2f}"]
-                    rows.append([f.kind, f.joint or "all", *numbers, f.text])
-                head = ["kind", "joint", "row", "rows", "from, s", "for, s", "what"]
-                with page.add_details(f"{len(rows)} findings"):
-                    page.add_table(head, rows)
-        return page
 
 
 def _combine(key: str, values: np.ndarray, seconds: np.ndarray) -> float | None:
@@ -299,7 +244,7 @@ def _format_file_row(one: InspectedFile) -> list[str]:
     rate_hz, jitter_s = timing.get("rate_hz"), timing.get("jitter_s")
     return [
         one.path.name,
-        f"{(timing.get('duration_s') or 0.0) / 60.0:.1f}",
+        f"{one.minutes:.1f}",
         "–" if rate_hz is None else f"{rate_hz:.2f} Hz",
         "–" if jitter_s is None else f"{1000.0 * jitter_s:.1f} ms",
         str(len(one.breaches) or "–"),

@@ -17,7 +17,7 @@ Axes: `T` rows of a log, `H` samples of history (oldest first), `C` columns of a
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -239,14 +239,14 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
                 f"{path}: the policy commands {', '.join(data['joints'])}, but machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}, without {', '.join(unknown)}; give the policy's machine=…"
             )
-        terms = _list_own_terms(data, machine) if is_own else _list_given_terms(observation)
+        terms = _list_own_terms(data, machine) if is_own else observation["terms"]
         joints = tuple(data["joints"])
         commands = data.get("command", {}).get("columns") or map(name_command_column, joints)
         return PolicyContract(
             source=path,
             rate_hz=float(data["rate_hz"]),
             joints=joints,
-            terms=terms,
+            terms=tuple(map(_read_term, terms)),
             commands=tuple(commands),
             training=data.get("training_observations"),
             data=data,
@@ -266,71 +266,52 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
         ) from error
 
 
-def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> tuple[ObservationTerm, ...]:
-    """Return the terms of a bundle of this project."""
-    joints, num = tuple(data["joints"]), int(data["history"]["samples"])
+def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str, Any]]:
+    """Return the terms of a bundle of this project, as a contract for any network lists them."""
+    joints, samples = tuple(data["joints"]), data["history"]["samples"]
     units = dict(zip(machine.joint_names, (joint.unit for joint in machine.joints), strict=True))
     scale = data["observation"]
-    positions = tuple(name_position_column(name, units[name]) for name in joints)
-    flows, advice = map(name_command_column, joints), map(name_advice_column, joints)
-    pitch = scale.get("pitch", {"mean_rad": 0.0, "std_rad": 1.0})
-    target = scale["target"]
+    pitch, target = scale.get("pitch", {}), scale["target"]
+    before = {"samples": samples, "newest": -1, "before": "zero"}
     known = {
-        "target_in_base_m": (
-            "target", TARGET_COLUMNS, 1, 0, target["mean_m"], target["std_m"], "first"
-        ),
-        "q": ("q", positions, num, 0, scale["q"]["mean"], scale["q"]["std"], "first"),
-        "u": ("u", tuple(flows), num, -1, scale["u"]["mean"], scale["u"]["std"], "zero"),
-        "pitch_rad": ("pitch", (PITCH_COLUMN,), 1, 0, pitch["mean_rad"], pitch["std_rad"], "first"),
-        "proposals": ("proposals", tuple(advice), num, -1, 0.0, 1.0, "zero"),
+        "target_in_base_m": {
+            "name": "target",
+            "columns": TARGET_COLUMNS,
+            "mean": target["mean_m"],
+            "std": target["std_m"],
+        },
+        "q": {
+            "name": "q",
+            "columns": [name_position_column(name, units[name]) for name in joints],
+            "samples": samples,
+            **scale["q"],
+        },
+        "u": {"name": "u", "columns": [*map(name_command_column, joints)], **scale["u"], **before},
+        "pitch_rad": {
+            "name": "pitch",
+            "columns": [PITCH_COLUMN],
+            "mean": pitch.get("mean_rad", 0.0),
+            "std": pitch.get("std_rad", 1.0),
+        },
+        "proposals": {
+            "name": "proposals", "columns": [*map(name_advice_column, joints)], **before
+        },
     }  # fmt: skip
-    terms = []
-    for part in scale["order"]:
-        name, columns, samples, newest, mean, std, before = known[part.split()[0]]
-        terms.append(_make_term(name, columns, samples, newest, mean, std, None, before))
-    return tuple(terms)
+    return [known[part.split()[0]] for part in scale["order"]]
 
 
-def _list_given_terms(observation: Mapping[str, Any]) -> tuple[ObservationTerm, ...]:
-    """Return the terms of a contract for any ONNX file."""
-    terms = []
-    for term in observation["terms"]:
-        before = term.get("before", "first")
-        if before not in ("first", "zero"):
-            raise ValueError(f"'before' of term {term['name']} is {before}, expected first or zero")
-        terms.append(
-            _make_term(
-                str(term["name"]),
-                tuple(term["columns"]),
-                int(term.get("samples", 1)),
-                int(term.get("newest", 0)),
-                term.get("mean", 0.0),
-                term.get("std", 1.0),
-                term.get("clip"),
-                before,
-            )
-        )
-    return tuple(terms)
-
-
-def _make_term(
-    name: str,
-    columns: Sequence[str],
-    samples: int,
-    newest: int,
-    mean: Any,
-    std: Any,
-    clip: float | None,
-    before: Filling,
-) -> ObservationTerm:
-    num = len(columns)
+def _read_term(term: Mapping[str, Any]) -> ObservationTerm:
+    """Return a term of a contract for any network."""
+    columns, before = tuple(term["columns"]), term.get("before", "first")
+    if before not in ("first", "zero"):
+        raise ValueError(f"'before' of term {term['name']} is {before}, expected first or zero")
     return ObservationTerm(
-        name=name,
-        columns=tuple(columns),
-        samples=samples,
-        newest=newest,
-        mean=np.broadcast_to(np.asarray(mean, float), (num,)),
-        std=np.broadcast_to(np.asarray(std, float), (num,)),
-        clip=clip,
+        name=str(term["name"]),
+        columns=columns,
+        samples=int(term.get("samples", 1)),
+        newest=int(term.get("newest", 0)),
+        mean=np.broadcast_to(np.asarray(term.get("mean", 0.0), float), (len(columns),)),
+        std=np.broadcast_to(np.asarray(term.get("std", 1.0), float), (len(columns),)),
+        clip=term.get("clip"),
         before=before,
     )

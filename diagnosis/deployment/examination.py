@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -25,6 +25,7 @@ from diagnosis.deployment.fault_search import (
     StageResult,
     judge_stage,
 )
+from diagnosis.deployment.mistakes import MAX_DELAY
 from diagnosis.deployment.motion_check import MotionEvidence
 from diagnosis.deployment.orders import match_order
 from diagnosis.deployment.replay import SPREAD_FACTOR, TOLERANCE, VECTOR_TOLERANCE, PolicyReplay
@@ -132,7 +133,7 @@ def examine_run(
     log = read_run_log(recording, contract, target_m)
     is_sent = is_sent and not log.is_measured
     lacking, notes = _list_lacking(log, is_sent), list[str]()
-    findings = [*_check_golden(policy), *_check_rate(policy, log), *_check_size(policy, log)]
+    findings = _check_without_replay(policy, log)
     stages = []
     is_other = any(finding.kind == "network" for finding in findings)
     for stage in () if is_other else _list_stages(policy, log, others, is_sent, generator):
@@ -200,57 +201,56 @@ def _list_stages(
     generator: np.random.Generator,
 ) -> list[ReplayStage]:
     """Return the parts of the way that the log lets one judge."""
-    stages, contract = list[ReplayStage](), policy.contract
+    contract, observed, in_force = policy.contract, log.observed, log.in_force
     commanded = log.commanded
     if commanded is None and is_sent:
-        commanded = log.in_force
-    replay = PolicyReplay(policy, log, generator) if log.is_complete else None
-    start = contract.num_samples
+        commanded = in_force
+    replay = PolicyReplay(policy, log, generator)
     after = distortions.list_command_distortions(policy)
     networks = distortions.list_network_distortions(policy, others)
-    if replay is not None and log.observed is not None:
-        floor = VECTOR_TOLERANCE + SPREAD_FACTOR * replay.vector_spread
+    stages, start = list[ReplayStage](), contract.num_samples
+    if log.is_complete and observed is not None:
+        floor = VECTOR_TOLERANCE + SPREAD_FACTOR * replay.spread[0]
         labels = [name for term in contract.terms for name in term.list_numbers()]
-        encoded = replay.encode()
-        known = _Known(encoded, replay)
-        rows = _find_first_departure(encoded, log.observed, floor)
-        inputs = [
-            *distortions.list_frame_distortions(policy),
-            *distortions.list_input_distortions(policy, log.signals, rows),
-            *distortions.list_matched_orders(policy, log.signals, log.observed),
-        ]
+        inputs = _list_inputs(policy, log, replay.encoded, observed, floor)
+        inputs += distortions.list_matched_orders(policy, log.signals, observed)
         stages.append(
-            ReplayStage("observation", known.encode, log.observed, floor, tuple(labels), tuple(inputs), start)
+            ReplayStage("observation", replay.encode, observed, floor, tuple(labels), tuple(inputs), start)
         )  # fmt: skip
-    if commanded is not None and log.observed is not None:
-        answer = _Answered(policy, log.observed)
+    if commanded is not None and observed is not None:
+        matched = _match_commands(contract, replay.nominal, commanded)
         floor = np.full(commanded.shape, TOLERANCE)
-        after += _match_commands(contract, answer.command((), np.arange(len(commanded))), commanded)
+        every = (*networks, *after, *matched)
         stages.append(
-            ReplayStage("network", answer.command, commanded, floor, contract.joints, (*networks, *after), 0)
-        )  # fmt: skip
-    elif commanded is not None and replay is not None:
-        floor = TOLERANCE + SPREAD_FACTOR * replay.command_spread
-        rows = _find_first_departure(replay.nominal, commanded, floor)
-        inputs = [
-            *distortions.list_frame_distortions(policy),
-            *distortions.list_input_distortions(policy, log.signals, rows),
-        ]
-        known = _Known(None, replay)
-        after += _match_commands(contract, replay.nominal, commanded)
+            ReplayStage("network", replay.command, commanded, floor, contract.joints, every, 0)
+        )
+    elif commanded is not None and log.is_complete:
+        matched = _match_commands(contract, replay.nominal, commanded)
+        floor = TOLERANCE + SPREAD_FACTOR * replay.spread[1]
+        inputs = _list_inputs(policy, log, replay.nominal, commanded, floor)
+        every = (*inputs, *networks, *after, *matched)
         stages.append(
-            ReplayStage("policy", known.command, commanded, floor, contract.joints, (*inputs, *after, *networks), start)
-        )  # fmt: skip
-    if log.commanded is not None and log.in_force is not None and is_sent:
-        sent = _Delivered(log.commanded)
-        after += _match_commands(contract, log.commanded, log.in_force)
-        floor = np.full(log.in_force.shape, TOLERANCE)
+            ReplayStage("policy", replay.command, commanded, floor, contract.joints, every, start)
+        )
+    if log.commanded is not None and in_force is not None and is_sent:
+        every = (*after, *_match_commands(contract, log.commanded, in_force))
+        floor = np.full(in_force.shape, TOLERANCE)
         stages.append(
-            ReplayStage(
-                "delivery", sent.deliver, log.in_force, floor, contract.joints, tuple(after), 0
-            )
+            ReplayStage("delivery", replay.deliver, in_force, floor, contract.joints, every, 0)
         )
     return stages
+
+
+def _list_inputs(
+    policy: LoadedPolicy, log: RunLog, nominal: np.ndarray, logged: np.ndarray, floor: np.ndarray
+) -> list[Distortion]:
+    """Return mistakes before the network; something may be stale from shortly before the first departure on."""
+    with np.errstate(invalid="ignore"):
+        departed = np.flatnonzero((np.abs(nominal - logged) > floor).any(1))
+    first = int(departed[0]) if len(departed) else 0
+    rows = tuple(range(max(0, first - MAX_DELAY), first + 1))
+    frames = distortions.list_frame_distortions(policy)
+    return [*frames, *distortions.list_input_distortions(policy, log.signals, rows)]
 
 
 def _match_commands(
@@ -262,145 +262,72 @@ def _match_commands(
     return [] if order is None else [distortions.make_command_order(names, order)]
 
 
-@dataclass(frozen=True)
-class _Known:
-    """A replay whose plain result is known."""
-
-    encoded: np.ndarray | None
-    replay: PolicyReplay
-
-    def encode(self, changes: Sequence[Any], rows: np.ndarray) -> np.ndarray:
-        if not changes and self.encoded is not None:
-            return self.encoded[rows]
-        return self.replay.encode(changes, rows)
-
-    def command(self, changes: Sequence[Any], rows: np.ndarray) -> np.ndarray:
-        return self.replay.command(changes, rows) if changes else self.replay.nominal[rows]
-
-
-class _Answered:
-    """Answers of networks to the logged observations."""
-
-    def __init__(self, policy: LoadedPolicy, observed: np.ndarray) -> None:
-        self._observed = observed
-        self._own = policy.network.answer(observed)
-
-    def command(self, changes: Sequence[Any], rows: np.ndarray) -> np.ndarray:
-        commands = self._own
-        for change in changes:
-            if change.network is not None:
-                commands = change.network(self._observed)
-        for change in changes:
-            if change.command is not None:
-                commands = change.command(commands)
-        return commands[rows]
-
-
-@dataclass(frozen=True)
-class _Delivered:
-    """The policy's logged commands on their way to the valve."""
-
-    commanded: np.ndarray
-
-    def deliver(self, changes: Sequence[Any], rows: np.ndarray) -> np.ndarray:
-        commands = self.commanded
-        for change in changes:
-            commands = change.command(commands)
-        return commands[rows]
-
-
-def _find_first_departure(
-    nominal: np.ndarray, logged: np.ndarray, floor: np.ndarray
-) -> tuple[int, ...]:
-    """Return rows up to the first departure, at which something may have begun to be stale."""
-    with np.errstate(invalid="ignore"):
-        departed = np.flatnonzero((np.abs(nominal - logged) > floor).any(1))
-    if not len(departed):
-        return (0,)
-    first = int(departed[0])
-    return tuple(range(max(0, first - distortions.MAX_DELAY), first + 1))
-
-
 def _describe_findings(result: StageResult, log: RunLog, rests: bool) -> list[Finding]:
     """Return the mistakes of a stage that departs."""
-    t_s, departed = log.t_s, result.departed
     if result.named:
-        return [
-            _describe_named(one, result, t_s, index == 0) for index, one in enumerate(result.named)
-        ]
-    begin_s, end_s = float(t_s[departed[0]]), float(t_s[departed[-1]])
+        first, *others = result.named
+        alike = dict.fromkeys((one.distortion.kind, one.distortion.field) for one in result.alike)
+        alike.pop((first.distortion.kind, first.distortion.field), None)
+        found = replace(_describe_named(first, result, log), alike=tuple(alike)[:NUM_RANKED])
+        return [found, *(_describe_named(one, result, log) for one in others)]
+    stage, departed = result.stage, result.departed
     labels = [label for label, _ in result.rank_labels()[:3]]
     if result.only_start and rests:
         text = "only the beginning departs: the history did not begin as the contract says"
-        return [Finding("history", "observation", result.stage, text, {}, begin_s, end_s, 1.0)]
-    if result.stage == "network":
+        return [_find("history", "observation", stage, text, log, departed)]
+    if stage == "network":
         text = (
             "the commands do not follow from what the network saw, and no change of the command "
             "explains them: another network"
         )
-        return [Finding("network", "network", result.stage, text, {}, begin_s, end_s, 0.0)]
+        return [_find("network", "network", stage, text, log, departed, 0.0)]
     share = len(departed) / result.num_rows
-    departing = "observation" if result.stage == "observation" else "command"
+    departing = "observation" if stage == "observation" else "command"
     text = (
         f"the {departing} departs in {share:.0%} of the rows, most in {', '.join(labels)}, by none "
         "of the mistakes that are known here"
     )
-    return [
-        Finding(
-            UNLISTED,
-            labels[0] if labels else result.stage,
-            result.stage,
-            text,
-            {},
-            begin_s,
-            end_s,
-            0.0,
-        )
-    ]
+    return [_find(UNLISTED, labels[0] if labels else stage, stage, text, log, departed, 0.0)]
 
 
-def _describe_named(
-    one: FittedDistortion, result: StageResult, t_s: np.ndarray, is_first: bool
-) -> Finding:
+def _describe_named(one: FittedDistortion, result: StageResult, log: RunLog) -> Finding:
     distortion, value = one.distortion, one.value
     inside = result.departed[(result.departed >= one.begin) & (result.departed <= one.end)]
     shown = inside if len(inside) else result.departed
-    alike = list[tuple[str, str]]()
-    for other in result.alike if is_first else ():
-        pair = (other.distortion.kind, other.distortion.field)
-        if pair != (distortion.kind, distortion.field) and pair not in alike:
-            alike.append(pair)
     parameters = {distortion.parameter: value} if distortion.parameter else {}
-    if distortion.kind == "stale" and distortion.parameter == "row":
-        parameters = {"since_s": float(t_s[int(value)])}
-        text = distortion.text.replace("row {value}", f"{t_s[int(value)]:.2f} s")
-    else:
-        text = distortion.text.format(value=f"{value:.4g}")
-    return Finding(
-        kind=distortion.kind,
-        field=distortion.field,
-        stage=result.stage,
-        text=text,
-        parameters=parameters,
-        begin_s=float(t_s[shown[0]]),
-        end_s=float(t_s[shown[-1]]),
-        explained=one.explained,
-        alike=tuple(alike[:NUM_RANKED]),
-    )
+    text = distortion.text.format(value=f"{value:.4g}")
+    if distortion.parameter == "row":
+        since_s = float(log.t_s[int(value)])
+        parameters = {"since_s": since_s}
+        text = distortion.text.replace("row {value}", f"{since_s:.2f} s")
+    found = _find(distortion.kind, distortion.field, result.stage, text, log, shown, one.explained)
+    return replace(found, parameters=parameters)
+
+
+def _find(
+    kind: str,
+    field: str,
+    stage: str,
+    text: str,
+    log: RunLog,
+    rows: np.ndarray | None = None,
+    explained: float = 1.0,
+) -> Finding:
+    """Return a mistake that shows in some rows, or in the whole log."""
+    t_s = log.t_s if rows is None else log.t_s[rows]
+    return Finding(kind, field, stage, text, {}, float(t_s[0]), float(t_s[-1]), explained)
 
 
 def _list_lacking(log: RunLog, is_sent: bool) -> list[str]:
     """Return what the log lacks, in words."""
     found = []
+    missing = f"the log has no column {', '.join(log.missing)}"
     if log.missing and log.observed is None:
         found.append(
-            f"the log has no column {', '.join(log.missing)}; give doctor.target_in_base_m where "
-            "only the target is missing, or record it"
+            f"{missing}; give doctor.target_in_base_m where only the target is missing, or record it"
         )
     elif log.missing:
-        found.append(
-            f"the observation cannot be checked: the log has no column {', '.join(log.missing)}"
-        )
+        found.append(f"the observation cannot be checked: {missing}")
     if log.commanded is None and not is_sent:
         found.append("the log has no advice_<joint>, and its commands are not the policy's own")
     if log.is_measured:
@@ -408,40 +335,29 @@ def _list_lacking(log: RunLog, is_sent: bool) -> list[str]:
     return found
 
 
-def _check_golden(policy: LoadedPolicy) -> list[Finding]:
-    """Compare the network with the answers that its training recorded."""
-    path = policy.contract.source.parent / GOLDEN
-    if not path.is_file():
-        return []
-    golden = json.loads(path.read_text())
-    found = policy.network.answer(np.array(golden["observation"]))
-    difference = np.abs(found - np.array(golden["command"])).max()
-    if difference <= TOLERANCE:
-        return []
-    text = f"the bundle is mixed: its network departs from {GOLDEN} by {difference:.2g}"
-    return [Finding("network", "bundle", "network", text, {}, 0.0, 0.0, 1.0)]
-
-
-def _check_size(policy: LoadedPolicy, log: RunLog) -> list[Finding]:
-    """Compare the length of the logged vector with that of the contract."""
-    size, found = policy.contract.size, log.num_observed
-    if found in (0, size):
-        return []
-    text = f"the network got {found} numbers, the contract has {size}: another policy ran"
-    begin_s, end_s = float(log.t_s[0]), float(log.t_s[-1])
-    return [Finding("network", "observation", "observation", text, {}, begin_s, end_s, 1.0)]
-
-
-def _check_rate(policy: LoadedPolicy, log: RunLog) -> list[Finding]:
-    """Compare the rate of the log with that of the policy."""
-    period_s = float(np.median(np.diff(log.t_s)))
-    ratio = period_s * policy.contract.rate_hz
-    if abs(ratio - 1.0) <= RATE_TOLERANCE:
-        return []
-    text = f"the loop ran at {1 / period_s:.4g} Hz, the policy was trained at {policy.contract.rate_hz:g} Hz"
-    return [
-        Finding(
-            "rate", "loop", "policy", text, {"rate_hz": 1 / period_s},
-            float(log.t_s[0]), float(log.t_s[-1]), 1.0,
+def _check_without_replay(policy: LoadedPolicy, log: RunLog) -> list[Finding]:
+    """Return what bundle, rate and length of the logged vector show."""
+    contract, found = policy.contract, list[Finding]()
+    path = contract.source.parent / GOLDEN
+    if path.is_file():
+        # Answers that the training recorded.
+        golden = json.loads(path.read_text())
+        answers = policy.network.answer(np.array(golden["observation"]))
+        difference = np.abs(answers - np.array(golden["command"])).max()
+        if difference > TOLERANCE:
+            text = f"the bundle is mixed: its network departs from {GOLDEN} by {difference:.2g}"
+            found.append(_find("network", "bundle", "network", text, log))
+    rate_hz = 1.0 / float(np.median(np.diff(log.t_s)))
+    if abs(contract.rate_hz / rate_hz - 1.0) > RATE_TOLERANCE:
+        text = (
+            f"the loop ran at {rate_hz:.4g} Hz, the policy was trained at {contract.rate_hz:g} Hz"
         )
-    ]  # fmt: skip
+        rate = _find("rate", "loop", "policy", text, log)
+        found.append(replace(rate, parameters={"rate_hz": rate_hz}))
+    if log.num_observed not in (0, contract.size):
+        text = (
+            f"the network got {log.num_observed} numbers, the contract has {contract.size}: another "
+            "policy ran"
+        )
+        found.append(_find("network", "observation", "observation", text, log))
+    return found

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from diagnosis.deployment.distortions import MAX_DELAY, Distortion
+from diagnosis.deployment.distortions import Distortion
+from diagnosis.deployment.mistakes import MAX_DELAY
 from diagnosis.deployment.replay import Change
 
 Predict = Callable[[Sequence[Change], np.ndarray], np.ndarray]

@@ -59,34 +59,24 @@ def _list_simple(same: Order) -> Iterator[Order]:
 
 
 def _list_grouped(names: Sequence[str]) -> Iterator[Order]:
-    """Yield orders of legs and kinds, for names of two parts that form a whole table."""
-    places = _find_table(names)
-    if places is None:
-        return
-    legs = list(dict.fromkeys(leg for leg, _ in places))
-    kinds = list(dict.fromkeys(kind for _, kind in places))
-    for some, others in itertools.product(_list_ways(legs), _list_ways(kinds)):
-        yield tuple(places[leg, kind] for leg in some for kind in others)
-        yield tuple(places[leg, kind] for kind in others for leg in some)
-
-
-def _list_ways(group: list[str]) -> Iterator[tuple[str, ...]]:
-    return itertools.permutations(group) if len(group) <= MAX_IN_GROUP else iter([tuple(group)])
-
-
-def _find_table(names: Sequence[str]) -> dict[tuple[str, str], int] | None:
-    """Return the place of each leg and kind, `None` where the names form no table."""
+    """Yield orders of legs and kinds, wherever names of several words part into a whole table of them."""
     for cut in range(1, 4):
         places = {}
         for place, name in enumerate(names):
             words = name.split("_")
             places["_".join(words[:cut]), "_".join(words[cut:])] = place
-        legs = {leg for leg, _ in places}
-        kinds = {kind for _, kind in places}
+        legs = list(dict.fromkeys(leg for leg, _ in places))
+        kinds = list(dict.fromkeys(kind for _, kind in places))
         is_whole = len(places) == len(names) == len(legs) * len(kinds)
-        if is_whole and min(len(legs), len(kinds)) > 1:
-            return places
-    return None
+        if not is_whole or min(len(legs), len(kinds)) < 2:
+            continue
+        for some, others in itertools.product(_list_ways(legs), _list_ways(kinds)):
+            yield tuple(places[leg, kind] for leg in some for kind in others)
+            yield tuple(places[leg, kind] for kind in others for leg in some)
+
+
+def _list_ways(group: list[str]) -> Iterator[tuple[str, ...]]:
+    return itertools.permutations(group) if len(group) <= MAX_IN_GROUP else iter([tuple(group)])
 
 
 def match_order(known: np.ndarray, seen: np.ndarray) -> Order | None:

@@ -61,11 +61,11 @@ class Change:
 
 
 class PolicyReplay:
-    """A policy on a log.
+    """A policy on a log, from what the log holds last before each part of the way.
 
     Args:
         policy: The policy.
-        log: The log; complete.
+        log: The log.
         generator: Draws the rounding of the log.
     """
 
@@ -74,9 +74,34 @@ class PolicyReplay:
         self._generator = generator
         self._all = np.arange(len(log.t_s))
 
-    def encode(self, changes: Sequence[Change] = (), rows: np.ndarray | None = None) -> np.ndarray:
-        """Return observation vectors, `(R, O)`, of all rows or those asked for."""
-        rows = self._all if rows is None else rows
+    @cached_property
+    def encoded(self) -> np.ndarray:
+        """Observation vectors as the contract says, `(T, O)`; the log is complete."""
+        return self._encode((), self._all)
+
+    @cached_property
+    def nominal(self) -> np.ndarray:
+        """Commands as the contract says, `(T, J)`."""
+        return self._answer((), self._all)
+
+    def encode(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
+        """Return observation vectors, `(R, O)`."""
+        return self._encode(changes, rows) if changes else self.encoded[rows]
+
+    def command(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
+        """Return commands, `(R, J)`: answers to the logged observation where there is one."""
+        before = [change for change in changes if not change.is_after_network]
+        if not any(change.command for change in changes):
+            return self._answer(changes, rows) if changes else self.nominal[rows]
+        commands = self._answer(before, self._all) if before else self.nominal
+        return apply_commands(commands, changes)[rows]
+
+    def deliver(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
+        """Return the policy's logged commands on their way to the valve, `(R, J)`."""
+        assert self.log.commanded is not None, "a stage is judged where its beginning was logged"
+        return apply_commands(self.log.commanded, changes)[rows]
+
+    def _encode(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
         parts = []
         for term in self.policy.contract.terms:
             values = self.log.signals[term.name]
@@ -98,49 +123,25 @@ class PolicyReplay:
                 vector = change.vector(vector)
         return vector
 
-    def command(self, changes: Sequence[Change] = (), rows: np.ndarray | None = None) -> np.ndarray:
-        """Return commands, `(R, J)`, of all rows or those asked for."""
-        rows = self._all if rows is None else rows
-        after = [change.command for change in changes if change.command is not None]
-        if not after:
-            return self._answer(changes, rows)
-        if all(change.is_after_network for change in changes):
-            commands = self.nominal
-        else:
-            commands = self._answer(changes, self._all)
-        for transform in after:
-            commands = transform(commands)
-        return commands[rows]
+    def _answer(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
+        network = self.policy.network.answer
+        for change in changes:
+            network = change.network or network
+        if self.log.observed is not None:
+            return network(self.log.observed[rows])
+        return network(self.encode(changes, rows))
 
     @cached_property
-    def nominal(self) -> np.ndarray:
-        """Commands as the contract says, `(T, J)`."""
-        return self._answer((), self._all)
-
-    @cached_property
-    def vector_spread(self) -> np.ndarray:
-        """Largest effect of the log's rounding on the observation vector, `(T, O)`."""
-        return self._rounded[0]
-
-    @cached_property
-    def command_spread(self) -> np.ndarray:
-        """Largest effect of the log's rounding on the command, `(T, J)`."""
-        return self._rounded[1]
-
-    @cached_property
-    def _rounded(self) -> tuple[np.ndarray, np.ndarray]:
-        vectors, nominal = self.encode(), self.nominal
-        largest_vector, largest = np.zeros_like(vectors), np.zeros_like(nominal)
+    def spread(self) -> tuple[np.ndarray, np.ndarray]:
+        """Largest effect of the log's rounding on observation vector and command, `(T, O)` and `(T, J)`."""
+        answer, terms = self.policy.network.answer, self.policy.contract.terms
+        nominal = answer(self.encoded)
+        largest_vector, largest = np.zeros_like(self.encoded), np.zeros_like(nominal)
         for _ in range(NUM_DRAWS):
-            change = Change(
-                signals={
-                    term.name: self._draw_rounding(term) for term in self.policy.contract.terms
-                }
-            )
-            drawn = self.encode([change])
-            largest_vector = np.maximum(largest_vector, np.abs(drawn - vectors))
-            answer = self._network((), drawn)
-            largest = np.maximum(largest, np.abs(answer - nominal))
+            change = Change(signals={term.name: self._draw_rounding(term) for term in terms})
+            drawn = self._encode([change], self._all)
+            largest_vector = np.maximum(largest_vector, np.abs(drawn - self.encoded))
+            largest = np.maximum(largest, np.abs(answer(drawn) - nominal))
         return largest_vector, largest
 
     def _draw_rounding(self, term: ObservationTerm) -> Transform:
@@ -161,13 +162,13 @@ class PolicyReplay:
 
         return transform
 
-    def _answer(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
-        return self._network(changes, self.encode(changes, rows))
 
-    def _network(self, changes: Sequence[Change], vectors: np.ndarray) -> np.ndarray:
-        others = [change.network for change in changes if change.network is not None]
-        network = others[-1] if others else self.policy.network.answer
-        return network(vectors)
+def apply_commands(commands: np.ndarray, changes: Sequence[Change]) -> np.ndarray:
+    """Return commands `(T, J)` after the changes of them."""
+    for change in changes:
+        if change.command is not None:
+            commands = change.command(commands)
+    return commands
 
 
 def cut_history(

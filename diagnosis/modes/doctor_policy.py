@@ -11,7 +11,6 @@ from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, Effect
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.plot import save_figure
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis.deployment import doctor, page
@@ -60,7 +59,7 @@ class DoctorPolicy:
     doctor: DoctorRequest
 
     def run(self) -> None:
-        """Write `doctor.json`, `doctor.html` and `evidence.png`.
+        """Write `doctor.json` and `doctor.html`.
 
         Raises:
             RecordingError: A log cannot be used.
@@ -71,8 +70,6 @@ class DoctorPolicy:
         folder = self.session.folder
         found.write(folder)
         page.write_page(found, folder)
-        if (picture := page.draw_evidence(found)) is not None:
-            save_figure(picture, folder / page.EVIDENCE_FILE)
         print_answer(found, folder)
 
     def examine(self) -> DoctorAnswer:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -200,18 +201,6 @@ def test_a_mistake_without_a_name_gets_none(policy: LoadedPolicy, machine: Machi
     assert [one.is_named for one in found.findings] == [False]
 
 
-def test_with_the_observation_another_network_is_told(
-    policy: LoadedPolicy, machine: Machine
-) -> None:
-    recording = run_loop(policy, machine, detail="observation")
-    rng = np.random.default_rng(6)
-    wrong = dict(recording.extra.items())
-    for name in machine.joint_names:
-        wrong[f"advice_{name}"] = rng.uniform(-1, 1, NUM_ROWS).astype(np.float32)
-    found = ask(policy, replace(recording, extra=wrong), machine)
-    assert found.findings[0].kind == "network"
-
-
 def test_a_target_out_of_the_training_is_the_task(policy: LoadedPolicy, machine: Machine) -> None:
     found = ask(policy, run_loop(policy, machine, target_m=(5.5, 0.3, 0.8)), machine)
     assert found.verdict == "task"
@@ -237,10 +226,39 @@ def test_a_log_without_the_target_cannot_tell(policy: LoadedPolicy, machine: Mac
     assert "target_x_m" in found.reason
 
 
-def test_a_log_at_another_rate_is_the_code(policy: LoadedPolicy, machine: Machine) -> None:
-    recording = run_loop(policy, machine)
-    found = ask(policy, replace(recording, rate_hz=10.0, t_s=recording.t_s * 2), machine)
-    assert [(one.kind, one.field) for one in found.findings] == [("rate", "loop")]
+def slow_down(recording: Recording) -> Recording:
+    return replace(recording, rate_hz=10.0, t_s=recording.t_s * 2)
+
+
+def lengthen(recording: Recording) -> Recording:
+    longer = dict(recording.extra) | {"obs_43": np.zeros(NUM_ROWS, np.float32)}
+    return replace(recording, extra=longer)
+
+
+def answer_otherwise(recording: Recording) -> Recording:
+    rng = np.random.default_rng(6)
+    wrong = dict(recording.extra)
+    for name in recording.joints:
+        wrong[f"advice_{name}"] = rng.uniform(-1, 1, NUM_ROWS).astype(np.float32)
+    return replace(recording, extra=wrong)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (slow_down, ("rate", "loop")),
+        (lengthen, ("network", "observation")),
+        (answer_otherwise, ("network", "network")),
+    ],
+)
+def test_another_rate_and_another_network_are_told(
+    policy: LoadedPolicy,
+    machine: Machine,
+    change: Callable[[Recording], Recording],
+    expected: tuple[str, str],
+) -> None:
+    found = ask(policy, change(run_loop(policy, machine, detail="observation")), machine)
+    assert (found.findings[0].kind, found.findings[0].field) == expected
 
 
 def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy, machine: Machine) -> None:
@@ -249,15 +267,6 @@ def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy, machine: Machin
     assert measure_resolution(rounded[:, 0].astype(float)) == pytest.approx(1e-3, rel=1e-2)
     found = ask(policy, replace(recording, q=rounded.astype(np.float32)), machine)
     assert found.verdict == "nothing"
-
-
-def test_a_vector_of_another_length_is_another_policy(
-    policy: LoadedPolicy, machine: Machine
-) -> None:
-    recording = run_loop(policy, machine, detail="observation")
-    longer = dict(recording.extra) | {"obs_43": np.zeros(NUM_ROWS, np.float32)}
-    (finding,) = ask(policy, replace(recording, extra=longer), machine).findings
-    assert (finding.kind, finding.field) == ("network", "observation")
 
 
 def test_the_page_of_the_whole_question_holds_verdict_and_next_step(
@@ -272,51 +281,39 @@ def test_the_page_of_the_whole_question_holds_verdict_and_next_step(
     assert page.REMEDIES["sign"] in text
 
 
-def test_page_and_answer_hold_the_verdict(
-    policy: LoadedPolicy, machine: Machine, tmp_path: Path
-) -> None:
-    found = ask(policy, run_loop(policy, machine, see_q=turn_joint), machine)
-    found.write(tmp_path)
-    page.write_page(found, tmp_path)
-    told = json.loads((tmp_path / "doctor.json").read_text())
-    assert (told["verdict"], told["logs"][0]["findings"][0]["field"]) == ("code", "q.q3")
-    assert "q.q3 has the wrong sign" in (tmp_path / page.PAGE_FILE).read_text()
+def drop_term(contract: dict[str, Any]) -> None:
+    contract["observation"]["terms"].pop()
 
 
+def drop_joints(contract: dict[str, Any]) -> None:
+    del contract["joints"]
+
+
+def keep_three_joints(contract: dict[str, Any]) -> None:
+    contract["joints"] = contract["joints"][:3]
+
+
+def make_of_terms(contract: dict[str, Any]) -> None:
+    contract["observation"] = {"parts": [{"name": "distance", "samples": 1, "width": 3}]}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (drop_term, "23 numbers, the network takes 43"),
+        (drop_joints, "lacks 'joints'"),
+        (keep_three_joints, "gives 5 commands, the contract names 3"),
+        (make_of_terms, r"terms of the task's own \(distance\)"),
+    ],
+)
 def test_a_contract_that_does_not_fit_is_refused(
-    folder: Path, machine: Machine, tmp_path: Path
+    folder: Path, machine: Machine, tmp_path: Path, change: Callable[[Any], None], told: str
 ) -> None:
     contract = json.loads((folder / "policy.json").read_text())
-    contract["observation"]["terms"].pop()
+    change(contract)
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
-    with pytest.raises(CheckpointError, match="23 numbers, the network takes 43"):
-        load_policy(str(tmp_path), machine)
-
-
-def test_the_doctor_from_the_command(
-    brokk: Callable[..., object], policy: LoadedPolicy, folder: Path, machine: Machine
-) -> None:
-    write_recording(run_loop(policy, machine, send=lambda u, _: -u), Path("log.parquet"))
-    brokk(
-        "mode=doctor_policy",
-        "~actuator",
-        "doctor.log=log.parquet",
-        f"policy={folder}",
-        "session.out=out",
-    )
-    told = json.loads(Path("out/doctor.json").read_text())
-    assert [one["kind"] for one in told["logs"][0]["findings"]] == ["sign"]
-
-
-def test_a_task_made_of_terms_is_refused_by_the_names_of_its_terms(
-    tmp_path: Path, machine: Machine
-) -> None:
-    parts = [{"name": "distance", "samples": 1, "width": 3, "mean": 0.0, "std": 1.0}]
-    observation = {"size": 3, "order": ["distance (1 x 3)"], "parts": parts}
-    contract = {"rate_hz": 20, "joints": list(machine.joint_names), "observation": observation}
-    (tmp_path / "policy.json").write_text(json.dumps(contract))
-    with pytest.raises(CheckpointError, match=r"terms of the task's own \(distance\)"):
+    with pytest.raises(CheckpointError, match=told):
         load_policy(str(tmp_path), machine)
 
 
@@ -325,19 +322,15 @@ def test_a_policy_of_another_machine_is_refused_by_its_joints() -> None:
         load_policy("tasks:policies/borehole_insertion", make_machine("hinge"))
 
 
-def test_a_contract_with_too_few_joints_is_refused(
-    folder: Path, machine: Machine, tmp_path: Path
+def test_the_doctor_from_the_command(
+    brokk: Callable[..., object], policy: LoadedPolicy, folder: Path, machine: Machine
 ) -> None:
-    contract = json.loads((folder / "policy.json").read_text())
-    (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
-    contract["joints"] = contract["joints"][:3]
-    (tmp_path / "policy.json").write_text(json.dumps(contract))
-    with pytest.raises(CheckpointError, match="gives 5 commands, the contract names 3"):
-        load_policy(str(tmp_path), machine)
-    del contract["joints"]
-    (tmp_path / "policy.json").write_text(json.dumps(contract))
-    with pytest.raises(CheckpointError, match="lacks 'joints'"):
-        load_policy(str(tmp_path), machine)
+    write_recording(run_loop(policy, machine, see_q=turn_joint), Path("log.parquet"))
+    arguments = ("~actuator", "doctor.log=log.parquet", f"policy={folder}", "session.out=out")
+    brokk("mode=doctor_policy", *arguments)
+    told = json.loads(Path("out/doctor.json").read_text())
+    assert (told["verdict"], told["logs"][0]["findings"][0]["field"]) == ("code", "q.q3")
+    assert "q.q3 has the wrong sign" in Path("out/doctor.html").read_text()
 
 
 @pytest.mark.parametrize("name", ["standard_normal", "standard_exponential", "random"])

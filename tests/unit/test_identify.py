@@ -4,85 +4,37 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from composed import option
+from axis import PLANT, driven, make_axis
 
 from actuators import open_loop
 from actuators.identify import dead_time
-from actuators.models.lag import FirstOrderLag
 from actuators.models.linear import ArxFit, Hold
 from brokk_rl import record
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
-PLANT = FirstOrderLag(
-    dead_time_s=0.43, dead_band_extend=0.06, dead_band_retract=0.09, gain=0.9, time_constant_s=0.0
-)
 
 
-def drive(
-    machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns commands and positions, each `(N, T, J)`, of `PLANT` under one segment of an excitation; with `sine` of joint `n`."""
-    generator, played = np.random.default_rng(seed), []
-    for n in range(num_runs):
-        spec = option("excitation", excitation)
-        found = spec.segments(
-            machine, seconds * (machine.num_joints if excitation == "sine" else 1), generator
-        )
-        played.append(
-            sorted(found, key=lambda segment: segment.name)[
-                n % machine.num_joints if excitation == "sine" else 0
-            ]
-        )
-    program = np.stack([segment.u for segment in played])
-    model = PLANT.build(machine, num_runs, CPU)
-    shape = (num_runs, machine.num_history, machine.num_joints)
-    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-    q = torch.as_tensor(np.stack([segment.start for segment in played]), dtype=torch.float32)
-    history.reset(torch.ones(num_runs, dtype=torch.bool), q)
-    positions = []
-    for k in range(program.shape[1]):
-        positions.append(q.numpy())
-        history.push_u(torch.as_tensor(program[:, k], dtype=torch.float32))
-        q = model.step(history)
-        history.push_q(q)
-    return program, np.stack(positions, 1)
-
-
-def recordings(
-    machine: Machine, excitation: str, num_runs: int, seconds: float, seed: int = 0
-) -> list[Recording]:
-    u, q = drive(machine, excitation, num_runs, seconds, seed)
-    return [
-        Recording(machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0,
-                  t_s=np.arange(u.shape[1]) * 0.05, u=u[n].astype(np.float32), q=q[n].astype(np.float32))
-        for n in range(num_runs)
-    ]  # fmt: skip
-
-
-def test_the_dead_time_is_found_to_the_hundredth(machine: Machine) -> None:
-    found = dead_time.estimate_dead_times(
-        recordings(machine, "sine", 10, 60.0), machine, np.random.default_rng(0)
-    )
-    for delay in found.values():
-        assert delay is not None
-        assert delay.value_s == pytest.approx(0.43, abs=0.011)
-        assert delay.ci95_s[0] - 0.011 <= 0.43 <= delay.ci95_s[1] + 0.011
-        assert delay.explained > 0.98
-
-
-def test_a_joint_that_rests_has_no_dead_time(machine: Machine) -> None:
-    only_q1 = recordings(machine, "sine", 1, 30.0)
-    found = dead_time.estimate_dead_times(only_q1, machine, np.random.default_rng(0))
-    assert found["q1"] is not None
-    assert found["q3"] is None
+def test_the_dead_time_is_found_to_the_hundredth_where_a_joint_is_commanded(
+    machine: Machine,
+) -> None:
+    axis = make_axis(machine)
+    plant = replace(PLANT, dead_time_s=0.43, time_constant_s=0.0)
+    runs = driven(axis, 8, 60.0, 0, plant)
+    delay = dead_time.estimate_dead_times(runs, axis, np.random.default_rng(0))["q3"]
+    assert delay is not None
+    assert delay.value_s == pytest.approx(0.43, abs=0.011)
+    assert delay.ci95_s[0] - 0.011 <= 0.43 <= delay.ci95_s[1] + 0.011
+    assert delay.explained > 0.98
+    still = [replace(run, u=np.zeros_like(run.u)) for run in runs]
+    assert dead_time.estimate_dead_times(still, axis, np.random.default_rng(0)) == {"q3": None}
 
 
 def test_a_linear_machine_is_learned_by_the_linear_model(machine: Machine, tmp_path: Path) -> None:

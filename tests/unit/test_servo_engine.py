@@ -206,18 +206,21 @@ def test_late_and_lost_frames_of_servos_are_named(
     assert [one.effect for one in answer.selected][:1] == named
 
 
-def test_a_late_servo_is_named_with_its_delay(pair: Machine) -> None:
+@pytest.mark.parametrize(("late", "joints"), [(3, [1]), (2, [0, 1])])
+def test_late_servos_are_named_with_their_delay(
+    pair: Machine, late: int, joints: list[int]
+) -> None:
     arm = option("machine", "so101")
     reference = [cut_joints(record_arm(arm, seed, 0.0, 0.0), pair) for seed in (1, 2, 3)]
     field = []
     for seed in (4, 5):
         one = cut_joints(record_arm(arm, seed, 0.0, 0.0), pair)
         q = one.q.copy()
-        q[3:, 1] = one.q[:-3, 1]
+        q[late:, joints] = one.q[:-late, joints]
         field.append(replace(one, q=q))
     answer = diagnose(GapCase(pair, reference, field))
-    assert [(one.effect, one.joints) for one in answer.selected] == [
-        ("dead_time", (pair.joint_names[1],))
-    ]
-    estimate = answer.selected[0].parameters["dead_time_s"][pair.joint_names[1]]
-    assert estimate.mean == pytest.approx(3 * pair.period_s, rel=0.1)
+    names = tuple(pair.joint_names[j] for j in joints)
+    assert [(one.effect, one.joints) for one in answer.selected] == [("dead_time", names)]
+    for name in names:
+        estimate = answer.selected[0].parameters["dead_time_s"][name]
+        assert estimate.mean == pytest.approx(late * pair.period_s, rel=0.1)
