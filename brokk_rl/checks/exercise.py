@@ -4,29 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Protocol
 
 import torch
 
+from brokk_rl.contracts.actuator import ActuatorModel, FollowerModel
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
 NUM_ENVS = 4
 """Environments of a check. Chosen by hand; not searched."""
 Tensors = Mapping[str, torch.Tensor]
-
-
-class Stateful(Protocol):
-    """A model that keeps its memory in `state` and forgets it by `reset`."""
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """Memory by name, each `(N, …)`."""
-        ...
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Forget in the environments of `mask`, `(N,)` bool."""
-        ...
 
 
 def build_rest_history(
@@ -86,7 +73,10 @@ def is_same(a: torch.Tensor, b: torch.Tensor, tolerance: float = 0.0) -> bool:
 
 
 def check_memory(
-    model: Stateful, machine: Machine, device: torch.device, run: Callable[[bool], torch.Tensor]
+    model: ActuatorModel | FollowerModel,
+    machine: Machine,
+    device: torch.device,
+    run: Callable[[bool], torch.Tensor],
 ) -> torch.Tensor:
     """Check results and memory of a model; return its results, `(T, N, J)`.
 

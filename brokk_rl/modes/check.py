@@ -105,19 +105,6 @@ class MachineCheck:
             return "It can be simulated, but not trained with this task and actuator."
         return f"It can be simulated and trained. Missing, guessed or mended: {len(self.missing)}."
 
-    def list_facts(self) -> dict[str, str]:
-        """Return reach, contact and starts in words."""
-        facts = {}
-        if reach := self.reach:
-            facts["reach"] = f"{reach['nearest_m']:.2f} to {reach['furthest_m']:.2f} m"
-            facts["height"] = f"{reach['lowest_m']:.2f} to {reach['highest_m']:.2f} m"
-            facts["above the ground"] = f"{reach['share_above_ground']:.0%} of random poses"
-        facts["touches, and feels it"] = ", ".join(self.contact) or "nothing"
-        if self.starts:
-            shares = [f"{name} {share:.1%}" for name, share in self.starts.items()]
-            facts["starts of the task, of candidates"] = ", ".join(shares)
-        return facts
-
 
 @spec
 class Check:
@@ -319,8 +306,15 @@ def _show(machine: Machine, found: MachineCheck) -> None:
         rows.append([name, *(None if one is None else f"{round(one, 9):.4g}" for one in values)])
     print_table(["joint", *JOINT_COLUMNS.values()], rows)
     print_text(JOINT_UNITS)
-    for name, text in found.list_facts().items():
-        print_text(f"{name}: {text}")
+    if reach := found.reach:
+        print_text(
+            f"reach: {reach['nearest_m']:.2f} to {reach['furthest_m']:.2f} m; height: {reach['lowest_m']:.2f} to "
+            f"{reach['highest_m']:.2f} m; above the ground in {reach['share_above_ground']:.0%} of random poses"
+        )
+    print_text(f"touches, and feels it: {', '.join(found.contact) or 'nothing'}")
+    if found.starts:
+        shares = [f"{name} {share:.1%}" for name, share in found.starts.items()]
+        print_text(f"starts of the task, of candidates: {', '.join(shares)}")
     kinds = {"problem": found.problems, "not fitting": found.unfit, "remark": found.missing}
     remarks = []
     for kind, texts in kinds.items():

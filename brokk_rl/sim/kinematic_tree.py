@@ -11,8 +11,9 @@ import mujoco
 from brokk_rl.errors import list_choices
 from brokk_rl.sim.model_source import KINDS, ModelSource
 
-GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb|pincer", re.IGNORECASE)
-"""Names of joints and links of grippers."""
+FINGER = re.compile("finger|jaw|claw|knuckle|thumb|pincer", re.IGNORECASE)
+GRIPPER = re.compile(f"grip|{FINGER.pattern}", re.IGNORECASE)
+"""Names of links, and of joints, of grippers: a link named `gripper` may be what the wrist turns."""
 LOCK = 1e5
 """Damping beyond which a joint without limits is a lock, as bases in scenes have it (1e11), Nm s/rad."""
 _TIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -257,7 +258,7 @@ class KinematicTree:
         """Return a chain up to the first joint that is named as one of a gripper."""
         for place, joint in enumerate(chain):
             link = self.model.body(int(self.model.jnt_bodyid[joint])).name
-            if GRIPPER.search(f"{self.name(joint)} {link}"):
+            if GRIPPER.search(self.name(joint)) or FINGER.search(link):
                 is_end = _is_gripper(place, len(chain) - place)
                 return chain[:place] if is_end else chain
         return chain

@@ -8,8 +8,10 @@ ring of eight walls.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -100,38 +102,22 @@ def build_collision_geoms(scale: float, radius_m: float) -> BlockGeoms:
     length, width, middle = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale, -HEIGHT_M / 2
     post = POST_HALF_THICKNESS_M
     plug = (HEIGHT_M - HOLE_DEPTH_M) / 2
-    names: list[str] = []
-    size: list[tuple[float, float, float]] = []
-    pos: list[tuple[float, float, float]] = []
-    yaw_rad: list[float] = []
-
-    def add(
-        name: str,
-        half: tuple[float, float, float],
-        center: tuple[float, float, float],
-        angle: float = 0.0,
-    ) -> None:
-        names.append(name)
-        size.append(half)
-        pos.append(center)
-        yaw_rad.append(angle)
-
+    parts = []
     for sign, name in ((1, "front"), (-1, "back")):
         half = ((length - radius_m) / 2, width, -middle)
-        add(f"slab_{name}", half, (sign * (length + radius_m) / 2, 0, middle))
+        parts.append((f"slab_{name}", half, (sign * (length + radius_m) / 2, 0, middle), 0.0))
     for sign, name in ((1, "left"), (-1, "right")):
         half = (radius_m, (width - radius_m) / 2, -middle)
-        add(f"slab_{name}", half, (0, sign * (width + radius_m) / 2, middle))
+        parts.append((f"slab_{name}", half, (0, sign * (width + radius_m) / 2, middle), 0.0))
     for i in range(4):
         angle = np.pi / 4 + i * np.pi / 2
         x, y = (radius_m + post) * np.cos(angle), (radius_m + post) * np.sin(angle)
         half = (post, radius_m * np.tan(np.pi / 8) + post, -middle)
-        add(f"post_{i}", half, (x, y, middle), angle)
-    add("plug", (radius_m, radius_m, plug), (0, 0, -HOLE_DEPTH_M - plug))
-    add("block_envelope", (length, width, -middle), (0, 0, middle))
-    return BlockGeoms(
-        tuple(names), np.array(size, float), np.array(pos, float), np.array(yaw_rad, float)
-    )
+        parts.append((f"post_{i}", half, (x, y, middle), angle))
+    parts.append(("plug", (radius_m, radius_m, plug), (0, 0, -HOLE_DEPTH_M - plug), 0.0))
+    parts.append(("block_envelope", (length, width, -middle), (0, 0, middle), 0.0))
+    names, size, pos, yaw_rad = zip(*parts, strict=True)
+    return BlockGeoms(names, *(np.array(one, float) for one in (size, pos, yaw_rad)))
 
 
 def build_visual_wall(radius_m: float) -> BlockGeoms:
@@ -163,15 +149,10 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         for radius in HOLE_RADIUS_BOUNDS_M:
             corners.append((scale, radius))
     largest = np.max([build_collision_geoms(*corner).size for corner in corners], axis=0)
-    for name, size, pos, yaw in zip(block.names, largest, block.pos, block.yaw_rad, strict=True):
+    for name, box in _list_boxes(replace(block, size=largest)):
         is_shown = name.startswith("slab") or name == "plug"
         body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=size,
-            pos=pos,
-            quat=_turn_about_z(yaw),
-            contype=0,
+            **box,
             conaffinity=_ARM if name == "block_envelope" else _TOOL,
             friction=_FRICTION,
             group=1 if is_shown else 3,
@@ -222,19 +203,8 @@ def add_site(spec: mujoco.MjSpec, path: Path | None) -> None:
 
 def _add_visuals(body: mujoco.MjsBody) -> None:
     """Add the round wall of the hole, and a camera that looks at the block."""
-    wall = build_visual_wall(HOLE_RADIUS_M)
-    for name, size, pos, yaw in zip(wall.names, wall.size, wall.pos, wall.yaw_rad, strict=True):
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=size,
-            pos=pos,
-            quat=_turn_about_z(yaw),
-            contype=0,
-            conaffinity=0,
-            group=2,
-            material="concrete",
-        )
+    for _, box in _list_boxes(build_visual_wall(HOLE_RADIUS_M)):
+        body.add_geom(**box, conaffinity=0, group=2, material="concrete")
     body.add_camera(
         name="close",
         pos=(-0.65, -1.05, 0.70),
@@ -244,9 +214,12 @@ def _add_visuals(body: mujoco.MjsBody) -> None:
     )
 
 
-def _turn_about_z(yaw_rad: float) -> tuple[float, float, float, float]:
-    """Return the quaternion of a turn about z."""
-    return (float(np.cos(yaw_rad / 2)), 0.0, 0.0, float(np.sin(yaw_rad / 2)))
+def _list_boxes(geoms: BlockGeoms) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield name and attributes of each box."""
+    for name, size, pos, yaw in zip(geoms.names, geoms.size, geoms.pos, geoms.yaw_rad, strict=True):
+        turn = (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2))
+        box = {"name": name, "type": mujoco.mjtGeom.mjGEOM_BOX, "contype": 0}
+        yield name, box | {"size": size, "pos": pos, "quat": turn}
 
 
 class ScenePlacement:

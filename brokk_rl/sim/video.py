@@ -202,67 +202,6 @@ def write_captions(job: RenderJob) -> list[str]:
     return lines
 
 
-class SceneRenderer:
-    """MuJoCo's renderer for one world in any pose and scene; a context manager.
-
-    Needs a GL library: set `MUJOCO_GL` before MuJoCo is imported for the first time
-    (`sim.probe.find_renderer` returns a value that works).
-
-    Args:
-        machine: The machine.
-        site: MJCF of what stands beside the block.
-    """
-
-    def __init__(self, machine: Machine, site: Path | None = None) -> None:
-        self._posed = PosedScene(machine, site)
-        self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
-        self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = [group in SHOWN_GROUPS for group in range(6)]
-        self._option.sitegroup[:] = 0
-
-    def __enter__(self) -> SceneRenderer:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        for renderer in self._renderers.values():
-            renderer.close()
-
-    def set_pose(self, q: np.ndarray, scene: np.ndarray) -> None:
-        """Put the machine at `q`, shape `(J,)`, beside the block of `scene`, shape `(S,)`."""
-        self._posed.set_pose(q, scene)
-        mujoco.mj_comPos(self._posed.model, self._posed.data)
-        mujoco.mj_camlight(self._posed.model, self._posed.data)
-
-    def render(
-        self, camera: str | mujoco.MjvCamera, width: int, height: int, mark_m: np.ndarray | None
-    ) -> np.ndarray:
-        """Return the picture of `camera`, shape `(height, width, 3)` uint8.
-
-        Args:
-            camera: Name of a camera of the model, or a free one.
-            width: Pixels.
-            height: Pixels.
-            mark_m: Centre of a ball that marks a target, `(3,)`; `None` for none.
-        """
-        key = (height, width)
-        if key not in self._renderers:
-            self._renderers[key] = mujoco.Renderer(self._posed.model, height, width)
-        renderer = self._renderers[key]
-        renderer.update_scene(self._posed.data, camera, self._option)
-        if mark_m is not None:
-            scene = renderer.scene
-            mujoco.mjv_initGeom(
-                scene.geoms[scene.ngeom],
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                np.full(3, MARK_RADIUS_M),
-                np.asarray(mark_m, float),
-                np.eye(3).ravel(),
-                np.array(MARK_RGBA, np.float32),
-            )
-            scene.ngeom += 1
-        return renderer.render()
-
-
 def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
     """Yield a picture, `(height, width, 3)` uint8, a step: overview, close-up, commands."""
     from PIL import Image, ImageDraw, ImageFont
@@ -271,16 +210,22 @@ def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
     split = width - CLOSE_WIDTH
     outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
     fixed = None if job.mark_m is None else _look_at(job.mark_m, TARGET_VIEW)
-    with SceneRenderer(job.machine, job.site) as renderer:
+    posed = PosedScene(job.machine, job.site)
+    with (
+        mujoco.Renderer(posed.model, height, split) as wide,
+        mujoco.Renderer(posed.model, height, CLOSE_WIDTH) as near,
+    ):
         for step in steps:
-            renderer.set_pose(job.episode.q[step], job.episode.scene)
+            posed.set_pose(job.episode.q[step], job.episode.scene)
+            mujoco.mj_comPos(posed.model, posed.data)
+            mujoco.mj_camlight(posed.model, posed.data)
             close = "close" if job.has_block else fixed
             if close is None:  # neither a block nor a target: the tool
                 tool = compute_tool_kinematics(job.machine, job.episode.q[step])
                 close = _look_at(tool.tip_in_base_m, TOOL_VIEW)
             views = (
-                renderer.render("overview", split, height, job.mark_m),
-                renderer.render(close, CLOSE_WIDTH, height, job.mark_m),
+                _draw_view(wide, posed, "overview", job.mark_m),
+                _draw_view(near, posed, close, job.mark_m),
             )
             picture = Image.fromarray(np.concatenate(views, axis=1))
             pen = ImageDraw.Draw(picture)
@@ -288,6 +233,31 @@ def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
             pen.text((16, 12), lines[step], fill="white", font=font, **outline)
             _draw_command_bars(pen, job.machine.joint_names, job.episode.u[step], font, height)
             yield np.asarray(picture)
+
+
+def _draw_view(
+    renderer: mujoco.Renderer,
+    posed: PosedScene,
+    camera: str | mujoco.MjvCamera,
+    mark_m: np.ndarray | None,
+) -> np.ndarray:
+    """Return what a camera sees, with a ball at `mark_m`, `(3,)`, `(height, width, 3)` uint8."""
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = [group in SHOWN_GROUPS for group in range(6)]
+    option.sitegroup[:] = 0
+    renderer.update_scene(posed.data, camera, option)
+    if mark_m is not None:
+        scene = renderer.scene
+        mujoco.mjv_initGeom(
+            scene.geoms[scene.ngeom],
+            mujoco.mjtGeom.mjGEOM_SPHERE,
+            np.full(3, MARK_RADIUS_M),
+            np.asarray(mark_m, float),
+            np.eye(3).ravel(),
+            np.array(MARK_RGBA, np.float32),
+        )
+        scene.ngeom += 1
+    return renderer.render()
 
 
 def _look_at(point_m: np.ndarray, view: tuple[float, float, float]) -> mujoco.MjvCamera:

@@ -239,6 +239,7 @@ LOOP = '<equality><connect body1="slide_link" body2="a_link" anchor="0 0 0"/></e
     [
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {}, ARM, "The gripper (left_finger"),
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"gripper": True}, (*ARM, "left_finger"), ""),
+        (SCENE.format(nest(*ARM, inside=nest("jaw")).replace("c_link", "gripper"), ""), {}, ARM, "The gripper (jaw)"),
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"chain": ("b",)}, ("a", "b"), "c, left_finger"),
         (SCENE.format(nest(*ARM), ""), {"chain": ("a_link", "c_link")}, ("b", "c"), "a are not part"),
         (SCENE.format(nest(*ARM), ""), {"chain": ("b", "c")}, ("b", "c"), "a are not part"),
