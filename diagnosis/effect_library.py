@@ -19,7 +19,6 @@ import numpy as np
 import torch
 import yaml
 
-from actuators.contracts import PlannedRun
 from actuators.models.linear import Hold
 from actuators.open_loop import FreeRunWindows
 from brokk_rl import registry
@@ -325,8 +324,6 @@ class EffectSimulator:
         batches = [
             np.arange(start, min(start + at_once, count)) for start in range(0, count, at_once)
         ]
-        if len(batches) > 1:
-            self._drive  # noqa: B018  # known before other processes need it
         runs = map_parallel(lambda batch: self._run(effects, own, batch), batches)
         for batch, paths in zip(batches, runs, strict=True):
             found[batch] = paths
@@ -355,8 +352,6 @@ class EffectSimulator:
             model: Any = self.base.build(self.machine, count, device)
             for name, value in own.items():
                 model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))
-            if not own and self._drive is not None:
-                model = _DrivenModel(model, u, self._drive.repeat(len(candidates)))
             for kind, values in effects:
                 model = kind.wrap(model, self.machine, count, device)
                 for name, value in values.items():
@@ -396,51 +391,6 @@ class EffectSimulator:
         """Recorded commands of the windows, `(T, W, J)`: time comes first, so that a step reads one piece of memory."""
         u = torch.as_tensor(self.cut.u, dtype=torch.float32)
         return u.transpose(0, 1).contiguous()
-
-    @cached_property
-    def _drive(self) -> Any:
-        """Demand of the recorded commands on the base in each window.
-
-        `None` where the base has no `drive`, or where its numbers are drawn.
-        """
-        device, size = torch.device("cpu"), self.cut.num_history
-        with torch.random.fork_rng(devices=[]), torch.inference_mode():
-            model: Any = self.base.build(self.machine, len(self.cut.u), device)
-            model.reset(torch.ones(len(self.cut.u), dtype=torch.bool))
-            if not hasattr(model, "drive"):
-                return None
-            if any((one != one[:1]).any() for one in model.parameters.values()):
-                return None
-            return model.drive(self._commands, size)
-
-
-class _DrivenModel:
-    """A model that knows already what the commands `u` of a run ask of it, `inner` for effects on its drive."""
-
-    def __init__(self, model: Any, u: torch.Tensor, drive: Any) -> None:
-        self.inner, self._u, self._drive = model, u, drive
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """State of the model."""
-        return self.inner.state
-
-    @property
-    def delay_s(self) -> torch.Tensor:
-        """Dead time of the model."""
-        return self.inner.delay_s
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Reset the model."""
-        self.inner.reset(mask)
-
-    def step(self, history: History) -> torch.Tensor:
-        """Return the positions one control period later."""
-        return self.inner.step(history)
-
-    def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> PlannedRun:
-        """Return a run; an effect on commands makes other commands of `u`."""
-        return self.inner.plan_run(u, first, q, drive=self._drive if u is self._u else None)
 
 
 class _SteppedRun:

@@ -114,11 +114,6 @@ class CommandParts:
     later: torch.Tensor
     part: torch.Tensor
 
-    def repeat(self, count: int) -> CommandParts:
-        """Return that of all environments, `count` times one after the other."""
-        earlier, later = self.earlier.repeat(1, count, 1), self.later.repeat(1, count, 1)
-        return CommandParts(earlier, later, self.part.repeat(count, 1))
-
 
 class PlannableModel(ParametricModel):
     """Base of models whose step is a planned run of one command.
@@ -159,15 +154,9 @@ class PlannableModel(ParametricModel):
         self.keep(memory)
         return moved
 
-    def plan_run(
-        self,
-        u: torch.Tensor,
-        first: int,
-        q: torch.Tensor | None = None,
-        drive: CommandParts | None = None,
-    ) -> JointRun:
-        """See `actuators.contracts.PlannedModel`; `drive`: that of the commands, if known."""
-        return JointRun(self, self.drive(u, first) if drive is None else drive, first)
+    def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> JointRun:
+        """See `actuators.contracts.PlannedModel`."""
+        return JointRun(self, self.drive(u, first), first)
 
 
 class JointRun:

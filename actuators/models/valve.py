@@ -287,10 +287,6 @@ class ValveDrive:
     wanted: torch.Tensor
     extends: torch.Tensor
 
-    def repeat(self, count: int) -> ValveDrive:
-        """Return that of all environments, `count` times one after the other."""
-        return ValveDrive(self.wanted.repeat(1, count, 1), self.extends.repeat(1, count, 1))
-
 
 def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.ndarray:
     """Return signed speeds at equal steps of the spool, `(J, CELLS + 1)`; curves `(J, K)`."""
