@@ -202,6 +202,8 @@ def _read_npz(path: Path) -> dict[str, dict[str, np.ndarray]]:
                     if "allow_pickle" not in str(error):
                         raise
                     continue
+                if values.dtype.kind in "mM":  # times
+                    values = values.astype(f"{values.dtype.kind}8[ns]").astype(float) * 1e-9
                 if _is_real(values) and values.ndim in (1, 2) and len(values) > 1:
                     found[name] = values
     except NPZ_ERRORS as error:

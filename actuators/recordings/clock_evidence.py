@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -36,6 +37,8 @@ EPOCH_S = (1e9, 4e9)
 """Seconds since 1970 from 2001 to 2096."""
 SECOND_WORDS = {"sec", "secs", "seconds", "s"}
 NANO_WORDS = {"nanosec", "nsec", "nsecs", "nanosecs", "ns", "nanoseconds", "nanos"}
+MOST_DRIFT = 0.01
+"""Drift of a sensor's clock from which on it does not count seconds; crystals drift by 1e-4 at most."""
 TIME_MODULI = (2.0**16, 2.0**24, 2.0**32, 1e3, 1e4, 1e5, 1e6, 1e9, 3600.0, 86400.0)
 """Values at which counters of time begin again, in their own unit."""
 
@@ -120,15 +123,15 @@ def _guess_own_clock(subject: str, table: Table, clock: str) -> TimeGuess:
     """Return the clock that the reader of the log made, or that of the sensor tied to it."""
     stamp_s, anchor_s = table.columns.get("header.stamp", np.zeros(1)), table.columns[clock]
     anchor = Column(column=clock, scale=1.0, offset=0.0)
-    steps_s = np.diff(stamp_s)
-    if len(steps_s) < 2 or not (steps_s > 0).all():
+    steps_s, late_s = np.diff(stamp_s), anchor_s - stamp_s
+    is_later = len(steps_s) > 1 and bool((steps_s > 0).all())
+    drift = float(np.polyfit(stamp_s - stamp_s[0], late_s, 1)[0]) if is_later else math.inf
+    if abs(drift) > MOST_DRIFT:  # it repeats, or is not in s
         num_doubled = (
             int((steps_s == 0).sum()) if steps_s.any() else 0
         )  # a driver may leave it at 0
         guess = Guess(subject, clock, (("the recorder's own clock, in s", 5.0),))
         return TimeGuess(anchor, guess, num_doubled)
-    late_s = anchor_s - stamp_s
-    drift = float(np.polyfit(stamp_s - stamp_s[0], late_s, 1)[0])
     scatter_s = np.quantile(late_s, 0.95) - late_s.min()
     reason = (
         f"the sensor's own clock; behind the recorder's by {np.median(late_s):.4g} s, drift {1e6 * drift:.3g} ppm, "

@@ -134,8 +134,18 @@ class _PairFinder:
         names = [name_joint(one.name.joint) for one in positions]
         commands, positions = self._unwrap(commands, positions, names)
         joints = self._assign(commands, positions)
-        keys = {one.name.key for joint in joints for one in (joint.u, joint.q)}
-        taken = {one.text for joint in joints for one in (joint.u, joint.q)}
+        self._weigh_lone(joints, commands, positions)
+        return joints
+
+    def _weigh_lone(
+        self,
+        joints: list[JointGuess],
+        commands: Sequence[ColumnEntry],
+        positions: Sequence[ColumnEntry],
+    ) -> None:
+        """Remark the columns that move and belong to no joint; several of both speak against the others."""
+        used = [*(joint.u for joint in joints), *(joint.q for joint in joints)]
+        keys, taken = {one.name.key for one in used}, {one.text for one in used}
         counts = []
         for several, text in (
             (commands, "other commands that were not taken"),
@@ -149,7 +159,6 @@ class _PairFinder:
             text = f"{missed} commands and positions that move have no partner"
             for joint in joints:
                 joint.evidence.append((text, -4.0 if 2 * missed >= len(joints) else -1.0))
-        return joints
 
     def _read_entries(self) -> list[ColumnEntry]:
         """Return the columns that are neither clock nor count nor switch."""
@@ -199,34 +208,26 @@ class _PairFinder:
         size = self.correlate(commands, positions).size
         numbers = np.vectorize(weigh_correlation)(size) + size
         numbers[[not one.is_changing for one in commands]] = -1.0  # another log may move it
-        usual = [_prefer(one, True) for one in commands], [_prefer(one, False) for one in positions]
-        score = names + numbers + np.add.outer(*usual)
-        pairs = sorted(
-            zip(*linear_sum_assignment(-score), strict=True), key=lambda pair: -score[pair]
+        score = (
+            names + numbers + np.add.outer(_prefer_targets(commands), _prefer_measured(positions))
         )
+        pairs = [
+            (int(row), int(column)) for row, column in np.stack(linear_sum_assignment(-score), 1)
+        ]
         chosen: dict[str, tuple[int, int]] = {}
-        for pair in pairs:
+        for pair in sorted(pairs, key=lambda pair: -score[pair]):
             if names[pair] == SAME_NAME:
                 chosen.setdefault(commands[pair[0]].name.key, pair)
         found = [(*pair, "same name", SAME_NAME) for pair in chosen.values()]
-        rest = [
-            [
-                at
-                for at, one in enumerate(several)
-                if one.name.key not in chosen and (one.is_changing or not chosen)
-            ]
-            for several in (commands, positions)
-        ]
-        clear = [pair for pair in pairs if _is_clear(size, *pair, *rest)]
-        if len(rest[0]) == len(rest[1]) == 1:
-            found.append((rest[0][0], rest[1][0], "the only command and the only position", 2.0))
-        elif len(clear) == min(map(len, rest)):
+        rows, columns = _list_rest(commands, chosen), _list_rest(positions, chosen)
+        clear = [pair for pair in pairs if _is_clear(size, *pair, rows, columns)]
+        if len(rows) == len(columns) == 1:
+            found.append((rows[0], columns[0], "the only command and the only position", 2.0))
+        elif len(clear) == min(len(rows), len(columns)):
             found += [(*pair, "paired by their numbers", 0.0) for pair in clear]
         elif not chosen:
-            listed = (
-                "commands and positions share no names, and not all follow each other clearly; "
-            )
-            self._refuse(listed, list(zip(commands, positions, strict=False)))
+            text = "commands and positions share no names, and not all follow each other clearly; "
+            self._refuse(text, list(zip(commands, positions, strict=False)))
         joints = []
         for row, column, text, weight in sorted(found):
             u, q = commands[row], positions[column]
@@ -321,10 +322,27 @@ def _weigh_names(commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntr
     return np.where(is_same, SAME_NAME, np.where(has_other, OTHER_NAME, 0.0))
 
 
-def _prefer(entry: ColumnEntry, is_command: bool) -> float:
-    """Return the log odds of a column among others of its joint: that of the position, as measured."""
-    is_usual = entry.name.quantity != "velocity" if is_command else entry.name.role == "measured"
-    return 0.4 * (entry.name.quantity == "position") + 0.2 * is_usual
+def _prefer_targets(commands: Sequence[ColumnEntry]) -> list[float]:
+    """Return log odds of commands among others of their joints: targets of the position come first."""
+    weights = {"position": 0.6, "velocity": 0.0}
+    return [weights.get(one.name.quantity, 0.2) for one in commands]
+
+
+def _prefer_measured(positions: Sequence[ColumnEntry]) -> list[float]:
+    """Return log odds of positions among others of their joints: what is called a measured position comes first."""
+    found = []
+    for one in positions:
+        found.append(0.4 * (one.name.quantity == "position") + 0.2 * (one.name.role == "measured"))
+    return found
+
+
+def _list_rest(entries: Sequence[ColumnEntry], chosen: Mapping[str, tuple[int, int]]) -> list[int]:
+    """Return the places of the columns whose joint has no pair yet; constant ones only where no joint has."""
+    found = []
+    for at, one in enumerate(entries):
+        if one.name.key not in chosen and (one.is_changing or not chosen):
+            found.append(at)
+    return found
 
 
 def _is_clear(size: np.ndarray, row: int, column: int, rows: list[int], columns: list[int]) -> bool:

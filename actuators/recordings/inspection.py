@@ -167,10 +167,7 @@ class _RecordingScan:
         self._travel = machine.upper - machine.lower
         self._reach = max(1, round(0.15 / self._period_s))
         self._after, self._before = self._speed(self._reach, 0), self._speed(0, self._reach)
-        both = (self._after + self._before) / 2.0
-        self._v = np.where(
-            np.isnan(self._after), self._before, np.where(np.isnan(self._before), self._after, both)
-        )
+        self._v = np.nanmean([self._after, self._before], 0)
         self._is_moving = np.abs(self._v) > thresholds.still * machine.max_speed
         self._lead = round((machine.dead_time_s + thresholds.settle_s) / self._period_s)
         least = HELD_TARGET if machine.interface == "position" else thresholds.commanded

@@ -198,7 +198,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
             if joint.name not in best or _rank(joint) > _rank(best[joint.name][0]):
                 best[joint.name] = joint, sample.signals
     joints = [joint for joint, _ in best.values()]
-    used = {column.name.table for joint in joints for column in (joint.u, joint.q)}
+    used = {one.u.signal.table for one in joints} | {one.q.signal.table for one in joints}
     times = {table: time for table, time in clocks.items() if table in used}
     survey = measure_logs(paths, times, joints, signs, given)
     moving = []

@@ -178,18 +178,7 @@ def expand_logs(paths: list[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        if not path.is_dir() or tell_folder(path) is not None:
-            found.append(path)
-            continue
-        inside = []
-        runs = _list_csv_runs(path)
-        for entry in sorted(path.iterdir()):
-            if entry in runs:
-                inside.append(entry)
-            elif entry.is_dir() and not entry.name.startswith("."):
-                inside += _find_below(entry)
-            elif entry.suffix.lower() in ENDINGS:
-                inside.append(entry)
+        inside = _expand_log(path)
         if not inside:
             there = sorted({entry.suffix for entry in path.iterdir()} - {""})
             if len(there) == 1 and there[0].lower() in FOREIGN:
@@ -199,6 +188,19 @@ def expand_logs(paths: list[Path]) -> list[Path]:
                 f"{path}: no log in this folder{ends}; logs end in {', '.join(ENDINGS)} or are folders of their own"
             )
         found += inside
+    return found
+
+
+def _expand_log(path: Path) -> list[Path]:
+    """Return a log, or those in a folder that is none and in the folders below it."""
+    if not path.is_dir() or tell_folder(path) is not None:
+        return [path]
+    runs, found = _list_csv_runs(path), []
+    for entry in sorted(path.iterdir()):
+        if entry in runs or (entry.is_file() and entry.suffix.lower() in ENDINGS):
+            found.append(entry)
+        elif entry.is_dir() and not entry.name.startswith("."):
+            found += _expand_log(entry)
     return found
 
 
@@ -217,10 +219,3 @@ def _list_csv_runs(folder: Path) -> list[Path]:
         if len(names) > 1 and len(entries) > 1:
             runs += entries
     return runs
-
-
-def _find_below(folder: Path) -> list[Path]:
-    try:
-        return expand_logs([folder])
-    except RecordingError:
-        return []

@@ -223,8 +223,9 @@ def _split_numbers(words: list[str]) -> list[str]:
     found = []
     for place, word in enumerate(words):
         numbered = re.fullmatch(r"([a-z]+)(\d+)", word)
-        is_role = numbered is not None and numbered[1] in ROLE_WORDS
-        is_apart = len(words) == 1 or (is_role and (place == 0 or len(numbered[1]) > 1))
+        is_apart = len(words) == 1
+        if numbered is not None and numbered[1] in ROLE_WORDS:
+            is_apart |= place == 0 or len(numbered[1]) > 1
         found += numbered.groups() if numbered and is_apart else [word]
     return found
 

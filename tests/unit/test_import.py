@@ -250,7 +250,9 @@ def test_rows_that_lack_a_number_are_left_out_and_counted(caplog: pytest.LogCapt
 def test_actions_that_are_scaled_and_added_to_a_pose_are_targets_in_another_unit() -> None:
     targets = make_targets()
     actions = (targets - [0.1, 0.8, -1.5]) / 0.25
-    np.savez("a.npz", time=np.arange(len(targets)) / RATE_HZ, actions=actions, dof_pos=delay(targets))  # fmt: skip
+    elapsed = (np.arange(len(targets)) * 1e9 / RATE_HZ).astype("timedelta64[ns]")
+    stamps = np.datetime64("2026-11-27", "ns") + elapsed
+    np.savez("a.npz", time=stamps, actions=actions, dof_pos=delay(targets))
     draft = make_draft("log.input=a.npz")
     guesses = {guess.subject: guess for guess in draft.list_guesses()}
     assert guesses["joint_1: command"].value == "a target of the position"
