@@ -48,8 +48,13 @@ def read_arguments(words: Sequence[str]) -> list[str]:
         groups.setdefault(option.group, []).append(option.name)
     options, values = _split(words, groups)
     sweep = not SWEEP.isdisjoint(options)
-    if sweep and not values:
+    swept = ("search=", "hydra")
+    if sweep and not any(re.search(r"[,(]", word) or word.startswith(swept) for word in values):
         raise ConfigError("a sweep needs values: brokk -m mode=train session.seed=0,1,2")
+    shown = any(word.startswith(("--cfg", "-c", "--info", "-i")) for word in options)
+    for word in options:
+        if word.startswith(("--package", "-p", "--resolve")) and not shown:
+            raise ConfigError(f"{word} is about what is printed: brokk mode=train --cfg job {word}")
     if not COMPLETION.isdisjoint(options) and len(values) != 1:
         raise ConfigError("completion of words: brokk -sc install=bash, or uninstall=bash")
     read = []
@@ -155,6 +160,13 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
         raise ConfigError(f"'{word}' has no value: {end}")
     if key in groups and value.endswith(ROBOT_FILES):
         raise ConfigError(f"{word}: expected an option or a YAML file; {explain_robot(value)}")
+    named = re.search(r"([^@,\[]+)\.ya?ml\b", value)
+    if key in groups and named and "@" not in value:
+        name = Path(named[1]).name
+        raise ConfigError(
+            f"{word}: an option has no ending, {key}={name}, and a file stands after @, "
+            f"{key}=@{named[1]}.yaml"
+        )
     try:
         override = OverridesParser.create().parse_override(word)
     except HydraException as error:

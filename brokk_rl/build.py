@@ -10,9 +10,9 @@ import importlib
 import re
 import sys
 import traceback
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
@@ -52,31 +52,28 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     if RUN not in values:
         raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
     nodes = {key: value for key, value in values.items() if key != RUN}
-    known = registry.list_fields(values[RUN])
-    if known is not None:
-        _check_keys(known, nodes.keys() - set(shared), nodes)
+    if known := registry.list_fields(values[RUN]):  # else its source was not found
+        _check_keys(known, nodes, shared)
     built = build_quick_nodes(values, shared)
     kind = load_class(values[RUN], "")
-    if known is None:  # its source was not found
-        known = {field.name: field.default is MISSING for field in fields(kind)}
-        _check_keys(known, nodes.keys() - set(shared), nodes)
-    own = {field.name for field in fields(kind)}
+    own = [field.name for field in fields(kind)]
+    _check_keys(own, nodes, shared)
     for key in nodes.keys() - built.keys():
         if key in own:
             built[key] = build_node(nodes[key], key)
     return _call(kind, {key: built[key] for key in nodes if key in built}, "")
 
 
-def _check_keys(known: Mapping[str, bool], keys: Collection[str], given: Collection[str]) -> None:
+def _check_keys(known: Collection[str], given: Collection[str], shared: Collection[str]) -> None:
     """Refuse keys that a mode does not have, and a mode that lacks one of its own."""
-    for key in sorted(keys):
-        if key not in known:
+    for key in sorted(given):
+        if key not in known and key not in shared:
             raise ConfigError(
                 f"the mode has no '{key}'; {list_choices(key, known)}. A preset or experiment that "
                 "sets it is for other modes: leave it out"
             )
-    for key, is_needed in known.items():
-        if is_needed and key not in given:
+    for key in known:
+        if key not in given:
             raise ConfigError(
                 f"the mode needs '{key}': give {key}=<option> in place of ~{key} or none"
             )
@@ -88,16 +85,11 @@ def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -
     Raises:
         ConfigError: Classes cannot be found or refuse their values; all of them are named.
     """
-    built, refusals = {}, []
-    for key, value in values.items():
-        if key == RUN or key in shared:
-            continue
-        try:
-            # the mode itself says which package it lacks
-            with defer_slow_import(), suppress(_SlowImport, _LackingPackageError):
-                built[key] = build_node(value, key)
-        except ConfigError as error:
-            refusals.append(error)
+    own = [key for key in values if key != RUN and key not in shared]
+    built, refusals = _try_nodes(values, own)
+    if refusals:  # of a value that others take in, the key is told as it is typed
+        _, typed = _try_nodes(values, shared)
+        refusals = typed or refusals
     for other in () if SUBJECT in values else built.keys() & BESIDE:
         for part in _list_parts(built):
             try:
@@ -108,6 +100,21 @@ def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -
     if refusals:
         raise ConfigError("\n".join(map(str, refusals))) from refusals[0]
     return built
+
+
+def _try_nodes(
+    values: Mapping[str, Any], keys: Iterable[str]
+) -> tuple[dict[str, Any], list[ConfigError]]:
+    """Return those of some nodes that do without torch, and the refusals of the others."""
+    built, refusals = {}, []
+    for key in keys:
+        try:
+            # the mode itself says which package it lacks
+            with defer_slow_import(), suppress(_SlowImport, _LackingPackageError):
+                built[key] = build_node(values[key], key)
+        except ConfigError as error:
+            refusals.append(error)
+    return built, refusals
 
 
 def _list_parts(nodes: Mapping[str, Any]) -> Iterator[Any]:

@@ -29,7 +29,6 @@ from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.explain import compose_choices, explain, list_sources
 from brokk_rl.help import add_comments, collect_comments, describe_command, describe_mode
 from brokk_rl.sim import probe
-from brokk_rl.sweep import SweepFolder, take_place
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +104,10 @@ def main() -> int:
     except SystemExit as left:  # Hydra has said why, as for `--cfg job --package` of no such part.
         return 2 if left.code else 0
     except (FailedJob, Exception) as error:
-        SweepFolder.drop_if_unused()
+        if "brokk_rl.job" in sys.modules:  # Hydra loads it before it makes a folder
+            from brokk_rl.job import SweepFolder
+
+            SweepFolder.drop_if_unused()
         cause = error.args[0] if isinstance(error, FailedJob) else error
         message = explain(cause)
         if isinstance(cause, SweepError) and cause.args[1] == os.getpid():
@@ -123,10 +125,10 @@ def run_job(cfg: DictConfig) -> float | None:
     """Run one composed configuration: the whole command, or one job of a sweep."""
     set_up_logging()  # A launcher may run the job in a process of its own.
     try:
-        with take_place():
-            from brokk_rl.job import run
+        from brokk_rl import job  # its parts take a while to import
 
-            return run(cfg)
+        with job.take_place():
+            return job.run(cfg)
     except Exception as error:
         if HydraConfig.get().mode is not RunMode.MULTIRUN:
             raise FailedJob(error) from error

@@ -93,7 +93,7 @@ def _explain_missing_option(error: MissingConfigException) -> str:
     group, _, name = typed or str(error.missing_cfg_file).rpartition("/")
     if not group:
         return str(error).split("\nConfig search path")[0]
-    if Path(name).suffix in (".yaml", ".yml") or Path(name).is_file():
+    if Path(name).is_file():
         return f"there is no {group}={name}; a file is given by its path after @: {group}=@{name}"
     if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
@@ -251,25 +251,12 @@ def compose_choices() -> DictConfig:
     chosen = list_chosen_options(sys.argv[1:])
     modes = [line for line in chosen if line.startswith("mode=")]
     with hydra.initialize_config_module("conf", version_base="1.3"):
+        command = GlobalHydra.instance().hydra
+        assert command is not None
         try:
-            return _compose_without_missing(chosen)
+            return command.compose_config("config", chosen, MISSING_SKIPPED, from_shell=False)
         except (HydraException, OmegaConfBaseException):
-            return _compose_without_missing(modes[-1:])
-
-
-def _compose_without_missing(chosen: list[str]) -> DictConfig:
-    """Compose options; a group that must be given and is not is left out."""
-    try:
-        return hydra.compose("config", overrides=chosen, return_hydra_config=True)
-    except ConfigCompositionException as error:
-        group = re.match(r"You must specify '([\w/@.]+)'", str(error))
-        if group is None:
-            raise
-        cfg = _compose_without_missing([*chosen, f"~{group[1]}"])
-        OmegaConf.set_readonly(cfg.hydra, False)
-        OmegaConf.set_struct(cfg.hydra, False)
-        cfg.hydra.runtime.choices[group[1]] = "???"
-        return cfg
+            return command.compose_config("config", modes[-1:], MISSING_SKIPPED, from_shell=False)
 
 
 def list_sources() -> list[tuple[str, Path]]:

@@ -277,7 +277,7 @@ def _find_package(
     classes = [name for name in packages if "." in name]
     if classes and not {"_target_", "defaults"} & {*named, *node}:
         raise ConfigError(f"{where}: expected _target_: <class>; {list_choices('', classes)}")
-    return EVERYWHERE if used == {EVERYWHERE} else None
+    return EVERYWHERE if EVERYWHERE in used else None
 
 
 def _read_packages(group: str) -> dict[str, str | None]:

@@ -12,6 +12,8 @@ import yaml
 
 from brokk_rl.errors import ConfigError
 
+MOST_JSON_BYTES = 1 << 28
+"""Size beyond which no file of ours is. Chosen by hand: an evaluation of 10^5 episodes has 10 MB."""
 MOST_NODES, MOST_DEPTH = 20_000, 40
 """Values of a YAML file with its aliases written out, and levels of nesting, beyond which it is no
 file of options: the largest that the commands write has some hundred values in five levels."""
@@ -40,7 +42,7 @@ def read_plain_file(path: Path, most_bytes: int) -> bytes:
     return path.read_bytes()
 
 
-def read_json(path: Path, most_bytes: int) -> dict[str, Any]:
+def read_json(path: Path, most_bytes: int = MOST_JSON_BYTES) -> dict[str, Any]:
     """Return the JSON object in a plain file.
 
     Raises:

@@ -88,6 +88,7 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
     OmegaConf.set_readonly(cfg, False)
     OmegaConf.set_struct(cfg, False)
     target = OmegaConf.select(cfg, f"policy.{TARGET}", default=None)
+    _require_network(cfg, target)
     if cfg.get(RUN) == TRAIN:
         target = _choose_beginning(cfg, target)
     built: dict[str, Any] = {}
@@ -194,14 +195,18 @@ def _recall_overrides(given: Mapping[str, Override]) -> list[str]:
     return recalled
 
 
+def _require_network(cfg: DictConfig, target: str | None) -> None:
+    """Refuse a policy that is no network where the mode, or a part of it, takes no other."""
+    hint = (registry.list_fields(str(cfg.get(RUN))) or {}).get("policy", "TrainedPolicy")
+    if target not in (None, TRAINED, SHIPPED) and "TrainedPolicy" in hint:
+        raise ConfigError(
+            f"policy={HydraConfig.get().runtime.choices.get('policy')}: this mode takes a network; "
+            "expected policy=shipped, or the path of a run folder, a policy folder or a checkpoint"
+        )
+
+
 def _choose_beginning(cfg: DictConfig, target: str | None) -> str | None:
     """Return the class of the policy with which training begins."""
-    if target not in (None, TRAINED, SHIPPED):
-        raise ConfigError(
-            f"mode=train policy={HydraConfig.get().runtime.choices.get('policy')}: training begins "
-            "with a network; expected policy=none, policy=shipped, or the path of a run "
-            "folder, a policy folder or a checkpoint"
-        )
     if target is None:
         return None
     cfg.policy[TARGET] = TRAINED

@@ -31,6 +31,7 @@ from brokk_rl.build import TARGET, describe_spec, drop_targets, name_class
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import measure_ranges, restore_encoder
+from brokk_rl.plain_files import read_json
 from brokk_rl.session import write_bytes, write_json
 
 if TYPE_CHECKING:
@@ -441,7 +442,7 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
 def read_contract(folder: Path, name: str) -> dict[str, Any]:
     """Return the content of `policy.json`, empty where there is none; `name` is for messages."""
     try:
-        return json.loads((folder / CONTRACT).read_text())
+        return read_json(folder / CONTRACT)
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:

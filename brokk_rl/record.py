@@ -296,12 +296,8 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
         ]
     metadata = {}
     for key, value in (table.schema.metadata or {}).items():
-        metadata[key.decode()] = value.decode()
-    metadata = {
-        key.removeprefix("brokk."): value
-        for key, value in metadata.items()
-        if key.startswith("brokk.")
-    }
+        if key.startswith(b"brokk."):
+            metadata[key.removeprefix(b"brokk.").decode()] = value.decode()
     units = tuple(joint.unit for joint in machine.joints)
     commands = [name_command_column(name) for name in machine.joint_names]
     positions = [

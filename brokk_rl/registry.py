@@ -175,8 +175,8 @@ def read_attributes(target: str) -> dict[str, str]:
     return found
 
 
-def list_fields(target: str) -> dict[str, bool] | None:
-    """Return the fields of the class `target`, and whether each must be given, from its source.
+def list_fields(target: str) -> dict[str, str] | None:
+    """Return the fields of the class `target` with their annotations, from its source.
 
     Nothing is imported. The answer is `None` where the source of the class or of one of its bases
     cannot be found.
@@ -194,7 +194,7 @@ def list_fields(target: str) -> dict[str, bool] | None:
             place = util.resolve_name(stated, module.rpartition(".")[0])
             for alias in node.names:
                 imported[alias.asname or alias.name] = f"{place}.{alias.name}"
-    found: dict[str, bool] | None = None
+    found: dict[str, str] | None = None
     for node in nodes:
         if not isinstance(node, ast.ClassDef) or node.name != name:
             continue
@@ -207,7 +207,7 @@ def list_fields(target: str) -> dict[str, bool] | None:
             found |= inherited
         for item in node.body:
             if isinstance(item, ast.AnnAssign) and "ClassVar" not in ast.unparse(item.annotation):
-                found[ast.unparse(item.target)] = item.value is None
+                found[ast.unparse(item.target)] = ast.unparse(item.annotation)
     return found
 
 

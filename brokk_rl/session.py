@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from brokk_rl import distributed
 from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
+from brokk_rl.plain_files import read_json
 from brokk_rl.spec import Seed, spec
 
 if TYPE_CHECKING:
@@ -213,7 +214,7 @@ class SessionRecord:
 def read_record(folder: Path) -> dict[str, Any] | None:
     """Return the content of `session.json` in a run folder, `None` where there is none."""
     try:
-        return json.loads((folder / RECORD).read_text())
+        return read_json(folder / RECORD)
     except (FileNotFoundError, NotADirectoryError):
         return None
     except ValueError as error:
@@ -231,8 +232,9 @@ def require_new_folder(folder: Path) -> None:
         raise StorageError(f"{place} is a file. Give a folder with session.out=<folder>.")
     if not os.access(place, os.W_OK):
         raise StorageError(f"cannot write into {place}. Choose session.out=<folder>.")
-    before, checkpoints = read_record(folder) or {}, list(folder.glob("model_*.pt"))
-    if before or checkpoints:
+    before, checkpoints = read_record(folder), list(folder.glob("model_*.pt"))
+    if before is not None or checkpoints:
+        before = before or {}
         mode, outcome = before.get("mode", "?"), before.get("outcome", "no record of it")
         advice = "Give another folder with session.out=<folder>, or delete this one."
         if mode == "train" and checkpoints:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import math
 import operator
 import reprlib
 import types
@@ -21,17 +20,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform
 
 from annotated_types import Ge, Gt, Interval, MinLen
-from pydantic import (
-    AfterValidator,
-    AllowInfNan,
-    BeforeValidator,
-    ConfigDict,
-    Strict,
-    TypeAdapter,
-    ValidationError,
-)
+from pydantic import AllowInfNan, BeforeValidator, ConfigDict, Strict, TypeAdapter, ValidationError
 from pydantic import dataclasses as pydantic_dataclasses
 from pydantic_core import ArgsKwargs, CoreSchema, PydanticCustomError, core_schema
+from typing_extensions import get_protocol_members, is_protocol
 
 from brokk_rl.errors import ConfigError, list_choices
 
@@ -64,6 +56,8 @@ WorldCount = Annotated[int, Interval(ge=1, le=10**7)]
 """Worlds side by side; the largest that was measured is 65,536."""
 Index = Annotated[int, Ge(0)]
 """A whole number of 0 or more: an index, a count that may be none."""
+Port = Annotated[int, Interval(ge=1, le=65535)]
+"""Port of UDP or TCP."""
 Seed = Annotated[int, Interval(ge=0, le=10**9)]
 """Seed of random numbers; numpy takes it below 2**32."""
 Range = Annotated[tuple[Finite, Finite], Ordered()]
@@ -93,7 +87,7 @@ def spec(cls: type[T]) -> type[T]:
 
     A YAML list becomes a tuple. An integer given for a float becomes a float, and a whole number
     such as 48e6 given for an integer becomes an integer. A table becomes the spec that the
-    annotation names. Any other mismatch, and NaN, raise a `SpecError` that names the field, the
+    annotation names. Any other mismatch, NaN and infinity raise a `SpecError` that names the field, the
     expected value and the given one. Of a field annotated with a protocol the members are compared.
     A spec may define `check(self)` for rules between fields. Specs are pure data: a number lives in
     one YAML file, so fields have no defaults here.
@@ -155,24 +149,14 @@ class _InstanceOf:
         return core_schema.no_info_plain_validator_function(self.check)
 
     def check(self, value: Any) -> Any:
-        protocol = getattr(self.kind, "_is_protocol", False)
-        if protocol and (lacking := _list_lacking_members(self.kind, value)):
+        if not is_protocol(self.kind):
+            if not isinstance(value, self.kind):
+                raise PydanticCustomError("instance", "another class")
+            return value
+        members = get_protocol_members(self.kind)
+        if lacking := sorted(name for name in members if not _has_member(value, name)):
             raise PydanticCustomError("members", "lacking", {"lacking": ", ".join(lacking)})
-        if not protocol and not isinstance(value, self.kind):
-            raise PydanticCustomError("instance", "another class")
         return value
-
-
-def _list_lacking_members(protocol: type, value: object) -> list[str]:
-    """Return the members of a protocol that `value` does not have."""
-    lacking = []
-    for kind in protocol.__mro__:
-        if not getattr(kind, "_is_protocol", False) or kind is typing.Protocol:
-            continue
-        for name in {**vars(kind), **inspect.get_annotations(kind)}:
-            if not name.startswith("_") and not _has_member(value, name):
-                lacking.append(name)
-    return lacking
 
 
 def _has_member(value: object, name: str) -> bool:
@@ -183,8 +167,8 @@ def _has_member(value: object, name: str) -> bool:
 def _constrain(hint: Any) -> Any:
     """Return an annotation with the constraints that pydantic does not set by itself.
 
-    Numbers, words and truth values are not converted into each other, NaN is no number, and every
-    other class is compared by `isinstance` or, for a protocol, by its members.
+    Numbers, words and truth values are not converted into each other, NaN and infinity are no
+    numbers, and every other class is compared by `isinstance` or, for a protocol, by its members.
     """
     arguments = typing.get_args(hint)
     origin = typing.get_origin(hint)
@@ -198,7 +182,7 @@ def _constrain(hint: Any) -> Any:
     if hint is int:
         return Annotated[int, Strict(), BeforeValidator(_read_whole)]
     if hint is float:
-        return Annotated[float, Strict(), AfterValidator(_refuse_nan)]
+        return Annotated[float, Strict(), AllowInfNan(False)]
     if hint in (bool, str):
         return Annotated[hint, Strict()]
     kind = origin or hint
@@ -212,12 +196,6 @@ def _constrain(hint: Any) -> Any:
 
 def _read_whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def _refuse_nan(value: float) -> float:
-    if math.isnan(value):
-        raise PydanticCustomError("nan", "nan")
-    return value
 
 
 def _explain(kind: type, error: ValidationError) -> SpecError:
@@ -344,14 +322,14 @@ def _describe_constrained(inner: Any, constraints: Sequence[Any]) -> str:
             bound = getattr(constraint, name, None)
             if bound is not None:
                 bounds[name] = bound
-        if isinstance(constraint, AllowInfNan):
-            text = text.replace("a number", "a finite number")
         if isinstance(constraint, Ordered):
             text = f"(lowest, highest), {text}"
         if isinstance(constraint, MinLen):
             text = f"{text}, at least {constraint.min_length} of them"
     if {"ge", "le"} <= bounds.keys():
         return f"{text} from {bounds['ge']:g} to {bounds['le']:g}"
+    if any(isinstance(constraint, AllowInfNan) for constraint in constraints):
+        text = text.replace("a number", "a finite number")
     words = {"gt": "above {:g}", "ge": "of {:g} or more", "lt": "below {:g}", "le": "up to {:g}"}
     for name, bound in bounds.items():
         text = f"{text} {words[name].format(bound)}"

@@ -18,7 +18,7 @@ from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
 from deploy.guard_setup import check_command_rate
@@ -57,7 +57,7 @@ class CanConnection:
     wire: CanBus
     dbc: str
     limits: GuardLimits
-    patience_s: float
+    patience_s: Positive
     realtime: bool
 
     @property

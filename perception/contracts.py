@@ -27,7 +27,6 @@ class Segmenter(Protocol):
 
     def segment(self, frame: Frame) -> Masks:
         """Return masks of the size of the frame."""
-        ...
 
 
 class SegmenterSpec(Protocol):
@@ -35,7 +34,6 @@ class SegmenterSpec(Protocol):
 
     def build(self) -> Segmenter:
         """Return a segmenter."""
-        ...
 
 
 class PoseEstimator(Protocol):
@@ -43,7 +41,6 @@ class PoseEstimator(Protocol):
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is refused; `frame` has no distortion."""
-        ...
 
 
 class PoseEstimatorSpec(Protocol):
@@ -51,7 +48,6 @@ class PoseEstimatorSpec(Protocol):
 
     def build(self) -> PoseEstimator:
         """Return an estimator."""
-        ...
 
 
 @runtime_checkable
@@ -60,7 +56,6 @@ class RejectionExplainer(Protocol):
 
     def explain(self, rejection: Rejection) -> str:
         """Return a sentence: the refused candidate, the reason, and a remedy."""
-        ...
 
 
 @runtime_checkable
@@ -70,8 +65,6 @@ class HoleFollower(Protocol):
     @property
     def search_every(self) -> int:
         """Frames of which one is to be searched as a whole."""
-        ...
 
     def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
         """Return those of some holes, seen before, that are still where they were."""
-        ...

@@ -17,7 +17,7 @@ from annotated_types import Ge, Interval
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import Index, spec
+from brokk_rl.spec import Index, Positive, spec
 
 CONDITIONS = ("guided", "unguided")
 PERIODS = (1, 2)
@@ -33,7 +33,7 @@ class Hole:
     """
 
     center_in_base_m: tuple[float, float, float]
-    radius_m: float
+    radius_m: Positive
 
 
 @spec
@@ -46,8 +46,8 @@ class Success:
             hole less that of the chisel.
     """
 
-    depth_m: float
-    clearance_m: float
+    depth_m: Positive
+    clearance_m: Positive
 
 
 @spec
@@ -70,7 +70,7 @@ class Design:
     holes: dict[str, Hole]
     starts: dict[str, tuple[float, ...]]
     practice_trials: Index
-    limit_s: float
+    limit_s: Positive
     success: Success
     primary: str
     alpha: Annotated[float, Interval(gt=0, lt=1)]

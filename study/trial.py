@@ -15,7 +15,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 from deploy.runtime.operator_state import AdviceStatus
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import request_fault
@@ -44,9 +44,9 @@ class Times:
             being there.
     """
 
-    countdown_s: float
-    settle_s: float
-    start_tolerance: float
+    countdown_s: NonNegative
+    settle_s: NonNegative
+    start_tolerance: Positive
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from brokk_rl.progress import track_items
 from brokk_rl.record import Recording, make_motion, write_recording
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
-from brokk_rl.spec import Index, name_spec, spec
+from brokk_rl.spec import Index, NonNegative, name_spec, spec
 from deploy.guidance import LeverGuidance, LeverMap
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
@@ -64,7 +64,7 @@ class TwinGround:
     plant: Connection
     guidance: LeverGuidance
     policy: str
-    settle_s: float
+    settle_s: NonNegative
     num_processes: Index
     guided: Operator
     unguided: Operator

@@ -22,7 +22,7 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs/tutorials").glob("*.md")))
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.M | re.S)
 SAVED = re.compile(r"as `(\w+\.(?:py|xml|yaml))`(?:, and run `([^`]+)`)?:?\s*$")
 EXPECTED = re.compile(r"# exit code (\d+)")
-SERVERS = re.compile(r"mode=(play|page|twin)|preset=(bench|machine|study)")
+SERVERS = re.compile(r"mode=(play|page|twin)|preset=(bench|study)")
 STOPPED_S = 40
 """Seconds after which a program that runs until it is stopped gets Ctrl-C."""
 SKIPPED = {
@@ -35,7 +35,7 @@ SKIPPED = {
     "brokk -m actuator=mlp,lag": "six trainings; sweeps have tests",
     "for run in": "the runs of that sweep",
     "mode=compare": "the runs of that sweep",
-    "preset=machine": "the bus of a machine",
+    "mode=deploy": "the bus of a machine",
     "runs/model": "the reader's own identification",
     "my_trace": "the example package, which a test installs and trains",
     "mine/": "the same",

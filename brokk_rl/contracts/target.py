@@ -39,18 +39,15 @@ class TargetSensor(Protocol):
 
     def reset(self, mask: np.ndarray, start: dict[str, np.ndarray]) -> None:
         """Begin new episodes in the environments of `mask`, `(N,)` bool, at the task's starts."""
-        ...
 
     def begin(self) -> None:
         """Forget all episodes, and sense in all environments from now on; before, nothing is sensed.
 
         What follows does not depend on what was.
         """
-        ...
 
     def attend(self, mask: np.ndarray) -> None:
         """Sense in the environments of `mask`, `(N,)` bool, alone; the others do not count."""
-        ...
 
     def read(self, q: np.ndarray, measured_q: np.ndarray, plan: MotionPlan) -> TargetReading:
         """Return the estimates; called once a control period, after `reset`.
@@ -60,11 +57,9 @@ class TargetSensor(Protocol):
             measured_q: The same as the machine's sensors tell them.
             plan: Plan of the coming motion.
         """
-        ...
 
     def summarize(self) -> dict[str, Any]:
         """Return figures of the episodes that ended since `begin`, as JSON data."""
-        ...
 
 
 class TargetSensorSpec(Protocol):
@@ -72,4 +67,3 @@ class TargetSensorSpec(Protocol):
 
     def sense(self, machine: Machine, num_envs: int, seed: int) -> TargetSensor:
         """Return a sensor for `num_envs` environments; the same seed gives the same errors."""
-        ...

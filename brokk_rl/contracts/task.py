@@ -267,7 +267,6 @@ class Task(Protocol):
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""
-        ...
 
 
 class Policy(Protocol):
@@ -275,4 +274,3 @@ class Policy(Protocol):
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the action for the observation groups, shape `(N, num_actions)`."""
-        ...

@@ -259,7 +259,6 @@ class BoreholeFinder(Protocol):
         Raises:
             FrameError: the frame cannot be used; its message says why.
         """
-        ...
 
 
 class FinderSpec(Protocol):
@@ -267,7 +266,6 @@ class FinderSpec(Protocol):
 
     def build(self) -> BoreholeFinder:
         """Return a finder."""
-        ...
 
 
 class HoleTracker(Protocol):
@@ -275,7 +273,6 @@ class HoleTracker(Protocol):
 
     def update(self, holes: Sequence[HolePose], t_s: float) -> Sequence[TrackedHole]:
         """Take the holes of the frame at `t_s`, possibly none; return all known ones by name."""
-        ...
 
 
 class TrackerSpec(Protocol):
@@ -283,7 +280,6 @@ class TrackerSpec(Protocol):
 
     def build(self) -> HoleTracker:
         """Return a tracker that has seen nothing yet."""
-        ...
 
 
 class FrameSource(Protocol):
@@ -292,7 +288,6 @@ class FrameSource(Protocol):
     @property
     def num_frames(self) -> int | None:
         """Number of frames; `None` for a live source."""
-        ...
 
     def read_latest(self) -> Frame | None:
         """Return the newest frame not returned yet, from disk the next one; `None` at the end.
@@ -301,7 +296,6 @@ class FrameSource(Protocol):
             FrameError: this frame cannot be used, its message says which and why; the next call
                 goes on with the next frame.
         """
-        ...
 
     def __enter__(self) -> FrameSource: ...
 
@@ -323,7 +317,6 @@ class AimedSource(Protocol):
         Returns:
             The view and the reason; `None` before the positions are known.
         """
-        ...
 
 
 class FrameSourceSpec(Protocol):
@@ -331,4 +324,3 @@ class FrameSourceSpec(Protocol):
 
     def build(self) -> FrameSource:
         """Return a source, not yet opened."""
-        ...

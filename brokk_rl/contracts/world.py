@@ -39,7 +39,6 @@ class World(Protocol):
             increment: Motion of each joint that the drive makes unless something blocks it, `(N,
                 J)`.
         """
-        ...
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Put worlds at rest.
@@ -49,7 +48,6 @@ class World(Protocol):
             q: Joint positions, `(N, J)`.
             scene: Scenes, `(N, S)`; see `sim.scene`.
         """
-        ...
 
     def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
         """Put the block of worlds elsewhere; the machine goes on as it was.
@@ -58,15 +56,12 @@ class World(Protocol):
             mask: Worlds whose block moves, `(N,)` bool.
             scene: Scenes, `(N, S)`; see `sim.scene`.
         """
-        ...
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of everything that must be stored to go on exactly."""
-        ...
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a copy that `state_dict` returned."""
-        ...
 
 
 @runtime_checkable
@@ -84,7 +79,6 @@ class ExplainedWorld(Protocol):
 
     def explain_faults(self) -> str:
         """Return why worlds became faults since the last call, in one line; waits for the device."""
-        ...
 
 
 class Simulator(Protocol):
@@ -97,4 +91,3 @@ class Simulator(Protocol):
 
     def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:
         """Return a world on `device`; `num_worlds` overrides the configured number."""
-        ...

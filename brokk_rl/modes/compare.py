@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -25,15 +24,13 @@ from scipy import stats
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.task import Figure
 from brokk_rl.errors import ConfigError
+from brokk_rl.plain_files import read_json
 from brokk_rl.session import RESOLVED, Session, read_record, write_json, write_text
 from brokk_rl.spec import spec
 from brokk_rl.statistics import CONFIDENCE, compute_student_interval
 
 log = logging.getLogger(__name__)
 
-MOST_COLUMNS = 4
-"""Largest number of columns of differences; above it one column has the values that most rows lack.
-Chosen by hand."""
 EVALUATION = "evaluation.json"
 SUCCESS_RATE = "success_strict"
 LOW, HIGH = "_low", "_high"
@@ -108,9 +105,6 @@ def _name_figure(figure: Figure) -> str:
 def _print_groups(
     groups: pd.DataFrame, columns: Sequence[str], words: Mapping[str, Figure], rates: Sequence[str]
 ) -> None:
-    settings: Any = groups[list(columns)]
-    if len(columns) > MOST_COLUMNS:
-        settings = pd.DataFrame({"unlike most": describe_differences(settings)})
     cells = {}
     for name, figure in words.items():
         shown = groups[name].map(lambda value, by=figure.factor: f"{by * value:.3g}")
@@ -119,8 +113,8 @@ def _print_groups(
             shown += half.map(lambda value: "" if pd.isna(value) else f" ±{value:.3f}")
         cells[_name_figure(figure)] = shown.where(groups[name].notna(), None)
     cells["difference by seed"] = groups.apply(_format_difference, axis=1)
-    table = pd.concat([groups["policy"], settings, groups["runs"], pd.DataFrame(cells)], axis=1)
-    headings = ["policy", *settings.columns, "seeds", *cells]
+    table = groups[["policy", *columns, "runs"]].join(pd.DataFrame(cells))
+    headings = ["policy", *columns, "seeds", *cells]
     print_table(headings, table.astype(object).where(table.notna(), None).to_numpy().tolist())
 
 
@@ -194,7 +188,7 @@ def load_run(folder: Path) -> EvaluatedRun:
     """
     path = folder / EVALUATION
     try:
-        evaluation = json.loads(path.read_text())
+        evaluation = read_json(path)
         path = folder / RESOLVED
         resolved = yaml.safe_load(path.read_text()) if path.exists() else {}
     except (OSError, ValueError, yaml.YAMLError) as error:
@@ -388,20 +382,3 @@ def _choose_baseline(
             f"have them; the rows are {', '.join(map(str, methods))}"
         )
     return found[0]
-
-
-def describe_differences(settings: pd.DataFrame) -> list[str]:
-    """Return for each row the values that it does not share with most others.
-
-    Where no value of a column is the most frequent, every value counts as unusual.
-    """
-    endings = Counter(column.rpartition(".")[2] for column in settings)
-    texts: list[list[str]] = [[] for _ in range(len(settings))]
-    for column in settings:
-        frequent = settings[column].mode()
-        ending = column.rpartition(".")[2]
-        name = ending if endings[ending] == 1 else column
-        for words, value in zip(texts, settings[column], strict=True):
-            if len(frequent) > 1 or value != frequent[0]:
-                words.append(f"{name} {value}")
-    return [", ".join(words) for words in texts]

@@ -172,9 +172,9 @@ def _drive(
                 log.info("playing %s", watch.note)
             if now_s >= report_s:
                 report_s = now_s + RATE_S
-                state = session.read()
-                steps = round(state.rate / session.machine.period_s)
+                rate = session.measure_rate()
+                steps = round(rate / session.machine.period_s)
                 worlds = session.loop.num_envs
                 text = "%.2f times real time, %d control steps/s in each of %d worlds"
-                log.info(text, state.rate, steps, worlds)
+                log.info(text, rate, steps, worlds)
             time.sleep(max(0.0, FRAME_S - (time.monotonic() - now_s)))

@@ -20,9 +20,8 @@ import viser.uplot as uplot
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.gamepad import Gamepad
-from brokk_rl.play.levers import KEY_STEP
 from brokk_rl.play.scene_view import SceneView
-from brokk_rl.play.session import DISTANCE_M, HEIGHT_M, PERSON, PlaySession, PlayState
+from brokk_rl.play.session import DISTANCE_M, HEIGHT_M, KEY_STEP, PERSON, PlaySession, PlayState
 from brokk_rl.play.settings import SPEEDS
 from brokk_rl.plot import BLUE, ORANGE, OTHERS
 
@@ -97,8 +96,8 @@ class PlayPage:
             self._session.set_levers(self._gamepad.read_axes(self._axes))
         state, now_s = self._session.read(), time.monotonic()
         with self._server.atomic():
-            self._scene.draw(state)
-            is_due = now_s - self._shown_s >= SHOW_S and not state.paused
+            self._scene.draw(state, self._session.selected)
+            is_due = now_s - self._shown_s >= SHOW_S and not self._session.paused
             if is_touched or is_due:
                 self._shown_s = now_s
                 self._show_figures(state)
@@ -309,39 +308,43 @@ class PlayPage:
 
     def _show_figures(self, state: PlayState) -> None:
         """Show status and levers as they are."""
-        num_worlds, finished = self._session.loop.num_envs, sum(state.endings.values())
-        parts = ["**paused**" if state.paused else f"**{state.rate:.2f} × real time**"]
+        session = self._session
+        num_worlds, finished = session.loop.num_envs, sum(session.endings.values())
+        parts = [
+            "**paused**" if session.paused else f"**{session.measure_rate():.2f} × real time**"
+        ]
         parts.append("1 world" if num_worlds == 1 else f"{num_worlds} worlds")
         if num_worlds > self._num_drawn:
             parts[-1] += f" ({self._num_drawn} drawn)"
-        if state.note:
-            parts.append(state.note)
-        episode = f"Episode {state.episode_s:.1f} s · "
+        if session.note:
+            parts.append(session.note)
+        episode = f"Episode {session.episode_s:.1f} s · "
         if finished:
-            endings = ", ".join(f"{name} {count}" for name, count in state.endings.items())
-            title = self._session.loop.task.figures[SUCCESS].title
-            episode += f"{title}: {state.successes} of {finished} ({endings})"
+            endings = ", ".join(f"{name} {count}" for name, count in session.endings.items())
+            title = session.loop.task.figures[SUCCESS].title
+            episode += f"{title}: {session.successes} of {finished} ({endings})"
         else:
             episode += "no episode finished"
         _assign(self._status, "content", f"{' · '.join(parts)}\n\n{episode}")
-        for lever, value in zip(self._levers, self._session.levers, strict=True):
+        for lever, value in zip(self._levers, session.levers, strict=True):
             _assign(lever, "value", round(float(value), 2))
-        _assign(self._driver, "value", state.driver)
-        if state.target_m is not None and self._session.can_move_target:
-            _assign(self._target, "value", _round_place(state.target_m[state.selected]))
+        _assign(self._driver, "value", session.driver)
+        if state.target_m is not None and session.can_move_target:
+            _assign(self._target, "value", _round_place(state.target_m[session.selected]))
 
     def _show_traces(self, state: PlayState) -> None:
         """Show the last seconds of the selected world."""
-        traces = self._session.read_traces()
-        if not len(traces.t_s):
+        traces, selected = self._session.read_traces(), self._session.selected
+        if not traces:
             return
-        self._commands.data = (traces.t_s, *traces.given.T, *traces.proposed.T)
-        self._error.data = (traces.t_s, 100 * traces.lateral_m, 100 * traces.height_m)
-        self._force.data = (traces.t_s, traces.force_n / 1000)
+        t_s = traces["t_s"]
+        self._commands.data = (t_s, *traces["given"].T, *traces["proposed"].T)
+        self._error.data = (t_s, 100 * traces["lateral_m"], 100 * traces["height_m"])
+        self._force.data = (t_s, traces["force_n"] / 1000)
         vector = self._session.read_observation().astype(float)
         self._vector.data = (np.arange(len(vector), dtype=float), vector)
         if state.estimate_m is not None and state.target_m is not None:
-            seen, true = state.estimate_m[state.selected], state.target_m[state.selected]
+            seen, true = state.estimate_m[selected], state.target_m[selected]
             distance_mm = 1000 * np.linalg.norm(seen - true)
             self._seen.content = (
                 f"Target seen (blue): {_round_place(seen)} m\n\n"

@@ -68,8 +68,8 @@ class SceneView:
                 "/hole", scale=0.55, disable_rotations=True, depth_test=False, opacity=0.85
             )
 
-    def draw(self, state: PlayState) -> None:
-        """Show a state."""
+    def draw(self, state: PlayState, selected: int) -> None:
+        """Show a state; the handle is at the target of the `selected` world."""
         places, turns = self._posed.locate_bodies(state.q[: self._num_worlds])
         self._machines.update_from_arrays(places + self._offsets[:, None], turns)
         for name, points in (("target", state.target_m), ("estimate", state.estimate_m)):
@@ -81,8 +81,8 @@ class SceneView:
             for world, scene in enumerate(state.scene[: self._num_worlds]):
                 self._draw_block(world, scene)
         if self.handle is not None and state.target_m is not None and not self._is_dragged:
-            offset = self._offsets[min(state.selected, self._num_worlds - 1)]
-            self.handle.position = tuple(state.target_m[state.selected] + offset)
+            offset = self._offsets[min(selected, self._num_worlds - 1)]
+            self.handle.position = tuple(state.target_m[selected] + offset)
 
     def hold_handle(self, held: bool) -> None:
         """Set whether a person drags the handle; the program does not move it meanwhile."""

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from brokk_rl.contracts.actuator import FollowerModel
 from brokk_rl.contracts.task import STEPS, SUCCESS, Policy
 from brokk_rl.contracts.world import LoadedWorld
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.play.dials import EffectDial, list_dials
-from brokk_rl.play.levers import PersonAtLevers
 from brokk_rl.play.settings import SPEEDS
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.scene import FAR_M
@@ -35,68 +36,74 @@ DISTANCE_M, HEIGHT_M = (1.6, 4.6), (0.0, 1.6)
 is nearer would stand in the undercarriage, and the arm of a Brokk 170 reaches 5.2 m."""
 SHOWN_STATE = {"scene": "start.scene", "target_m": "start.target_m", "estimate_m": "estimate_m"}
 """State of the task, where it has it, that is drawn."""
+KEY_STEP = 0.25
+"""Stroke by which one press of a key moves a lever. Chosen by hand: four presses to full speed."""
 PUSH_S = 0.5
 """Time for which a push lasts, s. Chosen by hand."""
 
 
 @dataclass(frozen=True)
 class PlayState:
-    """State to draw; `N` worlds, `J` joints.
+    """What is drawn of the simulated machines; `N` worlds, `J` joints.
 
     Attributes:
-        t_s: Simulated time since the start.
         q: Joint positions, `(N, J)`, rad or m.
         scene: Scenes, `(N, S)`; see `brokk_rl.sim.scene`; `None` where the task does not tell.
         target_m: True targets in the base frame, `(N, 3)`; `None` where the task has none.
         estimate_m: Targets as the policy sees them, likewise.
-        driver: Who drives: a policy's name, or `PERSON`.
-        note: About the policy, such as its checkpoint.
-        selected: World that traces and commands are about.
-        paused: Whether time stands still.
-        speed: Wanted share of real time.
-        rate: Simulated seconds per second, measured.
-        endings: Number of finished episodes by ending, of the present driver.
-        successes: Number of them with success.
-        episode_s: Time since the start of the selected world's episode.
     """
 
-    t_s: float
     q: np.ndarray
     scene: np.ndarray | None
     target_m: np.ndarray | None
     estimate_m: np.ndarray | None
-    driver: str
-    note: str
-    selected: int
-    paused: bool
-    speed: float
-    rate: float
-    endings: dict[str, int]
-    successes: int
-    episode_s: float
 
 
-@dataclass(frozen=True)
-class PlayTraces:
-    """Last seconds of the selected world; `T` control steps, oldest first.
+class PersonAtLevers(FollowerModel):
+    """Follower that gives a person's commands in one environment and the policy's in the others.
+
+    Levers stay where they were put until they are released.
+
+    Args:
+        inner: Follower of the other environments.
+        machine: The machine.
 
     Attributes:
-        t_s: Simulated time, `(T,)`.
-        proposed: Commands of the policy, `(T, J)`.
-        given: Commands in force, `(T, J)`.
-        q: Joint positions, `(T, J)`, rad or m.
-        lateral_m: Horizontal distance of tip and target, `(T,)`.
-        height_m: Height of the tip above the target, `(T,)`.
-        force_n: Peak contact force, `(T,)`.
+        env: Environment that the person drives; `None` for none.
+        levers: Positions of the levers, `(J,)` in [-1, 1].
+        proposed: Last commands that the policy proposed, `(N, J)`.
     """
 
-    t_s: np.ndarray
-    proposed: np.ndarray
-    given: np.ndarray
-    q: np.ndarray
-    lateral_m: np.ndarray
-    height_m: np.ndarray
-    force_n: np.ndarray
+    def __init__(self, inner: FollowerModel, machine: Machine) -> None:
+        self._inner = inner
+        self._is_exclusive = torch.as_tensor(machine.is_exclusive)
+        self.env: int | None = None
+        self.levers = torch.zeros(machine.num_joints)
+        self.proposed: torch.Tensor | None = None
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """State of the follower inside."""
+        return self._inner.state
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Reset the follower inside; the person's levers stay."""
+        self._inner.reset(mask)
+
+    def step(self, proposed: torch.Tensor) -> torch.Tensor:
+        """Return the commands that are given, `(N, J)`, for those proposed."""
+        self.proposed = proposed
+        given = self._inner.step(proposed)
+        if self.env is None:
+            return given
+        given = given.clone()
+        given[self.env] = self.read_command().to(given.device)
+        return given
+
+    def read_command(self) -> torch.Tensor:
+        """Return the person's command, `(J,)`: a lever of an exclusive joint rules out the others."""
+        positioning = bool(self.levers[self._is_exclusive].any())
+        return self.levers * mask_exclusive_joints(self._is_exclusive, positioning)
 
 
 class PlaySession:
@@ -106,6 +113,14 @@ class PlaySession:
         loop: Control loop; its follower is replaced by one that knows the person.
         policies: Policies by name; the first one drives at first.
         neutral: Whether effects begin switched off instead of drawn as configured.
+
+    Attributes:
+        driver: Who drives: a policy's name, or `PERSON`.
+        selected: World that traces and commands are about.
+        paused: Whether time stands still.
+        speed: Wanted share of real time.
+        endings: Number of finished episodes by ending, of the present driver.
+        successes: Number of them with success.
     """
 
     def __init__(self, loop: ControlLoop, policies: dict[str, Policy], neutral: bool) -> None:
@@ -132,8 +147,8 @@ class PlaySession:
             maxlen=round(TRACE_S / loop.machine.period_s)
         )
         self._clock: deque[tuple[float, int]] = deque()
-        self._endings: Counter[str] = Counter()
-        self._successes = 0
+        self.endings: Counter[str] = Counter()
+        self.successes = 0
         loop.begin()
 
     @property
@@ -163,14 +178,14 @@ class PlaySession:
         if name != PERSON:
             self._acting = name
         self.release_levers()
-        self._endings.clear()
-        self._successes = 0
+        self.endings.clear()
+        self.successes = 0
 
     def replace_policy(self, name: str, policy: Policy, note: str) -> None:
         """Put a newer policy in the place of the one called `name`; episodes go on."""
         self._policies[name], self._notes[name] = policy, note
-        self._endings.clear()
-        self._successes = 0
+        self.endings.clear()
+        self.successes = 0
 
     def select_world(self, index: int) -> None:
         """Choose the world that traces and commands are about.
@@ -209,6 +224,21 @@ class PlaySession:
         """Let all levers spring back to neutral."""
         self._person.levers.zero_()
         self._person.env = self.selected if self.driver == PERSON else None
+
+    @property
+    def note(self) -> str:
+        """About the policy that drives, such as its checkpoint."""
+        return self._notes[self._acting]
+
+    @property
+    def t_s(self) -> float:
+        """Simulated time since the start."""
+        return self._steps * self.machine.period_s
+
+    @property
+    def episode_s(self) -> float:
+        """Time since the start of the selected world's episode."""
+        return float(self.loop.task.state[STEPS][self.selected]) * self.machine.period_s
 
     @property
     def levers(self) -> np.ndarray:
@@ -318,28 +348,19 @@ class PlaySession:
         drawn = {}
         for field, name in SHOWN_STATE.items():
             drawn[field] = _to_numpy(state[name]) if name in state else None
-        return PlayState(
-            t_s=self._steps * self.machine.period_s,
-            q=_to_numpy(self.loop.world.q),
-            **drawn,
-            driver=self.driver,
-            note=self._notes[self._acting],
-            selected=self.selected,
-            paused=self.paused,
-            speed=self.speed,
-            rate=self._measure_rate(),
-            endings=dict(self._endings),
-            successes=self._successes,
-            episode_s=float(state[STEPS][self.selected]) * self.machine.period_s,
-        )
+        return PlayState(q=_to_numpy(self.loop.world.q), **drawn)
 
-    def read_traces(self) -> PlayTraces:
-        """Return the last seconds of the selected world."""
+    def read_traces(self) -> dict[str, np.ndarray]:
+        """Return the last seconds of the selected world by name, oldest first; empty before any.
+
+        `t_s` `(T,)`; `proposed` and `given`, commands of the policy and in force, `(T, J)`; `q`
+        `(T, J)`, rad or m; `lateral_m` and `height_m` of the tip from the target, `(T,)`;
+        `force_n`, peak contact force, `(T,)`.
+        """
         traces = {}
-        for field in fields(PlayTraces):
-            rows = [row[field.name][self.selected] for row in self._trace]
-            traces[field.name] = np.array(rows)
-        return PlayTraces(**traces)
+        for name in self._trace[0] if self._trace else ():
+            traces[name] = np.array([row[name][self.selected] for row in self._trace])
+        return traces
 
     def read_observation(self) -> np.ndarray:
         """Return the vector that the policy sees in the selected world, `(O,)`."""
@@ -377,7 +398,7 @@ class PlaySession:
         error = torch.where(loop.done[:, None], torch.nan, error)
         proposed = self._person.proposed
         assert proposed is not None
-        seconds = np.full(loop.num_envs, self._steps * self.machine.period_s)
+        seconds = np.full(loop.num_envs, self.t_s)
         self._trace.append(
             {
                 "t_s": seconds,
@@ -395,11 +416,11 @@ class PlaySession:
         loop = self.loop
         ended = loop.done & ~self._restarted
         for index in ended.nonzero()[:, 0].tolist():
-            self._endings[loop.task.reasons[int(loop.reason[index])]] += 1
-            self._successes += int(loop.finished[SUCCESS][index] > 0)
+            self.endings[loop.task.reasons[int(loop.reason[index])]] += 1
+            self.successes += int(loop.finished[SUCCESS][index] > 0)
         self._restarted &= ~loop.done
 
-    def _measure_rate(self) -> float:
+    def measure_rate(self) -> float:
         """Return simulated seconds per second over the last `RATE_S`."""
         clock = self._clock
         elapsed_s = sum(row[0] for row in clock)

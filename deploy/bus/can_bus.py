@@ -15,7 +15,7 @@ from typing import Literal, Self
 import can
 
 from brokk_rl.errors import LinkError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Index, Port, spec
 
 log = logging.getLogger(__name__)
 
@@ -61,9 +61,9 @@ class CanBus:
 
     interface: Literal["socketcan", "udp_multicast", "virtual"]
     channel: str
-    bitrate: int | None
-    port: int | None
-    hops: int | None
+    bitrate: Count | None
+    port: Port | None
+    hops: Index | None
 
     def open(self, frame_ids: Sequence[int] | None = None) -> OpenCanBus:
         """Open the bus.

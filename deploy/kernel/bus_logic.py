@@ -80,23 +80,18 @@ class MotionObserver(Protocol):
     @property
     def observation(self) -> Observation:
         """The newest result."""
-        ...
 
     def is_due(self, now_s: float) -> bool:
         """Return whether a control period has gone by since the last update."""
-        ...
 
     def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool) -> None:
         """Take in a control period: positions at its end, mean flow, whether contact may hold the arm."""
-        ...
 
     def forget(self) -> None:
         """Begin anew: positions are missing or not plausible."""
-        ...
 
     def clear(self) -> None:
         """Take back the named fault."""
-        ...
 
 
 class BusLogic:

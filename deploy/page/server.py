@@ -85,11 +85,9 @@ class PageExtension(Protocol):
 
     async def talk(self, connection: ServerConnection) -> None:
         """Talk to a browser until it goes."""
-        ...
 
     async def run(self) -> None:
         """Run beside the server, as long as it does."""
-        ...
 
 
 def serve_page(

@@ -56,7 +56,7 @@ class PageSettings:
     jpeg_quality: Annotated[int, Interval(ge=1, le=100)]
     points: Count
     tolerance: Positive
-    borehole_radius_m: float
+    borehole_radius_m: Positive
     stale_s: Positive
     clients: Count
 

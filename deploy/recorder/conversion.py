@@ -17,7 +17,7 @@ from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import DAMAGE, Recording
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 from deploy.recorder import capture_reader
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages
 
@@ -38,8 +38,8 @@ class CaptureLogReader:
         shortest_s: Shorter pieces are left out.
     """
 
-    longest_gap_s: float
-    shortest_s: float
+    longest_gap_s: Positive
+    shortest_s: NonNegative
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
         """Return the pieces of the capture at `path`; see `actuators.recordings.conversion.LogReader`.

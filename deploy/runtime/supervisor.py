@@ -61,7 +61,7 @@ class DeploymentLoop(BusAndPolicySettings):
         video: Live video on the page; `null`: none.
     """
 
-    target_s: float
+    target_s: Positive
     pitch_rad: float | None
     commands: bool
     armed: bool
@@ -227,7 +227,6 @@ class BenchSpec(Protocol):
 
     def companions(self, machine: Machine, session: Session) -> Sequence[CompanionProcess]:
         """Return the processes to run beside the loop."""
-        ...
 
 
 def _write_timing_report(memory: LoopMemory, session: Session) -> None:

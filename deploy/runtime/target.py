@@ -12,7 +12,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.plain_files import read_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import Share, spec
 from deploy.runtime.shared_memory import Slot
 
 NEAR_M = 0.1
@@ -57,7 +57,6 @@ class TargetProvider(Protocol):
         Raises:
             ConfigError: its source is invalid.
         """
-        ...
 
 
 class TargetSpec(Protocol):
@@ -65,7 +64,6 @@ class TargetSpec(Protocol):
 
     def build(self) -> TargetProvider:
         """Return it at work."""
-        ...
 
 
 @spec
@@ -106,7 +104,7 @@ class DetectedTarget:
         score: Least score, in [0, 1].
     """
 
-    score: float
+    score: Share
 
     def build(self) -> TargetProvider:
         """Return it at work; see `TargetSource`."""

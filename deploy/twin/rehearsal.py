@@ -15,7 +15,7 @@ from brokk_rl.contracts.link import Connection
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
 from deploy.guidance import LeverMap, find_full_angles_rad
@@ -61,7 +61,7 @@ class RehearsalBench:
 
     twin: Twin
     plant: Connection
-    rest_s: float
+    rest_s: Positive
     fails: str | None
 
     def check(self) -> None:

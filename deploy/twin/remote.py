@@ -13,7 +13,7 @@ from brokk_rl.contracts.actuator import Follower
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, spec
 from deploy.bus.can_bus import CanBus, CanFrame, OpenCanBus
 from deploy.bus.description import LEVER_AXES, STAMP, BusDescription
 from deploy.guidance import AXES, LeverMap, find_full_angles_rad
@@ -161,8 +161,8 @@ class GamepadRemote:
 
     device: str
     axes: tuple[int, ...]
-    deadman: int
-    button_right: int
+    deadman: Index
+    button_right: Index
 
     def check(self) -> None:
         if len(self.axes) != len(AXES):

@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Annotated, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from annotated_types import Interval
 
 from brokk_rl.contracts.link import Connection, Link
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.signals import Command
-from brokk_rl.spec import Positive, spec
+from brokk_rl.spec import Port, Positive, spec
 from deploy.bus.c_header import generate_c_header
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import GATEWAY, STAMP, BusDescription
@@ -79,8 +78,8 @@ class Twin:
     remote: bool
     deadman: bool
     again_s: Positive | None
-    fault_port: Annotated[int, Interval(ge=1, le=65535)] | None
-    seconds: float | None
+    fault_port: Port | None
+    seconds: Positive | None
     realtime: bool
 
     def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
@@ -125,11 +124,9 @@ class FrameBus(Protocol):
 
     def recv(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, `None` when none came in time."""
-        ...
 
     def send(self, frame: CanFrame) -> None:
         """Send a frame."""
-        ...
 
 
 class RunningTwin:

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from typing import Protocol
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import Count, spec
+from brokk_rl.spec import Count, Positive, spec
 from deploy.video.sources import OpenedDevice, TestPattern, VideoSource
 
 SOCKET = "video"
@@ -23,7 +23,6 @@ class VideoCamera(Protocol):
         Raises:
             FrameError: there is no such camera.
         """
-        ...
 
 
 @spec
@@ -55,9 +54,9 @@ class PatternCamera:
         rate_hz: Pictures a second.
     """
 
-    width_px: int
-    height_px: int
-    rate_hz: float
+    width_px: Count
+    height_px: Count
+    rate_hz: Positive
 
     def build(self) -> VideoSource:
         """See `VideoCamera`."""

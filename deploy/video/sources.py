@@ -43,7 +43,6 @@ class VideoSource(Protocol):
         Raises:
             FrameError: the camera is lost.
         """
-        ...
 
 
 class TestPattern:

@@ -14,7 +14,7 @@ from brokk_rl.build import build_node
 
 OVERRIDES = ("experiment", "preset", "search", "exam_protocol")
 ASKING_FOR_A_POLICY = ("doctor_policy", "export", "why")
-"""Modes without a policy of their own; `test_values` holds what they answer without one."""
+"""Modes without a policy of their own; `test_messages` holds what they answer without one."""
 PARTS = [one for one in registry.list_options() if one.group not in (*OVERRIDES, "mode")]
 BASE = ("~mode", "+machine=brokk170")
 
@@ -45,8 +45,9 @@ def test_every_option_composes_and_is_what_its_spec_says(group: str) -> None:
     for part in parts:
         if part in together:
             build_part(group, cfg[f"{part.name}_part"])
-        elif group == "deploy":  # its parts come from the mode
-            build_part(group, composed("mode=deploy", f"deploy={part.name}").deploy)
+        elif group in ("deploy", "bench"):  # its parts come from the mode
+            mode = "bringup" if part.name == "operator" else "deploy"
+            build_part(group, composed(f"mode={mode}", f"{group}={part.name}")[group])
         elif "@package _global_" in part.path.read_text():
             assert composed(*BASE, f"+{group}={part.name}")
         else:

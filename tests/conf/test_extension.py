@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from packages import install_package
 
-from brokk_rl.sweep import name_job
+from brokk_rl.job import name_job
 
 PARTS = '''"""Parts of another package."""
 

@@ -25,7 +25,6 @@ FLOORS = (
     ("brokk_rl.__main__", 5),
     ("diagnosis.api", 5),
     ("brokk_rl.extensions", 5),
-    ("brokk_rl.sweep", 5),
     ("brokk_rl.policy_choice", 5),
     ("conf", 5),
     *((f"{package}.modes", MODE) for package in ("brokk_rl", *ROOMS, *EXTENSIONS)),
@@ -45,7 +44,6 @@ COMPOSERS = (
     "brokk_rl.job",
     "brokk_rl.explain",
     "brokk_rl.extensions",
-    "brokk_rl.sweep",
     "brokk_rl.policy_choice",
 )
 """Modules that compose the configuration or explain why it does not compose."""

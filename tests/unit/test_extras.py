@@ -133,7 +133,7 @@ def test_every_foreign_package_of_the_code_comes_with_an_extra() -> None:
     brought = _list_modules(*STATED)
     # These come with the packages that stand in pyproject.toml.
     brought |= {"hydra", "omegaconf", "yaml", "PIL", "tensordict", "rsl_rl", "warp"}
-    brought |= {"aiortc", "aioice", "av", "pydantic_core", "annotated_types"}
+    brought |= {"aiortc", "aioice", "av", "pydantic_core", "annotated_types", "typing_extensions"}
     missing = set()
     for room in ROOMS:
         for path in (ROOT / room).rglob("*.py"):

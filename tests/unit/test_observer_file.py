@@ -153,6 +153,6 @@ def test_the_guard_says_whose_thresholds_it_has(
 def test_a_loop_that_would_command_a_machine_by_a_simulators_thresholds_does_not_start(
     brokk: Callable[..., Any],
 ) -> None:
-    done = brokk("preset=machine", "deploy=auto", "target=given", "session.out=run")
+    done = brokk("mode=deploy", "deploy=auto", "target=given", "session.out=run")
     assert done.code == 2 and "recordings of this machine by brokk mode=observe" in done.err
     assert not Path("run/processes.json").exists()

@@ -26,11 +26,6 @@ def test_a_gpu_that_is_missing_is_an_error_that_says_what_to_change(
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(DeviceError, match=r"session\.device=cpu"):
         session(tmp_path, device="cuda").torch_device()
-
-
-def test_a_gpu_number_that_is_missing_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert session(tmp_path, device="cuda:1").torch_device() == torch.device("cuda", 1)
@@ -74,17 +69,17 @@ def test_resuming_keeps_the_first_start_and_adds_another(tmp_path: Path) -> None
     assert len(read_record(tmp_path)["resumed"]) == 2
 
 
-def test_a_run_that_is_refused_before_it_wrote_anything_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError), session(tmp_path / "runs" / "a").start("", {}):
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_run_that_is_refused_before_it_wrote_anything_leaves_what_was_there(
+    is_there: bool, tmp_path: Path
+) -> None:
+    folder = tmp_path / "runs" / "a"
+    if is_there:
+        folder.mkdir(parents=True)
+    before = list(tmp_path.rglob("*"))
+    with pytest.raises(ConfigError), session(folder).start("", {}):
         raise ConfigError("no")
-    assert not (tmp_path / "runs").exists()
-
-
-def test_a_folder_that_was_there_before_stays(tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    with pytest.raises(ConfigError), session(tmp_path / "mine").start("", {}):
-        raise ConfigError("no")
-    assert list((tmp_path / "mine").iterdir()) == []
+    assert list(tmp_path.rglob("*")) == before
 
 
 def test_a_run_that_is_refused_after_it_wrote_something_keeps_it(tmp_path: Path) -> None:

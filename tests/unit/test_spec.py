@@ -75,8 +75,8 @@ def test_values_are_taken_as_people_write_them() -> None:
     [
         *[("steps", value, "Budget.steps: expected a whole number of 1 or more or null, got")
           for value in (1.5, float("nan"), float("inf"), True, "many", 0)],
-        ("seconds", float("nan"), "Budget.seconds: expected a number, got nan"),
-        ("seconds", True, "Budget.seconds: expected a number, got true"),
+        ("seconds", float("nan"), "Budget.seconds: expected a finite number, got nan"),
+        ("seconds", True, "Budget.seconds: expected a finite number, got true"),
         ("range_m", [2, 1], "Budget.range_m: expected (lowest, highest)"),
         ("range_m", [1], "Budget.range_m: expected (lowest, highest)"),
         ("range_m", [0, 1], "Budget.range_m[0]: expected a finite number above 0, got 0"),
