@@ -167,7 +167,6 @@ def diagnose(
     folder: str | Path,
     simulator: str | Path | Actuator | Callable[..., Any] | None = None,
     reference: RecordingSet | None = None,
-    unseen: RecordingSet | None = None,
     fit: str | Path | ActuatorFit | None = None,
     effects: Sequence[str] | None = None,
     repeatability: float = REPEATABILITY,
@@ -182,7 +181,6 @@ def diagnose(
         simulator: Option of `actuator`, or a simulator of your own: a function `step(state, command)` or
             its name `module:function`, or the path of an MJCF file; not needed with a reference.
         reference: Recordings that the simulator was built from; it is fitted to them.
-        unseen: More of the field, to which nothing is fitted.
         fit: Option of `fit` that makes the simulator of joints commanded by torque from a reference;
             `None`: `force`.
         effects: Names to choose among; `None`: all that the machine may have.
@@ -201,8 +199,7 @@ def diagnose(
     )
     asked.session.seed_all()
     before = () if reference is None else reference.recordings
-    later = () if unseen is None else unseen.recordings
-    return asked.find_causes(GapCase(field.machine, before, field.recordings, later))
+    return asked.find_causes(GapCase(field.machine, before, field.recordings))
 
 
 def simulate(
@@ -292,7 +289,6 @@ def _build_mode(
         diagnosis=DiagnosisSubject(  # pyright: ignore[reportCallIssue]
             case=None,
             field="",  # recordings are given, none is read
-            unseen=None,
             effects=None if effects is None else tuple(effects),
             repeatability=repeatability,
             workers=workers,

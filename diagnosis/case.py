@@ -38,14 +38,11 @@ class GapCase:
         machine: The machine.
         reference: Recordings that the simulator was built from; empty where it is given.
         field: Recordings of the machine as it is.
-        unseen: More of them, to which nothing is fitted: how far the effects carry is told there
-            too.
     """
 
     machine: Machine
     reference: Sequence[Recording]
     field: Sequence[Recording]
-    unseen: Sequence[Recording] = ()
 
     def doubts(self) -> list[str]:
         """Return reasons why these recordings cannot tell anything, in words for people; none where they can."""

@@ -19,8 +19,6 @@ class DiagnosisSubject:
         case: Folder with `reference/` and `field/`; or `null`.
         field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead
             of a case.
-        unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
-            fitted: how far the effects carry.
         effects: Names of the effects to choose among; `null`: all that are registered.
         repeatability: How much the machine repeats from day to day, standard deviation over the
             value; where the reference is of two days or more it is measured.
@@ -29,7 +27,6 @@ class DiagnosisSubject:
 
     case: str | None
     field: str | tuple[str, ...] | None
-    unseen: str | tuple[str, ...] | None
     effects: tuple[str, ...] | None
     repeatability: NonNegative
     workers: int

@@ -24,7 +24,7 @@ from diagnosis.closure import Estimate, Gate
 from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.engine.sizes import SIGMAS
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.gap import combine_joints, describe_joints
+from diagnosis.gap import combine_joints
 from diagnosis.gates import MAX_RIVAL_RATIO
 from diagnosis.grown_effects import GrownEffect
 from diagnosis.reference_diagnosis import (
@@ -188,7 +188,7 @@ class SimulatorDiagnosis:
         for one, numbers in zip(found, sizes, strict=True):
             selected.append(self._describe(one, numbers, proof))
         selected += [describe_detected(one, machine) for one in on_tool]
-        return self._build_outcome(selected, found, search, proof, (*told, *judged), failed)
+        return self._build_outcome(selected, search, proof, (*told, *judged), failed)
 
     @cached_property
     def remarks(self) -> list[RecordingRemark]:
@@ -242,7 +242,6 @@ class SimulatorDiagnosis:
     def _build_outcome(
         self,
         selected: Sequence[Selected],
-        found: Sequence[GrownEffect],
         search: SimulatorSearch,
         proof: SimulatorProof,
         told: Sequence[Gate],
@@ -257,9 +256,6 @@ class SimulatorDiagnosis:
         rivals = [one.summarise() for one in search.rivals]
         evidence = {"rivals": describe_rivals(rivals, machine), "unit": "log likelihood"}
         sanity = [remark.plain() for remark in self.remarks]
-        more: dict[str, Any] = {"sanity": sanity, "evidence": evidence}
-        if self.case.unseen:
-            more["unseen"] = self._evaluate_unseen(found)
         answer = Answer(
             verdict=verdict,
             selected=tuple(sorted(selected, key=lambda one: -one.probability)),
@@ -270,27 +266,9 @@ class SimulatorDiagnosis:
             gates=tuple(told),
             next_experiment=propose_measurement(selected),
             reason=_explain(verdict, selected, failed),
-            more=more,
+            more={"sanity": sanity, "evidence": evidence},
         )
         return Outcome(answer, before, after, floor)
-
-    def _evaluate_unseen(self, found: Sequence[GrownEffect]) -> dict[str, Any]:
-        """Return how far the effects carry on recordings that nothing was fitted to, plain JSON data.
-
-        Raises:
-            RecordingError: no recording is long enough.
-        """
-        machine, runs = self.case.machine, self._cut(self.case.unseen)
-        errors = []
-        for effects in ((), found):
-            given = [(one.kind, one.repeat(1)) for one in effects]
-            paths = runs.simulator.simulate(given)[0]
-            errors.append(np.sqrt(np.square(paths - runs.cut.measured).mean((0, 1))))
-        joints = describe_joints(machine, errors[0], errors[1], None)
-        seconds = runs.cut.measured.shape[1] * machine.period_s * len(runs.row)
-        num_recordings = len(np.unique(runs.source))
-        told = {name: vars(one) for name, one in joints.items()}
-        return {"seconds": seconds, "recordings": num_recordings, "joints": told}
 
 
 def describe_doubts(case: GapCase, why: str) -> Outcome:

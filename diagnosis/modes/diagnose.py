@@ -143,15 +143,14 @@ class Diagnose:
 
     def _case(self) -> GapCase:
         subject = self.diagnosis
-        unseen = case.read_recordings(subject.unseen, self.machine) if subject.unseen else ()
         if subject.case is not None:
-            return replace(case.load_case(Path(subject.case), self.machine), unseen=unseen)
+            return case.load_case(Path(subject.case), self.machine)
         assert subject.field is not None, "checked by Subject"
         if self.base is None:
             raise ConfigError(
                 "diagnosis.field needs a simulator to hold it against: add actuator=<name>, or simulator=<your own>"
             )
-        return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine), unseen)
+        return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine))
 
     def _find_base(self, given: GapCase) -> Actuator:
         """Return the simulator: the one that was given, or one fitted to the reference."""
