@@ -21,11 +21,12 @@ from scipy.ndimage import minimum_filter1d
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.case import PAUSE_S
-from diagnosis.engine.sizes import SIGMAS
 from diagnosis.regimes import shift_by_dead_time
+from diagnosis.where import FALSE_DISCOVERY_RATE
 
-PART_S = 30.0
-"""Longest part that is measured by itself, s, as in `diagnosis.where`."""
+PART_S, MIN_RECORDINGS = 30.0, 3
+"""Length of the parts of recordings that are measured by themselves, s, as in `diagnosis.where`; so many
+recordings stay whole."""
 SPAN_S = 0.12
 """Time to either side over which a speed is taken, s."""
 STEADY_S = 1.0
@@ -37,6 +38,8 @@ LEAST_COMMAND = 0.3
 LEAST_SAMPLES = 10
 """Samples without which a part says nothing about a quantity."""
 EFFORT = re.compile(r"(current|torque|force|pressure)_(.+)_([a-z]+)")
+UNITS = {"a": "A", "nm": "Nm", "n": "N", "pa": "Pa"}
+"""Units as columns name them, and as they are written."""
 STATES = {"moving out": 1.0, "moving in": -1.0, "at rest": 0.0}
 """Steady states of a joint, each with the sign of its motion."""
 
@@ -52,6 +55,7 @@ class MeasuredChange:
         before: Mean over the parts of the reference.
         change: Mean over the parts of the field less that.
         half_width: Half of its 95 % interval.
+        is_beyond: It is beyond what the machine repeats, at most 5 % of such statements falsely.
     """
 
     joint: str
@@ -60,11 +64,7 @@ class MeasuredChange:
     before: float
     change: float
     half_width: float
-
-    @property
-    def is_beyond(self) -> bool:
-        """True where the change is beyond what the machine repeats."""
-        return abs(self.change) > self.half_width
+    is_beyond: bool = False
 
 
 def measure_changes(
@@ -84,26 +84,34 @@ def measure_changes(
     laws = {}
     for name in _list_efforts(reference, field, machine):
         laws[name] = _EffortLaw(reference, name, machine)
-    before = [_measure_part(part, machine, laws) for part in _cut_parts(reference)]
-    after = [_measure_part(part, machine, laws) for part in _cut_parts(field)]
-    day = _number_days(_cut_parts(reference))
-    found = []
+    known, now = _cut_parts(reference), _cut_parts(field)
+    before = [_measure_part(part, machine, laws) for part in known]
+    after = [_measure_part(part, machine, laws) for part in now]
+    day, found, chances = _number_days(known), [], []
     for key in dict.fromkeys(key for part in before for key in part):
-        seen = np.array([part.get(key, np.nan) for part in before])
-        now = np.array([part[key] for part in after if key in part])
-        told = np.isfinite(seen)
-        if min(told.sum(), len(now)) < 2:
+        then = np.array([part.get(key, np.nan) for part in before])
+        later = np.array([part[key] for part in after if key in part])
+        told = np.isfinite(then)
+        if min(told.sum(), len(later)) < 2:
             continue
-        mean = float(seen[told].mean())
+        mean = float(then[told].mean())
         between = repeatability * abs(mean)
         if len(np.unique(day[told])) > 1:
-            between = float(
-                np.std([seen[told & (day == d)].mean() for d in set(day[told])], ddof=1)
-            )
-        test = stats.ttest_ind(now, seen[told], equal_var=False).confidence_interval()
-        half = float(np.hypot(0.5 * (test.high - test.low), SIGMAS * between))
-        found.append(MeasuredChange(*key, mean, float(now.mean()) - mean, half))
-    return found
+            days = [then[told & (day == one)].mean() for one in np.unique(day[told])]
+            between = float(np.std(days, ddof=1))
+        freedom = stats.ttest_ind(later, then[told], equal_var=False).df
+        own = later.var(ddof=1) / len(later) + then[told].var(ddof=1) / told.sum()
+        error = float(np.sqrt(own + between**2))
+        change = float(later.mean()) - mean
+        half = float(stats.t.ppf(0.975, freedom)) * error
+        found.append(MeasuredChange(*key, mean, change, half))
+        chances.append(2.0 * stats.t.sf(abs(change) / max(error, 1e-12), freedom))
+    # Of many quantities some would differ by chance.
+    adjusted = stats.false_discovery_control(chances) if chances else []
+    return [
+        replace(one, is_beyond=bool(chance <= FALSE_DISCOVERY_RATE))
+        for one, chance in zip(found, adjusted, strict=True)
+    ]
 
 
 def _list_efforts(
@@ -120,10 +128,10 @@ def _list_efforts(
 
 
 def _cut_parts(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings in parts of equal length."""
+    """Return the recordings; a few long ones in parts, which a motion that goes on makes alike."""
     found = []
     for one in recordings:
-        count = max(1, round(one.duration_s / PART_S))
+        count = max(1, round(one.duration_s / PART_S)) if len(recordings) < MIN_RECORDINGS else 1
         for rows in np.array_split(np.arange(one.num_samples), count):
             extra = {name: values[rows] for name, values in one.extra.items()}
             part = replace(one, t_s=one.t_s[rows], u=one.u[rows], q=one.q[rows], extra=extra)
@@ -175,7 +183,8 @@ class _EffortLaw:
     """Effort of a joint as a function of its steady motion on the reference."""
 
     def __init__(self, reference: Sequence[Recording], name: str, machine: Machine) -> None:
-        kind, joint, self.unit = EFFORT.fullmatch(name).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        kind, joint, unit = EFFORT.fullmatch(name).groups()  # pyright: ignore[reportOptionalMemberAccess]
+        self.unit = UNITS.get(unit, unit)
         self.name, self.kind, self.machine = name, kind, machine
         self.joint = machine.joint_names.index(joint)
         q = np.concatenate([one.q[:, self.joint] for one in reference])
@@ -229,7 +238,7 @@ def _measure_part(
             if machine.interface == "position":
                 behind = (target - q)[mask]
                 told["target less position", joint.unit] = float(behind.mean())
-                told["scatter of that", joint.unit] = float(behind.std())
+                told["scatter of target less position", joint.unit] = float(behind.std())
             commanded = mask & (np.abs(asked[:, j]) > LEAST_COMMAND)
             if machine.interface == "speed" and commanded.sum() > LEAST_SAMPLES:
                 per_command = machine.max_speed[j] * speed[commanded] / asked[commanded, j]
@@ -247,4 +256,4 @@ def _measure_part(
 def list_changes(changes: Sequence[MeasuredChange]) -> list[dict[str, Any]]:
     """Return the changes as plain JSON data, those beyond what the machine repeats first."""
     order = sorted(changes, key=lambda one: -abs(one.change) / max(one.half_width, 1e-12))
-    return [asdict(one) | {"is_beyond": one.is_beyond} for one in order]
+    return [asdict(one) for one in order]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
 from brokk_rl.session import Session
 from diagnosis import api, effect_library
-from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
+from diagnosis.answer import ANSWER_FILE, Answer, Selected, Where
 from diagnosis.closure import Estimate
 from diagnosis.mjcf.changes import JointFinding, write_changed_mjcf
 from diagnosis.mjcf.plant import MjcfPlant
@@ -46,24 +47,27 @@ def name_effects() -> Answer:
     selected = []
     for name, numbers in parameters.items():
         (values,) = numbers.values()
-        selected.append(
-            Selected(
-                effect=name,
-                joints=tuple(values),
-                probability=0.9,
-                parameters=numbers,
-                gap_closed=estimate(closed[name], 0.05),
-            )
-        )
-    return Answer(
-        verdict="effects",
-        selected=tuple(selected),
-        ranking=(Ranked("dead_time", (), 0.9),),
-        where=Where({}, (), None),
-        gap=None,
-        rivals={},
-        next_experiment=None,
-        reason="test",
+        part = estimate(closed[name], 0.05)
+        one = Selected(effect=name, joints=tuple(values), probability=0.9, parameters=numbers, gap_closed=part)  # fmt: skip
+        selected.append(one)
+    return replace(NOTHING, verdict="effects", selected=tuple(selected), reason="test")
+
+
+NOTHING = Answer(
+    verdict="none", selected=(), ranking=(), where=Where({}, (), None), gap=None, next_experiment=None
+)  # fmt: skip
+
+
+def build_mode(folder: Path, answer: Answer, recordings: str | None) -> ChangeSimulator:
+    """Returns the mode for the arm and an answer."""
+    (folder / "arm.xml").write_text(ARM)
+    answer.write(folder / ANSWER_FILE)
+    return ChangeSimulator(
+        session=Session(out=str(folder / "out"), seed=0, device="cpu"),
+        machine=make_machine("shoulder", "elbow"),
+        simulator=str(folder / "arm.xml"),
+        own=api._load_option("actuator", "own"),
+        changes=ChangeRequest(diagnosis=str(folder), recordings=recordings),
     )
 
 
@@ -71,19 +75,9 @@ def change_arm(folder: Path) -> dict[str, Any]:
     """Returns `changes.json` of the arm with delay and friction, replayed on two recordings."""
     machine = make_machine("shoulder", "elbow")
     for seed in range(2):
-        write_recording(
-            record_arm(machine, rub, round(DELAY_S / machine.period_s), seed),
-            folder / f"{seed}.parquet",
-        )
-    (folder / "arm.xml").write_text(ARM)
-    name_effects().write(folder / ANSWER_FILE)
-    ChangeSimulator(
-        session=Session(out=str(folder / "out"), seed=0, device="cpu"),
-        machine=machine,
-        simulator=str(folder / "arm.xml"),
-        own=api._load_option("actuator", "own"),
-        changes=ChangeRequest(diagnosis=str(folder), recordings=str(folder / "*.parquet")),
-    ).run()
+        late = record_arm(machine, rub, round(DELAY_S / machine.period_s), seed)
+        write_recording(late, folder / f"{seed}.parquet")
+    build_mode(folder, name_effects(), str(folder / "*.parquet")).run()
     return json.loads((folder / "out" / "changes.json").read_text())
 
 
@@ -150,25 +144,7 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
 
 
 def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
-    none = Answer(
-        verdict="none",
-        selected=(),
-        ranking=(),
-        where=Where({}, (), None),
-        gap=None,
-        rivals={},
-        next_experiment=None,
-        reason="test",
-    )
-    none.write(tmp_path / ANSWER_FILE)
-    (tmp_path / "arm.xml").write_text(ARM)
-    mode = ChangeSimulator(
-        session=Session(out=str(tmp_path / "out"), seed=0, device="cpu"),
-        machine=make_machine("shoulder", "elbow"),
-        simulator=str(tmp_path / "arm.xml"),
-        own=api._load_option("actuator", "own"),
-        changes=ChangeRequest(diagnosis=str(tmp_path), recordings=None),
-    )
+    mode = build_mode(tmp_path, NOTHING, None)
     with pytest.raises(ConfigError, match="its verdict is 'none', so there is nothing to change"):
         mode.run()
     assert not (tmp_path / "out").exists()
