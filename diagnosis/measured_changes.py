@@ -22,7 +22,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.case import PAUSE_S
 from diagnosis.regimes import shift_by_dead_time
-from diagnosis.where import FALSE_DISCOVERY_RATE
 
 PART_S, MIN_RECORDINGS = 30.0, 3
 """Length of the parts of recordings that are measured by themselves, s, as in `diagnosis.where`; so many
@@ -37,6 +36,8 @@ LEAST_COMMAND = 0.3
 """Speeds are measured at commands above this, beyond a usual dead band."""
 LEAST_SAMPLES = 10
 """Samples without which a part says nothing about a quantity."""
+FALSE_DISCOVERY_RATE = 0.05
+"""The usual level."""
 EFFORT = re.compile(r"(current|torque|force|pressure)_(.+)_([a-z]+)")
 UNITS = {"a": "A", "nm": "Nm", "n": "N", "pa": "Pa"}
 """Units as columns name them, and as they are written."""
@@ -223,7 +224,7 @@ def _measure_part(
 ) -> dict[tuple[str, str, str], float]:
     """Return the quantities that a part shows, by joint, words and unit."""
     period_s = 1.0 / part.rate_hz
-    asked = shift_by_dead_time(part.u, np.full(machine.num_joints, machine.dead_time_s), period_s)
+    asked = shift_by_dead_time(part.u, machine.dead_time_s, period_s)
     found: dict[tuple[str, str, str], float] = {}
     for j, joint in enumerate(machine.joints):
         q = part.q[:, j].astype(float)
