@@ -50,7 +50,6 @@ class ArmModel:
         model: The MJCF as MuJoCo compiles it, a joint a row.
         mjcf: Its text.
         meshes: Files beside it, by their path from it.
-        remarks: Simplifications, one sentence each.
 
     Raises:
         ConfigError: The file is missing or invalid, or has no serial chain of hinges and slides.
@@ -61,7 +60,7 @@ class ArmModel:
         self.tree = KinematicTree(self.source)
         self._arm = self.tree.choose(choices.chain_names, choices.tip, choices.gripper)
         self.joints = self._arm.joints
-        self.remarks = self.source.remarks + self.tree.describe_held(self._arm)
+        self.tree.note_held(self._arm)
         self._drawn = mujoco.MjData(self.source.model)
         mujoco.mj_forward(self.source.model, self._drawn)
         tool_m = self._find_tool(choices.tip) - self._drawn.xanchor[self.joints[-1]]
@@ -76,7 +75,6 @@ class ArmModel:
     def _choose_names(self) -> list[str]:
         """Return a name for each joint, of letters, digits and `_`, as columns of recordings need it."""
         names: list[str] = []
-        changed = []
         for row, joint in enumerate(self.joints):
             old = self.source.model.joint(joint).name
             name = re.sub(r"\W+", "_", old) or f"q{row + 1}"
@@ -84,15 +82,12 @@ class ArmModel:
                 name += "_"
             names.append(name)
             if name != old:
-                changed.append(name)
-        if changed:
-            self._remark(f"Joints are renamed: {', '.join(changed)}.")
+                self.source.note(name, "the joint is renamed.")
         return names
 
     def _cut_out(self) -> mujoco.MjModel:
         """Return the arm alone: bodies without a joint of the arm are joined to what carries them."""
         model, cut = self.source.model, self.source.spec
-        left_out = []
         for kind in ELEMENTS:
             for element in list(getattr(cut, kind)):
                 cut.delete(element)
@@ -102,10 +97,8 @@ class ArmModel:
             cut.delete(geom)
         for number, body in reversed(list(enumerate(cut.bodies))):
             if number and model.body_parentid[number] == 0 and number != self._arm.root:
-                left_out.insert(0, body.name or "a body without name")
+                self.source.note(body.name or "a body without name", "not of the robot; left out.")
                 cut.delete(body)
-        if left_out:
-            self._remark(f"{', '.join(left_out)} are other bodies of the scene and are left out.")
         cut.compiler.fusestatic = True
         return cut.compile()
 
@@ -116,7 +109,7 @@ class ArmModel:
         forward = drawn.xmat[root].reshape(3, 3)[:, 0]
         yaw = math.atan2(forward[1], forward[0]) if np.hypot(*forward[:2]) > 0.5 else 0.0
         if not np.allclose((x_m, y_m, yaw), 0.0, atol=1e-6):
-            self._remark(
+            self.source.remark(
                 f"The robot stands at x {x_m:.3g}, y {y_m:.3g} m, turned by {yaw:.3g} rad; its foot is the "
                 "origin here, and it looks along x."
             )
@@ -156,7 +149,7 @@ class ArmModel:
         if named := [name for name in away_m if TIP_NAMES.search(name)]:
             chosen = named[-1]
         elif fingers:
-            self._remark(
+            self.source.remark(
                 "The tool point is the middle of the gripper's fingers; subject.tip=… chooses another."
             )
             moved = sorted({int(model.jnt_bodyid[joint]) for joint in fingers})
@@ -164,14 +157,16 @@ class ArmModel:
         elif away_m:
             chosen = max(away_m, key=lambda name: away_m[name])
         else:
-            self._remark(
+            self.source.remark(
                 "There is no site nor fixed frame for the tool point; twice the distance to the last link's centre "
                 "of mass is a guess."
             )
             com_m = drawn.xipos[model.jnt_bodyid[last]] - drawn.xanchor[last]
             is_apart = np.linalg.norm(com_m) > NEAREST_TIP_M
             return drawn.xanchor[last] + (2.0 * com_m if is_apart else GUESSED_TIP_M)
-        self._remark(f"The tool point is the frame '{chosen}'; subject.tip=… chooses another.")
+        self.source.remark(
+            f"The tool point is the frame '{chosen}'; subject.tip=… chooses another."
+        )
         return frames[chosen]
 
     def _list_frames(self, bodies: Sequence[int]) -> dict[str, np.ndarray]:
@@ -188,7 +183,7 @@ class ArmModel:
         model, data = self._cut, self._data
         made = mujoco.MjSpec()
         made.modelname, made.compiler.degree = name, False
-        link, at_m, frames = made.worldbody, np.zeros(3), []
+        link, at_m = made.worldbody, np.zeros(3)
         self._add_shapes(made, link, 0, at_m)
         for row, joint_name in enumerate(self._choose_names()):
             link = link.add_body(name=f"{joint_name}_link", pos=data.xanchor[row] - at_m)
@@ -204,14 +199,12 @@ class ArmModel:
             body = int(model.jnt_bodyid[row])
             if row + 1 == model.njnt or model.jnt_bodyid[row + 1] != body:
                 if model.body_mass[body] < LEAST_KG:
-                    frames.append(model.body(body).name)
+                    self.source.note(
+                        model.body(body).name, "no mass: it weighs nothing. Write <inertial>."
+                    )
                 link.mass, link.inertia = model.body_mass[body], model.body_inertia[body]
                 link.ipos, link.iquat = data.xipos[body] - at_m, _to_quaternion(data.ximat[body])
                 self._add_shapes(made, link, body, at_m)
-        if frames:
-            self._remark(
-                f"Links without a mass weigh nothing: {', '.join(frames)}. Write <inertial>."
-            )
         link.add_site(name=TIP, pos=tool_m, size=[0.01, 0.01, 0.01])
         made.assets = self.meshes
         return made
@@ -246,7 +239,7 @@ class ArmModel:
                     box = model.geom_aabb[geom]
                     place["pos"] = centre + turn @ box[:3] - at_m
                     place |= {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": box[3:]}
-                    self._remark("Meshes touch as boxes around them.")
+                    self.source.remark("Meshes touch as boxes around them.")
                 link.add_geom(group=3, contype=1, conaffinity=0, **place)
 
     def _add_mesh(self, made: mujoco.MjSpec, mesh: int) -> str:
@@ -263,11 +256,6 @@ class ArmModel:
             self.meshes[file] = stream.getvalue()
             made.add_mesh(name=name, file=file, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         return name
-
-    def _remark(self, text: str) -> None:
-        """Add a remark once."""
-        if text not in self.remarks:
-            self.remarks.append(text)
 
 
 def _to_quaternion(turn: np.ndarray) -> np.ndarray:

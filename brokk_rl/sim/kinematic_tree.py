@@ -44,13 +44,11 @@ class KinematicTree:
         source: The model.
 
     Attributes:
-        loops: Sentences about loops that `<equality>` closes.
         has_cylinders: Whether a slide closes a loop, as hydraulic cylinders do.
     """
 
     def __init__(self, source: ModelSource) -> None:
         self._source, self.model = source, source.model
-        self.loops: list[str] = []
         self.has_cylinders = False
         self._passive: dict[int, str] = {}
         for joint in range(self.model.njnt):
@@ -113,26 +111,21 @@ class KinematicTree:
             body = int(self.model.body_parentid[body])
         return found
 
-    def describe_held(self, chain: ArmChain) -> list[str]:
-        """Return sentences about all joints that the machine does not have."""
-        said = list(self.loops)
-        reasons: dict[str, list[int]] = {}
+    def note_held(self, chain: ArmChain) -> None:
+        """Say which joints the machine does not have."""
         for joint, why in self._passive.items():
             if self._find_root(joint) == chain.root and why != CLOSES_LOOP:
-                reasons.setdefault(why, []).append(joint)
-        for why, joints in reasons.items():
-            said.append(f"{self.list_names(joints)} {why}; held where drawn.")
+                self._source.note(self.name(joint), f"{why}; held where drawn.")
         if chain.gripper:
-            said.append(
+            self._source.remark(
                 f"The gripper ({self.list_names(chain.gripper)}) is held where it is drawn; subject.gripper=true makes "
                 "its first joint the last of the machine."
             )
-        if chain.left_out:
-            said.append(
-                f"{self.list_names(chain.left_out)} are not part of the chain and are held where they are drawn; "
-                "subject.chain=<joint or link> chooses another."
+        for joint in chain.left_out:
+            self._source.note(
+                self.name(joint),
+                "not part of the chain and held where drawn; subject.chain=<joint or link> chooses another.",
             )
-        return said
 
     def _list_chains(self) -> list[tuple[int, ...]]:
         """Driven joints from the base to each end of the model."""
@@ -179,7 +172,7 @@ class KinematicTree:
             self.has_cylinders |= any(self._is_slide(joint) for joint in passive)
             names = self.list_names(passive)
             self._passive |= dict.fromkeys(passive, CLOSES_LOOP)
-            self.loops.append(
+            self._source.remark(
                 f"<equality> closes a loop of {names} with {self.list_names(kept)}; {names} are left out, and "
                 f"{self.name(kept[-1])} is driven directly."
             )

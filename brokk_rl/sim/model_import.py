@@ -109,9 +109,8 @@ class _MachineDescription:
     def __init__(self, path: Path, name: str, choices: ModelChoices) -> None:
         self._file, self._name, self._choices = path.name, name, choices
         self._arm = ArmModel(path, name, choices)
-        self._made, self._remarks = self._arm.model, self._arm.remarks
-        self._model, self._joints = self._arm.source.model, self._arm.joints
-        self._guesses: dict[tuple[str, str], list[str]] = {}
+        self._made, self._source = self._arm.model, self._arm.source
+        self._model, self._joints = self._source.model, self._arm.joints
         self._travel = np.array([self._read_travel(row) for row in range(self._made.nq)])
         self._drive_name = self._choose_drive()
         self._drive = DRIVES[self._drive_name]
@@ -120,10 +119,6 @@ class _MachineDescription:
         """Return the machine."""
         self._measure_poses()
         joints = [self._describe_joint(row) for row in range(self._made.nq)]
-        for (what, guess), names in self._guesses.items():
-            self._remarks.append(
-                f"No {what} in {self._file} of {', '.join(names)}; {guess} is a guess, measure it."
-            )
         self._describe_commands(joints)
         values = {
             "name": self._name,
@@ -137,14 +132,14 @@ class _MachineDescription:
             "exclusive": [],
             "levers": [],
         }
-        self._remarks.append(
+        self._source.remark(
             f"The drive counts as {self._drive_name} (subject.drive): its control period ({self._drive.period_s:g} s), "
             f"dead time ({self._drive.dead_time_s:g} s) and stiffness are guesses; mode=identify measures the dead time."
         )
-        self._remarks.append(
+        self._source.remark(
             "Only the last link touches anything; give other links contype in the MJCF."
         )
-        return ImportedMachine(values, self._arm.mjcf, self._arm.meshes, self._remarks)
+        return ImportedMachine(values, self._arm.mjcf, self._arm.meshes, self._source.remarks)
 
     def _measure_poses(self) -> None:
         """Measure weights and inertias of the arm, its home, and its fastest mode with equal drives."""
@@ -166,13 +161,13 @@ class _MachineDescription:
         if lowest_m[0] < CLEARANCE_M and lowest_m.max() >= CLEARANCE_M:
             away = (((poses - poses[0]) / (upper - lower)) ** 2).sum(1)
             self._home = poses[np.where(lowest_m >= CLEARANCE_M, away, np.inf).argmin()]
-            self._remarks.append(
+            self._source.remark(
                 "At zero the arm reaches into the ground; home is the nearest of some random poses above it."
             )
         self._inertia = compute_inertia(made, self._home).diagonal()
         carried_kg = made.body_mass[:0:-1].cumsum()[::-1]
         for row in np.flatnonzero(carried_kg < LEAST_KG):
-            raise self._arm.source.refuse(
+            raise self._source.refuse(
                 f"nothing that joint '{made.joint(row).name}' moves has a mass; give its link an <inertial>"
             )
         self._mode_rad_s, _ = find_fastest_mode(made, self._inertia, poses)
@@ -207,7 +202,7 @@ class _MachineDescription:
 
     def _describe_joint(self, row: int) -> dict[str, Any]:
         """Return a joint and its link as plain data."""
-        made, source, joint = self._made, self._arm.source, self._joints[row]
+        made, source, joint = self._made, self._source, self._joints[row]
         name, kind = made.joint(row).name, KINDS[int(made.jnt_type[row])]
         lower, upper = self._travel[row]
         travel = (self._file, "low" if joint in source.doubted else "high")
@@ -266,14 +261,14 @@ class _MachineDescription:
             command = self._choices.command
         elif found == {"torque"}:
             command = "velocity"
-            self._remarks.append(
+            self._source.remark(
                 "The model's actuators are torques, and a policy commands speeds: command: velocity stands for a "
                 "controller of the joints; subject.command=torque keeps torques, for recordings."
             )
         elif len(found) == 1 and None not in found:
             command = str(found.pop())
         else:
-            self._remarks.append(
+            self._source.remark(
                 f"command: {command} is a guess; subject.command=… or the machine's file changes it."
             )
         for joint in joints:
@@ -313,8 +308,9 @@ class _MachineDescription:
         return float(np.abs(full).max())
 
     def _guess(self, what: str, row: int, guess: str) -> None:
-        """Note a guess for a joint; one sentence tells of all joints that share it."""
-        self._guesses.setdefault((what, guess), []).append(self._made.joint(row).name)
+        self._source.note(
+            self._made.joint(row).name, f"no {what} in the file; {guess} is a guess, measure it."
+        )
 
 
 def _make_dimension(value: float, source: str, confidence: str) -> dict[str, Any]:

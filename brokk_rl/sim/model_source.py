@@ -86,7 +86,7 @@ class ModelSource:
         speeds: Speed limits of joints by name, rad/s or m/s.
         doubted: Joints whose numbers were converted from a unit that was guessed.
         followers: Name of the joint that a joint follows (`<mimic>`, or `<equality>` of joints).
-        notes: Names of joints and links by what was mended at them.
+        notes: Names of joints and links by what was mended or guessed of them.
     """
 
     path: Path
@@ -100,10 +100,17 @@ class ModelSource:
     @property
     def remarks(self) -> list[str]:
         """One sentence for each kind of finding, with the names of what it is about."""
-        return [f"{', '.join(names)}: {text}" for text, names in self.notes.items()]
+        said = []
+        for text, names in self.notes.items():
+            said.append(f"{', '.join(names)}: {text}" if names else text)
+        return said
+
+    def remark(self, text: str) -> None:
+        """Say something about the whole file, once."""
+        self.notes.setdefault(text, [])
 
     def note(self, name: str, text: str) -> None:
-        """Note that something was mended at a joint, link or file."""
+        """Note that something was mended or guessed of a joint or link."""
         self.notes.setdefault(text, []).append(name)
 
     def refuse(self, text: str) -> ConfigError:

@@ -101,7 +101,7 @@ def test_limits_masses_and_guesses_of_a_urdf_are_told(urdf: Path) -> None:
     assert slew.body.yield_force.value == 3000.0 and slew.body.yield_force.confidence == "medium"
     assert reach.max_speed.confidence == "low" and reach.body.yield_force.confidence == "low"
     remarks = " ".join(imported.remarks)
-    for text in ("turn are not part of the chain", "No speed at full command", "frame 'tool0'"):
+    for text in ("turn: not part of the chain", "no speed at full command", "frame 'tool0'"):
         assert text in remarks
 
 
@@ -149,7 +149,7 @@ def edit(old: str, new: str) -> str:
         (edit('velocity="0.5"', 'velocity="-1"'), -2.0, 2.0, 1.0, 'velocity="-1" is no limit'),
         (edit('velocity="0.5"', 'velocity="1e9"'), -2.0, 2.0, 1.0, "is doubted"),
         (edit('lower="-2" upper="2"', 'lower="2" upper="-2"'), -2.0, 2.0, 0.5, "swapped"),
-        (edit('lower="-2" upper="2"', ""), -np.pi, np.pi, 0.5, "No limits"),
+        (edit('lower="-2" upper="2"', ""), -np.pi, np.pi, 0.5, "no limits"),
         (edit('lower="-2" upper="2"', 'lower="0" upper="0"'), -np.pi, np.pi, 0.5, "are none"),
         (
             edit(SLEW, SLEW.replace('-2" upper="2', '-90" upper="70').replace("0.5", "90")),
@@ -162,7 +162,7 @@ def edit(old: str, new: str) -> str:
         (edit('lower="-2" upper="2"', 'upper="2"'), 0.0, 2.0, 0.5, ""),
         (edit('effort="3000"', 'effort="1e9"'), -2.0, 2.0, 0.5, 'effort="1e+09" is no limit'),
         (edit(INERTIA, INERTIA.replace("1", "0")), -2.0, 2.0, 0.5, "'mast': a principal inertia"),
-        (edit('<mass value="30"/>', '<mass value="0"/>'), -2.0, 2.0, 0.5, "weigh nothing: beam"),
+        (edit('<mass value="30"/>', '<mass value="0"/>'), -2.0, 2.0, 0.5, "beam: no mass"),
     ],
 )  # fmt: skip
 def test_odd_numbers_of_a_urdf_are_read_with_a_remark(
@@ -240,27 +240,27 @@ LOOP = '<equality><connect body1="slide_link" body2="a_link" anchor="0 0 0"/></e
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {}, ARM, "The gripper (left_finger"),
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"gripper": True}, (*ARM, "left_finger"), ""),
         (SCENE.format(nest(*ARM, inside=nest("jaw")).replace("c_link", "gripper"), ""), {}, ARM, "The gripper (jaw)"),
-        (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"chain": ("b",)}, ("a", "b"), "c, left_finger"),
-        (SCENE.format(nest(*ARM), ""), {"chain": ("a_link", "c_link")}, ("b", "c"), "a are not part"),
-        (SCENE.format(nest(*ARM), ""), {"chain": ("b", "c")}, ("b", "c"), "a are not part"),
+        (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"chain": ("b",)}, ("a", "b"), "c, left_finger, right_finger: not part"),
+        (SCENE.format(nest(*ARM), ""), {"chain": ("a_link", "c_link")}, ("b", "c"), "a: not part"),
+        (SCENE.format(nest(*ARM), ""), {"chain": ("b", "c")}, ("b", "c"), "a: not part"),
         (
             SCENE.format(nest(*ARM, inside=FINGERS + nest("t1", "t2")), ""),
             {}, ARM, "The gripper (left_finger, right_finger, t1, t2)",
         ),
-        (SCENE.format(nest(*ARM) + nest("door") + nest("drawer"), MOTORS), {}, ARM, "door_link, drawer_link are other"),
+        (SCENE.format(nest(*ARM) + nest("door") + nest("drawer"), MOTORS), {}, ARM, "drawer_link, door_link: not of the robot"),
         (SCENE.format(nest(*ARM, inside='<site name="x" pos="1 0 0"/>'), ""), {"tip": "x"}, ARM, ""),
         (
             SCENE.format(nest(*ARM), '<equality><joint joint1="c" joint2="b"/></equality>'),
-            {}, ("a", "b"), "c follows b",
+            {}, ("a", "b"), "c: follows b",
         ),
         (
             SCENE.format(nest(*ARM) + f'<body name="box" pos="3 0 0"><freejoint/>{BALL}</body>', ""),
-            {}, ARM, "box are other bodies",
+            {}, ARM, "box: not of the robot",
         ),
         (SCENE.format(nest("swing", "slide") + nest("a", "b"), LOOP), {}, ("a", "b"), "closes a loop of swing, slide"),
         (
             SCENE.format(f'<body>{TABLE}{BALL}{nest("a")}</body>', ""),
-            {}, ("x", "y", "a"), "No limits",
+            {}, ("x", "y", "a"), "no limits",
         ),
     ],
 )  # fmt: skip

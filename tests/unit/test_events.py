@@ -85,22 +85,6 @@ def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> Non
         np.testing.assert_allclose(used.body_subtreemass[0], edited.body_mass.sum(), rtol=1e-6)
 
 
-def test_a_saturated_drive_accelerates_by_yield_force_over_mass(machine: Machine) -> None:
-    world: Any = NATIVE.build(machine, "cpu", None, events=FIXED)
-    world._properties.factors["yield_force"][:] = torch.tensor(
-        [[1.0], [0.5], [0.25], [1.0]]
-    ).expand(-1, 5)
-    world._properties.factors["mass"][:] = torch.tensor([[1.0], [1.0], [1.0], [2.0]]).expand(-1, 5)
-    world._properties.apply()
-    before = world.q.clone()
-    turn = torch.zeros(NUM, machine.num_joints)
-    turn[:, 0] = 0.05  # rad in a period: far more than any relief valve lets the slew do
-    world.step(turn)
-    moved = (world.q - before)[:, 0]
-    assert 0.001 < moved[0] < 0.03
-    np.testing.assert_allclose(moved / moved[0], [1.0, 0.5, 0.25, 0.5], rtol=0.02)
-
-
 @pytest.mark.slow
 def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(machine: Machine) -> None:
     sim = dataclasses.replace(option("sim", "warp"), num_worlds=NUM)

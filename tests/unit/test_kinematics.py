@@ -10,7 +10,6 @@ import torch
 
 from brokk_rl.kinematics import Gravity, Kinematics, compute_tool_kinematics, solve_joint_step
 from brokk_rl.machine import Dimension, Machine
-from brokk_rl.sim.model import compile_model
 
 
 def _random_positions(machine: Machine, count: int) -> torch.Tensor:
@@ -73,22 +72,6 @@ def test_a_tool_that_points_straight_down_has_the_papers_pitch(machine):
     )
     torch.testing.assert_close(pose.axis_in_base, torch.tensor([0.0, 0.0, -1.0]), atol=1e-6, rtol=0)
     assert pose.pitch_rad.item() == pytest.approx(math.pi / 2, abs=1e-6)
-
-
-def test_tip_and_joints_agree_with_mujoco(machine):
-    model = compile_model(machine, 0.01)
-    data = mujoco.MjData(model)
-    q = _random_positions(machine, 50)
-    pose = Kinematics(machine).pose(q)
-    for i, row in enumerate(q.double().numpy()):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(pose.tip_in_base_m[i], data.site("tip").xpos, atol=3e-6)
-        np.testing.assert_allclose(
-            pose.joints_in_base_m[i],
-            [data.body(f"{n}_link").xpos for n in machine.joint_names],
-            atol=3e-6,
-        )
 
 
 @pytest.mark.parametrize(

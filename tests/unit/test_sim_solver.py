@@ -152,18 +152,6 @@ def test_the_same_problem_gives_the_same_bits_on_one_thread_and_on_a_warp_nearly
     np.testing.assert_allclose(problem.found()[4], first[4], rtol=1e-3, atol=0.1)
 
 
-def test_nan_stays_in_its_world():
-    problem = Problem(num_joints=3)
-    sound = problem.found()
-    wp.to_torch(problem.data.qacc_warmstart)[7] = float("nan")
-    wp.to_torch(problem.data.qfrc_smooth)[9] = float("nan")
-    ill = problem.found()
-    others = np.delete(np.arange(NUM_WORLDS), [7, 9])
-    assert np.isnan(ill[0][9]).all()
-    for a, b in zip(sound[:4], ill[:4], strict=True):
-        assert np.array_equal(a[others], b[others])
-
-
 def test_too_few_iterations_stop_the_loop_and_are_counted():
     *_, iterations, _ = Problem(num_joints=5, iterations=2).found()
     assert iterations.max() == 2
