@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from axis import driven
 from composed import option
 from safetensors.torch import load_file
 
@@ -28,28 +29,8 @@ TINY: dict[str, Any] = {
 }  # fmt: skip
 
 
-def recording(
-    machine: Machine, seed: int = 0, minutes: float = 1.0, noise: float = 3e-4
-) -> Recording:
-    """Returns a recording of joints that follow their commands after 0.5 s, each slowed down by the commands of all."""
-    generator = np.random.default_rng(seed)
-    count = round(minutes * 60.0 / machine.period_s)
-    levels = generator.uniform(-1.0, 1.0, (count // 20 + 1, machine.num_joints)) * (
-        generator.random((count // 20 + 1, 1)) > 0.3
-    )
-    u = np.repeat(levels, 20, 0)[:count]
-    speed = (
-        0.2
-        * np.vstack([np.zeros((10, machine.num_joints)), u])[:count]
-        / np.maximum(1.0, np.abs(u).sum(1, keepdims=True) / 2.0)
-    )
-    middle, half = (machine.lower + machine.upper) / 2.0, (machine.upper - machine.lower) / 2.0
-    q = middle + half * np.sin(np.cumsum(speed, 0) * machine.period_s / half) * 0.9
-    q += noise * generator.standard_normal(q.shape)
-    return Recording(
-        machine=machine.name, joints=machine.joint_names, units=tuple(joint.unit for joint in machine.joints), rate_hz=20.0,
-        t_s=np.arange(count) * machine.period_s, u=u.astype(np.float32), q=q.astype(np.float32),
-    )  # fmt: skip
+def recording(machine: Machine, seed: int = 0, minutes: float = 1.0) -> Recording:
+    return driven(machine, 1, 60.0 * minutes, seed)[0]
 
 
 def tiny(name: str, **changes: Any) -> NetworkFit:
@@ -92,11 +73,11 @@ def test_the_same_seed_draws_the_same_windows_and_none_crosses_recordings(machin
     assert moving.any(2).all()
 
 
-@pytest.mark.parametrize(("noise", "step"), [(3e-4, 0.0), (1e-5, 0.002), (0.0, 0.004)])
+@pytest.mark.parametrize(("noise", "step"), [(2e-4, 0.0), (1e-5, 0.002), (0.0, 0.004)])
 def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(
     machine: Machine, noise: float, step: float
 ) -> None:
-    made = recording(machine, minutes=10.0, noise=noise)
+    made = recording(machine, minutes=10.0)
     u = made.u.copy()
     u[: u.shape[0] // 2] = 0.0
     q = made.q.copy()
@@ -121,12 +102,11 @@ def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> N
 
 
 def test_thin_data_is_warned_of(machine: Machine, caplog: pytest.LogCaptureFixture) -> None:
+    runs = [recording(machine, seed, minutes=4.0) for seed in range(5)]
     with caplog.at_level(logging.WARNING):
-        training_data.check_enough([recording(machine, minutes=4.0)], machine)
+        training_data.check_enough(runs[:1], machine)
     assert "thin data: q1 1." in caplog.text
     caplog.clear()
     with caplog.at_level(logging.WARNING):
-        training_data.check_enough(
-            [recording(machine, seed, minutes=4.0) for seed in range(5)], machine
-        )
+        training_data.check_enough(runs, machine)
     assert not caplog.text

@@ -137,12 +137,9 @@ def test_an_interrupted_identification_goes_on_and_does_no_fit_twice(
     parts = run(identify(machine, tmp_path / "parts", recordings, again, resume=True, folds=3))
     assert len(broken.fitted_to) == 2 and len(again.fitted_to) == 2
     assert all(parts[key] == whole[key] for key in ("joints", "overall", "against", "delay_s"))
+    others = {"resume": True, "folds": 3, "stride_s": 2.0}
     with pytest.raises(StorageError, match="is of another fit, or of other recordings or windows"):
-        run(
-            identify(
-                machine, tmp_path / "parts", recordings, Fit(), resume=True, folds=3, stride_s=2.0
-            )
-        )
+        run(identify(machine, tmp_path / "parts", recordings, Fit(), **others))
 
 
 def test_going_on_needs_the_folder_itself_and_a_run_in_it(
@@ -159,18 +156,12 @@ def test_going_on_needs_the_folder_itself_and_a_run_in_it(
 def test_a_run_is_refused_as_test_when_it_was_fitted_to(
     machine: Machine, recordings: Path, tmp_path: Path
 ) -> None:
-    first = {"recordings": f"{recordings}/*_0.parquet"}
+    seen: dict[str, Any] = {
+        "recordings": f"{recordings}/*_0.parquet",
+        "test": f"{recordings}/run0_1.parquet",
+    }
     with pytest.raises(RecordingError, match=r"run 0 is also among identify\.recordings"):
-        run(
-            identify(
-                machine,
-                tmp_path / "a",
-                recordings,
-                Fit(),
-                test=f"{recordings}/run0_1.parquet",
-                **first,
-            )
-        )
+        run(identify(machine, tmp_path / "a", recordings, Fit(), **seen))
     with pytest.raises(ConfigError, match="folds and test are two ways"):
         identify(machine, tmp_path / "a", recordings, Fit(), test="x", folds=2)
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ TINY = (
 
 @pytest.mark.slow
 def test_collect_and_identify_from_the_command(
-    brokk: Callable[..., object], tmp_path: Path, machine: Machine
+    brokk: Callable[..., Any], tmp_path: Path, machine: Machine
 ) -> None:
     small = ("collect.run_minutes=1.0", "collect.file_minutes=0.5", "actuator=lag")
     assert brokk("mode=collect", "session.out=sine", "collect.num_runs=10", *small).code == 0
