@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import logging
 import re
-from dataclasses import fields
 from pathlib import Path
 
 from actuators.recordings import conversion, log_draft
-from actuators.recordings.guess import CommandKind, Damaged, GivenColumns, Guess
+from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.log_draft import Draft
 from actuators.recordings.name_evidence import UNITS, read_unit
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.report import embed_picture, render_page
 from brokk_rl.session import Session, write_json, write_text
-from brokk_rl.spec import Positive, spec
+from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
@@ -26,40 +25,16 @@ TEMPLATE = Path(__file__).with_name("import.html.jinja")
 
 
 @spec
-class LogSelection:
-    """Logs to import.
+class LogSelection(GivenColumns):
+    """Logs to import, and what a person says about them.
 
     Attributes:
         input: Glob, or list of globs, of logs of one kind; a folder stands for the logs in it.
         name: Name of the machine that is drafted; `null`: that of the folder of the logs.
-        joints: Columns of command and position by joint, where their names do not say it; `null`
-            to find them by their names.
-        command: `velocity`, `position` or `torque`, the quantity that commands set; `null` to guess.
-        position_unit: Unit of the positions where their names do not say it, `deg` or `0.00153 rad`: one
-            for all joints, or a table by joint; `null` to guess.
-        clock_offset_s: Seconds added to the clock of a table, a number by table; `null`: none.
-        dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
-        time: Column of the time, or those of seconds and nanoseconds, where names do not say it; `null`
-            to guess.
-        rate_hz: Rate of a log without times, whose rows are equally spaced; `null`: it has times.
-        wraps: Value of the log at which positions begin again, such as 4096 or 6.28318: one for all
-            joints, or a table by joint; 0 for none, `null` to guess.
-        channel: Channel of the recorder of a CAN bus; `null` where each message comes on one.
-        damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
     """
 
     input: str | tuple[str, ...]
     name: str | None
-    joints: dict[str, tuple[str, str]] | None
-    command: CommandKind | None
-    position_unit: str | dict[str, str] | None
-    clock_offset_s: dict[str, float] | None
-    time: tuple[str, ...] | None
-    rate_hz: Positive | None
-    wraps: float | dict[str, float] | None
-    dbc: str | None
-    channel: int | str | None
-    damaged: Damaged
 
     def check(self) -> None:
         given = self.position_unit
@@ -95,10 +70,8 @@ class ImportLogs:
             StorageError: A file could not be written.
         """
         paths = conversion.find_logs(self.log.input)
-        keys = [one.name for one in fields(GivenColumns)]
-        given = GivenColumns(**{key: getattr(self.log, key) for key in keys})
         name = self.log.name or _name_machine(paths[0])
-        draft = log_draft.make_draft(paths, name, given)
+        draft = log_draft.make_draft(paths, name, self.log)
         picture = self.session.folder / PICTURE_FILE
         log_draft.draw_draft(draft).savefig(picture, dpi=110)
         log.info("picture: %s", picture)

@@ -37,6 +37,8 @@ EPOCH_S = (1e9, 4e9)
 """Seconds since 1970 from 2001 to 2096."""
 SECOND_WORDS = {"sec", "secs", "seconds", "s"}
 NANO_WORDS = {"nanosec", "nsec", "nsecs", "nanosecs", "ns", "nanoseconds", "nanos"}
+DOUBLED_SHARE = 0.2
+"""Share of repeated stamps from which two programs send to one topic."""
 MOST_DRIFT = 0.01
 """Drift of a sensor's clock from which on it does not count seconds; crystals drift by 1e-4 at most."""
 TIME_MODULI = (2.0**16, 2.0**24, 2.0**32, 1e3, 1e4, 1e5, 1e6, 1e9, 3600.0, 86400.0)
@@ -50,12 +52,10 @@ class TimeGuess:
     Attributes:
         time: Its column.
         guess: How sure it is.
-        num_doubled: Rows whose stamp repeats that of the row before, with other values.
     """
 
     time: TimeColumn
     guess: Guess
-    num_doubled: int = 0
 
 
 def guess_times(run: LogRun, given: GivenColumns) -> dict[str, TimeGuess]:
@@ -127,11 +127,13 @@ def _guess_own_clock(subject: str, table: Table, clock: str) -> TimeGuess:
     is_later = len(steps_s) > 1 and bool((steps_s > 0).all())
     drift = float(np.polyfit(stamp_s - stamp_s[0], late_s, 1)[0]) if is_later else math.inf
     if abs(drift) > MOST_DRIFT:  # it repeats, or is not in s
-        num_doubled = (
-            int((steps_s == 0).sum()) if steps_s.any() else 0
-        )  # a driver may leave it at 0
-        guess = Guess(subject, clock, (("the recorder's own clock, in s", 5.0),))
-        return TimeGuess(anchor, guess, num_doubled)
+        evidence = [("the recorder's own clock, in s", 5.0)]
+        num_doubled = int((steps_s == 0).sum())
+        # a driver may leave all stamps at 0
+        if steps_s.any() and num_doubled > DOUBLED_SHARE * len(steps_s):
+            text = f"{num_doubled} of {len(stamp_s)} messages repeat the stamp of the one before"
+            evidence.append((f"{text}: two programs send on one topic", -8.0))
+        return TimeGuess(anchor, Guess(subject, clock, evidence))
     scatter_s = np.quantile(late_s, 0.95) - late_s.min()
     reason = (
         f"the sensor's own clock; behind the recorder's by {np.median(late_s):.4g} s, drift {1e6 * drift:.3g} ppm, "

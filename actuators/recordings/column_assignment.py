@@ -40,8 +40,6 @@ from brokk_rl.errors import RecordingError
 
 SAME_NAME, OTHER_NAME = 3.0, -6.0
 """Log odds of a pair with one name of a joint, and of one in which a column shares it with another one."""
-DOUBLED_SHARE = 0.2
-"""Share of equal stamps with other values from which two programs send to one topic."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,6 @@ def read_columns(run: LogRun, given: GivenColumns) -> ColumnTable:
         judge = JointJudge(joint, matrix, at, given)
         judge.judge_kind()
         judge.judge_motion([one.u.text for one in joints])
-        finder.check_source(joint)
         finder.check_drive(joint)
         judge.judge_columns()
         judge.judge_unit()
@@ -129,8 +126,7 @@ class _PairFinder:
         if not commands or not positions:
             lacking = f"no column is named like {'positions' if commands else 'commands'}; "
             self._refuse(lacking, self._list_followers(entries))
-        if _has_several_sources(commands) and _has_several_sources(positions):
-            commands, positions = _name_sources(commands), _name_sources(positions)
+        commands, positions = _tell_sources(commands, positions)
         names = [name_joint(one.name.joint) for one in positions]
         commands, positions = self._unwrap(commands, positions, names)
         joints = self._assign(commands, positions)
@@ -285,14 +281,6 @@ class _PairFinder:
                     f"{joint.name}: {text}, first at {t_s[0]:.2f} s, last at {t_s[-1]:.2f} s ({full_name} = 0)"
                 )
 
-    def check_source(self, joint: JointGuess) -> None:
-        """Add the evidence of a topic on which two programs send."""
-        table, num_rows = joint.q.name.table, len(joint.q.values)
-        num_doubled = self._times[table].num_doubled
-        if num_doubled > DOUBLED_SHARE * num_rows:
-            text = f"{num_doubled} of {num_rows} messages repeat the stamp of the one before: two programs send to '{table}'"
-            joint.evidence.append((text, -8.0))
-
 
 def _remove_wrap(entry: ColumnEntry, wrap: Wrap | None) -> ColumnEntry:
     """Return a column without its wraps."""
@@ -354,16 +342,17 @@ def _is_clear(size: np.ndarray, row: int, column: int, rows: list[int], columns:
     return bool(size[row, column] >= max(CLEAR_CORRELATION, max([0.0, *along, *across]) + MARGIN))
 
 
-def _has_several_sources(entries: Sequence[ColumnEntry]) -> bool:
-    """Return whether tables of different names have a joint of one name: two arms, each on its topics."""
-    sources = {(one.name.key, one.name.source) for one in entries}
-    return len(sources) > len({one.name.key for one in entries})
+def _tell_sources(*sides: Sequence[ColumnEntry]) -> list[list[ColumnEntry]]:
+    """Return commands and positions, with the words of their tables where both have a joint of one name twice.
 
-
-def _name_sources(entries: Sequence[ColumnEntry]) -> list[ColumnEntry]:
-    """Return the columns with the words of their tables before those of their joints."""
+    Two arms, each on its topics, have joints of the same names.
+    """
     found = []
-    for one in entries:
-        joint = f"{one.name.source}_{one.name.joint}".strip("_")
-        found.append(replace(one, name=replace(one.name, joint=joint)))
+    for entries in sides:
+        sources = {(one.name.key, one.name.source) for one in entries}
+        if len(sources) == len({one.name.key for one in entries}):
+            return [list(entries) for entries in sides]
+        names = [f"{one.name.source}_{one.name.joint}".strip("_") for one in entries]
+        pairs = zip(entries, names, strict=True)
+        found.append([replace(one, name=replace(one.name, joint=name)) for one, name in pairs])
     return found

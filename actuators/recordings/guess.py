@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from brokk_rl.spec import Positive
+
 Sureness = Literal["sure", "likely", "unsure"]
 CommandKind = Literal["velocity", "position", "torque"]
 """Quantity that commands set."""
@@ -83,7 +85,7 @@ class GivenColumns:
     """Meanings that a person gives.
 
     Attributes:
-        joints: Columns of command and position by joint; `None` to find them.
+        joints: Columns of command and position by joint, where their names do not say it; `None` to find them.
         command: Quantity that commands set; `None` to guess it.
         position_unit: Unit of the positions, for all joints or by joint; `None` to guess it.
         clock_offset_s: Seconds added to the clocks of tables.
@@ -95,13 +97,13 @@ class GivenColumns:
         damaged: What to do about damaged parts.
     """
 
-    joints: Mapping[str, tuple[str, str]] | None = None
+    joints: dict[str, tuple[str, str]] | None = None
     command: CommandKind | None = None
-    position_unit: str | Mapping[str, str] | None = None
-    clock_offset_s: Mapping[str, float] | None = None
-    time: Sequence[str] | None = None
-    rate_hz: float | None = None
-    wraps: float | Mapping[str, float] | None = None
+    position_unit: str | dict[str, str] | None = None
+    clock_offset_s: dict[str, float] | None = None
+    time: tuple[str, ...] | None = None
+    rate_hz: Positive | None = None
+    wraps: float | dict[str, float] | None = None
     dbc: str | None = None
     channel: int | str | None = None
     damaged: Damaged = "refuse"

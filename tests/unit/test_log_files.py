@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -135,41 +134,11 @@ def test_an_older_lerobot_dataset_is_refused_by_its_version(tmp_path: Path) -> N
         open_log(tmp_path / "set")
 
 
-def write_folder(folder: Path, shift_s: float = 0.0) -> None:
-    signals = make_signals()
-    folder.mkdir(parents=True)
-    for name, kind, values, t_s in (
-        ("control", "CONTROL", signals["u"], signals["t"]),
-        ("state_motor", "STATE_MOTOR", signals["q"], signals["t"] + shift_s),
-    ):
-        rows = [f'{kind},{t * 1e6!r},"[{v!r}, 0.5]"' for t, v in zip(t_s.tolist(), values.tolist(), strict=True)]  # fmt: skip
-        text = "\n".join(["type,timestamp,positions", *rows]) + "\n"
-        (folder / f"{name}.csv").write_text(text)
-
-
-def make_folder_map() -> ColumnMap:
-    return replace(
-        make_map("control:positions[0]", "state_motor:positions[0]"),
-        time=Column(column="timestamp", scale=1e-6, offset=0.0),
-    )
-
-
-def test_the_two_files_of_a_folder_keep_their_clocks(tmp_path: Path, carriage: Machine) -> None:
-    write_folder(tmp_path / "same")
-    (recording,) = make_folder_map().read(tmp_path / "same", carriage)
-    check(recording)
-    write_folder(tmp_path / "late", shift_s=0.005)
-    (late,) = make_folder_map().read(tmp_path / "late", carriage)
-    signals = make_signals()
-    # the piece begins with the later file, half a period after the other one
-    expected = np.interp(signals["t"][:-1] + 0.005, signals["t"] + 0.005, signals["q"])
-    np.testing.assert_allclose(late.q[:, 0], expected, atol=1e-6)
-    np.testing.assert_array_equal(late.u[:, 0], signals["u"][:-1].astype(np.float32))
-
-
 def test_a_folder_of_folders_gives_the_logs_below_it(tmp_path: Path) -> None:
     for name in ("b", "a"):
-        write_folder(tmp_path / "raw" / name)
+        (tmp_path / "raw" / name).mkdir(parents=True)
+        for source in ("control", "state"):
+            write_csv(tmp_path / "raw" / name / f"{source}.csv", make_signals())
     (tmp_path / "raw" / "notes").mkdir()
     write_csv(tmp_path / "raw" / "c.csv", make_signals())
     found = expand_logs([tmp_path / "raw"])
