@@ -97,7 +97,7 @@ class ClockFault:
     """Rows of a clock that do not come later than all before.
 
     Attributes:
-        kind: `repeated` rows, a `coarse` or a `broken` clock, one that was set `back`, or rows out of `order`.
+        kind: A `coarse` or a `broken` clock, one that was set `back`, or rows that repeat or are out of `order`.
         rows: Rows concerned.
         text: Description.
         advice: How the log is read all the same.
@@ -174,14 +174,12 @@ def find_fault(t_s: np.ndarray, table: Table, clock: str) -> ClockFault | None:
     if 0 < len(back) <= max(3, 0.01 * len(t_s)):
         text = f"the clock is set back {len(back)} times, by {-steps[back[0]]:.4g} s at first; what follows is a piece of its own"
         return ClockFault("back", back, text, advise("damaged"))
-    if (is_equal & same).sum() > 0.5 * len(bad):
-        text = f"the time does not increase in {count}, which repeat the row before"
-        return ClockFault("repeated", bad, text, advise("damaged"))
     text = f"the time does not increase in {count}"
+    if (is_equal & same).sum() > 0.5 * len(bad):
+        return ClockFault("order", bad, f"{text}, which repeat the row before", advise("damaged"))
     if len(bad) > MOST_UNORDERED * len(t_s):
-        return ClockFault(
-            "broken", bad, f"{text}: its digits may be wrong", _advise_rate(np.floor(t_s))
-        )
+        rate = _advise_rate(np.floor(t_s))
+        return ClockFault("broken", bad, f"{text}: its digits may be wrong", rate)
     return ClockFault("order", bad, text, advise("damaged"))
 
 

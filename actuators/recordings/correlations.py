@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from actuators.recordings.advice import advise
-from actuators.recordings.guess import CommandKind
 from actuators.recordings.log_signals import Signal
 from actuators.recordings.log_tables import LogRun
 from brokk_rl.errors import RecordingError
@@ -28,9 +27,8 @@ class Correlations:
     """Commands and positions of a run on one grid, and how they follow each other.
 
     Attributes:
-        target: Correlation of each position with each command at the best lag, `(C, P)`.
-        speed: That of speeds.
-        force: That of accelerations.
+        r: Correlation at the best lag of each position, its speed or its acceleration with each command, by the
+            kind of command that they follow, `(C, P)`.
     """
 
     def __init__(
@@ -50,9 +48,9 @@ class Correlations:
         self._v = np.gradient(self._q, self._period_s, axis=0)
         most = min(int(LONGEST_LAG_S / self._period_s), num_rows // 4)
         self._lags = np.arange(0, most + 1, max(1, most // NUM_LAGS))
-        self.target = self._correlate(self._u, self._q)[0]
-        self.speed = self._correlate(self._u, self._v)[0]
-        self.force = self._correlate(self._u, np.gradient(self._v, self._period_s, axis=0))[0]
+        acceleration = np.gradient(self._v, self._period_s, axis=0)
+        followed = {"position": self._q, "velocity": self._v, "torque": acceleration}
+        self.r = {kind: self._correlate(self._u, moved)[0] for kind, moved in followed.items()}
 
     def _refuse(self, run: LogRun, signals: Sequence[Signal]) -> None:
         spans = {one.table: (float(one.t_s[0]), float(one.t_s[-1])) for one in signals}
@@ -70,11 +68,7 @@ class Correlations:
     @property
     def size(self) -> np.ndarray:
         """Size of the correlation of each position or its speed with each command, `(C, P)`."""
-        return np.maximum(np.abs(self.target), np.abs(self.speed))
-
-    def get(self, kind: CommandKind) -> np.ndarray:
-        """Return the correlations of a kind of command, `(C, P)`."""
-        return {"position": self.target, "velocity": self.speed, "torque": self.force}[kind]
+        return np.maximum(np.abs(self.r["position"]), np.abs(self.r["velocity"]))
 
     def find_lag(self, at: int, is_target: bool) -> float:
         """Return the lag of a joint's speed behind its command, or behind its target's speed, s."""

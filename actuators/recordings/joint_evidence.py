@@ -143,7 +143,7 @@ class JointJudge:
     ) -> None:
         self._joint, self._matrix, self._at, self._given = joint, matrix, at, given
         self._slope, self._rest = matrix.fit_target(at)
-        self._r = {kind: float(matrix.get(kind)[at, at]) for kind in KIND_TEXTS}
+        self._r = {kind: float(matrix.r[kind][at, at]) for kind in KIND_TEXTS}
 
     def judge_kind(self) -> None:
         """Choose which quantity the command sets."""
@@ -198,7 +198,7 @@ class JointJudge:
         if joint.lag_s > LAST_LAG * LONGEST_LAG_S:
             text = "no longer lag is tried: its delay is longer, or it is no pair"
             joint.evidence.append((text, -5.0))
-        size = np.abs(self._matrix.get(joint.kind)[:, self._at])
+        size = np.abs(self._matrix.r[joint.kind][:, self._at])
         rival = int(np.argmax(size))
         if size[self._at] < CLEAR_CORRELATION and size[rival] > size[self._at] + MARGIN:
             weight = -6.0 if size[rival] > CLEAR_CORRELATION else -1.0

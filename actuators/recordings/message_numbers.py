@@ -18,7 +18,7 @@ LABELS = ("name", "names", "joint_names", "joint_name")
 """Fields that name the items of the lists beside them."""
 TIMES = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
 """Fields of a time: whole seconds and nanoseconds."""
-NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[Nn]a[Nn]")
 """A number as text."""
 NO_NUMBERS = ("layout",)
 """Fields that describe their message."""

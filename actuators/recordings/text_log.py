@@ -24,6 +24,7 @@ import pandas as pd
 
 from actuators.recordings.advice import advise
 from actuators.recordings.log_tables import LogFile, Table, Wanted
+from actuators.recordings.message_numbers import read_number
 from actuators.recordings.name_evidence import is_unit
 from brokk_rl.errors import RecordingError
 
@@ -227,9 +228,9 @@ def convert_cells(cells: Any, kind: CellKind, length: int, decimal: str) -> np.n
         return convert_times(texts)
     found = np.full((len(texts), length), np.nan)
     for row, text in enumerate(texts):
-        parts = split_list(text)
-        if len(parts) == length and all(_is_number(part) for part in parts):
-            found[row] = [float(part) for part in parts]
+        numbers = [read_number(part) for part in split_list(text)]
+        if len(numbers) == length and None not in numbers:
+            found[row] = numbers
     return found
 
 
@@ -408,22 +409,14 @@ def simplify_number(text: str, decimal: str) -> str:
 def tell_kind(text: str, decimal: str) -> CellKind:
     """Return the kind of a cell; an empty cell counts as a number that is missing."""
     if text.startswith("[") and text.endswith("]"):
-        return "list" if all(_is_number(part) for part in split_list(text)) else "text"
+        return "text" if None in map(read_number, split_list(text)) else "list"
     if any(form.fullmatch(text) for form in (ISO_TIME, DAY_TIME, CLOCK_TIME)):
         return "time"
     if text.lower() in FLAGS:
         return "flag"
     plain = simplify_number(text, decimal)
-    is_number = text in MISSING or ("_" not in text and _is_number(plain))
+    is_number = text in MISSING or read_number(plain) is not None
     return "number" if is_number else "text"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def split_list(text: str) -> list[str]:
