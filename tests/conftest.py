@@ -39,7 +39,7 @@ def pytest_collection_finish() -> None:
 
 LONGEST = (
     "test_check", "test_circuit", "test_collect", "test_compose", "test_deploy_faults", "test_every_experiment",
-    "test_exam", "test_exam_sitting", "test_identification", "test_log_kinds", "test_messages", "test_own_task",
+    "test_exam", "test_exam_plants", "test_exam_sitting", "test_identification", "test_log_kinds", "test_messages", "test_own_task",
     "test_perception_calibrate", "test_video",
 )  # fmt: skip
 """Files that take more than ten seconds: they begin first, so that no core waits for one at the end."""

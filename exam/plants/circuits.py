@@ -6,8 +6,9 @@ machine has numbers of its own, and an effect or a cause changes these numbers w
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,8 +33,6 @@ AJAR_LOAD = 0.4
 """Weight over the yield force under which a valve that stays ajar leaks as `OutsideCauses` says."""
 SOFT_FRICTION = 0.4
 """Dry friction of a soft joint over its usual one: full friction would end the ringing after one swing."""
-
-
 NARROWED = 0.4
 """Turn of either end of a triangle over that of a mounting that moved; the lever arm varies less then."""
 STRANGE = ("stiction", "load_dependence")
@@ -42,27 +41,18 @@ OF_CIRCUITS = {name: change for name, change in CHANGES.items() if name not in S
 """Change of the numbers by effect."""
 
 
-@dataclass(frozen=True, eq=False)
-class HeldWeight:
-    """A weight that was computed before.
+class SteppedCircuit(CircuitModel):
+    """A circuit in steps so short that a command and the weight of the arm hold for many of them.
 
-    Attributes:
-        weight: On each joint, `(N, J)`, Nm or N.
+    To compute both anew, and the state of a free run, would take half of the time of a step.
     """
-
-    weight: torch.Tensor
-
-    def load(self, q: torch.Tensor) -> torch.Tensor:
-        """Return it, whatever the pose."""
-        return self.weight
-
-
-class WeighedCircuit(CircuitModel):
-    """A circuit that is given the weight of its arm, which takes a quarter of the time of a step."""
 
     def take_weight(self, weight: torch.Tensor) -> None:
         """Take the weight on each joint, `(N, J)`, Nm or N, for the coming steps."""
-        self._gravity = HeldWeight(weight)
+        self._gravity: Any = SimpleNamespace(load=lambda q: weight)
+
+    def _read_commands(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        return u[:, -1], u[:, -1], torch.zeros(())
 
     def _begin(self, *now: Any) -> dict[str, torch.Tensor]:
         return super()._begin(*now) if self._fresh.any() else self._state
@@ -113,7 +103,7 @@ class CircuitValves:
         }
         self._sinking = numbers["supply_ratio"] / machine.max_speed * numbers["sink_rad_s"]
         self._ajar = numbers["supply_ratio"] / AJAR_LOAD
-        unit = replace(  # pyright: ignore[reportCallIssue]
+        stepped = replace(  # pyright: ignore[reportCallIssue]
             machine,  # pyright: ignore[reportArgumentType]
             period_s=STEP_S,
             dead_time_s=0.0,
@@ -124,7 +114,7 @@ class CircuitValves:
             transport_s=0.0,
             outrigger_nm_rad=0.0,
         )
-        self._model = WeighedCircuit(at_once, unit, shape[0], torch.device("cpu"))
+        self._model = SteppedCircuit(at_once, stepped, shape[0], torch.device("cpu"))
         for name in self._model.parameters:
             self._set(name, changed[name])
         history = torch.zeros(shape[0], 2, shape[1])
@@ -155,6 +145,7 @@ class CircuitValves:
         self._is_open = np.abs(self._spool) > overlap
         return self._is_open
 
+    @torch.inference_mode()
     def move(self, flow: np.ndarray) -> np.ndarray:
         """Return the speeds after a step, rad/s or m/s, `(N, J)`.
 

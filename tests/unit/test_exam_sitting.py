@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from small_exam import run_model
 
 from brokk_rl.errors import RecordingError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import make_motion, write_recording
 from diagnosis.answer import Answer, Estimate, Gap, Where
@@ -26,18 +26,9 @@ def record_lag(machine: Machine, gain: float, seed: int, seconds: float, path: P
     levels = np.random.default_rng(seed).uniform(-0.7, 0.7, (round(seconds), machine.num_joints))
     u = np.repeat(levels, 20, 0).astype(np.float32)
     lag = replace(option("actuator", "lag"), gain=gain)
-    model = lag.build(machine, 1, torch.device("cpu"))
-    shape = (1, machine.num_history, machine.num_joints)
-    history = History(torch.zeros(shape), torch.zeros(shape))
-    home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
-    history.reset(torch.ones(1, dtype=torch.bool), home)
-    q = []
-    for command in u:
-        q.append(history.q[0, -1].numpy().copy())
-        history.push_u(torch.as_tensor(command[None]))
-        history.push_q(model.step(history))
+    q = run_model(lag.build(machine, 1, torch.device("cpu")), machine, u)
     t_s = machine.period_s * np.arange(len(u))
-    write_recording(make_motion(machine, f"{seed}", t_s, u, np.array(q)), path)
+    write_recording(make_motion(machine, f"{seed}", t_s, u, q), path)
 
 
 @pytest.fixture(scope="module")
