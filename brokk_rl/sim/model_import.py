@@ -158,7 +158,11 @@ class _MachineDescription:
             bottom_m = data.geom_xpos[touching, 2] - made.geom_rbound[touching]
             lowest_m[number] = min(*data.xpos[1:, 2], data.site(TIP).xpos[2], *bottom_m)
         self._home = poses[0]
-        if lowest_m[0] < CLEARANCE_M and lowest_m.max() >= CLEARANCE_M:
+        if lowest_m.max() < CLEARANCE_M:
+            self._source.remark(
+                "No pose lies above the ground, z = 0: raise the base of the robot."
+            )
+        elif lowest_m[0] < CLEARANCE_M:
             away = (((poses - poses[0]) / (upper - lower)) ** 2).sum(1)
             self._home = poses[np.where(lowest_m >= CLEARANCE_M, away, np.inf).argmin()]
             self._source.remark(

@@ -156,16 +156,17 @@ def read_source(path: Path, packages: Sequence[str] = ()) -> ModelSource:
 
 def _clean_urdf(root: ElementTree.Element, source: ModelSource) -> None:
     """Make a URDF readable for MuJoCo, and read the speed limits; refuse what has no meaning."""
-    for part in (*root.findall("link"), *root.findall("joint")):
+    for part in root:
         where = f"{part.tag} '{part.get('name')}'"
         for element in part.iter():
             for key, text in [("", f"<{element.tag}>"), *element.attrib.items()]:
-                if "${" in text or "$(" in text or text.startswith("<xacro"):
+                if "${" in text or "$(" in text or (not key and "xacro" in text):
                     raise source.refuse(
                         f'{where} has {key}="{text}": this is xacro, not yet a URDF; run '
                         f"`xacro {source.path.name} > robot.urdf` and give robot.urdf"
                     )
-                if key in NUMBERS and (key != "value" or element.tag == "mass"):
+                is_number = key in NUMBERS and (key != "value" or element.tag == "mass")
+                if is_number and part.tag in ("link", "joint"):
                     _clean_number(element, key, where, source)
     _check_tree(root, source)
     for link in root.findall("link"):
