@@ -1,4 +1,4 @@
-"""Events: properties of the simulated machine that change at start-up, at resets or in between.
+"""Events: properties of the simulated machine that change at start-up or at resets.
 
 An event draws a factor on one property of the machine's bodies. Effects change how commands become
 motion; events change what the arm weighs, how it grips, and how hard it pushes.
@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.spec import Finite, Interval, Ordered, spec
 
 Property = Literal["mass", "friction", "stiffness", "yield_force"]
 """Properties of the machine that can change from world to world."""
 Least = Annotated[Finite, Interval(ge=0.05)]
-"""A factor or a time in s: below a twentieth contacts get stiff, and a draw needs a control step."""
+"""A factor: below a twentieth contacts get stiff."""
 LeastRange = Annotated[tuple[Least, Least], Ordered()]
 
 
@@ -28,17 +27,11 @@ class Event:
         property: `mass` and inertia of the links, sliding `friction` of chisel and links,
             `stiffness` of the drives (their damping ratio stays), or their `yield_force`.
         factor: Range of the factor; [1, 1] changes nothing.
-        when: `startup` once and for all, `reset` with each episode, `interval` also during it.
-        interval_s: Range of the time between two draws; for `interval` only.
+        when: `startup` once and for all, `reset` with each episode.
         joints_alike: Whether all joints have the same factor. Friction has one anyway.
     """
 
     property: Property
     factor: LeastRange
-    when: Literal["startup", "reset", "interval"]
-    interval_s: LeastRange | None
+    when: Literal["startup", "reset"]
     joints_alike: bool
-
-    def check(self) -> None:
-        if self.when == "interval" and self.interval_s is None:
-            raise ConfigError("interval_s: expected [low, high] in s, got null")

@@ -94,8 +94,6 @@ class NativeWorld(StoredWorld):
 
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
-        if self._properties:
-            self._properties.advance()
         self._drive.step(self._qpos, increment, self._act, self._ctrl)
         try:
             self._batch.rollout(self.substeps, record=("sensordata",), out=self._recorded)

@@ -49,7 +49,6 @@ class WorldProperties:
 
     Attributes:
         factors: By property, `(N, J)`, friction `(N, 1)`.
-        left_s: Time until the next draw of each event, `(E, N)`, s.
     """
 
     def __init__(
@@ -60,8 +59,7 @@ class WorldProperties:
         fields: dict[str, torch.Tensor],
         events: tuple[Event, ...],
     ) -> None:
-        self._fields, self._drive = fields, drive
-        self._events, self._period_s = events, machine.period_s
+        self._fields, self._drive, self._events = fields, drive, events
         some = next(iter(fields.values()))
         num, device, dtype = len(some), some.device, some.dtype
 
@@ -73,7 +71,6 @@ class WorldProperties:
         for event in events:
             width = 1 if event.property == "friction" else machine.num_joints
             self.factors[event.property] = torch.ones(num, width, dtype=dtype, device=device)
-        self.left_s = torch.zeros(len(events), num, device=device)
         links = [int(model.joint(name).bodyid[0]) for name in machine.joint_names]
         self._links = torch.tensor(links, device=device)
         carried = np.zeros((model.nbody, model.nbody))
@@ -94,23 +91,9 @@ class WorldProperties:
 
     def begin(self, mask: torch.Tensor) -> None:
         """Draw anew for the worlds of `mask`, `(N,)` bool, what an episode changes."""
-        for left_s, event in zip(self.left_s, self._events, strict=True):
+        for event in self._events:
             if event.when != "startup":
                 self._draw(event, mask)
-            if event.when == "interval":
-                left_s.copy_(self._draw_interval(event).where(mask, left_s))
-        self.apply()
-
-    def advance(self) -> None:
-        """Let a control period pass; draw where an interval is over."""
-        if all(event.when != "interval" for event in self._events):
-            return
-        self.left_s.sub_(self._period_s)
-        for left_s, event in zip(self.left_s, self._events, strict=True):
-            if event.when == "interval":
-                due = left_s <= 0
-                self._draw(event, due)
-                left_s.copy_(self._draw_interval(event).where(due, left_s))
         self.apply()
 
     def _draw(self, event: Event, mask: torch.Tensor) -> None:
@@ -119,11 +102,6 @@ class WorldProperties:
         width = 1 if event.joints_alike else value.shape[1]
         drawn = low + (high - low) * torch.rand(len(mask), width, device=mask.device)
         value.copy_(drawn.to(value.dtype).expand_as(value).where(mask[:, None], value))
-
-    def _draw_interval(self, event: Event) -> torch.Tensor:
-        assert event.interval_s is not None, "checked by the spec"
-        low, high = event.interval_s
-        return low + (high - low) * torch.rand_like(self.left_s[0])
 
     def apply(self) -> None:
         """Write the fields that follow from `factors`; everything is in place."""
@@ -216,7 +194,6 @@ class StoredWorld:
         tensors = self._stored() | {"reference": self._drive.reference, "q": self.q}
         tensors |= {"contact_force_n": self.contact_force_n, "faults": self.faults}
         if self._properties:
-            tensors["event.left_s"] = self._properties.left_s
             for name, value in self._properties.factors.items():
                 tensors[f"event.{name}"] = value
         return tensors

@@ -139,8 +139,6 @@ class WarpWorld(StoredWorld):
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
         view = self._views
-        if self._properties:
-            self._properties.advance()
         self._drive.step(view["qpos"], increment, view["act"], view["ctrl"])
         self.contact_force_n.zero_()
         with self._on_torch_stream():

@@ -34,7 +34,7 @@ def event(name: str, **changes: Any) -> Event:
     return dataclasses.replace(option("event", name), **changes)
 
 
-FIXED = tuple(event(name, when="startup", interval_s=None, factor=(1.0, 1.0)) for name in ALL)
+FIXED = tuple(event(name, when="startup", factor=(1.0, 1.0)) for name in ALL)
 """Events that change nothing by themselves."""
 
 
@@ -128,14 +128,6 @@ def test_an_event_draws_when_it_says(machine: Machine) -> None:
         world.reset(first, home, make_nominal_scenes(NUM))
         assert (look(world)[0] != before[0]).all() == changed
         assert torch.equal(look(world)[1:], before[1:])
-    interval = build(when="interval", interval_s=(0.2, 0.2), joints_alike=True)
-    seen = []
-    for _ in range(12):
-        interval.step(still)
-        seen.append(float(look(interval)[0, 0]))
-    # 0.2 s are four periods
-    assert len(set(seen)) == 3
-    assert (look(interval) == look(interval)[:, :1]).all()
 
 
 def test_a_restored_state_keeps_its_properties(machine: Machine) -> None:
