@@ -35,6 +35,14 @@ ERROR_SCALES_M = (0.1, 0.02)
 Chosen by hand."""
 PITCH_SCALE_RAD = 0.1
 """The same for the pitch error. Chosen by hand."""
+PLAN_GAIN_1_S = 1.0
+"""Speed of joints along a planned path per distance left. Chosen by hand: half the controller's
+strikes half as hard."""
+PLAN_END_RAD = 0.2
+"""Distance of each joint from the end of a planned path, rad or m, within which it is done. Chosen
+by hand."""
+PLAN_DONE = -1.0
+"""Marks a plan whose path is done."""
 PLAN_STEP_S = 0.1
 """Step of a planned motion: joints turn by 0.05 rad at most. Chosen by hand."""
 REACH_CENTER_M = 2.0
@@ -119,8 +127,7 @@ class ClassicalController:
             along: Direction in which the tool goes in, `(N, 3)`; `None`: straight down.
         """
         config = self.config
-        now = q[:, -1]
-        ahead = now + (self.rate(u) * self._in_flight).sum(1)
+        now, ahead = q[:, -1], self.predict(q, u)
         if coming is not None:
             ahead = ahead + self.rate(coming).sum(1) * self._period_s
         # one pass for both: small operations cost their launch, not their size
@@ -168,6 +175,10 @@ class ClassicalController:
             lowest=-self._opening(down),
             highest=self._opening(up),
         )
+
+    def predict(self, q: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        """Return the positions, `(N, J)`, to which the commands that were sent will lead."""
+        return q[:, -1] + (self.rate(u) * self._in_flight).sum(1)
 
     def reach(self, q: torch.Tensor, target_m: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the reach at `q`, `(N, J)`, and its slope over joints: `(N,)` and `(N, J)`."""
@@ -235,12 +246,14 @@ class ControlInput:
     Attributes:
         vector: The policy's observation vector, `(N, O)`.
         features: The `guide` group, `(N, G)`; see `compute_features`.
+        joints: The newest joint positions, scaled as in `vector`, `(N, J)`.
         base: Command of the classical controller, and bounds.
         reach_m: Distance by which the switch decides, `(N,)`.
     """
 
     vector: torch.Tensor
     features: torch.Tensor
+    joints: torch.Tensor
     base: CommandBase
     reach_m: torch.Tensor
 
@@ -263,6 +276,8 @@ class ToolPoseControl:
         self.adviser = LeverAdviser(task.advice, machine, device) if task.advice else None
         parts = list_pose_parts(machine, task.scaling, with_proposals=self.adviser is not None)
         self.encoder = ObservationEncoder(parts, to_constant, torch.cat)
+        self._middle = to_constant((machine.lower + machine.upper) / 2)
+        self._quarter = to_constant((machine.upper - machine.lower) / 4)
         self._down = to_constant([0.0, 0.0, task.aim_below_m])
         self.exclusive = to_constant(machine.is_exclusive).bool()
 
@@ -282,9 +297,38 @@ class ToolPoseControl:
         return ControlInput(
             vector=self.encoder.encode(values),
             features=compute_features(guidance, base.positioning, u[:, -1]),
+            joints=(q[:, -1] - self._middle) / self._quarter,
             base=base,
             reach_m=self.task.switch.reach(guidance),
         )
+
+    def follow_plan(
+        self, values: Mapping[str, torch.Tensor], plan: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return commands along a planned path of the joints, and those of the controller, `(N, J)`.
+
+        The controller acts from the end of the path on, and where only exclusive joints move.
+
+        Args:
+            values: As `process` takes them.
+            plan: As `tasks.starts.StartSearch.check` returns it, `(N, J + 1)`; the last number is
+                `PLAN_DONE` from the end of the path on.
+        """
+        q, u = values["q"], values["u"]
+        _, base = self._guide(q, u, values[TARGET], values[PITCH])
+        left = self.measure_rest(values, plan)
+        waits = (plan[:, -1] > 0.5) & (left[:, 1:].abs().amax(1) > PLAN_END_RAD)
+        left[:, 0] *= ~waits
+        share = PLAN_GAIN_1_S * left / self.controller.speed
+        share = share / share.abs().amax(1, keepdim=True).clamp(min=1.0)
+        u_planned = self.controller.valve(share).minimum(base.highest).maximum(base.lowest)
+        is_led = base.positioning | (plan[:, -1] == PLAN_DONE)
+        return base.command.where(is_led[:, None], u_planned), base.command
+
+    def measure_rest(self, values: Mapping[str, torch.Tensor], plan: torch.Tensor) -> torch.Tensor:
+        """Return how far joints will be from the end of a planned path, `(N, J)`."""
+        ahead = self.controller.predict(values["q"], values["u"])
+        return (plan[:, :-1] - ahead) * ~self.exclusive
 
     def aim(self, target_m: torch.Tensor, pitch_rad: torch.Tensor) -> torch.Tensor:
         """Return where the tool point shall end up for targets `(N, 3)` and pitches `(N,)`."""
@@ -406,7 +450,8 @@ class DeployedPolicy(torch.nn.Module):
             values[PITCH] = torch.full_like(observation[:, 0], self._pitch_rad)
         seen = control.process(values)
         # encoding again is not exact to the last bit
-        output = self.network({"policy": observation, "guide": seen.features})
+        groups = {"policy": observation, "guide": seen.features, "joints": seen.joints}
+        output = self.network(groups)
         return control.command(output, seen.base, values.get(PROPOSALS))
 
 

@@ -62,7 +62,7 @@ class HoleRowProcess(ToolPoseProcess):
                 place = shifted["scene"].clone()
                 place[:, :3] += shift_m
                 shifted = shifted | {"target_m": shifted["target_m"] + shift_m, "scene": place}
-                is_good &= search.check(shifted)[-1]
+                is_good &= search.check(shifted)[0][-1]
             found.append({name: value[is_good] for name, value in part.items()})
         drawn = {name: torch.cat([part[name] for part in found])[:count] for name in found[0]}
         return self._judge_starts(drawn)

@@ -20,7 +20,7 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET
-from tasks.control import DeployedPolicy, ToolPoseControl
+from tasks.control import PLAN_DONE, PLAN_END_RAD, DeployedPolicy, ToolPoseControl
 from tasks.process import START, EpisodeProcess
 from tasks.settings import CommandBase, PoseJudgement, ToolPoseTask
 from tasks.starts import DrawTally, StartSearch
@@ -56,7 +56,8 @@ class ToolPoseProcess(EpisodeProcess):
         return shapes
 
     def _list_drawn_shapes(self) -> dict[str, tuple[int, ...]]:
-        return {"target_m": (3,), "target_pitch_rad": (), "closeness": ()}
+        planned = self._machine.num_joints + 1
+        return {"target_m": (3,), "target_pitch_rad": (), "closeness": (), "plan": (planned,)}
 
     def _list_groups(self) -> dict[str, dict[str, ObservedTerm | None]]:
         return {"privileged": self.task.privileged}
@@ -150,9 +151,9 @@ class ToolPoseProcess(EpisodeProcess):
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
-        """Return `policy`, `guide` (`compute_features`) and `privileged` (for the critic only).
+        """Return `policy`, `guide` and `joints` (`ControlInput`), and what is for training only.
 
-        See `TaskProcess.observe`.
+        `privileged` is for the critic, `plan` for an example. See `TaskProcess.observe`.
         """
         state = self.state
         estimate_m = self._estimate_target(shift_m)
@@ -173,7 +174,11 @@ class ToolPoseProcess(EpisodeProcess):
         if self._observed.encoders:
             terms = self._observed.observe(self._make_state(history, state["contact_force_n"]))
             privileged = torch.cat((privileged, terms["privileged"]), 1)
-        return {"policy": seen.vector, "guide": seen.features, "privileged": privileged}
+        plan = state[f"{START}plan"]
+        is_done = self.control.measure_rest(values, plan).abs().amax(1) < PLAN_END_RAD
+        plan[:, -1].masked_fill_(is_done, PLAN_DONE)
+        groups = {"policy": seen.vector, "guide": seen.features, "joints": seen.joints}
+        return groups | {"privileged": privileged, "plan": plan}
 
     def _estimate_target(self, shift_m: torch.Tensor | None) -> torch.Tensor:
         """Return the sensed target, or draw a noisy sample and return the estimate, `(N, 3)`."""
@@ -224,6 +229,14 @@ class ToolPoseProcess(EpisodeProcess):
         """Return the classical controller's action; see `TaskProcess.classical_action`."""
         command, action = groups["guide"][:, : self.num_actions], self.task.action
         return torch.zeros_like(command) if action.kind == "residual" else command / action.scale
+
+    def example_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Return the action of one who knows a clear path; see `TaskProcess.example_action`."""
+        values = self.control.encoder.decode(groups["policy"])
+        fixed_rad = torch.full_like(groups["policy"][:, 0], self.task.fixed_pitch_rad)
+        action = self.task.action
+        u, base = self.control.follow_plan({PITCH: fixed_rad} | values, groups["plan"])
+        return (u - base if action.kind == "residual" else u) / action.scale
 
     def describe(self) -> dict[str, Any]:
         """Return the contract of the `policy` group; see `TaskProcess.describe`."""

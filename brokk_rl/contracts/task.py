@@ -40,6 +40,7 @@ SUCCESS = "success_strict"
 """Figure of `TaskProcess.episode` by which policies are compared: 1 after success, else 0."""
 OPTIONAL = {
     "classical_action": "classical controller",
+    "example_action": "example to imitate",
     "move_target": "target that can be moved",
     "count_starts": "count of the starts that can be done",
     "bring_near": "starts near its target",
@@ -173,6 +174,13 @@ class TaskProcess(ABC):
     def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the classical controller's action, `(N, num_actions)`, for observation groups."""
         self.refuse("classical_action")
+
+    def example_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Return the action that a training may imitate, `(N, num_actions)`.
+
+        Unlike a policy it may use groups of what only a simulator knows.
+        """
+        self.refuse("example_action")
 
     def move_target(self, mask: torch.Tensor, shift_m: torch.Tensor) -> None:
         """Shift the target in the environments of `mask`, `(N,)` bool, by `shift_m`, `(N, 3)`.

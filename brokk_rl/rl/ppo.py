@@ -29,7 +29,6 @@ from torch import nn
 from torch.distributions import Normal
 from torch.nn.utils import get_total_norm
 
-from brokk_rl.contracts.task import Policy
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.rollout import CapturedRollout, pad_columns, run_network
 
@@ -67,12 +66,16 @@ class DevicePPO(PPO):
     _wanted: torch.Tensor
     """`desired_kl`, which may change from update to update."""
     _sums: torch.Tensor
-    _teacher: Policy | None = None
+    _teacher: Callable[[Any], torch.Tensor] | None = None
     _imitation: torch.Tensor
     """Weight of the distance from the teacher."""
 
-    def follow(self, teacher: Policy) -> None:
-        """Follow a teacher, with weight 0 until `set_imitation`; call it before the first step."""
+    def follow(self, teacher: Callable[[Any], torch.Tensor]) -> None:
+        """Follow a teacher, with weight 0 until `set_imitation`; call it before the first step.
+
+        Args:
+            teacher: Returns actions for observation groups.
+        """
         self._teacher = teacher
         self._imitation = torch.zeros((), device=self.device)
 
@@ -255,7 +258,7 @@ class DevicePPO(PPO):
         observations: Any = storage.observations.flatten(0, 1)[order]
         samples = {}
         if self._teacher is not None:
-            samples["wanted"] = self._teacher.act(observations).clamp(-1.0, 1.0)
+            samples["wanted"] = self._teacher(observations).clamp(-1.0, 1.0)
         names = ("actions", "values", "returns", "advantages")
         stored = {name: getattr(storage, name) for name in names}
         stored["log_prob"] = storage.actions_log_prob

@@ -17,7 +17,6 @@ from brokk_rl.policy_folder import TaskDescription, list_checkpoints, read_check
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
 from brokk_rl.rl.settings import REFUSED_CLASSES, TrainingConfig
 
@@ -72,7 +71,8 @@ class TrainingRunner(OnPolicyRunner):
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
             if training.teacher:
-                self.alg.follow(ClassicalPolicy(task=None).build(env, seed=0))
+                env.task.require("example_action", "give rl.teacher=null")
+                self.alg.follow(env.task.example_action)
 
     def run(self) -> None:
         """Train until the budget is spent; save a checkpoint every `save_interval`.

@@ -140,7 +140,7 @@ class Exploration:
 
 @spec
 class Teacher:
-    """The task's classical controller as the example that a training follows at its beginning.
+    """The task's example, which a training follows at its beginning.
 
     Attributes:
         weight: Weight of the mean squared distance between the actions of both at the beginning.

@@ -240,6 +240,16 @@ def test_without_a_compiler_it_says_what_to_do(
         loop.capture(fuse=True)
 
 
+def test_the_example_gets_there_where_the_controller_is_stuck(machine: Machine) -> None:
+    reached = []
+    for name in ("classical_action", "example_action"):
+        loop = make(machine, 64)
+        policy = SimpleNamespace(act=getattr(loop.task, name))
+        found = evaluate_policy(loop, policy, loop.starts, 0, 1)
+        reached.append(found.summary["success_reached"]["mean"])
+    assert reached[0] < 0.95 <= reached[1]
+
+
 NEAR = NearStarts(share=(0.5, 0.0), height_m=(0.05, 0.3), way=(0.0, 0.0))
 
 

@@ -97,15 +97,11 @@ def test_compiled_parts_learn_the_same_as_rsl_rls_own() -> None:
         torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)
 
 
-class _Teacher(MLPModel):
-    act = MLPModel.forward
-
-
-def _teacher() -> _Teacher:
+def _teacher() -> MLPModel:
     torch.manual_seed(7)
     seen = TensorDict({"policy": torch.zeros(1, 7)}, batch_size=[1])
     noise = {"class_name": "GaussianDistribution"}
-    return _Teacher(seen, GROUPS, "actor", 3, (16,), distribution_cfg=noise)
+    return MLPModel(seen, GROUPS, "actor", 3, (16,), distribution_cfg=noise)
 
 
 def test_a_teacher_is_followed_to_its_command() -> None:
