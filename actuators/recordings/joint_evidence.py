@@ -30,6 +30,8 @@ KIND_TEXTS: dict[CommandKind, str] = {
     "position": "a target of the position",
     "torque": "sets a force or torque",
 }
+ADVISED = {"kind": "command", "unit": "unit"}
+"""Key that gives a guess by hand."""
 FOLLOWED = {"position": "position", "velocity": "speed", "torque": "acceleration"}
 """Quantity of the motion that follows each kind of command."""
 NAMED_KINDS: dict[str, CommandKind] = {
@@ -217,10 +219,12 @@ class JointJudge:
         spikes, jumps = find_spikes(q), find_jumps(t_s, q, cause, LONGEST_LAG_S)
         if len(spikes):
             is_mixed = len(spikes) > SPIKE_SHARE * len(q)
-            cause_text = ": two sources, or lost bits" if is_mixed else ""
+            text = f"{len(spikes)} of {len(q)} samples leave their neighbours and come back"
+            asked = "two sources, or lost bits?" if is_mixed else "lost bits?"
             begin_s = t_s[spikes[0]] - t_s[0]
-            text = f"{len(spikes)} of {len(q)} samples leave their neighbours and come back, first at {begin_s:.2f} s{cause_text}"
-            joint.evidence.append((text, -8.0 if is_mixed else -0.5))
+            joint.evidence.append(
+                (f"{text}, first at {begin_s:.2f} s: {asked}", -8.0 if is_mixed else -0.5)
+            )
         if len(jumps):
             row = jumps[0]
             text = (
@@ -283,8 +287,9 @@ class JointJudge:
     ) -> None:
         """Add a guess, with the key that gives it by hand where it is unsure."""
         guess = Guess(f"{self._joint.name}: {what}", value, evidence, (), is_given)
-        remedy = advise({"kind": "command"}.get(key, key)) if key in ("kind", "unit") else ""
-        self._joint.guesses[key] = guess.advise(remedy)
+        if key in ADVISED:
+            guess = guess.advise(advise(ADVISED[key]))
+        self._joint.guesses[key] = guess
 
 
 def _guess_unit(entry: ColumnEntry) -> tuple[str, list[Evidence]]:
@@ -310,7 +315,8 @@ def _check_travel(joint: JointGuess) -> list[Evidence]:
     travel, largest = float(np.ptp(joint.q.values)), float(np.abs(joint.q.values).max())
     turns = largest * abs(joint.scale) / math.tau
     if joint.unit == "rad" and joint.kind == "position" and turns > MOST_TURNS:
-        return [(f"but {largest:.4g} rad is {turns:.2g} turns: degrees?", -5.0)]
+        asked = "degrees?" if joint.scale == 1.0 else "another unit?"
+        return [(f"but {largest * joint.scale:.4g} rad is {turns:.2g} turns: {asked}", -5.0)]
     plain = math.tau if joint.unit == "rad" else 2.0
     if abs(joint.scale) < 1.0 and 0.0 < travel < plain:
         text = f"but it moves by {travel:.2g} of them in all: is the log in {joint.unit}?"

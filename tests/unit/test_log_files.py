@@ -78,19 +78,6 @@ def test_every_kind_of_file_gives_the_same_recording(
     check(recording)
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_columns_of_a_matrix_are_read_from_archives(
-    tmp_path: Path, carriage: Machine, order: str
-) -> None:
-    signals = make_signals()
-    both = np.array(np.stack([signals["u"], signals["q"]], 1), order=order)
-    np.savez(tmp_path / "a.npz", t=signals["t"], both=both, note=np.array("text"))
-    scipy.io.savemat(tmp_path / "b.mat", {"t": signals["t"], "both": both})
-    for name in ("a.npz", "b.mat"):
-        (recording,) = make_map("both[0]", "both[1]").read(tmp_path / name, carriage)
-        check(recording)
-
-
 def write_lerobot(folder: Path, version: str) -> None:
     """Writes two episodes as LeRobot lays them out: a file each, or one file for both."""
     signals = make_signals()

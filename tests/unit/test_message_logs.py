@@ -16,7 +16,6 @@ from log_import import write_messages
 from mcap.writer import Writer
 
 from actuators.recordings.column_map import AlignedTime, Column
-from actuators.recordings.log_files import open_log
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 
@@ -185,26 +184,6 @@ def test_the_sensor_clock_of_a_topic_replaces_a_late_recorder(
     assert errors[1] < 0.1 * errors[0]
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda data: data[: len(data) // 10],
-        lambda data: data[: int(0.98 * len(data))],
-        lambda data: data[: len(data) // 3] + b"\xff\xff" + data[len(data) // 3 + 2 :],
-    ],
-)
-def test_a_damaged_mcap_is_refused_by_its_place(
-    tmp_path: Path, carriage: Machine, damage: Callable[[bytes], bytes]
-) -> None:
-    path = tmp_path / "a.mcap"
-    reader = write_json(path)
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(
-        RecordingError, match=r"a\.mcap: (damaged after \d+ messages|chunk at byte)"
-    ):
-        reader.read(path, carriage)
-
-
 def test_a_damaged_sqlite_bag_is_refused_by_its_name(tmp_path: Path, carriage: Machine) -> None:
     reader = WRITERS["sqlite"](tmp_path / "bag")
     (file,) = (tmp_path / "bag").glob("*.db3")
@@ -267,11 +246,3 @@ def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(
     path.write_text("no log")
     with pytest.raises(RecordingError, match="damaged after 0 messages"):
         reader.read(path, carriage)
-
-
-def test_items_of_lists_keep_their_order(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    write_messages(path, [(0.0, "/state", {"q": list(range(12))})])
-    opened = open_log(path)
-    (run,) = opened.read_runs(opened.list_tables(), None)
-    assert list(run.tables["/state"].columns)[1:] == [f"q[{j}]" for j in range(12)]
