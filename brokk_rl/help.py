@@ -173,8 +173,8 @@ def _list_values(
             continue
         meaning = re.split(r"(?<=[.;]) ", meanings.get(key, ""))[0].rstrip(";.")
         comment = comments.get(key, "")
-        if len(comment.split()) >= NUM_WORDS:  # it says the meaning itself
-            meaning = ""
+        if len(comment.split()) >= NUM_WORDS or comment.lower() == meaning.lower():
+            meaning = ""  # the comment says it itself
         yield key, _format_value(value), "; ".join(filter(None, (meaning, comment)))
     for key, value in inner:
         below = {}
