@@ -26,8 +26,8 @@ import torch
 
 from actuators.effects.ranges import CHANCE, EffectNumber, ParameterRanges, Value
 from actuators.models.parameters import draw_normal, open_valve, select_commands_in_force
+from brokk_rl.commands import select_levers
 from brokk_rl.errors import ConfigError
-from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import spec
 

@@ -1,4 +1,8 @@
-"""Commands of a machine as speeds, and speeds as commands, for each command interface.
+"""From a policy's proposal to the commands of a machine: who gives them, and in which interface.
+
+On the machine a person reads the proposed lever positions and moves the levers, late and
+imperfectly; such a follower is one of `conf/follower`. The neutral one, of which every other is a
+departure, is here.
 
 A program of a policy, an excitation or an inspection thinks in speeds: at 0 a joint rests. Joints
 commanded by position take the integral of such a program as their target, which begins where the
@@ -10,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -18,11 +22,52 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.spec import spec
 
 if TYPE_CHECKING:
     import torch
 
     from brokk_rl.contracts.actuator import ActuatorModel
+
+
+@spec
+class NoFollower:
+    """No person in between: the policy's command is given unchanged and at once."""
+
+    label: ClassVar = "nobody"
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NoFollowerModel:
+        """Return the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""
+        return NoFollowerModel()
+
+
+class NoFollowerModel:
+    """Gives the proposed command."""
+
+    def __init__(self) -> None:
+        self.state: dict[str, torch.Tensor] = {}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Have no memory."""
+
+    def step(self, proposed: torch.Tensor) -> torch.Tensor:
+        """Return `proposed`, `(N, J)`."""
+        return proposed
+
+
+def select_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
+    """Return the levers that are moved, `(N, J)` bool: the `most` of highest `priority`.
+
+    Args:
+        priority: Priority of each lever, `(N, J)`; of equal ones the first counts.
+        most: Number of levers, one for all environments or `(N, 1)`.
+    """
+    import torch  # this module is read by programs that need none
+
+    mine, others = priority[:, :, None], priority[:, None, :]
+    order = torch.arange(priority.shape[1], device=priority.device)
+    before = (others > mine) | ((others == mine) & (order < order[:, None]))
+    return before.sum(2) < most
 
 
 def read_targets(u: np.ndarray, machine: Machine) -> np.ndarray:
@@ -124,7 +169,7 @@ class TargetIntegrator:
     def __init__(
         self, inner: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        import torch  # this module is read by programs that need none
+        import torch
 
         middle, half = _measure_travel(machine)
         rows = np.stack((middle, half, machine.max_speed * machine.period_s))

@@ -8,7 +8,7 @@ times of machine and person are one.
 
 import torch
 
-from brokk_rl.follower import select_levers
+from brokk_rl.commands import select_levers
 from brokk_rl.machine import Machine
 from tasks.settings import AdviceConfig, take_middle
 
