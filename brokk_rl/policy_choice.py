@@ -104,10 +104,15 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
                 "the classical controller acts, for the shipped policy does not fit: %s", error
             )
             cfg.policy = {TARGET: CLASSICAL, "task": None}
-    for node in (cfg.get("rivals") or {}).values():
+    for node in _list_rivals(cfg):
         if node[TARGET] == TRAINED:
             _insert_task(cfg, node)
     return cfg, built
+
+
+def _list_rivals(cfg: DictConfig) -> list[DictConfig]:
+    """Return the policies beside the one; what is none is refused when it is built."""
+    return [node for node in (cfg.get("rivals") or {}).values() if isinstance(node, DictConfig)]
 
 
 def is_going_on(cfg: DictConfig) -> bool:
@@ -312,7 +317,7 @@ def _insert_behaviour(
     if changes:
         cfg.task = after
         own_values = {key: before[key] for key in RIVALS_OWN if key in before}
-        for node in (cfg.get("rivals") or {}).values():
+        for node in _list_rivals(cfg):
             if node[TARGET] == CLASSICAL and own_values:
                 node.task = after | own_values
         if before.get("advice") and not after.get("advice"):

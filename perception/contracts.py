@@ -27,6 +27,7 @@ class Segmenter(Protocol):
 
     def segment(self, frame: Frame) -> Masks:
         """Return masks of the size of the frame."""
+        ...
 
 
 class SegmenterSpec(Protocol):
@@ -34,6 +35,7 @@ class SegmenterSpec(Protocol):
 
     def build(self) -> Segmenter:
         """Return a segmenter."""
+        ...
 
 
 class PoseEstimator(Protocol):
@@ -41,6 +43,7 @@ class PoseEstimator(Protocol):
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is refused; `frame` has no distortion."""
+        ...
 
 
 class PoseEstimatorSpec(Protocol):
@@ -48,6 +51,7 @@ class PoseEstimatorSpec(Protocol):
 
     def build(self) -> PoseEstimator:
         """Return an estimator."""
+        ...
 
 
 @runtime_checkable
@@ -56,6 +60,7 @@ class RejectionExplainer(Protocol):
 
     def explain(self, rejection: Rejection) -> str:
         """Return a sentence: the refused candidate, the reason, and a remedy."""
+        ...
 
 
 @runtime_checkable
@@ -65,6 +70,8 @@ class HoleFollower(Protocol):
     @property
     def search_every(self) -> int:
         """Frames of which one is to be searched as a whole."""
+        ...
 
     def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
         """Return those of some holes, seen before, that are still where they were."""
+        ...

@@ -27,6 +27,7 @@ class ActuatorModel(Protocol):
     @property
     def state(self) -> dict[str, torch.Tensor]:
         """Internal state by name, each `(N, …)`; written in place. Empty without memory."""
+        ...
 
     def reset(self, mask: torch.Tensor) -> None:
         """Put the environments of `mask`, `(N,)` bool, into the state of a machine at rest."""
@@ -37,6 +38,7 @@ class ActuatorModel(Protocol):
         `history.u[:, -1]` is the command that has just come into force, `history.q[:, -1]` the
         position at this moment.
         """
+        ...
 
 
 class SensingModel(ActuatorModel, Protocol):
@@ -49,15 +51,19 @@ class SensingModel(ActuatorModel, Protocol):
     @property
     def sides(self) -> frozenset[str]:
         """`measurement` where `measure` matters, `kinematics` where `misplacement` does."""
+        ...
 
     def measure(self, q: torch.Tensor) -> torch.Tensor:
         """Return the sensor readings at the true positions `q`, `(N, J)`."""
+        ...
 
     def truth(self, q: torch.Tensor) -> torch.Tensor:
         """Return likely true positions for readings `q`, `(N, J)` or `(N, H, J)`."""
+        ...
 
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
         """Return the controller's error in a target near the tool at `q`, `(N, 3)` in m."""
+        ...
 
 
 class Actuator(Protocol):
@@ -65,6 +71,7 @@ class Actuator(Protocol):
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
         """Return a model for `num_envs` environments on `device`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -100,6 +107,7 @@ class Excitation(Protocol):
     @property
     def share(self) -> float:
         """Part of the time, relative to the others of a plan; above 0."""
+        ...
 
     def segments(
         self, machine: Machine, duration_s: float, generator: np.random.Generator
@@ -115,6 +123,7 @@ class Excitation(Protocol):
         Raises:
             ConfigError: not a single segment fits into `duration_s`.
         """
+        ...
 
 
 class Effect(Protocol):
@@ -124,6 +133,7 @@ class Effect(Protocol):
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
     ) -> ActuatorModel:
         """Return `model` with the effect added; with the effect's neutral value nothing changes."""
+        ...
 
 
 class FollowerModel(Protocol):
@@ -136,6 +146,7 @@ class FollowerModel(Protocol):
     @property
     def state(self) -> dict[str, torch.Tensor]:
         """Complete state by name, each `(N, …)`; written in place. Empty without memory."""
+        ...
 
     def reset(self, mask: torch.Tensor) -> None:
         """Put a new person at the levers in the environments of `mask`, `(N,)` bool.
@@ -149,6 +160,7 @@ class FollowerModel(Protocol):
         `proposed`, `(N, J)`, is the proposal from now on. Where no proposal moves an
         exclusive joint together with others, the given command does not either.
         """
+        ...
 
 
 class Follower(Protocol):
@@ -156,3 +168,4 @@ class Follower(Protocol):
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> FollowerModel:
         """Return followers for `num_envs` environments on `device`."""
+        ...

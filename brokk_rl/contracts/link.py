@@ -21,9 +21,11 @@ class Link(Protocol):
 
     def read(self) -> JointState:
         """Return the newest measured state; its `t_s` is the clock of the control periods."""
+        ...
 
     def send(self, command: Command) -> Command:
         """Send a command and returns the command that was really sent."""
+        ...
 
     def __enter__(self) -> Link: ...
 
@@ -36,6 +38,7 @@ class Connection(Protocol):
     @property
     def source(self) -> str:
         """Source that recordings name."""
+        ...
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> Link:
         """Return a link, not yet opened, to `num_runs` machines side by side.
@@ -45,3 +48,4 @@ class Connection(Protocol):
         Raises:
             ConfigError: there are not as many machines.
         """
+        ...

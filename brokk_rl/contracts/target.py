@@ -57,9 +57,11 @@ class TargetSensor(Protocol):
             measured_q: The same as the machine's sensors tell them.
             plan: Plan of the coming motion.
         """
+        ...
 
     def summarize(self) -> dict[str, Any]:
         """Return figures of the episodes that ended since `begin`, as JSON data."""
+        ...
 
 
 class TargetSensorSpec(Protocol):
@@ -67,3 +69,4 @@ class TargetSensorSpec(Protocol):
 
     def sense(self, machine: Machine, num_envs: int, seed: int) -> TargetSensor:
         """Return a sensor for `num_envs` environments; the same seed gives the same errors."""
+        ...

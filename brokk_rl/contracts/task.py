@@ -275,6 +275,7 @@ class Task(Protocol):
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""
+        ...
 
 
 class Policy(Protocol):
@@ -282,3 +283,4 @@ class Policy(Protocol):
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the action for the observation groups, shape `(N, num_actions)`."""
+        ...

@@ -259,6 +259,7 @@ class BoreholeFinder(Protocol):
         Raises:
             FrameError: the frame cannot be used; its message says why.
         """
+        ...
 
 
 class FinderSpec(Protocol):
@@ -266,6 +267,7 @@ class FinderSpec(Protocol):
 
     def build(self) -> BoreholeFinder:
         """Return a finder."""
+        ...
 
 
 class HoleTracker(Protocol):
@@ -273,6 +275,7 @@ class HoleTracker(Protocol):
 
     def update(self, holes: Sequence[HolePose], t_s: float) -> Sequence[TrackedHole]:
         """Take the holes of the frame at `t_s`, possibly none; return all known ones by name."""
+        ...
 
 
 class TrackerSpec(Protocol):
@@ -280,6 +283,7 @@ class TrackerSpec(Protocol):
 
     def build(self) -> HoleTracker:
         """Return a tracker that has seen nothing yet."""
+        ...
 
 
 class FrameSource(Protocol):
@@ -288,6 +292,7 @@ class FrameSource(Protocol):
     @property
     def num_frames(self) -> int | None:
         """Number of frames; `None` for a live source."""
+        ...
 
     def read_latest(self) -> Frame | None:
         """Return the newest frame not returned yet, from disk the next one; `None` at the end.
@@ -296,6 +301,7 @@ class FrameSource(Protocol):
             FrameError: this frame cannot be used, its message says which and why; the next call
                 goes on with the next frame.
         """
+        ...
 
     def __enter__(self) -> FrameSource: ...
 
@@ -317,6 +323,7 @@ class AimedSource(Protocol):
         Returns:
             The view and the reason; `None` before the positions are known.
         """
+        ...
 
 
 class FrameSourceSpec(Protocol):
@@ -324,3 +331,4 @@ class FrameSourceSpec(Protocol):
 
     def build(self) -> FrameSource:
         """Return a source, not yet opened."""
+        ...

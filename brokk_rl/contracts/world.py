@@ -59,6 +59,7 @@ class World(Protocol):
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of everything that must be stored to go on exactly."""
+        ...
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a copy that `state_dict` returned."""
@@ -79,6 +80,7 @@ class ExplainedWorld(Protocol):
 
     def explain_faults(self) -> str:
         """Return why worlds became faults since the last call, in one line; waits for the device."""
+        ...
 
 
 class Simulator(Protocol):
@@ -91,3 +93,4 @@ class Simulator(Protocol):
 
     def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:
         """Return a world on `device`; `num_worlds` overrides the configured number."""
+        ...

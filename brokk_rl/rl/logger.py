@@ -68,6 +68,7 @@ class Tracking(Protocol):
         The run goes on at the iteration `step`: what an earlier process stored from there on is
         replaced.
         """
+        ...
 
 
 @spec

@@ -37,6 +37,7 @@ class PolicySpec(Protocol):
 
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Return the policy for the control loop."""
+        ...
 
 
 @spec

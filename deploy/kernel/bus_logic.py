@@ -80,9 +80,11 @@ class MotionObserver(Protocol):
     @property
     def observation(self) -> Observation:
         """The newest result."""
+        ...
 
     def is_due(self, now_s: float) -> bool:
         """Return whether a control period has gone by since the last update."""
+        ...
 
     def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool) -> None:
         """Take in a control period: positions at its end, mean flow, whether contact may hold the arm."""

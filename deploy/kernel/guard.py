@@ -213,6 +213,7 @@ class CommandEnvelope(Protocol):
         is_seen: bool,
     ) -> tuple[Numbers, bool]:
         """Return the command within the envelope, and whether it was withheld."""
+        ...
 
 
 class Guard:

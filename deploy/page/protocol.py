@@ -304,18 +304,23 @@ class PageFeed(Protocol):
 
         It tells at little cost whether `read_state` has a new one.
         """
+        ...
 
     def read_state(self) -> PageState:
         """Return the newest state."""
+        ...
 
     def read_frame(self, after_s: float) -> Frame | None:
         """Return the newest frame if it is later than `after_s`, else `None`."""
+        ...
 
     def submit(self, request: OperatorRequest) -> bool:
         """Pass a request on; return whether it was accepted."""
+        ...
 
     def confirms_stop(self) -> bool:
         """Return whether the guard sends nothing any more, after the last `stop` was submitted."""
+        ...
 
 
 class FeedSpec(Protocol):
@@ -323,3 +328,4 @@ class FeedSpec(Protocol):
 
     def build(self, machine: Machine) -> PageFeed:
         """Return the feed."""
+        ...

@@ -227,6 +227,7 @@ class BenchSpec(Protocol):
 
     def companions(self, machine: Machine, session: Session) -> Sequence[CompanionProcess]:
         """Return the processes to run beside the loop."""
+        ...
 
 
 def _write_timing_report(memory: LoopMemory, session: Session) -> None:

@@ -57,6 +57,7 @@ class TargetProvider(Protocol):
         Raises:
             ConfigError: its source is invalid.
         """
+        ...
 
 
 class TargetSpec(Protocol):
@@ -64,6 +65,7 @@ class TargetSpec(Protocol):
 
     def build(self) -> TargetProvider:
         """Return it at work."""
+        ...
 
 
 @spec

@@ -124,6 +124,7 @@ class FrameBus(Protocol):
 
     def recv(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, `None` when none came in time."""
+        ...
 
     def send(self, frame: CanFrame) -> None:
         """Send a frame."""

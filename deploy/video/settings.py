@@ -23,6 +23,7 @@ class VideoCamera(Protocol):
         Raises:
             FrameError: there is no such camera.
         """
+        ...
 
 
 @spec

@@ -43,6 +43,7 @@ class VideoSource(Protocol):
         Raises:
             FrameError: the camera is lost.
         """
+        ...
 
 
 class TestPattern:

@@ -59,6 +59,7 @@ class CameraProcess(Protocol):
         self, light: np.ndarray, exposure: CameraExposure, generator: np.random.Generator
     ) -> np.ndarray:
         """Return the picture, RGB, `(h, w, 3)` uint8, of light, `(h, w, 3)` float32."""
+        ...
 
 
 class LinearCamera:

@@ -105,20 +105,25 @@ class Solid(Protocol):
     @property
     def role(self) -> str:
         """`block`, `arm`, `ground` or `clutter`."""
+        ...
 
     @property
     def materials(self) -> tuple[Material, ...]:
         """One for each part."""
+        ...
 
     @property
     def corners_m(self) -> np.ndarray | None:
         """Points, `(K, 3)`, whose convex hull holds the solid; `None` for one without end."""
+        ...
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
         """Return where rays meet the solid first."""
+        ...
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describe the surface at points, `(M, 3)`; `to_sun` is the unit vector to the light."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -40,16 +40,20 @@ class CameraDevice(Protocol):
 
     def open(self) -> LensCalibration:
         """Open the camera; raises a `FrameError` when that fails."""
+        ...
 
     def capture(self, timeout_s: float) -> RawCapture | None:
         """Wait for a new capture; `None` when there is none within the time."""
+        ...
 
     @property
     def has_ended(self) -> bool:
         """True once no capture will come any more: a recording is at its end."""
+        ...
 
     def now_s(self) -> float:
         """Return the time on the clock by which captures are stamped."""
+        ...
 
     def close(self) -> None:
         """Close the camera; may be called twice."""

@@ -56,6 +56,7 @@ class OperatorModel(Protocol):
             rim_in_base_m: Centre of the hole's rim, `(3,)`; the model adds its errors of vision.
             advice: Commands that are advised, `(J,)`; NaN where none is shown.
         """
+        ...
 
 
 class Operator(Protocol):
@@ -63,6 +64,7 @@ class Operator(Protocol):
 
     def build(self, machine: Machine, person: Person) -> OperatorModel:
         """Return a model of the operator `person`."""
+        ...
 
 
 class Hands:
