@@ -112,7 +112,9 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
 
 def _list_rivals(cfg: DictConfig) -> list[DictConfig]:
     """Return the policies beside the one; what is none is refused when it is built."""
-    return [node for node in (cfg.get("rivals") or {}).values() if isinstance(node, DictConfig)]
+    rivals = cfg.get("rivals")
+    nodes = rivals.values() if isinstance(rivals, DictConfig) else ()
+    return [node for node in nodes if isinstance(node, DictConfig)]
 
 
 def is_going_on(cfg: DictConfig) -> bool:

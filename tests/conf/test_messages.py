@@ -199,7 +199,6 @@ VALUES = {
     "mode=compare compare.runs=[1]": "compare.runs",
     "mode=inspect inspect.recordings=3": "inspect",
     "mode=render render.count=0": "render.count: expected",
-    "mode=evaluate rivals.classical=none": "rivals.classical",
     "mode=export policy=classical": "this mode takes a network",
     "mode=why log=x policy=classical": "this mode takes a network",
     "mode=train policy=classical": "this mode takes a network",
@@ -218,6 +217,8 @@ VALUES = {
 """Words of a command whose number or word nothing can use, and a part of its message."""
 WRONG |= {tuple(words.split()): (told,) for words, told in VALUES.items()}
 AFTER_TORCH = {
+    ("mode=evaluate", "rivals.classical=none"): ("rivals.classical: expected an option",),
+    ("mode=evaluate", "rivals=none"): ("rivals: expected a table",),
     ("mode=check", "subject=arm"): ("subject: expected a table with model, name",),
     ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
     ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
