@@ -61,7 +61,6 @@ class EffectSpec:
         weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
-        alike: Whether a shared effect has about the same size on all joints.
         running: Name of the number that is the time since the machine was started. That number is
             known and not fitted.
         interfaces: Quantities commanded of the machines that it is on; see `Machine.interface`.
@@ -83,7 +82,6 @@ class EffectSpec:
     placed: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
-    alike: ClassVar[bool] = True
     running: ClassVar[str | None] = None
     interfaces: ClassVar[frozenset[str]] = frozenset({"speed"})
     variants: ClassVar[Mapping[str, type[EffectSpec]]] = MappingProxyType({})

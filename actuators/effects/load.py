@@ -102,7 +102,6 @@ class FlowSharing(EffectSpec):
 
     side = "joints"
     shared = True
-    alike = False  # a boom asks the pump for more than a slewing gear
     numbers: ClassVar = {"demand": EffectNumber("1", none=0.0, typical=0.7, bounds=(0.0, 4.0))}
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
