@@ -16,16 +16,16 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 REGIMES = (
-    "hold",
-    "stop",
+    "at rest",
+    "just after stops",
     "near an end stop",
     "after a reversal",
-    "start",
-    "creep",
-    "several joints at once",
-    "cruise",
+    "at starts",
+    "at small commands",
+    "while several joints move",
+    "at larger commands, alone",
 )
-"""The first that fits is a sample's only one: at rest (just come to rest: `stop`), else commanded
+"""The first that fits is a sample's only one: at rest (or just come to rest), else commanded
 near an end of its travel, else shortly after a change of direction (whatever time it rested in
 between), else shortly after rest, else by a small command, else together with other joints, else
 alone."""

@@ -171,26 +171,7 @@ def _describe_place(answer: Answer) -> str:
     joint, gap = max(answer.where.joints.items(), key=lambda pair: pair[1].share)
     regime = next((one for one in answer.where.regimes if one.joint == joint), None)
     text = f"; {100 * gap.share:.0f} % of it lies in {joint}"
-    return text + (
-        f", most of that ({100 * regime.share:.0f} %) {describe_regime(regime.regime)}"
-        if regime
-        else ""
-    )
-
-
-def describe_regime(regime: str) -> str:
-    """Return a regime as a phrase of a sentence."""
-    phrases = {
-        "hold": "at rest",
-        "stop": "just after stops",
-        "start": "at starts",
-        "creep": "at small commands",
-    }
-    phrases |= {
-        "cruise": "at larger commands, alone",
-        "several joints at once": "while several joints move",
-    }
-    return phrases.get(regime, regime)
+    return text + (f", most of that ({100 * regime.share:.0f} %) {regime.regime}" if regime else "")
 
 
 def _format_share(value: Estimate, of: str = "") -> str:

@@ -164,16 +164,7 @@ class Writer:
         self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
         self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
         self._created, self._begin_s = record.format_now(), 0.0
-        self._template = record.Recording(
-            machine=machine.name,
-            joints=machine.joint_names,
-            units=tuple(joint.unit for joint in machine.joints),
-            rate_hz=1.0 / machine.period_s,
-            t_s=np.empty(0),
-            u=np.empty(0),
-            q=np.empty(0),
-            metadata=metadata,
-        )
+        self._machine, self._metadata = machine, metadata
         self._part, self._samples, self._written = 0, [], time.monotonic()
         self.files, self.recorded_s = 0, 0.0
 
@@ -213,12 +204,17 @@ class Writer:
         for name in samples[0].extra:
             extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
         for n, name in enumerate(self._names):
-            metadata = {
-                **self._template.metadata,
-                "created": record.add_seconds(self._created, begin_s - self._begin_s),
-                "run": f"{name} {self._created}",
-            }
-            columns = {key: values[n] for key, values in extra.items()}
-            motion = {"t_s": track.t_s - begin_s, "u": track.u[:, n], "q": track.q[:, n]}
-            recording = replace(self._template, **motion, extra=columns, metadata=metadata)
+            motion = record.make_motion(
+                self._machine,
+                f"{name} {self._created}",
+                track.t_s - begin_s,
+                track.u[:, n],
+                track.q[:, n],
+            )
+            created = record.add_seconds(self._created, begin_s - self._begin_s)
+            recording = replace(
+                motion,
+                extra={key: values[n] for key, values in extra.items()},
+                metadata={**self._metadata, "created": created, **motion.metadata},
+            )
             record.write_recording(recording, self._folder / f"{name}_{self._part:02d}.parquet")

@@ -66,7 +66,16 @@ def planted(
     return replace(base, simulated=base.simulated + added)
 
 
-@pytest.mark.parametrize("regime", ["creep", "cruise", "after a reversal", "hold", "stop"])
+@pytest.mark.parametrize(
+    "regime",
+    [
+        "at small commands",
+        "at larger commands, alone",
+        "after a reversal",
+        "at rest",
+        "just after stops",
+    ],
+)
 def test_an_error_that_arises_in_one_regime_of_one_joint_is_found_there(
     machine: Machine, regime: str
 ) -> None:
@@ -81,7 +90,8 @@ def test_an_error_that_arises_in_one_regime_of_one_joint_is_found_there(
 def test_two_errors_share_the_gap_as_their_squares_do(machine: Machine) -> None:
     quiet = runs(machine, 4, 0, size=0.0)
     one, other = (
-        planted(quiet, machine, joint, "cruise", speed) for joint, speed in ((1, 0.02), (3, 0.04))
+        planted(quiet, machine, joint, "at larger commands, alone", speed)
+        for joint, speed in ((1, 0.02), (3, 0.04))
     )
     both = replace(quiet, simulated=one.simulated + other.simulated - quiet.simulated)
     squares = [np.nansum(runs.error**2) for runs in (one, other)]
@@ -90,12 +100,12 @@ def test_two_errors_share_the_gap_as_their_squares_do(machine: Machine) -> None:
     assert found.joints["q2"].share == pytest.approx(squares[0] / sum(squares))
     assert found.joints["q4"].share == pytest.approx(squares[1] / sum(squares))
     parts = {(one.joint, one.regime): one.share for one in found.regimes}
-    assert parts["q4", "cruise"] == pytest.approx(found.joints["q4"].share)
+    assert parts["q4", "at larger commands, alone"] == pytest.approx(found.joints["q4"].share)
 
 
 @pytest.mark.parametrize("has_floor", [True, False])
 def test_the_shares_add_up_to_the_whole(machine: Machine, has_floor: bool) -> None:
-    field = planted(runs(machine, 6, 0), machine, 2, "creep", 0.05)
+    field = planted(runs(machine, 6, 0), machine, 2, "at small commands", 0.05)
     field = replace(field, row=field.row + 30)  # the last windows reach beyond the end
     found = locate_gap(field, runs(machine, 12, 1) if has_floor else None, machine)
     assert sum(joint.share for joint in found.joints.values()) == pytest.approx(1.0)
@@ -120,20 +130,24 @@ def test_each_sample_has_the_regime_that_its_command_makes(machine: Machine) -> 
     q = np.tile(machine.home, (200, 1))
     names = np.array(REGIMES)[label_regimes(u, q, machine, 20.0)]
     assert (
-        names[10, 2] == "hold"
-        and names[22, 2] == "start"
-        and names[40, 2] == "creep"
-        and names[70, 2] == "cruise"
+        names[10, 2] == "at rest"
+        and names[22, 2] == "at starts"
+        and names[40, 2] == "at small commands"
+        and names[70, 2] == "at larger commands, alone"
     )
     assert (
         names[85, 2] == "after a reversal"
-        and names[105, 2] == "several joints at once"
-        and names[115, 2] == "cruise"
+        and names[105, 2] == "while several joints move"
+        and names[115, 2] == "at larger commands, alone"
     )
-    assert names[122, 2] == "stop" and names[150, 2] == "hold" and names[165, 2] == "start"
+    assert (
+        names[122, 2] == "just after stops"
+        and names[150, 2] == "at rest"
+        and names[165, 2] == "at starts"
+    )
     q[:, 2] = machine.upper[2] - 0.01
     names = np.array(REGIMES)[label_regimes(u, q, machine, 20.0)]
-    assert names[85, 2] == "near an end stop" and names[150, 2] == "hold"
+    assert names[85, 2] == "near an end stop" and names[150, 2] == "at rest"
 
 
 def test_the_command_in_force_is_that_of_a_dead_time_before() -> None:
