@@ -20,8 +20,8 @@ TIMES = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "n
 """Fields of a time: whole seconds and nanoseconds."""
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[Nn]a[Nn]")
 """A number as text."""
-NO_NUMBERS = ("layout",)
-"""Fields that describe their message."""
+NO_NUMBERS = ("layout", *LABELS)
+"""Fields that describe their message; names of joints may be digits."""
 
 
 def list_numbers(message: Any, path: str = "") -> Iterator[tuple[str, float]]:
@@ -34,6 +34,8 @@ def list_numbers(message: Any, path: str = "") -> Iterator[tuple[str, float]]:
     fields = dict(_list_fields(message))
     labels = next((fields[name] for name in LABELS if _is_names(fields.get(name))), None)
     for name, value in fields.items():
+        if name in NO_NUMBERS:
+            continue
         time_s = read_time(value) if name.endswith("stamp") else None
         if time_s is not None:
             yield f"{path}{name}", time_s
@@ -41,7 +43,7 @@ def list_numbers(message: Any, path: str = "") -> Iterator[tuple[str, float]]:
             yield f"{path}{name}", number
         elif _is_sequence(value):
             yield from _list_items(value, f"{path}{name}", labels)
-        elif name not in NO_NUMBERS:
+        else:
             yield from list_numbers(value, f"{path}{name}.")
 
 

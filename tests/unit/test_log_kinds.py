@@ -23,6 +23,7 @@ from conftest import Done
 from log_import import import_log, try_draft, write_messages
 
 from actuators.recordings.advice import ADVICE
+from actuators.recordings.log_files import open_log
 from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
 from brokk_rl import extensions
 from brokk_rl.errors import RecordingError
@@ -595,13 +596,20 @@ def test_arm_and_wheels_on_one_topic_keep_their_own_rates() -> None:
         content = {"layout": {"data_offset": 0}, "name": names, "target": [row[1], row[3]]}
         messages.append((row[0], "/command", content))
         for part in range(4):
-            content = {"name": ["wheel"], "position": [0.1 * number + 0.02 * part]}
+            content = {"name": ["7"], "position": [0.1 * number + 0.02 * part]}
             messages.append((row[0] + 0.001 + 0.004 * part, "/joint_states", content))
     write_messages("a.mcap", messages)
     done, recordings = import_log("log.input=a.mcap")
     assert done.code == 0, done.err
     assert "2 joints at 50 Hz" in done.out
-    assert "layout" not in done.out
+    columns = open_log(Path("a.mcap")).list_tables()
+    assert [*columns["/joint_states"]] == [
+        "log_time",
+        "position[hip]",
+        "position[knee]",
+        "position[7]",
+    ]
+    assert "layout" not in "".join(columns["/command"])
     check_joints(recordings)
 
 
