@@ -233,6 +233,7 @@ FINGERS = nest("left_finger") + nest("right_finger")
 ARM = ("a", "b", "c")
 MOTORS = "<actuator>" + "".join(f'<motor joint="{name}"/>' for name in ARM) + "</actuator>"
 TABLE = '<joint name="x" type="slide"/><joint name="y" type="slide" axis="0 1 0"/>'
+WELD = '<equality><weld body1="c_link" body2="rod_link"/></equality>'
 LOOP = '<equality><connect body1="slide_link" body2="a_link" anchor="0 0 0"/></equality>'
 
 
@@ -260,6 +261,7 @@ LOOP = '<equality><connect body1="slide_link" body2="a_link" anchor="0 0 0"/></e
             {}, ARM, "box: not of the robot",
         ),
         (SCENE.format(nest("swing", "slide") + nest("a", "b"), LOOP), {}, ("a", "b"), "closes a loop of swing, slide"),
+        (SCENE.format(nest(*ARM) + nest("rod"), WELD), {}, ARM, "closes a loop of rod"),
         (
             SCENE.format(f'<body>{TABLE}{BALL}{nest("a")}</body>', ""),
             {}, ("x", "y", "a"), "no limits",
@@ -332,12 +334,12 @@ def test_meshes_of_a_package_are_found_and_kept(
     folder = tmp_path / "elsewhere" / "arm_description"
     file = tmp_path / "arm_description" / "urdf" / "arm.urdf"
     file.parent.mkdir(parents=True)
-    mesh = (folder if where != "package" else file.parent.parent) / "meshes" / "mast.stl"
+    mesh = (folder if where != "package" else file.parent.parent) / "meshes" / "the mast.stl"
     mesh.parent.mkdir(parents=True)
     trimesh.creation.box((0.2, 0.1, 0.3)).export(mesh)
     if where == "variable":
         monkeypatch.setenv("ROS_PACKAGE_PATH", str(folder.parent))
-    shape = '<visual><geometry><mesh filename="package://arm_description/meshes/mast.stl"/></geometry></visual>'
+    shape = '<visual><geometry><mesh filename="package://arm_description\\meshes/the%20mast.stl"/></geometry></visual>'
     file.write_text(edit('<link name="mast">', f'<link name="mast">{shape}'))
     packages = (str(folder.parent),) if where == "key" else ()
     found = import_file(file, packages=packages)
@@ -400,8 +402,11 @@ def test_drives_that_are_too_stiff_are_named_with_a_stiffness_that_is_not(machin
     assert simulate(calm) is None
 
 
-def test_a_machine_that_is_known_by_its_joints_only_is_no_error() -> None:
+def test_missing_links_and_lengths_and_forces_of_another_unit_are_told(tmp_path: Path) -> None:
     mode = load_mode("mode=check", "machine=mini_excavator", "session.out=unused")
     found = check_machine(mode.machine, 10, np.random.default_rng(0))
     assert found.problems == [] and found.reach == {}
     assert any("recorded and identified" in text for text in found.missing)
+    in_mm = read(edit('xyz="1 0 0"', 'xyz="1000 0 0"'), tmp_path).build()
+    told = " ".join(check_machine(in_mm, 10, np.random.default_rng(0)).missing)
+    assert "m is doubted" in told and "lift: the yield force is less than the weight" in told
