@@ -147,19 +147,6 @@ def test_jacobians_are_the_derivatives_of_the_pose(machine):
         torch.testing.assert_close(jacobian.pitch[..., j], turned / (2 * step), atol=3e-4, rtol=0)
 
 
-def test_leading_dimensions_are_kept(machine):
-    q = _random_positions(machine, 6)
-    kinematics = Kinematics(machine)
-    pose, jacobian = kinematics.pose(q.view(2, 3, 5)), kinematics.jacobian(q.view(2, 3, 5))
-    assert (
-        pose.tip_in_base_m.shape == (2, 3, 3)
-        and pose.pitch_rad.shape == (2, 3)
-        and pose.joints_in_base_m.shape == (2, 3, 5, 3)
-    )
-    assert jacobian.tip.shape == (2, 3, 3, 5) and jacobian.pitch.shape == (2, 3, 5)
-    torch.testing.assert_close(pose.tip_in_base_m[1, 2], kinematics.pose(q[5]).tip_in_base_m)
-
-
 def test_the_weight_on_each_joint_is_mujocos_in_both_libraries(machine):
     model = _mujoco_chain(machine)
     data = mujoco.MjData(model)

@@ -1,7 +1,6 @@
 """From a machine and its MJCF to a model."""
 
 import dataclasses
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,54 +9,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
-from brokk_rl.machine import Dimension, Machine
+from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.machine import Dimension
 from brokk_rl.sim.model import ASSETS, compile_model
 from brokk_rl.sim.scene import ScenePlacement, build_collision_geoms, make_nominal_scenes
-from brokk_rl.sim.simulator import NativeSimulator
-
-SMALL_MJCF = """
-<mujoco>
-  <default><default class="free"><geom type="capsule" contype="0" conaffinity="0"/></default></default>
-  <worldbody>
-    <body name="mast_link"><joint name="mast"/><geom class="free" size="0.1" fromto="0 0 0 0 0 1"/>
-      <body name="swing_link" pos="0 0 1"><joint name="swing"/><geom class="free" size="0.06" fromto="0 0 0 1.5 0 0"/>
-        <body name="lance_link" pos="1.5 0 0"><joint name="lance"/>
-          <geom name="rod" type="capsule" size="0.04" fromto="0 0 -0.4 0 0 -0.96" contype="1" conaffinity="0"/>
-          <site name="tip" pos="0 0 -1"/>
-        </body></body></body>
-  </worldbody>
-</mujoco>"""
 
 
 def _dimension(value: float) -> Dimension:
     return Dimension(value=value, source="test", confidence="high")
-
-
-def _small(machine: Machine, path: Path) -> Machine:
-    """Returns a machine of two hinges and a vertical slide whose MJCF lies at `path`."""
-    path.write_text(SMALL_MJCF)
-    parts = (
-        ("mast", "hinge", (0, 0, 1), (0, 0, 0.1)),
-        ("swing", "hinge", (0, 0, 1), (0, 0, 1)),
-        ("lance", "slide", (0, 0, 1), (1.5, 0, 0)),
-    )
-    joints = tuple(
-        dataclasses.replace(
-            machine.joints[0],
-            name=name,
-            kind=kind,
-            body=dataclasses.replace(
-                machine.bodies[0], axis=axis, origin_m=tuple(_dimension(float(x)) for x in origin)
-            ),
-            home=0.0,
-        )
-        for name, kind, axis, origin in parts
-    )
-    tool = tuple(_dimension(x) for x in (0.0, 0.0, -1.0))
-    return dataclasses.replace(
-        machine, name="small", mjcf=str(path), joints=joints, exclusive=(), levers=(), tool_m=tool
-    )
 
 
 def test_numbers_of_the_machine_stand_in_the_model(machine):
@@ -109,20 +68,6 @@ def test_joints_that_do_not_match_are_named(machine):
     other = dataclasses.replace(machine, joints=machine.joints[:4], levers=())
     with pytest.raises(ConfigError, match=r"missing: none, unknown: q5"):
         compile_model(other, 0.01)
-
-
-def test_a_second_machine_is_only_a_machine_and_an_mjcf(machine, tmp_path):
-    small = _small(machine, tmp_path / "small.xml")
-    world = NativeSimulator(num_worlds=2, substeps=5, num_threads=1).build(small, "cpu")
-    scene = make_nominal_scenes(2)
-    scene[:, 0], scene[:, 2] = 1.5, 0.05
-    start = torch.zeros(2, 3)
-    world.reset(torch.ones(2, dtype=torch.bool), start, scene)
-    for _ in range(40):  # the lance goes down 0.3 m from 0.1 m, into the hole right below it
-        world.step(torch.tensor([[0.0, 0.0, -0.005]]).expand(2, -1))
-    tip = Kinematics(small).pose(world.q).tip_in_base_m
-    torch.testing.assert_close(tip[0], torch.tensor([1.5, 0.0, -0.1]), atol=5e-3, rtol=0)
-    assert not world.faults.any()
 
 
 @pytest.mark.parametrize(("scale", "radius_m"), [(1.0, 0.05), (1.1, 0.045), (0.9, 0.08)])
