@@ -222,19 +222,19 @@ def _check_tree(root: ElementTree.Element, source: ModelSource) -> None:
         kind = joint.get("type", "")
         if kind not in JOINT_TYPES:
             raise source.refuse(f'{where} has type="{kind}"; {list_choices(kind, JOINT_TYPES)}')
+        ends: dict[str, str] = {}
         for tag, key, known in (
             ("parent", "link", links),
             ("child", "link", links),
             ("mimic", "joint", movable),
         ):
             element = joint.find(tag)
-            wanted = "" if element is None else element.get(key, "")
+            ends[tag] = wanted = "" if element is None else element.get(key, "")
             if wanted not in known and not (tag == "mimic" and element is None):
                 raise source.refuse(
                     f"{where}: there is no {tag} {key} '{wanted}'; {list_choices(wanted, known)}"
                 )
-        child = joint.find("child").get("link", "")
-        if child in carriers:
+        if (child := ends["child"]) in carriers:
             raise source.refuse(
                 f"link '{child}' is the child of two joints ({carriers[child]}, {name}): a URDF cannot close a loop; "
                 "leave one out, or give an MJCF with <equality>"
