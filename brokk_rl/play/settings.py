@@ -10,6 +10,7 @@ from annotated_types import Interval
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine
+from brokk_rl.session import Session
 from brokk_rl.spec import Positive, Seed, WorldCount, spec
 
 SPEEDS = (0.1, 10.0)
@@ -47,6 +48,7 @@ class PlaySettings:
     seconds: Positive | None
 
     def check(self) -> None:
+        Session(out=".", seed=self.seed, device=self.device)  # refuses an unknown device
         if self.gamepad is not None:
             Gamepad(Path(self.gamepad), "play.gamepad").close()
 

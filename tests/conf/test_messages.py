@@ -187,6 +187,7 @@ VALUES = {
     "mode=collect excitation.sine.share=[2.0,1.0]": "excitation.sine.share: expected a",
     "mode=play play.gamepad=nowhere": "play.gamepad=nowhere: No such file",
     "mode=play play.gamepad=/dev/null play.gamepad_axes=[1]": "an axis for each of q1",
+    "mode=play play.device=tpu": "play.device: expected auto, cpu, cuda or cuda:<index>, got 'tpu'",
     "mode=play play.port=0": "port: expected a whole number from 1024 to 65535, got 0",
     "mode=bench bench.num_envs=[0]": "num_envs[0]: expected a whole number of 1 or more, got 0",
     "mode=diagnose": "give either case=<folder with reference/ and field/>, or field=<glob>",
