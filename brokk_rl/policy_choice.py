@@ -28,6 +28,7 @@ from brokk_rl.policy_folder import (
     CONTRACT,
     StoredPolicy,
     TaskDescription,
+    find_checkpoint,
     find_policy,
     find_resumed,
     format_value,
@@ -41,7 +42,7 @@ log = logging.getLogger(__name__)
 PLACE = "brokk_rl.rl.policy"
 CLASSICAL, TRAINED = f"{PLACE}.ClassicalPolicy", f"{PLACE}.TrainedPolicy"
 SHIPPED = f"{PLACE}.ShippedPolicy"
-TRAIN = "brokk_rl.modes.train.Train"
+TRAIN, EXPORT = "brokk_rl.modes.train.Train", "brokk_rl.modes.export.Export"
 OLD_KEYS = ("policy.folder", "checkpoint", "start_from", "doctor.policy", "resume")
 """Names that `policy` had in one mode or another. Other modes than training still have `resume`."""
 RIVALS_OWN = ("classical", "advice")
@@ -228,6 +229,8 @@ def _take_over(cfg: DictConfig, built: dict[str, Any]) -> DictConfig:
     A machine that is built and stays is put into `built`.
     """
     stored = find_policy(str(cfg.policy.path), may_lack=cfg.get(RUN) == TRAIN)
+    if cfg.get(RUN) == EXPORT:
+        find_checkpoint(stored.name)
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
         return cfg

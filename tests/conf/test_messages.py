@@ -200,6 +200,7 @@ VALUES = {
     "mode=compare compare.runs=[1]": "compare.runs",
     "mode=inspect inspect.recordings=3": "inspect",
     "mode=render render.count=0": "render.count: expected",
+    "mode=export policy=shipped": "the folder holds no checkpoint",
     "mode=export policy=classical": "this mode takes a network",
     "mode=why log=x policy=classical": "this mode takes a network",
     "mode=train policy=classical": "this mode takes a network",
