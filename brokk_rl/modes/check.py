@@ -246,11 +246,7 @@ def check_machine(machine: Machine, num_poses: int, generator: np.random.Generat
             )
         load = np.abs(Gravity(machine).load(q)).max(0)
         yields = np.array([body.yield_force.value for body in machine.bodies])
-        if weak := [
-            joint.name
-            for joint, is_weak in zip(machine.joints, yields < load, strict=True)
-            if is_weak
-        ]:
+        if weak := np.array(machine.joint_names)[yields < load].tolist():
             found.missing.append(
                 f"{', '.join(weak)}: the yield force is less than the weight in the worst pose. The drive counts it "
                 "beyond the weight, so this is allowed; look at masses (kg) and force limits"
@@ -270,7 +266,7 @@ def check_machine(machine: Machine, num_poses: int, generator: np.random.Generat
         found.missing.append(
             "without joints[].body, tool_m and mjcf it can be recorded and identified, not simulated"
         )
-    guessed = [*_list_guesses(machine.tool_m, "tool_m")]
+    guessed = list(_list_guesses(machine.tool_m, "tool_m"))
     for joint in machine.joints:
         guessed += _list_guesses(joint, joint.name)
     if guessed:

@@ -30,7 +30,7 @@ tool point where the model has none."""
 LEAST_KG = 1e-4
 """Mass below which a link counts as a frame."""
 ELEMENTS = ("equalities", "tendons", "actuators", "sensors", "excludes", "pairs", "keys", "flexes")
-"""Parts of a model that name bodies and joints, and that an arm alone has not."""
+"""Parts of a model that name bodies and joints; an arm alone has none of them."""
 
 
 class ArmModel:
