@@ -73,11 +73,6 @@ def compute_ece(rows: np.ndarray) -> float:
     return float(np.abs(apart).sum() / len(rows))
 
 
-def compute_median(rows: np.ndarray) -> float:
-    """Return the median."""
-    return float(np.median(rows))
-
-
 ONE, SEVERAL, KNOWN = ("one",), ("several",), ("one", "several")
 ROWS: dict[str, tuple[Any, ...]] = {
     "top1": ("one effect: named first", ONE, lambda s: [s.first]),
@@ -98,10 +93,10 @@ ROWS: dict[str, tuple[Any, ...]] = {
     "missed": ("effects called none", KNOWN, lambda s: [s.verdict == "none"]),
     "unknown_auroc": ("AUROC of `unknown`", KINDS, lambda s: [(s.unknown, s.kind == "outside")], compute_auroc),
     "ece": ("calibration error", KINDS, lambda s: s.claims, compute_ece),
-    "parameter_error": ("size: median error", KINDS, lambda s: [one.error for one in s.numbers], compute_median),
+    "parameter_error": ("size: median error", KINDS, lambda s: [one.error for one in s.numbers], np.median),
     "cover_90": ("size: inside 90 %", KINDS, lambda s: [one.in_90 for one in s.numbers]),
     "cover_95": ("size: inside 95 %", KINDS, lambda s: [one.in_95 for one in s.numbers]),
-    "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: drop_none(s.examined), compute_median),
+    "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: drop_none(s.examined), np.median),
     "closed_differs": ("stated closing contradicted", KNOWN, lambda s: drop_none(s.differs)),
     "closed_missing": ("named without closing", KINDS, lambda s: [s.closed is None] if s.named else []),
 }  # fmt: skip

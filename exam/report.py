@@ -60,9 +60,11 @@ def write_report(
     """Write `exam.md`: the exam, the table of all candidates, and by effect what each of them said."""
     kinds = next(iter(tables.values()))["cases"]
     cases = _join_counts({kind: count for kind, count in kinds.items() if count})
+    # labels of the first exams name neither
+    made = f"machine {exam['machine']} ({', '.join(exam['makes'])}), " if "makes" in exam else ""
     parts = [
         f"# Exam of {', '.join(tables)}",
-        f"{exam['num_cases']} cases ({cases}), roughness {exam['roughness']}, seed {exam['seed']}.",
+        f"{exam['num_cases']} cases ({cases}), {made}roughness {exam['roughness']}, seed {exam['seed']}.",
         *([] if exam["sealed"] else [OPEN]),
         STRICT,
         *exam["ledger"],

@@ -158,6 +158,8 @@ class Exam:
             "schema": 2,
             "seed": self.session.seed,
             "sealed": is_exam,
+            "machine": self.machine.name,
+            "makes": list(settings.plants.makes),
             "roughness": settings.roughness,
             "num_cases": len(labels),
         }
