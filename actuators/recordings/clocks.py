@@ -127,7 +127,7 @@ def unwrap(values: np.ndarray, modulus: float | None) -> np.ndarray:
 
 def put_near(values: np.ndarray, near: float, modulus: float) -> np.ndarray:
     """Return unwrapped values moved by whole turns until their median lies next to `near`; same shape."""
-    if modulus < 0.0:  # a sign bit
+    if modulus <= 0.0:  # a sign bit, or none
         return values
     return values + modulus * round((near - float(np.median(values))) / modulus)
 
