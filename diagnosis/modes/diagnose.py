@@ -121,8 +121,13 @@ class Diagnose:
         changes = measured_changes.measure_changes(
             given.reference, given.field, self.machine, self.diagnosis.repeatability
         )
-        more = {**found.answer.more, "changes": measured_changes.list_changes(changes)}
-        return replace(found, answer=replace(found.answer, more=more))
+        told = found.answer
+        reason, num_beyond = told.reason, sum(one.is_beyond for one in changes)
+        if told.verdict == "none" and num_beyond:
+            # Efforts and scatter may change where the motion does not.
+            reason += f"; {num_beyond} measured quantities changed beyond what the machine repeats"
+        more = {**told.more, "changes": measured_changes.list_changes(changes)}
+        return replace(found, answer=replace(told, reason=reason, more=more))
 
     def write(self, outcome: Outcome) -> None:
         """Write `diagnosis.json`, `report.html` and `effects.yaml`.

@@ -14,6 +14,8 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library, geometry, sensors
 from diagnosis.case import GapCase
 from diagnosis.effect_library import estimate_interval
+from diagnosis.engine.direct import find_lattice
+from diagnosis.engine.side import stack_side
 
 CPU = torch.device("cpu")
 
@@ -45,7 +47,7 @@ def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine
     reference, field = [swept(machine, 100.0, seed) for seed in (0, 1, 2)], swept(machine, 100.0, 3)
     q = field.q.copy()
     q[:, 1] += 1.5e-3 * np.random.default_rng(4).standard_normal(len(q))
-    q[:, 3] = np.round(q[:, 3] / 0.004) * 0.004
+    q[:, 3] = np.round(q[:, 3] / 0.0037) * 0.0037
     kinds = {kind.name: kind for kind in effect_library.load_effects(machine)}
     rough = GapCase(machine, reference, [dataclasses.replace(field, q=q)])
     found = sensors.find_sensor_noise(rough, kinds["sensor_noise"], 8.0, 12.0)
@@ -144,3 +146,17 @@ def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:
     sizes = np.geomspace(0.5, 2.0, 25)
     mean, low, high = estimate_interval(sizes, -0.5 * np.square((sizes - 1.0) / 0.1))
     assert (mean, low, high) == pytest.approx((1.0, 0.804, 1.196), abs=0.02)
+
+
+def test_a_lattice_that_motion_blurs_in_the_reference_is_no_coarse_sensor(machine: Machine) -> None:
+    """The reference is brought to another rate, so that only its rests lie on the lattice of its encoder."""
+    coarse = []
+    for seed in (0, 1):
+        one = swept(machine, 300.0, seed)
+        coarse.append(dataclasses.replace(one, q=np.round(one.q / 0.0037) * 0.0037))
+    fine = swept(machine, 300.0, 0)
+    moved = np.abs(np.gradient(coarse[0].q, axis=0)) > 0.0
+    blurred = dataclasses.replace(coarse[0], q=np.where(moved, fine.q, coarse[0].q))
+    field = stack_side([coarse[1]], machine)
+    assert find_lattice(field, stack_side([fine], machine), 2) > 0.0
+    assert find_lattice(field, stack_side([blurred], machine), 2) == 0.0
