@@ -52,28 +52,30 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     if RUN not in values:
         raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
     nodes = {key: value for key, value in values.items() if key != RUN}
-    if known := registry.list_fields(values[RUN]):  # else its source was not found
+    known = registry.list_fields(values[RUN])
+    if known is not None:
         _check_keys(known, nodes, shared)
     built = build_quick_nodes(values, shared)
     kind = load_class(values[RUN], "")
     own = [field.name for field in fields(kind)]
-    _check_keys(own, nodes, shared)
+    if known is None:  # its source was not found
+        _check_keys(dict.fromkeys(own, " = "), nodes, shared)
     for key in nodes.keys() - built.keys():
         if key in own:
             built[key] = build_node(nodes[key], key)
     return _call(kind, {key: built[key] for key in nodes if key in built}, "")
 
 
-def _check_keys(known: Collection[str], given: Collection[str], shared: Collection[str]) -> None:
-    """Refuse keys that a mode does not have, and a mode that lacks one of its own."""
+def _check_keys(known: Mapping[str, str], given: Collection[str], shared: Collection[str]) -> None:
+    """Refuse keys that a mode does not have, and a mode that lacks one without a default."""
     for key in sorted(given):
         if key not in known and key not in shared:
             raise ConfigError(
                 f"the mode has no '{key}'; {list_choices(key, known)}. A preset or experiment that "
                 "sets it is for other modes: leave it out"
             )
-    for key in known:
-        if key not in given:
+    for key, stated in known.items():
+        if key not in given and " = " not in stated:
             raise ConfigError(
                 f"the mode needs '{key}': give {key}=<option> in place of ~{key} or none"
             )

@@ -176,7 +176,7 @@ def read_attributes(target: str) -> dict[str, str]:
 
 
 def list_fields(target: str) -> dict[str, str] | None:
-    """Return the fields of the class `target` with their annotations, from its source.
+    """Return the fields of the class `target` with annotation and default, from its source.
 
     Nothing is imported. The answer is `None` where the source of the class or of one of its bases
     cannot be found.
@@ -207,7 +207,8 @@ def list_fields(target: str) -> dict[str, str] | None:
             found |= inherited
         for item in node.body:
             if isinstance(item, ast.AnnAssign) and "ClassVar" not in ast.unparse(item.annotation):
-                found[ast.unparse(item.target)] = ast.unparse(item.annotation)
+                field, _, stated = ast.unparse(item).partition(": ")
+                found[field] = stated
     return found
 
 

@@ -65,9 +65,9 @@ def test_the_error_of_an_own_module_is_told_with_its_line(parts: Path) -> None:
 @pytest.mark.parametrize(
     ("head", "base", "fields"),
     [
-        ("from some_parts import Fast", "Fast", {"size_m": "Positive", "rate": "float", "more": "int"}),
-        ("import some_parts as parts", "parts.Fast", {"size_m": "Positive", "rate": "float", "more": "int"}),
-        ("from typing import Generic, TypeVar\nT = TypeVar('T')", "Generic[T]", {"more": "int"}),
+        ("from some_parts import Fast", "Fast", {"size_m": "Positive", "rate": "float", "more": "int = 1"}),
+        ("import some_parts as parts", "parts.Fast", {"size_m": "Positive", "rate": "float", "more": "int = 1"}),
+        ("from typing import Generic, TypeVar\nT = TypeVar('T')", "Generic[T]", {"more": "int = 1"}),
         ("from some_parts import *", "Fast", None),
     ],
 )  # fmt: skip
