@@ -101,6 +101,8 @@ def test_orders_of_legs_and_kinds_are_listed_with_what_undoes_them() -> None:
     orders = set(list_orders(BY_KIND))
     assert tuple(BY_LEG) in orders and invert_order(tuple(BY_LEG)) in orders
     assert tuple(SAME) not in orders
+    long = {"FL": "left_front", "FR": "right_front", "RL": "left_hind", "RR": "right_hind"}
+    assert tuple(BY_LEG) in set(list_orders([long[name[:2]] + name[2:] for name in BY_KIND]))
     known = np.random.default_rng(0).normal(size=(50, 12))
     assert match_order(known, known[:, SHUFFLED]) == tuple(SHUFFLED)
     assert match_order(known, known[:, SHUFFLED] + 1.0) is None
