@@ -294,6 +294,7 @@ def test_another_hand_drives_the_field_of_half_of_the_cases_and_never_the_refere
     words = ("exam_recording=hands", "exam.field.other_hand=[[work],[work]]")
     mode = load_mode(*SMALL, *words, "exam.mix.num_cases=20", f"session.out={tmp_path}")
     exam, questions = mode.exam, mode.questions("")
+    assert mode.excitation["holds"].hold_s == 9.0, "as without another hand"
     recorder = CaseRecorder(mode.machine, exam.plants, "mild", mode.excitation, exam.approach)
     by_person = set()
     for job in recorder.planned(questions, exam.field, "field"):
