@@ -221,7 +221,7 @@ WRONG |= {tuple(words.split()): (told,) for words, told in VALUES.items()}
 AFTER_TORCH = {
     ("mode=evaluate", "rivals.classical=none"): ("rivals.classical: expected an option",),
     ("mode=evaluate", "rivals=none"): ("rivals: expected a table",),
-    ("mode=check", "subject=arm"): ("subject: expected a table with model, name",),
+    ("mode=check", "subject=arm"): ("subject: expected a table with",),
     ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
     ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
     ("--config-dir", "own", "actuator=fails"): ("fails.py, line 2", "squareroot"),
