@@ -9,8 +9,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 AGE = re.compile(r"\*\*Older than its code\.\*\*|Today's code\.|\b(today's|older)\|$", re.M)
@@ -90,3 +92,11 @@ def test_changed_code_makes_a_figure_old_and_a_changed_comment_does_not(
 def test_benchmarks_stay_small() -> None:
     size = sum(path.stat().st_size for path in (ROOT / "benchmarks").rglob("*") if path.is_file())
     assert size < 4e6
+
+
+def test_every_ingredient_of_the_ablation_is_still_there() -> None:
+    text = (ROOT / "benchmarks/diagnosis/ingredients.yaml").read_text()
+    for targets in yaml.safe_load(text).values():
+        for target in targets:
+            with patch(f"diagnosis.{target.removesuffix('()')}", None):
+                pass
