@@ -20,7 +20,8 @@ wp.config.log_level = wp.LOG_ERROR  # that a kernel is compiled or read is no ne
 
 NUM_POSE = 4
 NUM_LOAD = 4
-
+NUM_WAYS = 8
+"""Four other joints, each opened one way or the other."""
 
 DRIFT_SPAN_S = wp.constant(wp.float64(600.0))
 """The drift is the change of speed over ten minutes, so that its prior is that of a working day."""
@@ -136,6 +137,7 @@ def simulate_path(
     load: wp.array[wp.float64],
     stops: wp.array[wp.int32],
     demand: wp.array[wp.float64],
+    opened_others: wp.array2d[wp.float64],
     time_s: wp.array[wp.float64],
     period_s: wp.float64,
     substeps: int,
@@ -202,6 +204,9 @@ def simulate_path(
         for i in range(NUM_LOAD):
             load_out += numbers[c, Place.LOAD_OUT_1 + i] * loads[k, i]
             load_in += numbers[c, Place.LOAD_IN_1 + i] * loads[k, i]
+        for i in range(NUM_WAYS):
+            load_out += numbers[c, Place.OTHERS_OUT_1 + i] * opened_others[k, i]
+            load_in += numbers[c, Place.OTHERS_IN_1 + i] * opened_others[k, i]
         warm = one + numbers[c, Place.DRIFT] * (time_s[k] / DRIFT_SPAN_S - half)
         if numbers[c, Place.THERMAL_SHARE] != zero:
             fading = wp.exp(-time_s[k] / numbers[c, Place.THERMAL_S])
@@ -250,9 +255,9 @@ def simulate_path(
                     )
                 )
             own = wp.abs(speed) / mean_speed
-            asked += own * step
+            asked += speed / mean_speed * step
             total = own + demand[k]
-            cut = one - numbers[c, Place.DROOP] * demand[k]
+            cut = one
             if numbers[c, Place.PUMP_LOAD] * total > one:
                 cut /= numbers[c, Place.PUMP_LOAD] * total
             if numbers[c, Place.DEMAND_LIMIT] > zero and total > numbers[c, Place.DEMAND_LIMIT]:

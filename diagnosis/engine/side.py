@@ -35,6 +35,8 @@ STOP_UNITS = 0.006
 DEVICE = "cpu"
 """A GPU does each of the many small calls in the time of its longest thread: 24,000 steps one after the
 other. On one H100 a case took several minutes, on one core of its host 15 s."""
+OPEN_FLOW = 0.04
+"""Share of its full flow from which on a valve counts as open."""
 MAX_DEMAND = 1.5
 """A joint asks for at most so much flow, over that of its full speed."""
 
@@ -66,6 +68,8 @@ class Side:
         stops: 1 at the upper end of the travel, -1 at the lower, `(J, T)`.
         machine: The machine.
         demand: Flow that all other joints ask for, over that of one at full speed, `(J, T)`.
+        others: How far the valves of up to four other joints are open out and in, 0 to 1, `(J, T, 8)`.
+            The highest load pressure sets the pump, and no valve keeps its own flow quite the same.
     """
 
     u: np.ndarray
@@ -78,6 +82,7 @@ class Side:
     stops: np.ndarray
     machine: Machine = field(repr=False)
     demand: np.ndarray = field(repr=False)
+    others: np.ndarray = field(repr=False)
 
     @property
     def num_samples(self) -> int:
@@ -185,6 +190,7 @@ class Side:
                 load,
                 stops,
                 _send(self.demand[joint]),
+                _send(self.others[joint]),
                 time_s,
                 self.period_s,
                 self.substeps,
@@ -222,13 +228,19 @@ class Side:
         return replace(self, q=q, poses=poses, loads=loads, stops=stops)
 
     def ask_others(self, numbers: Sequence[np.ndarray]) -> None:
-        """Simulate what each joint asks for with its numbers `(P,)`, and set the demand of the others."""
-        flows = []
-        for j, row in enumerate(numbers):
-            flow = self.simulate_flow(j, row)[1][0].astype(float)
-            flows.append(np.clip(flow, 0.0, MAX_DEMAND))
-        total = np.sum(flows, 0)
-        self.demand = np.stack([total - flow for flow in flows])
+        """Simulate what each joint asks for with its numbers `(P,)`, and set what the others see of it."""
+        signed = [self.simulate_flow(j, row)[1][0].astype(float) for j, row in enumerate(numbers)]
+        flows = np.minimum(np.abs(signed), MAX_DEMAND)
+        self.demand = flows.sum(0) - flows
+        ways = np.stack([signed, np.negative(signed)], 2)
+        opened = np.clip(ways / OPEN_FLOW, 0.0, 1.0)
+        self.others = np.zeros((self.num_joints, self.num_samples, kernel.NUM_WAYS))
+        for j in range(self.num_joints):
+            for i, other in enumerate(np.delete(opened, j, 0)):
+                # Behind the fourth joint all others count as one with it.
+                place = min(2 * i, kernel.NUM_WAYS - 2)
+                seen = self.others[j, :, place : place + 2]
+                seen[:] = np.maximum(seen, other)
 
 
 def _send(values: np.ndarray) -> wp.array:
@@ -263,6 +275,7 @@ def stack_side(recordings: Sequence[Recording], machine: Machine) -> Side:
         stops=stops,
         machine=machine,
         demand=np.zeros((machine.num_joints, count)),
+        others=np.zeros((machine.num_joints, count, kernel.NUM_WAYS)),
     )
 
 

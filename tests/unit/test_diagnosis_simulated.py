@@ -135,6 +135,19 @@ def test_a_delayed_lag_is_that_of_scipy(two_joints: Machine) -> None:
     assert np.abs(path - expected[::fine, ...].ravel()).max() < 0.02
 
 
+def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Machine) -> None:
+    u = np.full((300, 2), 0.5)
+    u[:100, 1] = 0.0
+    u[200:, 1] = -0.5
+    side = make_side(two_joints, u)
+    numbers = pure_numbers(others_out_1=0.2, others_out_2=-0.1)
+    side.ask_others([numbers, pure_numbers()])
+    path = side.simulate(0, numbers)[0]
+    ways = [np.ptp(path[first : first + 61]) for first in (20, 120, 220)]
+    # Over 3 s half the command goes 1.5 units: alone, with the other one out, and with it in.
+    assert ways == pytest.approx([1.5, 1.8, 1.35], rel=0.01)
+
+
 def test_rows_do_not_depend_on_those_simulated_beside_them(two_joints: Machine) -> None:
     side = make_side(two_joints, make_commands(20.0, 1))
     base = VALVE.list_values("mean")
