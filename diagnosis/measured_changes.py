@@ -100,8 +100,12 @@ def measure_changes(
         if len(np.unique(day[told])) > 1:
             days = [then[told & (day == one)].mean() for one in np.unique(day[told])]
             between = float(np.std(days, ddof=1))
-        freedom = stats.ttest_ind(later, then[told], equal_var=False).df
-        own = later.var(ddof=1) / len(later) + then[told].var(ddof=1) / told.sum()
+        samples = (later, then[told])
+        counts = np.array([len(sample) for sample in samples])
+        squares = np.array([sample.var(ddof=1) for sample in samples]) / counts
+        own = float(squares.sum())
+        # Degrees of freedom of two means after Welch and Satterthwaite.
+        freedom = own**2 / float((squares**2 / (counts - 1)).sum())
         error = float(np.sqrt(own + between**2))
         change = float(later.mean()) - mean
         half = float(stats.t.ppf(0.975, freedom)) * error

@@ -24,12 +24,12 @@ class Room:
 
 # The bound is the size at the last change of this table. It only falls, until it is the budget.
 ROOMS = (
-    Room(("brokk_rl", "tasks", "conf"), bound=14_191, budget=10_500),
-    Room(("actuators", "diagnosis", "exam"), bound=23_953, budget=16_500),
-    Room(("perception",), bound=11_135, budget=9_500),
-    Room(("deploy",), bound=8_094, budget=7_500),
+    Room(("brokk_rl", "tasks", "conf"), bound=13_968, budget=10_500),
+    Room(("actuators", "diagnosis", "exam"), bound=22_467, budget=16_500),
+    Room(("perception",), bound=11_134, budget=9_500),
+    Room(("deploy",), bound=8_086, budget=7_500),
     Room(("study",), bound=1_816, budget=1_800),
-    Room(("tests",), bound=33_153, budget=25_000),
+    Room(("tests",), bound=32_038, budget=25_000),
     Room(("benchmarks",), bound=2_000, budget=2_000),
 )
 
