@@ -23,15 +23,18 @@ from brokk_rl.record import Recording
 from diagnosis.case import PAUSE_S
 from diagnosis.regimes import shift_by_dead_time
 
-PART_S, MIN_RECORDINGS = 30.0, 3
-"""Length of the parts of recordings that are measured by themselves, s, as in `diagnosis.where`; so many
-recordings stay whole."""
+PART_S = 30.0
+"""Length of the parts of recordings that are measured by themselves, s, as in `diagnosis.where`."""
+MIN_RECORDINGS = 3
+"""So many recordings stay whole."""
 SPAN_S = 0.12
 """Time to either side over which a speed is taken, s."""
 STEADY_S = 1.0
 """Time after which motion, or rest, counts as steady, s."""
-MOVING, RESTING = 0.05, 0.01
-"""Speed over the top speed above which a joint moves; of the command below which it is to rest."""
+MOVING = 0.05
+"""Speed over the top speed above which a joint moves."""
+RESTING = 0.01
+"""Command below which a joint is to rest."""
 LEAST_COMMAND = 0.3
 """Speeds are measured at commands above this, beyond a usual dead band."""
 LEAST_SAMPLES = 10

@@ -23,8 +23,6 @@ MAX_RIVALS = 14
 """Most rivals of the table. Chosen by hand: a screen."""
 MAX_LISTED = 8
 """Most remarks in sight; the rest is folded. Chosen by hand: a screen."""
-MAX_CHANGES = 20
-"""Most measured changes of the table. Chosen by hand: a screen."""
 RIVALS = {
     "hold": "standing still",
     "arx": "ARX with dead-band hinges, fitted to other parts of the field",
@@ -201,7 +199,6 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "rivals": RIVALS,
         "severities": SEVERITIES,
         "max_listed": MAX_LISTED,
-        "max_changes": MAX_CHANGES,
         "earned": _rank_rivals(more.get("evidence")),
         "describe_class": describe_class,
         "describe_bounds": describe_bounds,
