@@ -9,15 +9,12 @@ from typing import Literal
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from brokk_rl.machine import Machine
 from brokk_rl.session import write_bytes
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#8c8c8c"
 PURPLE = "#cc79a7"
 OTHERS = (GREEN, PURPLE, RED, "#56b4e9", "#5b4a9e")
 """Colour-blind-safe palette. Source: Okabe and Ito, Color Universal Design (2008), with a grey."""
-PANEL_INCHES = (3.9, 2.9)
-"""Width and height of a panel, inches; chosen by hand: three panels fill a page."""
 DPI = 150
 """Resolution of pictures, dots an inch: sharp in print at page width; chosen by hand."""
 
@@ -25,23 +22,6 @@ DPI = 150
 def make_figure(width_inches: float, height_inches: float) -> Figure:
     """Return an empty figure whose layout leaves room for labels."""
     return Figure(figsize=(width_inches, height_inches), layout="constrained")
-
-
-def make_joint_panels(machine: Machine, shared: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with one panel a joint, at most three a row.
-
-    Args:
-        machine: Gives the joints.
-        shared: Axes with the same scale in all panels: `x`, `y`, `xy` or nothing.
-    """
-    columns = 2 if machine.num_joints in (2, 4) else min(3, machine.num_joints)
-    rows = -(-machine.num_joints // columns)
-    figure = make_figure(PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows + 0.6)
-    axes = [figure.add_subplot(rows, columns, 1)]
-    share = {f"share{side}": axes[0] for side in shared}
-    for number in range(2, machine.num_joints + 1):
-        axes.append(figure.add_subplot(rows, columns, number, **share))
-    return figure, axes
 
 
 def add_legend(figure: Figure, axis: Axes) -> None:

@@ -26,6 +26,8 @@ from diagnosis.engine.side import Side
 NUM_PARTS = 4
 """Parts of the reference that are left out in turn."""
 FIRST_DELAYS_S = np.arange(0.0, 0.9, 0.05)
+LATE_FACTORS = np.array([1.0, 1.4, 2.0, 2.8, 4.0])
+"""Multiples of the mean from which numbers that are known late begin."""
 POOLED = 0.15
 """Share of the mean of all joints in the variance of each."""
 ENOUGH = 2e-4
@@ -145,6 +147,21 @@ def guess_numbers(side: Side, joint: int) -> np.ndarray:
     return numbers
 
 
+def guess_late(side: Side, joint: int, numbers: np.ndarray) -> np.ndarray:
+    """Return the numbers with those that are known late at the multiple of their mean that fits best, `(P,)`.
+
+    A limit that is never reached has no slope, so that no method of descent would find it.
+    """
+    model = side.model
+    measure = IncrementMeasure(side, PLAIN)
+    places = [model.place[name] for name in model.late]
+    trials = np.repeat(numbers[None], len(LATE_FACTORS), 0)
+    trials[:, places] = np.outer(LATE_FACTORS, model.list_values("mean")[places])
+    found = measure(side.simulate(joint, trials)).astype(float)
+    errors = np.square(measure(side.q[:, joint]) - found).sum(1)
+    return trials[int(np.argmin(errors))]
+
+
 def split_parts(side: Side) -> np.ndarray:
     """Return the part of each sample, `(T,)`: whole recordings where there are enough."""
     edges = side.starts
@@ -164,9 +181,7 @@ def fit_reference(side: Side) -> list[JointBaseline]:
     every = [guess_numbers(side, j) for j in joints]
     every = [fit_numbers(side, j, every[j], plain, 4, tuple(model.late)) for j in joints]
     side.ask_others(every)
-    places = [model.place[name] for name in model.late]
-    for numbers in every:
-        numbers[places] = model.list_values("mean")[places]
+    every = [guess_late(side, j, every[j]) for j in joints]
     every = [fit_numbers(side, j, every[j], plain, 6) for j in joints]
     side.ask_others(every)
     first = [_leave_out(side, j, every[j], PLAIN, None) for j in joints]

@@ -134,7 +134,6 @@ class Decider:
             self.evidence.noises = noises
         self.generic = GenericCauses(self.evidence)
         self.holds = HeldCommands(self.evidence)
-        self.num_joints = reference.num_joints
         self.outside = frozenset(row.effect for row in self.evidence.outside)
 
     def decide(self) -> Decision:
@@ -180,8 +179,9 @@ class Decider:
             can_hold = joints[0].side is evidence.field
             held = self._find_held(joints) if can_hold else None
             found = self._list_findings(joints, table, held)
-            further = [other for other in found if other.effect not in self.outside]
-            further = _drop_names(further, named)
+            names = {other.name for other in named}
+            known = [other for other in found if other.effect not in self.outside]
+            further = [other for other in known if other.name not in names]
             left = max([left, *(other.nats for other in found if other.effect in self.outside)])
             seconds = seconds or further
         verdict = "none"
@@ -211,13 +211,13 @@ class Decider:
     def _describe_clock(self) -> EffectFinding:
         """Return the clock that is late; it is simulated as a dead time of all joints."""
         row = Row("dead_time", (("delay_s", "add", self.clock_late_s),))
-        joints = range(self.num_joints)
+        joints = range(self.evidence.field.num_joints)
         return EffectFinding("dead_time", tuple(joints), SHOWN_NATS, dict.fromkeys(joints, row))
 
     def _find_held(self, joints: Sequence[FieldJoint]) -> EffectFinding | None:
         """Return the likelier of lost frames and jitter with what it earns."""
         hold = _choose_hold(self.holds.find(joints))
-        return None if hold is None else _weigh_hold(hold, self.num_joints)
+        return None if hold is None else _weigh_hold(hold, self.evidence.field.num_joints)
 
     def _find_coarse(self) -> list[int]:
         """Return the joints with a coarse sensor on the field; their steps enter the scale."""
@@ -322,11 +322,3 @@ def _choose_hold(holds: Mapping[str, HeldCourse]) -> HeldCourse | None:
     is_jitter = earned > JITTER_FACTOR * other
     is_jitter |= jitter.share > MOSTLY and earned > 1.05 * other
     return jitter if is_jitter else loss
-
-
-def _drop_names(
-    findings: Sequence[EffectFinding], named: Sequence[EffectFinding]
-) -> list[EffectFinding]:
-    """Return the findings but for those whose name is there already."""
-    names = {one.name for one in named}
-    return [one for one in findings if one.name not in names]

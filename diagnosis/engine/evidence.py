@@ -142,19 +142,14 @@ class RowEvidence:
         self.noises = np.zeros(reference.num_joints)
 
     @cached_property
-    def is_loaded(self) -> np.ndarray:
-        """Which joints carry weight, `(J,)` bool."""
-        return np.abs(self.reference.loads).max((1, 2)) > 1e-3
-
-    @cached_property
     def parts(self) -> list[np.ndarray]:
         """Gain of each row on each part of the reference, nats a second, of each joint `(parts, C)`."""
         return [self._price_joint(j) for j in range(self.reference.num_joints)]
 
     def can_have(self, joint: int) -> np.ndarray:
         """Return which rows a joint can have, `(C,)` bool."""
-        weighs = self.names == "load_dependence"
-        return np.logical_not(weighs) | self.is_loaded[joint]
+        is_loaded = np.abs(self.reference.loads[joint]).max() > 1e-3
+        return (self.names != "load_dependence") | is_loaded
 
     def _price_joint(self, joint: int) -> np.ndarray:
         base, side = self.bases[joint], self.reference

@@ -29,11 +29,9 @@ def swept(machine: Machine, seconds: float, seed: int, noise: float = 3e-4) -> R
         for t in range(count):
             if t % 40 == 0:
                 middle = (machine.lower[j] + machine.upper[j]) / 2
-                level = (
-                    0.0
-                    if random.random() < 0.3
-                    else -np.sign(at - middle + 0.2 * random.standard_normal())
-                )
+                level = 0.0
+                if random.random() >= 0.3:
+                    level = -np.sign(at - middle + 0.2 * random.standard_normal())
             u[t, j], q[t, j] = 0.5 * level, at
             at += 0.5 * level * speed * machine.period_s
     q += noise * random.standard_normal(q.shape)
@@ -62,11 +60,8 @@ def tracked(
     recording: Recording, machine: Machine, bias: np.ndarray, tilt_rad: float, seed: int
 ) -> Recording:
     """Returns a recording with tool points as measured beside a machine whose encoders show too much and whose base is tilted."""
-    tip = (
-        Kinematics(machine, CPU)
-        .pose(torch.as_tensor(recording.q - bias, dtype=torch.float32))
-        .tip_in_base_m.numpy()
-    )
+    true_q = torch.as_tensor(recording.q - bias, dtype=torch.float32)
+    tip = Kinematics(machine, CPU).pose(true_q).tip_in_base_m.numpy()
     turn = np.array(
         [
             [1, 0, 0],

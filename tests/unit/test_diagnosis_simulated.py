@@ -22,6 +22,7 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.case import GapCase
 from diagnosis.engine import holds, sizes
+from diagnosis.engine.baseline import fit_reference
 from diagnosis.engine.decide import Decider
 from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Motion, fit_variance
@@ -137,8 +138,7 @@ def test_a_delayed_lag_is_that_of_scipy(two_joints: Machine) -> None:
 
 def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Machine) -> None:
     u = np.full((300, 2), 0.5)
-    u[:100, 1] = 0.0
-    u[200:, 1] = -0.5
+    u[:, 1] = np.repeat([0.0, 0.5, -0.5], 100)
     side = make_side(two_joints, u)
     numbers = pure_numbers(others_out_1=0.2, others_out_2=-0.1)
     side.ask_others([numbers, pure_numbers()])
@@ -148,14 +148,21 @@ def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Ma
     assert ways == pytest.approx([1.5, 1.8, 1.35], rel=0.01)
 
 
+def test_the_limit_of_a_pump_that_was_always_small_is_found(two_joints: Machine) -> None:
+    numbers = VALVE.list_values("mean").copy()
+    numbers[VALVE.place["pump_load"]] = 0.8
+    side = make_side(two_joints, np.clip(2.0 * make_commands(120.0, 3), -1.0, 1.0))
+    side.ask_others([numbers, numbers])
+    side.q = np.stack([side.simulate(j, numbers)[0] for j in (0, 1)], 1).astype(float)
+    found = [one.numbers[VALVE.place["pump_load"]] for one in fit_reference(side)]
+    assert found == pytest.approx([0.8, 0.8], abs=0.05)
+
+
 def test_rows_do_not_depend_on_those_simulated_beside_them(two_joints: Machine) -> None:
     side = make_side(two_joints, make_commands(20.0, 1))
     base = VALVE.list_values("mean")
-    rows = [
-        Row("dead_time", (("delay_s", "add", 0.2),)),
-        Row("backlash", (("play", "add", 0.02),)),
-        Row("lag", (("command_lag_s", "add", 0.2),)),
-    ]
+    changed = {"dead_time": "delay_s", "backlash": "play", "lag": "command_lag_s"}
+    rows = [Row(effect, ((name, "add", 0.2),)) for effect, name in changed.items()]
     together = side.simulate(1, VALVE.change(base, rows))
     for row, path in zip(rows, together, strict=True):
         alone = side.simulate(1, VALVE.change(base, [row]))[0]
