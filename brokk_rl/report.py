@@ -22,7 +22,7 @@ from brokk_rl.errors import StorageError
 from brokk_rl.plot import draw_png
 
 Tone = Literal["good", "bad", "warn", "plain"]
-"""What sets a summary apart as good news, bad news or a warning."""
+"""Class of a summary: good news, bad news or a warning."""
 BASE = Path(__file__).parent
 """Folder of the base template and its parts."""
 PNG = "image/png"

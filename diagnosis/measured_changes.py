@@ -1,4 +1,4 @@
-"""What changed between two sets of recordings, measured joint by joint, whatever the cause.
+"""Changes between two sets of recordings, measured joint by joint, whatever the cause.
 
 Every quantity is measured in parts of the recordings. Their scatter, and what the machine repeats from day
 to day, give the interval of a change. No simulator takes part. Efforts are optional columns: `current_q1_a`,

@@ -1,4 +1,4 @@
-"""What the columns of a log are: hypotheses that names propose and numbers weigh.
+"""Columns of a log as hypotheses, which names propose and numbers weigh.
 
 Each pair of a command and a position is a hypothesis. Its names give evidence (the same joint), its numbers as
 well (how the motion follows the command). One assignment takes the pairs with the most evidence in all.

@@ -1,4 +1,4 @@
-"""What the numbers of a joint's columns say of it: kind of command, motion, unit and target.
+"""Evidence of the numbers in a joint's columns: kind of command, motion, unit and target.
 
 Each guess is the hypothesis with the most evidence. What a person gives is weighed like a guess: numbers that
 speak against it make it unsure, but it is used as it was given. Axes: `T` samples.

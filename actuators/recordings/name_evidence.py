@@ -1,4 +1,4 @@
-"""What the name of a column says: role, quantity, unit and joint, read from its words."""
+"""Role, quantity, unit and joint of a column, read from the words of its name."""
 
 from __future__ import annotations
 

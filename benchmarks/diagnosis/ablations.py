@@ -1,4 +1,4 @@
-"""What each ingredient of the diagnosis earns: cases with known causes, answered with one of them switched off.
+"""Ablations of the diagnosis: cases with known causes, answered with one ingredient switched off.
 
     python benchmarks/diagnosis/ablations.py <out.json> <exam> [<exam> …] --workers 32
     python benchmarks/diagnosis/ablations.py <out.json> <exam> --without wander ageing

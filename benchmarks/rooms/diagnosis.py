@@ -54,7 +54,7 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "100 simulated cranes of a make that nothing was fitted to, answered once. In half of the cases a person drives the field.",
+        "100 simulated cranes, answered once. Six open cases of this make were seen before: they showed that the limit of a small pump was not fitted. In half of the cases a person drives the field.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 100, "diagnosis", "valve",
     ),
     describe_exam(

@@ -44,7 +44,7 @@ PUSH_S = 0.5
 
 @dataclass(frozen=True)
 class PlayState:
-    """What is drawn of the simulated machines; `N` worlds, `J` joints.
+    """Drawn state of the simulated machines; `N` worlds, `J` joints.
 
     Attributes:
         q: Joint positions, `(N, J)`, rad or m.

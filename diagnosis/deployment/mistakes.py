@@ -1,4 +1,4 @@
-"""What deployment code may do to values wherever they pass, as tables.
+"""Mistakes of deployment code that can spoil values wherever they pass, as tables.
 
 Axes: `T` rows, `C` columns.
 """
@@ -16,7 +16,7 @@ Spoil = Callable[[np.ndarray, float, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Mistake:
-    """What code may do to values wherever they pass.
+    """A mistake that code may make wherever values pass.
 
     Attributes:
         kind: Kind of mistake.

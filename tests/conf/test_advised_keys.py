@@ -1,4 +1,4 @@
-"""What a message tells its reader to type exists: each key, each mode and each option that it names."""
+"""Each key, mode and option that a message tells its reader to type exists."""
 
 from __future__ import annotations
 

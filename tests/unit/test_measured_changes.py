@@ -1,4 +1,4 @@
-"""What is measured to have changed, against what was planted."""
+"""Measured changes are those that were planted."""
 
 from __future__ import annotations
 
