@@ -10,16 +10,17 @@ from __future__ import annotations
 import functools
 import inspect
 import operator
+import re
 import reprlib
 import types
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform
 
-from annotated_types import Ge, Gt, Interval, MinLen
+from annotated_types import Ge, Gt, Interval
 from pydantic import AllowInfNan, BeforeValidator, ConfigDict, Strict, TypeAdapter, ValidationError
 from pydantic import dataclasses as pydantic_dataclasses
 from pydantic_core import ArgsKwargs, CoreSchema, PydanticCustomError, core_schema
@@ -28,8 +29,16 @@ from typing_extensions import get_protocol_members, is_protocol
 from brokk_rl.errors import ConfigError, list_choices
 
 T = TypeVar("T")
-MOST_NAMED = 6
-"""Fields of a table that a message still names. Chosen by hand."""
+WORDS = {
+    "be greater": "be a number greater",
+    "be less": "be a number less",
+    "Input should be": "expected",
+    "dictionary": "table",
+    "tuple": "list",
+    "Tuple should have": "expected",
+    " after validation": "",
+}
+"""Words of pydantic's messages, and those of the people who write YAML."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +51,7 @@ class Ordered:
     def check(self, value: tuple[float, float]) -> tuple[float, float]:
         """Return the range; raise an error of pydantic where it is reversed."""
         if value[0] > value[1]:
-            raise PydanticCustomError("order", "reversed")
+            raise PydanticCustomError("order", "expected (lowest, highest)")
         return value
 
 
@@ -107,7 +116,7 @@ def spec(cls: type[T]) -> type[T]:
         try:
             made.__pydantic_validator__.validate_python(ArgsKwargs((), values), self_instance=self)
         except ValidationError as error:
-            raise _explain(made, error) from None
+            raise _explain(made, error, values) from None
 
     made.__init__ = initialise
     return made
@@ -129,9 +138,9 @@ def require_value(key: str, hint: Any, value: Any) -> Any:
     """
     try:
         return TypeAdapter(_constrain(hint)).validate_python(value)
-    except ValidationError:
-        problem = {"type": "value", "input": value}
-        raise ConfigError(f"{key}: {_describe_problem(problem, hint)}") from None
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        raise ConfigError(f"{key}: {_describe_problem(problem)}") from None
 
 
 def _check(self: Any) -> None:
@@ -151,11 +160,14 @@ class _InstanceOf:
     def check(self, value: Any) -> Any:
         if not is_protocol(self.kind):
             if not isinstance(value, self.kind):
-                raise PydanticCustomError("instance", "another class")
+                raise PydanticCustomError("class", "expected {name}", {"name": self.kind.__name__})
             return value
         members = get_protocol_members(self.kind)
         if lacking := sorted(name for name in members if not _has_member(value, name)):
-            raise PydanticCustomError("members", "lacking", {"lacking": ", ".join(lacking)})
+            text = (
+                f"expected an option of its group ({self.kind.__name__} with {', '.join(lacking)})"
+            )
+            raise PydanticCustomError("members", "{text}", {"text": text})
         return value
 
 
@@ -198,83 +210,53 @@ def _read_whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _explain(kind: type, error: ValidationError) -> SpecError:
-    """Return the error of a spec in the words of its annotations."""
+def _explain(kind: type, error: ValidationError, given: Any) -> SpecError:
+    """Return the error of a spec; its keys are those of the data that was given."""
     problems: dict[str, str] = {}
-    unknown: dict[str, str] = {}
     lacking: dict[str, list[str]] = {}
+    unknown: dict[str, tuple[str, Any]] = {}
     for problem in error.errors(include_url=False):
         *above, last = problem["loc"]
+        table, fields_given = _follow(above, given)
         if problem["type"] == "missing" and isinstance(last, str):
-            lacking.setdefault(_follow(kind, above)[0], []).append(last)
+            lacking.setdefault(table, []).append(last)
         elif problem["type"] == "unexpected_keyword_argument":
-            key, hint = _follow(kind, above)
-            names = [field.name for field in fields(_strip(hint))]
-            unknown.setdefault(key, f"has no field '{last}'; {list_choices(str(last), names)}")
+            unknown.setdefault(table, (str(last), fields_given))
         else:
-            place = above if problem["type"] == "missing" else problem["loc"]
-            key, hint = _follow(kind, place)
-            problems.setdefault(key, _describe_problem(problem, hint))
+            problems.setdefault(_follow(problem["loc"], given)[0], _describe_problem(problem))
     for key, names in lacking.items():
-        if key not in unknown:  # a misspelt field is lacking too
-            problems[key] = f"lacks {', '.join(names)}"
-    return SpecError(kind.__name__, list({**unknown, **problems}.items()))
+        problems[key] = f"lacks {', '.join(names)}"
+    for key, (name, others) in unknown.items():  # a misspelt field is lacking too
+        known = {*others, *lacking.get(key, ())} - {name}
+        problems[key] = f"has no field '{name}'; {list_choices(name, known)}"
+    return SpecError(kind.__name__, list(problems.items()))
 
 
-def _follow(kind: type, place: Sequence[int | str]) -> tuple[str, Any]:
-    """Return the key of a place below a spec, and its annotation.
+def _follow(place: Sequence[int | str], given: Any) -> tuple[str, Any]:
+    """Return the key of a place in the data that was given, and the data there.
 
-    In a union the key ends at the union: pydantic has one error for each of its members.
+    The place of a union goes on with names of its types, at which the key ends.
     """
-    key, hint = "", kind
+    key = ""
     for part in place:
-        inner = _strip(hint)
-        arguments = typing.get_args(inner)
-        if typing.get_origin(inner) in (Union, types.UnionType):
+        try:
+            given = given[part]
+        except (KeyError, IndexError, TypeError):
             break
-        if isinstance(inner, type) and is_dataclass(inner):
-            hints = typing.get_type_hints(inner, include_extras=True)
-            key, hint = f"{key}.{part}", hints.get(str(part), Any)
-        elif typing.get_origin(inner) is dict:
-            key, hint = f"{key}.{part}", arguments[1]
-        elif isinstance(part, int) and arguments:
-            repeated = arguments[-1] is ... or typing.get_origin(inner) is list
-            key, hint = f"{key}[{part}]", arguments[0 if repeated else part]
-    return key.lstrip("."), hint
+        key += f"[{part}]" if isinstance(part, int) else f".{part}"
+    return key.lstrip("."), given
 
 
-def _strip(hint: Any) -> Any:
-    """Return an annotation without its constraints and without `None`."""
-    while typing.get_origin(hint) is Annotated:
-        hint = typing.get_args(hint)[0]
-    if typing.get_origin(hint) in (Union, types.UnionType):
-        others = [item for item in typing.get_args(hint) if item is not type(None)]
-        if len(others) == 1:
-            return _strip(others[0])
-    return hint
-
-
-def _describe_problem(problem: Any, hint: Any) -> str:
-    value = problem["input"]
-    end = ""
-    if problem["type"] == "members" and isinstance(value, (str, int, float, list)):
-        return f"expected an option of its group (a {describe_hint(hint)}), got {_show(value)}"
-    if problem["type"] == "members":
-        end = f" without {problem['ctx']['lacking']}"
-    near = get_close_matches(str(value), _list_words(hint), n=1)
-    if near:
-        end = f"; did you mean '{near[0]}'?"
-    return f"expected {describe_hint(hint)}, got {_show(value)}{end}"
-
-
-def _list_words(hint: Any) -> list[str]:
-    """Return the words that an annotation allows by `Literal`."""
-    if typing.get_origin(hint) is Literal:
-        return [str(word) for word in typing.get_args(hint)]
-    words = []
-    for item in typing.get_args(hint):
-        words += _list_words(item)
-    return words
+def _describe_problem(problem: Any) -> str:
+    """Return what pydantic expected, in the words of YAML, and what came."""
+    text, value = problem["msg"], problem["input"]
+    if problem["type"] == "missing":
+        return f"expected more than {problem['loc'][-1]} values, got {_show(value)}"
+    for word, ours in WORDS.items():
+        text = text.replace(word, ours)
+    choices = re.findall(r"'(.+?)'", problem.get("ctx", {}).get("expected", ""))
+    near = get_close_matches(str(value), choices, n=1)
+    return f"{text}, got {_show(value)}" + (f"; did you mean '{near[0]}'?" if near else "")
 
 
 def _show(value: Any) -> str:
@@ -285,52 +267,3 @@ def _show(value: Any) -> str:
     if isinstance(value, (str, list, tuple, dict)):
         return reprlib.repr(value)
     return type(value).__name__
-
-
-def describe_hint(hint: Any) -> str:
-    """Return in words which values an annotation allows: `a finite number above 0 or null`."""
-    arguments = typing.get_args(hint)
-    origin = typing.get_origin(hint)
-    if origin is Annotated:
-        return _describe_constrained(arguments[0], hint.__metadata__)
-    if origin in (Union, types.UnionType):
-        return " or ".join(map(describe_hint, arguments))
-    if origin is Literal:
-        return "one of " + ", ".join(map(repr, arguments))
-    if origin in (tuple, list) and arguments:
-        if origin is list or arguments[-1] is ...:
-            return f"a list, each item {describe_hint(arguments[0])}"
-        items = list(map(describe_hint, arguments))
-        if len(set(items)) == 1:
-            return f"a list of {len(items)}, each {items[0]}"
-        return f"a list of {', '.join(items)}"
-    if origin is dict and arguments[1] is not Any:
-        return f"a table, each value {describe_hint(arguments[1])}"
-    if is_dataclass(hint):
-        names = [field.name for field in fields(hint)]
-        return f"a table with {', '.join(names[:MOST_NAMED])}{', …' * (len(names) > MOST_NAMED)}"
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
-    words |= {type(None): "null", Any: "a value", tuple: "a list", list: "a list", dict: "a table"}
-    return words.get(origin or hint) or getattr(hint, "__name__", str(hint))
-
-
-def _describe_constrained(inner: Any, constraints: Sequence[Any]) -> str:
-    text = describe_hint(inner)
-    bounds: dict[str, Any] = {}
-    for constraint in constraints:
-        for name in ("gt", "ge", "lt", "le"):
-            bound = getattr(constraint, name, None)
-            if bound is not None:
-                bounds[name] = bound
-        if isinstance(constraint, Ordered):
-            text = f"(lowest, highest), {text}"
-        if isinstance(constraint, MinLen):
-            text = f"{text}, at least {constraint.min_length} of them"
-    if {"ge", "le"} <= bounds.keys():
-        return f"{text} from {bounds['ge']:g} to {bounds['le']:g}"
-    if any(isinstance(constraint, AllowInfNan) for constraint in constraints):
-        text = text.replace("a number", "a finite number")
-    words = {"gt": "above {:g}", "ge": "of {:g} or more", "lt": "below {:g}", "le": "up to {:g}"}
-    for name, bound in bounds.items():
-        text = f"{text} {words[name].format(bound)}"
-    return text

@@ -95,7 +95,7 @@ def test_a_sweep_takes_files_beside_options(
     assert done.code == 2
     for job in (0, 1):  # each was composed, and refused for its size alone
         (message,) = (one for one in caplog.messages if one.startswith(f"job {job} failed"))
-        assert "num_envs[0]: expected a whole number of 1 or more, got 0" in message
+        assert "num_envs[0]: expected a number greater than or equal to 1, got 0" in message
     assert not (tmp_path / "sweep").exists()
 
 

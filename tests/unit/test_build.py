@@ -40,10 +40,10 @@ def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("node", "message"),
     [
-        (FAST | {"size_m": -1}, "a.b.size_m: expected a finite number above 0, got -1 (change a.b.size_m=…"),
+        (FAST | {"size_m": -1}, "a.b.size_m: expected a number greater than 0, got -1 (change a.b.size_m=…"),
         (FAST | {"rate": 3.0}, "a.b.rate: expected up to 2.0, got 3.0 (change a.b.rate=…"),
         (FAST | {"siez_m": 1}, "a.b: has no field 'siez_m'; did you mean 'size_m'?"),
-        ([FAST, FAST | {"rate": "x"}], "a.b[1].rate: expected a finite number, got 'x'"),
+        ([FAST, FAST | {"rate": "x"}], "a.b[1].rate: expected a valid number, got 'x'"),
         ({"_target_": "nowhere.at.All"}, "nowhere.at.All: there is no module 'nowhere'"),
         ({"_target_": "some_parts.Fest"}, "the module 'some_parts' has no 'Fest' (in 'a.b': change a.b.<field>=…"),
     ],

@@ -73,16 +73,17 @@ def test_values_are_taken_as_people_write_them() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        *[("steps", value, "Budget.steps: expected a whole number of 1 or more or null, got")
-          for value in (1.5, float("nan"), float("inf"), True, "many", 0)],
+        *[("steps", value, "Budget.steps: expected a valid integer, got")
+          for value in (1.5, float("nan"), float("inf"), True, "many")],
+        ("steps", 0, "Budget.steps: expected a number greater than or equal to 1, got 0"),
         ("seconds", float("nan"), "Budget.seconds: expected a finite number, got nan"),
-        ("seconds", True, "Budget.seconds: expected a finite number, got true"),
+        ("seconds", True, "Budget.seconds: expected a valid number, got true"),
         ("range_m", [2, 1], "Budget.range_m: expected (lowest, highest)"),
-        ("range_m", [1], "Budget.range_m: expected (lowest, highest)"),
-        ("range_m", [0, 1], "Budget.range_m[0]: expected a finite number above 0, got 0"),
-        ("device", "auot", "expected one of 'auto', 'cpu', got 'auot'; did you mean 'auto'?"),
-        ("motor", Wheel(), "Budget.motor: expected Motor, got Wheel without turn"),
-        ("limits", {"q1": {"highest": 0}}, "Budget.limits.q1.highest: expected a finite number above 0"),
+        ("range_m", [1], "Budget.range_m: expected more than 1 values, got [1]"),
+        ("range_m", [0, 1], "Budget.range_m[0]: expected a number greater than 0, got 0"),
+        ("device", "auot", "expected 'auto' or 'cpu', got 'auot'; did you mean 'auto'?"),
+        ("motor", Wheel(), "Budget.motor: expected an option of its group (Motor with turn), got Wheel"),
+        ("limits", {"q1": {"highest": 0}}, "Budget.limits.q1.highest: expected a number greater than 0"),
         ("limits", {"q1": {"hihgest": 1}}, "has no field 'hihgest'; did you mean 'highest'?"),
         ("limits", {"q1": {}}, "Budget.limits.q1: lacks highest"),
         ("second", 1, "Budget: has no field 'second'; did you mean 'seconds'?"),
