@@ -66,22 +66,15 @@ class NativeWorld(StoredWorld):
             ) from error
         super().__init__(machine, num_worlds, model, torch.device("cpu"), torch.float64, ALARMS)
         self.substeps = substeps
-        self._state, self._warning = (
-            torch.from_numpy(self._batch.state),
-            torch.from_numpy(self._batch.warning),
-        )
-        bound = {}
+        views = {"state": self._batch.state, "warning": self._batch.warning}
         for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat"):
-            bound[name] = torch.from_numpy(self._batch.bind(name))
-        self._qpos, self._qvel, self._act, self._ctrl, self._mocap_pos, self._mocap_quat = (
-            bound.values()
-        )
-        self._geom_size, self._geom_pos = (
-            torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos")
-        )
-        self.joint_load = torch.from_numpy(self._batch.bind("qfrc_applied"))
+            views[name] = self._batch.bind(name)
+        for name in ("geom_size", "geom_pos"):
+            views[name] = self._batch.expand(name)
+        tensors = {name: torch.from_numpy(view) for name, view in views.items()}
         # zeros would switch the equalities of the MJCF off
-        self._first_state = self._state[0].clone()
+        at_rest = {name: tensors[name][0].clone() for name in ("state", "warning")}
+        self.joint_load = torch.from_numpy(self._batch.bind("qfrc_applied"))
         # contacts are felt in every substep; recording them all catches a peak between two control
         # steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
@@ -90,58 +83,23 @@ class NativeWorld(StoredWorld):
         fields = {}
         for name in list_fields(events):
             fields[name] = torch.from_numpy(self._batch.expand(name))
-        self._begin(fields, events)
+        stored = ("state", "warning", "geom_size", "geom_pos")
+        self._begin(tensors, at_rest, stored, fields, events)
 
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
-        self._drive.step(self._qpos, increment, self._act, self._ctrl)
+        view = self._views
+        self._drive.step(view["qpos"], increment, view["act"], view["ctrl"])
         try:
             self._batch.rollout(self.substeps, record=("sensordata",), out=self._recorded)
         except SimulationError as error:  # those worlds keep the state they had, all others went on
             self.faults[torch.from_numpy(error.ids)] = True
         self.contact_force_n.copy_((self._sensors @ self._is_normal).amax(1))
-        self.q.copy_(self._qpos)
-        speeds = self._drive.measure_speeds(self._qvel)
+        self.q.copy_(view["qpos"])
+        speeds = self._drive.measure_speeds(view["qvel"])
         self.faults.logical_or_(self._drive.diverged(speeds)).logical_or_(
-            self._warning.flatten(1).any(1)
+            view["warning"].flatten(1).any(1)
         )
         if self.faults.any():
             bits = torch.tensor(list(ALARMS))
-            self._note_faults(speeds, (self._warning[:, :, 1] > 0).long() @ bits)
-
-    def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
-        rows = mask.nonzero()[:, 0]
-        if not len(rows):
-            return
-        if self._properties:
-            self._properties.begin(mask)
-        start, placed = q[rows], scene[rows]
-        self._state[rows] = self._first_state
-        self._qpos[rows] = self._act[rows] = start.double()
-        self._drive.reset(mask, q)
-        self._place(rows, placed)
-        self._warning[rows] = 0
-        self.q[rows], self.contact_force_n[rows], self.faults[rows] = start, 0.0, False
-
-    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
-        """Put blocks elsewhere; see `brokk_rl.contracts.world.World`."""
-        rows = mask.nonzero()[:, 0]
-        if len(rows):
-            self._place(rows, scene[rows])
-
-    def _place(self, rows: torch.Tensor, scene: torch.Tensor) -> None:
-        """Write the scenes, `(R, S)`, of the worlds `rows`, `(R,)`."""
-        position, turn = self._placement.pose(scene)
-        self._mocap_pos[rows, 0], self._mocap_quat[rows, 0] = position, turn
-        size, pos = self._placement.geoms(scene)
-        index = (rows[:, None], self._placement.geom_ids)
-        self._geom_size[index], self._geom_pos[index] = size, pos
-
-    def _stored(self) -> dict[str, torch.Tensor]:
-        return {
-            "state": self._state,
-            "warning": self._warning,
-            "geom_size": self._geom_size,
-            "geom_pos": self._geom_pos,
-        }
+            self._note_faults(speeds, (view["warning"][:, :, 1] > 0).long() @ bits)

@@ -6,7 +6,7 @@ Properties of a machine are nominal numbers times factors, which events draw.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import mujoco
 import numpy as np
@@ -164,8 +164,24 @@ class StoredWorld:
         self._drive = DriveReferences(model, machine, num_worlds, device, dtype)
         self._properties: WorldProperties | None = None
 
-    def _begin(self, fields: dict[str, torch.Tensor], events: tuple[Event, ...]) -> None:
-        """Draw the properties that events change in `fields`, and put all machines at home."""
+    def _begin(
+        self,
+        views: dict[str, torch.Tensor],
+        at_rest: dict[str, torch.Tensor],
+        stored: Sequence[str],
+        fields: dict[str, torch.Tensor],
+        events: tuple[Event, ...],
+    ) -> None:
+        """Draw the properties that events change, and put all machines at home.
+
+        Args:
+            views: Tensors of all worlds by MuJoCo's names, `(N, …)`, written in place.
+            at_rest: Values of one world that a reset writes.
+            stored: Those that a state consists of.
+            fields: Fields of the model that events change.
+            events: One a property.
+        """
+        self._views, self._at_rest, self._stored = views, at_rest, stored
         if events:
             self._properties = WorldProperties(
                 self.model, self._machine, self._drive, fields, events
@@ -175,8 +191,30 @@ class StoredWorld:
         self.reset(~self.faults, home.expand(self.num_worlds, -1), scenes)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """See `brokk_rl.contracts.world.World`."""
-        raise NotImplementedError
+        """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
+        if self.device.type == "cpu" and not mask.any():  # a GPU would wait for the answer
+            return
+        if self._properties:
+            self._properties.begin(mask)
+        for name, value in self._at_rest.items():
+            view = self._views[name]
+            torch.where(mask.view(-1, *[1] * (view.dim() - 1)), value, view, out=view)
+        for view in (self._views["qpos"], self._views["act"], self.q):
+            torch.where(mask[:, None], q.to(view.dtype), view, out=view)
+        self._drive.reset(mask, q)
+        self.place(mask, scene)
+        self.contact_force_n.masked_fill_(mask, 0.0)
+        self.faults.masked_fill_(mask, False)
+
+    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
+        """Put blocks elsewhere; see `brokk_rl.contracts.world.World`."""
+        view, rows, ids = self._views, mask[:, None], self._placement.geom_ids
+        position, turn = self._placement.pose(scene)
+        size, pos = self._placement.geoms(scene)
+        for name, value in (("mocap_pos", position), ("mocap_quat", turn)):
+            torch.where(rows, value, view[name][:, 0], out=view[name][:, 0])
+        for name, value in (("geom_size", size), ("geom_pos", pos)):
+            view[name].index_copy_(1, ids, torch.where(rows[..., None], value, view[name][:, ids]))
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return a copy of all that `load_state_dict` needs to go on exactly."""
@@ -191,7 +229,8 @@ class StoredWorld:
 
     def _list_tensors(self) -> dict[str, torch.Tensor]:
         """Return the simulator's tensors, and those of the events."""
-        tensors = self._stored() | {"reference": self._drive.reference, "q": self.q}
+        tensors = {name: self._views[name] for name in self._stored}
+        tensors |= {"reference": self._drive.reference, "q": self.q}
         tensors |= {"contact_force_n": self.contact_force_n, "faults": self.faults}
         if self._properties:
             for name, value in self._properties.factors.items():
@@ -216,7 +255,3 @@ class StoredWorld:
         )
         torch.maximum(self._fastest, of_faults.amax(0), out=self._fastest)
         self._alarms.bitwise_or_(alarms.masked_fill(~self.faults, 0))
-
-    def _stored(self) -> dict[str, torch.Tensor]:
-        """Return the tensors of the state that only this simulator has."""
-        raise NotImplementedError

@@ -116,25 +116,17 @@ class WarpWorld(StoredWorld):
             self._data = mjw.make_data(self.model, num_worlds, **sizes)
         self._write_options(simulator)
         data, model = self._data, self._model
-        names = (
-            "qpos",
-            "qvel",
-            "act",
-            "ctrl",
-            "time",
-            "qacc_warmstart",
-            "mocap_pos",
-            "mocap_quat",
-            "overflow",
-        )
-        self._views = {name: wp.to_torch(getattr(data, name)) for name in names}
-        self._views |= {
-            name: wp.to_torch(getattr(model, name)) for name in ("geom_size", "geom_pos")
-        }
+        resting = ("qvel", "ctrl", "time", "qacc_warmstart", "overflow")
+        views = {}
+        for name in ("qpos", "act", "mocap_pos", "mocap_quat", *resting):
+            views[name] = wp.to_torch(getattr(data, name))
+        for name in ("geom_size", "geom_pos"):
+            views[name] = wp.to_torch(getattr(model, name))
         peak = wp.from_torch(self.contact_force_n)
         self._substep = make_substep(self.model, model, data, peak)
         fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(events)}
-        self._begin(fields, events)
+        at_rest = {name: torch.zeros_like(views[name][0]) for name in resting}
+        self._begin(views, at_rest, tuple(views), fields, events)
 
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
@@ -148,38 +140,6 @@ class WarpWorld(StoredWorld):
         speeds, alarms = self._drive.measure_speeds(view["qvel"]), view["overflow"] & _LOST
         self.faults.logical_or_(self._drive.diverged(speeds)).logical_or_(alarms != 0)
         self._note_faults(speeds, alarms)
-
-    def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
-        """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
-        view = self._views
-        if self._properties:
-            self._properties.begin(mask)
-        rows, zero = mask[:, None], q.new_zeros(())
-        for name in ("qpos", "act"):
-            torch.where(rows, q, view[name], out=view[name])
-        for name in ("qvel", "ctrl", "qacc_warmstart"):
-            torch.where(rows, zero, view[name], out=view[name])
-        view["time"].masked_fill_(mask, 0.0)
-        view["overflow"].masked_fill_(mask, 0)
-        self.place(mask, scene)
-        self._drive.reset(mask, q)
-        torch.where(rows, q, self.q, out=self.q)
-        self.contact_force_n.masked_fill_(mask, 0.0)
-        self.faults.masked_fill_(mask, False)
-
-    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
-        """Put blocks elsewhere; see `brokk_rl.contracts.world.World`."""
-        view, rows = self._views, mask[:, None]
-        position, turn = self._placement.pose(scene)
-        size, pos = self._placement.geoms(scene)
-        for name, value in (("mocap_pos", position), ("mocap_quat", turn)):
-            torch.where(rows, value, view[name][:, 0], out=view[name][:, 0])
-        for name, value in (("geom_size", size), ("geom_pos", pos)):
-            ids = self._placement.geom_ids
-            view[name].index_copy_(1, ids, torch.where(rows[..., None], value, view[name][:, ids]))
-
-    def _stored(self) -> dict[str, torch.Tensor]:
-        return dict(self._views)
 
     def _write_options(self, simulator: Any) -> None:
         option = self._model.opt

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from composed import every, option
-from promises import check_world
+from promises import NUM_ENVS, check_world
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -104,7 +104,7 @@ def test_every_event_keeps_a_world_a_world(name: str, machine: Machine) -> None:
         def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any:
             return NATIVE.build(machine, CPU, num_worlds, events=(option("event", name),))
 
-    check_world(Varied(), machine, make_nominal_scenes(8), "cpu")
+    check_world(Varied(), machine, make_nominal_scenes(NUM_ENVS), "cpu")
 
 
 def test_an_event_draws_when_it_says(machine: Machine) -> None:

@@ -114,18 +114,18 @@ def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
         for i, one in enumerate(data):
             # the drive's outputs at the start of the period: what MuJoCo integrated since is ctrl
             # for one period
-            one.ctrl[:] = world._ctrl[i].numpy()
+            one.ctrl[:] = world._views["ctrl"][i].numpy()
             one.act[:] = (
                 world._drive.reference[i].numpy()
-                - world._ctrl[i].numpy() * 0.05
-                + (world._drive._lead * world._ctrl[i]).numpy()
+                - world._views["ctrl"][i].numpy() * 0.05
+                + (world._drive._lead * world._views["ctrl"][i]).numpy()
             )
             peak = 0.0
             for _ in range(5):
                 mujoco.mj_step(world._batch.get_model(i), one)
                 peak = max(peak, _sum_normal_forces(world._batch.get_model(i), one))
             assert world.contact_force_n[i].item() == pytest.approx(peak, rel=1e-4, abs=1e-3)
-            np.testing.assert_allclose(world._qpos[i].numpy(), one.qpos, atol=1e-6)
+            np.testing.assert_allclose(world._views["qpos"][i].numpy(), one.qpos, atol=1e-6)
             touched = touched or peak > 0
             mujoco.mj_setState(
                 world._batch.get_model(i),
@@ -194,7 +194,7 @@ def test_a_blocked_joint_pushes_no_harder_than_its_relief_valve_and_does_not_win
     # 30 kNm of q2 at 2.35 m are 12.8 kN, and no joint pushes harder than that on the tip
     assert 1_000 < held < 14_000
     leash = torch.tensor([body.yield_force.value / body.stiffness.value for body in machine.bodies])
-    assert ((world._drive.reference - world._qpos).abs() <= leash + 0.02).all()
+    assert ((world._drive.reference - world._views["qpos"]).abs() <= leash + 0.02).all()
     kinematics = Kinematics(machine)
     pressed = kinematics.pose(world.q).tip_in_base_m[0, 2]
     for _ in range(10):  # as soon as the command turns, the tip leaves the block
