@@ -9,6 +9,7 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from brokk_rl import registry
@@ -186,11 +187,28 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     is_name = override.is_sweep_override() or isinstance(override.value(), (str, list))
     if key in groups and not is_name:
         return f"{key}='{value}'"  # so that Hydra looks for an option of that name
-    names = value.strip("[]").split(",") if key in groups else []
+    names = list_names(override) if key in groups else []
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{word}: '{name}' stands in it twice; leave one out")
     return word
+
+
+def parse_words(words: Sequence[str]) -> list[Override]:
+    """Return the overrides among the words of a command, read by Hydra."""
+    plain = [word for word in words if word[:1] != "-" and ("=" in word or word[:1] == "~")]
+    return OverridesParser.create().parse_overrides(plain)
+
+
+def list_names(override: Override) -> list[str]:
+    """Return the texts that an override gives: its value, the items of a list, or all of a sweep."""
+    if override.is_sweep_override():
+        texts = ",".join(override.sweep_string_iterator())
+        return [text.strip("[]'\" ") for text in texts.split(",")]
+    value = override.value()
+    return [
+        item for item in (value if isinstance(value, list) else [value]) if isinstance(item, str)
+    ]
 
 
 def is_list_group(group: str) -> bool:
@@ -226,31 +244,16 @@ def _explain_several(key: str, value: str, is_group: bool, is_single: bool) -> s
 
 def _explain_characters(key: str, value: str) -> str:
     """Explain a value with characters that Hydra reads as something else, and how to write it."""
-    repaired = [value.strip(), value.rstrip(", ")]
-    if value.startswith("("):
-        repaired.append(f"[{value.strip('()')}]")
-    for candidate in repaired:
-        if _is_readable(f"x={candidate}"):
-            return f"{key}={value} cannot be read. Write {_show(key, candidate)}"
-    reason = ""
-    ways = []
-    if value.startswith("["):
-        inner = value.strip("[]") if value.count("[") != value.count("]") else value[1:-1]
+    ways = [value.strip(), value.rstrip(", ")]
+    inner = value.strip("[]()")
+    if value[0] in "[(" and inner:
         items = [item if _is_readable(f"x={item}") else _quote(item) for item in inner.split(",")]
-        listed = ",".join(items)
-        ways.append(f"a list: {_show(key, f'[{listed}]')}")
-    for opening, closing in ("[]", "()", "{}"):
-        if value.count(opening) != value.count(closing):
-            reason = f": '{opening}' and '{closing}' do not match"
-    if reason or not ways:
-        ways.append(f"one text: {_show(key, _quote(value))}")
-    odd = []
-    for character in dict.fromkeys(value[1:-1] if value.startswith("[") else value):
-        if not _is_readable(f"x=a{character}b"):
-            odd.append(character)
-    if odd and not reason:
-        reason = f": {' '.join(odd)} must be quoted"
-    return f"{key}={value} cannot be read{reason}. If you mean {', or '.join(ways)}"
+        ways.append(f"[{','.join(items)}]")
+    readable = [way for way in (*ways, _quote(value)) if _is_readable(f"x={way}")]
+    return (
+        f"{key}={value} cannot be read: a character must be quoted, or brackets do not match. "
+        f"Write {_show(key, readable[0])}"
+    )
 
 
 def _quote(value: str) -> str:

@@ -6,7 +6,6 @@ import contextlib
 import io
 import logging
 import os
-import re
 import shutil
 import signal
 import sys
@@ -143,7 +142,7 @@ def run_job(cfg: DictConfig) -> float | None:
 
 def _prepare_policy(arguments: Sequence[str]) -> list[str]:
     """Return the arguments with the policy that they name, if any, as an option of Hydra."""
-    if not any(re.match(r"policy|checkpoint|resume|start_from|doctor\.", one) for one in arguments):
+    if not any(one.startswith("policy") for one in arguments):
         return list(arguments)  # the readers of policies take a quarter of a second to import
     from brokk_rl.policy_choice import prepare_arguments
 

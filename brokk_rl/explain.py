@@ -9,12 +9,10 @@ import sys
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
 import hydra
 import yaml
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -25,7 +23,7 @@ from omegaconf.errors import (
 )
 
 from brokk_rl import registry
-from brokk_rl.arguments import ROBOT_FILES, explain_robot, is_list_group
+from brokk_rl.arguments import ROBOT_FILES, explain_robot, is_list_group, list_names, parse_words
 from brokk_rl.errors import BrokkError, list_choices
 
 CLOSE = 0.85
@@ -168,57 +166,52 @@ def _list_options(group: str, name: str, offered: Sequence[str]) -> str:
 def _explain_absence(cfg: DictConfig, key: str, value: str) -> str:
     """Return what a configuration has in the place of a key that it does not have."""
     mode = f"mode={cfg.hydra.runtime.choices['mode']}"
-    if isinstance(table := OmegaConf.select(cfg, key, default=None), DictConfig):
-        fields = [str(field) for field in table if field != "_target_"]
+    groups = [str(group) for group in cfg.hydra.runtime.choices if str(group)[:5] != "hydra"]
+    keys = sorted({*_list_keys(cfg), *groups}, key=lambda one: one.count("."))
+    if fields := _list_inside(keys, key):
         return f"'{key}' is a table, whose values are given as {key}.<name>=…; {list_choices(value, fields)}"
-    parent, _, leaf = key.rpartition(".")
-    group, _, rest = key.partition(".")
-    name = rest.partition(".")[0]
-    for option in registry.list_options(group):
-        if option.name == name and OmegaConf.select(cfg, f"{group}.{name}", default=None) is None:
-            chosen = f"[{option.name}]" if is_list_group(group) else option.name
-            return f"'{option.name}' is not chosen: add {group}={chosen}"
-    keys = _find_keys(cfg, leaf)
-    groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
-    likely = key.lower().replace("/", ".")
-    if likely in groups or likely in _find_keys(cfg, likely.rpartition(".")[2]):
-        return f"{mode} has no such key; {_suggest([likely], value)}"
-    if key in {option.group for option in registry.list_options()} and not (keys and value):
-        return f"{mode} does not use such a group; {list_choices(key, groups)}"
-    while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
-        parent, _, leaf = parent.rpartition(".")
-    names = []
-    if isinstance(node, DictConfig):
-        names = [str(k) for k in node if str(k) not in ("hydra", "run", "_target_")]
-    if keys:
-        return f"'{parent or mode}' has no '{leaf}'; {_suggest(keys, value)}"
     for option in registry.list_options():
+        place = f"{option.group}.{option.name}"
         if option.name == key and option.group in groups:
             return f"'{key}' is an option: {option.group}={key}"
+        if f"{key}.".startswith(f"{place}.") and place not in keys:
+            chosen = f"[{option.name}]" if is_list_group(option.group) else option.name
+            return f"'{option.name}' is not chosen: add {option.group}={chosen}"
+    parent, _, leaf = key.rpartition(".")
+    typed = leaf.lower().rpartition("/")[2]
+    while parent and parent not in keys:
+        parent, _, leaf = parent.rpartition(".")
+    inside = _list_inside(keys, parent)
+    names = {one.rpartition(".")[2] for one in keys}
+    near = get_close_matches(typed, [*names, *map(_shorten, names)], n=1, cutoff=CLOSE)
+    if typed not in names and get_close_matches(leaf, inside):
+        near = []
+    wanted = {name for name in names if near and near[0] in (name, _shorten(name))}
+    lacks = f"'{parent or mode}' has no '{leaf}'"
+    if found := [f"{one}={value}" for one in keys if one.rpartition(".")[2] in wanted]:
+        return f"{lacks}; did you mean {' or '.join(found[:3])}?"
     if value.endswith(ROBOT_FILES):
-        return f"{mode} has no '{leaf}'; {explain_robot(value)}"
-    if leaf in groups:
-        return f"'{leaf}' is a group, whose options are chosen by {leaf}=<option>"
-    here = names if parent else list({*names, *groups})
-    if not get_close_matches(leaf, here) and (keys := _find_keys(cfg, _guess_name(cfg, leaf))):
-        return f"'{parent or mode}' has no '{leaf}'; {_suggest(keys, value)}"
-    choices = list_choices(leaf, here)
-    return f"'{parent or mode}' has no '{leaf}'; {choices}; `brokk {mode} --help` lists all values"
+        return f"{lacks}; {explain_robot(value)}"
+    return f"{lacks}; {list_choices(leaf, inside)}; `brokk {mode} --help` lists all values"
 
 
-def _guess_name(cfg: DictConfig, typed: str) -> str:
-    """Return the name of a value that was misspelt, or shortened as in `lr`; empty for none."""
-    names = {}
+def _shorten(name: str) -> str:
+    """Return the initials of a name: `lr` of `learning_rate`."""
+    return "".join(word[:1] for word in name.split("_"))
+
+
+def _list_keys(cfg: DictConfig) -> set[str]:
+    """Return the keys of all values and tables of a configuration, with dots between."""
+    keys = set()
     for place, _ in registry.iterate_leaves(OmegaConf.to_container(cfg)):
-        if place[0] != "hydra":
-            names["".join(word[:1] for word in place[-1].split("_"))] = place[-1]
-            names[place[-1]] = place[-1]
-    near = [typed] if typed in names else get_close_matches(typed, names, n=1, cutoff=CLOSE)
-    return names[near[0]] if near else ""
+        if place[0] not in ("hydra", "run"):
+            keys.update(".".join(place[:end]) for end in range(1, len(place) + 1))
+    return {key for key in keys if not key.endswith("_target_")}
 
 
-def _suggest(keys: Sequence[str], value: str) -> str:
-    return f"did you mean {' or '.join(f'{key}={value}' for key in keys[:3])}?"
+def _list_inside(keys: Sequence[str], table: str) -> list[str]:
+    """Return the names of what a table holds; the empty table is the whole."""
+    return [key.rpartition(".")[2] for key in keys if key.rpartition(".")[0] == table]
 
 
 def _find_value(key: str) -> str:
@@ -228,18 +221,6 @@ def _find_value(key: str) -> str:
         if name == key:
             return value.strip("'")
     return "<value>"
-
-
-def _find_keys(node: Any, name: str, above: str = "") -> list[str]:
-    """Return the keys of a configuration that end with `name`, the shortest first."""
-    found = []
-    for key in node if isinstance(node, DictConfig) else ():
-        inside = None if OmegaConf.is_missing(node, key) else node._get_node(key)
-        if key == name:
-            found.append(f"{above}{key}")
-        if f"{above}{key}" != "hydra":
-            found += _find_keys(inside, name, f"{above}{key}.")
-    return sorted(found, key=lambda key: key.count("."))
 
 
 def compose_choices() -> DictConfig:
@@ -277,11 +258,9 @@ def list_chosen_options(arguments: Sequence[str]) -> list[str]:
     """Return the arguments that choose options; of a sweep's options the first is taken."""
     groups = {option.group for option in registry.list_options()}
     chosen: list[str] = []
-    for override in OverridesParser.create().parse_overrides(
-        [argument for argument in arguments if "=" in argument and argument[0] != "-"]
-    ):
-        plain = override.is_sweep_override() or isinstance(override.value(), (str, list))
-        if override.key_or_group.split("@")[0] not in groups or not plain:
+    for override in parse_words(arguments):
+        names = list_names(override)
+        if override.key_or_group.split("@")[0] not in groups or not names:
             continue
         line = str(override.input_line)
         if override.is_sweep_override():

@@ -21,16 +21,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from brokk_rl import registry
+from brokk_rl.arguments import list_names, parse_words
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.explain import explain_missing_value
 from brokk_rl.plain_files import check_yaml_size, read_plain_file
 
-GROUP = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>.*)", re.DOTALL)
-"""An override of a config group: group, package, value."""
-FILE = re.compile(
-    r"""(?:^|[\[,(])\s*(?:"@(?P<double>[^"]+)"|'@(?P<single>[^']+)'|@(?P<plain>[^,\])]+))"""
-)
-"""A file in the value of an override: alone, in a list, or among the values of a sweep."""
 PACKAGE = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
 MOST_BYTES = 1 << 20
 """Size beyond which a file holds no option."""
@@ -62,16 +57,21 @@ def register_options(arguments: Sequence[str]) -> None:
             text = option.path.read_text()
             node = OmegaConf.to_container(OmegaConf.create(text))
             stated = PACKAGE.search(text)
-            folder, package = f"{option.group}/{option.prefix}", stated[1] if stated else None
-            ConfigStore.instance().store(option.path.stem, node, folder, package)
+            store_option(option.group, name, node, stated[1] if stated else None)
     Plugins.instance().register(Extensions)
-    for argument in arguments:
-        override = GROUP.fullmatch(argument)
-        if override and override["group"] in groups:
-            refuse_ambiguous({override["group"]: override["value"]})
-            for found in FILE.finditer(override["value"]):
-                name = found["double"] or found["single"] or found["plain"]
-                _offer_file(override["group"], name.strip())
+    for override in parse_words(arguments):
+        group, names = override.key_or_group, list_names(override)
+        if group in groups:
+            refuse_ambiguous({group: ",".join(names)})
+            for name in names:
+                if name.startswith("@"):
+                    store_option(group, name, *_read(group, name[1:]))
+
+
+def store_option(group: str, name: str, node: Any, package: str | None = None) -> None:
+    """Put an option into Hydra's store; a name with slashes is one, as that of a path."""
+    *folders, stem = [part for part in name.split("/") if part]
+    ConfigStore.instance().store(stem, node, "/".join([group, *folders]), package, "brokk")
 
 
 def refuse_ambiguous(choices: Mapping[str, Any]) -> None:
@@ -103,7 +103,7 @@ def load_option(group: str, name: str, **fields: object) -> Any:
     Raises:
         ConfigError: There is no such option or file, or it is not valid.
     """
-    register_options([f"{group}={name}"])
+    register_options([f"{group}='{name}'"])
     known = {option.name for option in registry.list_options(group)}
     if not name.startswith("@") and name not in known:
         raise ConfigError(f"there is no {group}={name}; {list_choices(name, known)}")
@@ -169,15 +169,6 @@ def read_values(cfg: DictConfig) -> tuple[dict[str, Any], set[str]]:
                 shared.add(name)
     values: Any = OmegaConf.to_container(cfg, resolve=True)
     return values, shared
-
-
-def _offer_file(group: str, name: str) -> None:
-    """Put the file `name` into Hydra's store as the option `@<name>` of `group`."""
-    node, package = _read(group, name)
-    folder, _, stem = f"@{name}".rpartition("/")
-    ConfigStore.instance().store(
-        stem, node, "/".join(filter(None, (group, folder))), package, provider="file"
-    )
 
 
 def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:

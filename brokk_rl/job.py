@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import IO, Any
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from brokk_rl import distributed, extensions, registry
+from brokk_rl.arguments import parse_words
 from brokk_rl.build import build_mode
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.session import (
@@ -204,7 +204,7 @@ class SweepFolder(Callback):
         keeps those that no folder name should have.
         """
         fixed = []
-        for override in OverridesParser.create().parse_overrides(list(config.hydra.overrides.task)):
+        for override in parse_words(config.hydra.overrides.task):
             if not override.is_sweep_override():
                 fixed.append(override.get_key_element().lstrip("+~"))
         with read_write(config):

@@ -8,21 +8,20 @@ behaviour. A value that the caller typed and that contradicts the policy is refu
 from __future__ import annotations
 
 import logging
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
+from brokk_rl.arguments import list_names, parse_words
 from brokk_rl.build import RUN, TARGET, build_node, drop_targets
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.extensions import store_option
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import (
     CONTRACT,
@@ -43,8 +42,6 @@ PLACE = "brokk_rl.rl.policy"
 CLASSICAL, TRAINED = f"{PLACE}.ClassicalPolicy", f"{PLACE}.TrainedPolicy"
 SHIPPED = f"{PLACE}.ShippedPolicy"
 TRAIN, EXPORT = "brokk_rl.modes.train.Train", "brokk_rl.modes.export.Export"
-OLD_KEYS = ("policy.folder", "checkpoint", "start_from", "doctor.policy", "resume")
-"""Names that `policy` had in one mode or another. Other modes than training still have `resume`."""
 RIVALS_OWN = ("classical", "advice")
 """Fields of a task that the classical controller keeps beside a policy."""
 WHOLE = ("--config-name", "-cn")
@@ -56,21 +53,16 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
 
     A path after `policy=` becomes an option of that group. A training that goes on in its own
     folder, or from a checkpoint, takes up the overrides of its run.
-
-    Raises:
-        ConfigError: A key has another name now; the message ends with the command that works.
     """
-    words = [word for word in arguments if "=" in word and not word.startswith("-")]
-    overrides = OverridesParser.create().parse_overrides(words)
+    overrides = parse_words(arguments)
     # `policy@rivals.<name>` is another key than `policy`
     given = {one.key_or_group: one for one in overrides if one.package is None}
-    _refuse_old_keys(arguments, given)
     prepared = list(arguments)
     is_whole = any(word.startswith(WHOLE) for word in arguments)
     for override in overrides:
         if override.key_or_group == "policy":
             for name in _list_paths(override):
-                _offer(name)
+                store_option("policy", name, {TARGET: TRAINED, "path": name, "task": None})
                 if is_whole and override.package is None:  # such a configuration has no groups
                     prepared.remove(str(override.input_line))
                     prepared.append(f"policy={{{TARGET}: {TRAINED}, path: '{name}', task: null}}")
@@ -127,22 +119,6 @@ def is_going_on(cfg: DictConfig) -> bool:
     return _find_run(path).resolve() == Path(out).resolve()
 
 
-def _refuse_old_keys(arguments: Sequence[str], given: Mapping[str, Override]) -> None:
-    is_training = _read_value(given, "mode") == "train" or not {"mode", "experiment"} & {*given}
-    for key in OLD_KEYS:
-        if key not in given or (key == "resume" and not is_training):
-            continue
-        line, value = str(given[key].input_line), _read_value(given, key)
-        works = [word for word in arguments if word != line]
-        works.append(f"policy={value}")
-        if key == "resume" and "session.out" not in given:
-            works.append(f"session.out={value}")
-        raise ConfigError(
-            f"{line}: '{key}' is now 'policy', in every mode. This works: "
-            f"{shlex.join(['brokk', *works])}"
-        )
-
-
 def _refuse_late_values(cfg: DictConfig, stored: StoredPolicy) -> None:
     """Refuse values that count only when a training begins, where it goes on with others."""
     trained = stored.contract.get("trained", {})
@@ -162,24 +138,13 @@ def _read_value(given: Mapping[str, Override], key: str) -> str | None:
 
 def _list_paths(override: Override) -> list[str]:
     """Return the values of `policy=` that are no options; of a sweep there may be several."""
-    values: list[Any] = [override.value()]
-    if override.is_sweep_override():
-        values = list(override.sweep_string_iterator())
-    offered = {option.name for option in registry.list_options() if option.group == "policy"}
+    offered = {option.name for option in registry.list_options("policy")}
     paths = []
-    for value in values:
-        is_text = isinstance(value, str) and value not in offered and not value.startswith("@")
-        if is_text and (Path(value).exists() or set("/:.") & set(value)):
+    for value in list_names(override):
+        is_other = value not in offered and not value.startswith("@")
+        if is_other and (Path(value).exists() or set("/:.") & set(value)):
             paths.append(value)
     return paths
-
-
-def _offer(name: str) -> None:
-    """Put a path into Hydra's store as an option of `policy`."""
-    folders = [part for part in name.split("/")[:-1] if part]
-    node = {TARGET: TRAINED, "path": name, "task": None}
-    group = "/".join(["policy", *folders])
-    ConfigStore.instance().store(name.rpartition("/")[2], node, group, provider="policy")
 
 
 def _find_run(policy: str) -> Path:
@@ -197,7 +162,7 @@ def _recall_overrides(given: Mapping[str, Override]) -> list[str]:
         return []
     recalled = []
     lines = (read_record(run) or {}).get("overrides", [])
-    for override in OverridesParser.create().parse_overrides(lines):
+    for override in parse_words(lines):
         if override.key_or_group not in {*given, "session.out"}:
             recalled.append(str(override.input_line))
     return recalled
@@ -348,8 +313,7 @@ def _insert_task(cfg: DictConfig, node: DictConfig) -> None:
 def _list_given() -> set[str]:
     """Return the keys that the caller typed."""
     given = set()
-    lines = list(HydraConfig.get().overrides.task)
-    for override in OverridesParser.create().parse_overrides(lines):
+    for override in parse_words(HydraConfig.get().overrides.task):
         key, value = override.key_or_group.replace("/", "."), override.value()
         if isinstance(value, dict):
             given.update(f"{key}.{name}" for name in value)

@@ -11,7 +11,6 @@ import torch
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.target import TargetSensorSpec
 from brokk_rl.contracts.task import SUCCESS, Figure
-from brokk_rl.errors import ConfigError
 from brokk_rl.policy_folder import describe_task
 from brokk_rl.progress import ItemProgress
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
@@ -50,13 +49,6 @@ class Evaluate(SimulatedPlant):
     policy: PolicySpec
     rivals: dict[str, PolicySpec]
     evaluation: Evaluation
-
-    def check(self) -> None:
-        if self.target is not None and not hasattr(self.target, "sense"):
-            raise ConfigError(
-                f"target={name_spec(self.target)}: mode=evaluate takes none, or "
-                "target=perceived; the others are for mode=deploy"
-            )
 
     def run(self) -> float:
         """Evaluate; return the strict success of the policy."""
