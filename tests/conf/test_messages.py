@@ -138,7 +138,6 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
 """A command, and parts of its message."""
 VALUES = {
     "rl.num_envs=0": "rl.num_envs: expected a number greater than or equal to 1",
-    "rl.num_starts=0": "rl.num_starts: expected a number greater than or equal to 1, got 0",
     "rl.settling=2": "rl.settling",
     "rl.budget.max_seconds=-1": "rl.budget.max_seconds: expected a number greater than 0",
     "rl.runner.algorithm.learning_rate=-1e-3": "rl.runner.algorithm.learning_rate: expected a number greater than 0, got -0.001",
@@ -186,7 +185,6 @@ VALUES = {
     "tracking=wandb tracking.mode=sideways": "tracking.mode: expected 'offline'",
     "mode=identify": "identify.recordings has no default and must be given",
     "mode=identify identify.recordings=x identify.folds=1": "identify.folds: expected",
-    "mode=collect collect.num_runs=0": "collect.num_runs: expected",
     "mode=collect excitation.sine.share=[2.0,1.0]": "excitation.sine.share: expected ",
     "mode=play play.gamepad=nowhere": "play.gamepad=nowhere: No such file",
     "mode=play play.gamepad=/dev/null play.gamepad_axes=[1]": "an axis for each of q1",
@@ -197,12 +195,10 @@ VALUES = {
     "mode=diagnose diagnosis.case=nowhere": "diagnosis.case=nowhere: there is no such folder",
     "mode=diagnose diagnosis.field=x diagnosis.workers=0": "diagnosis.workers: expected 1",
     "mode=check subject.model=nowhere.urdf": "subject.model: cannot read nowhere.urdf",
-    "mode=check subject.num_starts=0": "subject.num_starts: expected",
     "mode=check subject.num_poses=1e12": "subject.num_poses: expected a number less than or equal to 10000000",
     "mode=export": "policy has no default and must be given",
     "mode=compare compare.runs=[1]": "compare.runs",
     "mode=inspect inspect.recordings=3": "inspect",
-    "mode=render render.count=0": "render.count: expected",
     "mode=export policy=shipped": "the folder holds no checkpoint",
     "mode=export policy=classical": "this mode takes a network",
     "mode=why log=x policy=classical": "this mode takes a network",
