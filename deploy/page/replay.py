@@ -35,6 +35,7 @@ from deploy.page.protocol import (
     TimelineMark,
 )
 from deploy.page.scene import place_tool
+from deploy.recorder.camera_topics import decode_frame
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
 from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import ALIVE_S, AdviceStatus, OperatorState
@@ -180,9 +181,6 @@ class ReplayFeed:
         """See `PageFeed`; a jump back shows an earlier picture, at the time of the clock."""
         if not {PICTURE, LENS, CLOUD} <= self._views.keys():
             return None
-        # Foxglove's schemas are loaded where there are pictures alone.
-        from deploy.recorder.scene_topics import decode_frame
-
         index, t_s, picture = self._views[PICTURE].find(self._begin_s + self.position_s)
         if picture is None or (index == self._picture and after_s >= 0):
             return None

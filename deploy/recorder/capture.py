@@ -2,7 +2,7 @@
 
 MCAP holds every decoded message of the bus as a topic of its name, and the decisions of all
 processes, as protobuf messages with complete schemas (`topics`). Beside them stand Foxglove's own
-messages (`scene_topics`), from which Foxglove and Rerun show the session. Times are monotonic ones
+messages (`camera_topics`), from which Foxglove and Rerun show pictures and points. Times are monotonic ones
 plus one constant, so that a step of the wall clock shows nowhere.
 """
 
@@ -13,10 +13,10 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
@@ -25,22 +25,17 @@ from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.signals import Frame
 from deploy.bus.description import BusDescription, MessageLayout
-from deploy.checks.shapes import MachineShapes, read_machine_shapes
 from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.kernel.protection import MessageFault
+from deploy.recorder.camera_topics import describe_schema, encode_frame
 from deploy.recorder.topics import TIME, TOPICS, TopicSchema, describe_bus_fields
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
 
-if TYPE_CHECKING:
-    from deploy.recorder.scene_topics import SceneTopics
-
 log = logging.getLogger(__name__)
 
-WriteMessage = Callable[[str, float, str, bytes, bytes], None]
-"""Takes topic, monotonic time, name and data of the schema, and the message."""
 POLL_S = 0.05
 """Between looks into the pipes, which hold minutes. Chosen by hand."""
 FLUSH_S = 0.5
@@ -62,7 +57,6 @@ class CaptureConfig:
         machine: The machine.
         facts: Further metadata: `source`, `policy`, …
         pictures_hz: Pictures of the camera a second; 0: none.
-        shapes: File with the machine's shapes (`deploy.checks.shapes`); `None`: none are drawn.
     """
 
     folder: Path
@@ -70,7 +64,6 @@ class CaptureConfig:
     machine: Machine
     facts: dict[str, str]
     pictures_hz: float
-    shapes: str | None = None
 
 
 def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
@@ -130,10 +123,6 @@ class CaptureWriter:
         self._schemas: dict[str, TopicSchema] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
-        shapes = None
-        if capture.shapes is not None:
-            shapes = read_machine_shapes(resolve_package_path(capture.shapes), machine)
-        self._scene = open_scene(machine, shapes, self._write_message, self._offset_ns)
         self._flushed_s = time.monotonic()
 
     def add(self, data: bytes) -> None:
@@ -145,13 +134,13 @@ class CaptureWriter:
             values = json.loads(data[1:])
             topic, t_s = values.pop("topic"), values.pop("t_s")
             self._write(topic, t_s, values)
-            if self._scene is not None:
-                self._scene.add(topic, t_s, values)
 
     def add_frame(self, frame: Frame) -> None:
         """Take a frame of the camera."""
-        if self._scene is not None:
-            self._scene.add_frame(frame)
+        for topic, message in encode_frame(frame):
+            message.timestamp.FromNanoseconds(int(frame.t_s * 1e9) + self._offset_ns)
+            name, data = message.DESCRIPTOR.full_name, message.SerializeToString()
+            self._write_message(topic, frame.t_s, name, describe_schema(message), data)
 
     def flush_when_due(self) -> None:
         """Flush where it is time to."""
@@ -186,8 +175,6 @@ class CaptureWriter:
             self._write("refused", t_s, refused)
         else:
             self._write(layout.name, t_s, values | {"sent": sent}, layout)
-            if self._scene is not None:
-                self._scene.add(layout.name, t_s, values)
 
     def _write(
         self, topic: str, t_s: float, values: dict[str, Any], layout: MessageLayout | None = None
@@ -212,23 +199,6 @@ class CaptureWriter:
         self._sequence[topic] += 1
         wall_ns = int(t_s * 1e9) + self._offset_ns
         self._mcap.add_message(self._channels[topic], wall_ns, data, wall_ns, self._sequence[topic])
-
-
-def open_scene(
-    machine: Machine, shapes: MachineShapes | None, write: WriteMessage, offset_ns: int
-) -> SceneTopics | None:
-    """Return what writes the scene for viewers; `None` where Foxglove's schemas are missing.
-
-    A recording is worth more than its pictures: it goes on without them.
-    """
-    try:
-        from deploy.recorder.scene_topics import SceneTopics
-    except ModuleNotFoundError as error:
-        log.warning(
-            "no scene and no pictures in the recording: %s; install brokk-rl[deploy]", error
-        )
-        return None
-    return SceneTopics(machine, shapes, write, offset_ns)
 
 
 class PictureSampler:

@@ -7,12 +7,12 @@ import logging
 import mmap
 import os
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from mmap import PROT_READ
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -38,7 +38,7 @@ MOST_CHUNK_BYTES = 1 << 28
 """Size of an opened chunk; those of a capture are flushed twice a second and hold a few MB."""
 
 
-class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
+class TopicMessages:
     """Messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
 
     Topics of numbers alone, as those of the bus, are kept by column: an hour of them takes a tenth
@@ -79,15 +79,7 @@ class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
     def __len__(self) -> int:
         return len(self._t_s)
 
-    @overload
-    def __getitem__(self, index: int) -> tuple[float, dict[str, Any]]: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[tuple[float, dict[str, Any]]]: ...
-    def __getitem__(
-        self, index: int | slice
-    ) -> tuple[float, dict[str, Any]] | list[tuple[float, dict[str, Any]]]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
+    def __getitem__(self, index: int) -> tuple[float, dict[str, Any]]:
         if not self._columns:
             return self._t_s[index], self._rows[index]
         return self._t_s[index], {name: column[index] for name, column in self._columns.items()}
@@ -137,28 +129,37 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
     Raises:
         RecordingError: there is none, or not even its beginning can be read.
     """
-    contents, decoder, ahead_ns = CaptureContents(whole=is_whole(path)), _Decoder(), None
+    contents, decoder = CaptureContents(whole=is_whole(path)), _Decoder()
     seen: list[tuple[str, Message]] = []
-    scan, facts = CaptureScan(path), list[dict[str, str]]()
-    for record in (*list_definitions(path), *scan):
+    ahead_ns, waiting, facts = None, list[Message](), list[dict[str, str]]()
+
+    def take(message: Message) -> None:
+        nonlocal ahead_ns
+        topic = decoder.channels[message.channel_id].topic
+        values = decoder.decode(message)
+        if values is not None:
+            t_s = values.pop(TIME)
+            contents.wall_ns = contents.wall_ns or message.log_time
+            ahead_ns = message.log_time - int(t_s * 1e9) if ahead_ns is None else ahead_ns
+            contents.messages.setdefault(topic, TopicMessages()).add(t_s, values)
+        elif topic in views:
+            seen.append((topic, message))
+
+    for record in _iterate_records(path, contents):
         if isinstance(record, Metadata) and record.name == FACTS:
             facts.append(dict(record.metadata))
         elif isinstance(record, Schema):
             decoder.schemas[record.id] = record
         elif isinstance(record, Channel):
             decoder.channels[record.id] = record
-        # Where the summary is lost, too, a channel may be unknown.
         elif isinstance(record, Message) and record.channel_id in decoder.channels:
-            topic = decoder.channels[record.channel_id].topic
-            values = decoder.decode(record)
-            if values is not None:
-                t_s = values.pop(TIME)
-                contents.wall_ns = contents.wall_ns or record.log_time
-                ahead_ns = record.log_time - int(t_s * 1e9) if ahead_ns is None else ahead_ns
-                contents.messages.setdefault(topic, TopicMessages()).add(t_s, values)
-            elif topic in views:
-                seen.append((topic, record))
-    contents.num_lost, contents.num_damaged = scan.num_lost, scan.num_damaged
+            take(record)
+        elif isinstance(record, Message):
+            waiting.append(record)
+    # The definitions of a damaged chunk stand again at the end.
+    for message in waiting:
+        if message.channel_id in decoder.channels:
+            take(message)
     # They are written several times, and have no check sum.
     contents.facts = max(facts, key=facts.count, default={})
     if not contents.facts:
@@ -201,91 +202,68 @@ def is_whole(path: Path) -> bool:
         return file.read() == MCAP_MAGIC
 
 
-def list_definitions(path: Path) -> list[Any]:
-    """Return schemas and channels that stand outside of chunks, as at the end of a capture.
+def _iterate_records(path: Path, contents: CaptureContents) -> Iterator[Any]:
+    """Yield the records of a capture; what is damaged is left out and counted in `contents`.
 
-    Those of a damaged chunk are known by them, too.
+    A record that cannot be read costs what follows up to the next chunk, and a chunk its messages.
+
+    Raises:
+        RecordingError: the file cannot be read.
     """
-    scan = CaptureScan(path, opens_chunks=False)
-    return [record for record in scan if isinstance(record, (Schema, Channel))]
+    try:
+        if not path.is_file():
+            raise FileNotFoundError(errno.ENOENT, "no such file, or no plain one")
+        if path.stat().st_size == 0:
+            return
+        # A link is followed; a pipe or a device was refused.
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=PROT_READ) as data:
+            yield from _scan(data, contents)
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: cannot be read ({error})") from error
+    if not contents.whole:
+        log.warning("%s: ends before its end", path)
+    if contents.num_damaged:
+        text = "%s: damaged in %d places, at least %d messages are lost"
+        log.warning(text, path, contents.num_damaged, contents.num_lost)
 
 
-class CaptureScan:
-    """Records of a capture, chunk by chunk; what is damaged is left out and counted.
+def _scan(data: mmap.mmap, contents: CaptureContents) -> Iterator[Any]:
+    at, count, is_hidden = MAGIC_SIZE, 0, False
+    following = _find_chunk(data, at)
+    while at < len(data) - MAGIC_SIZE * contents.whole:
+        if following <= at:
+            following = _find_chunk(data, at + 1)
+        record, end = _read_record(data, at)
+        if isinstance(record, Chunk):
+            inner = _open_chunk(record)
+            is_hidden = inner is None
+            contents.num_damaged += is_hidden
+            for one in inner or ():
+                count += isinstance(one, Message)
+                yield one
+        elif isinstance(record, MessageIndex) and is_hidden:
+            contents.num_lost += len(record.records)
+        elif isinstance(record, Statistics):
+            # A wrong opcode may turn a chunk into a record of another kind.
+            contents.num_lost = max(contents.num_lost, record.message_count - count)
+            contents.num_damaged = max(contents.num_damaged, int(contents.num_lost > 0))
+        elif record is not None:
+            yield record
+        # A wrong length leads to where no record begins, or beyond the next chunk.
+        if record is None or end > following:
+            contents.num_damaged += contents.whole or following < len(data)
+            end = following
+        at = end
 
-    A record that cannot be read costs itself, and a chunk its messages: the scan goes on at the next
-    record, or at the next chunk where the damage hides how long the record is.
 
-    Args:
-        path: The capture.
-        opens_chunks: Whether the records within chunks are wanted, too.
-
-    Attributes:
-        num_lost: Messages that are missing, as far as the file says how many it held.
-        num_damaged: Places at which something could not be read.
-    """
-
-    def __init__(self, path: Path, opens_chunks: bool = True) -> None:
-        self.path, self.num_lost, self.num_damaged = path, 0, 0
-        self._opens_chunks, self._following = opens_chunks, 0
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yield the records.
-
-        Raises:
-            RecordingError: the file cannot be read.
-        """
-        try:
-            if not self.path.is_file():
-                raise FileNotFoundError(errno.ENOENT, "no such file, or no plain one")
-            if self.path.stat().st_size == 0:
-                return
-            # A link is followed; a pipe or a device was refused.
-            with self.path.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=PROT_READ) as data:
-                yield from self._scan(data)
-        except (OSError, ValueError) as error:
-            raise RecordingError(f"{self.path}: cannot be read ({error})") from error
-        if self.num_damaged and self._opens_chunks:
-            text = "%s: damaged in %d places, at least %d messages are lost"
-            log.warning(text, self.path, self.num_damaged, self.num_lost)
-
-    def _scan(self, data: mmap.mmap) -> Iterator[Any]:
-        at, count, is_hidden, num_hidden, self._following = MAGIC_SIZE, 0, False, 0, 0
-        is_closed = data[-MAGIC_SIZE:] == MCAP_MAGIC
-        while not _is_file_end(data, at):
-            record, end = _read_record(data, at)
-            if isinstance(record, Chunk):
-                inner = _open_chunk(record) if self._opens_chunks else []
-                is_hidden = inner is None
-                self.num_damaged += is_hidden
-                for one in inner or ():
-                    count += isinstance(one, Message)
-                    yield one
-            elif isinstance(record, MessageIndex) and is_hidden:
-                num_hidden += len(record.records)
-            elif isinstance(record, Statistics):
-                # A wrong opcode may turn a chunk into a record of another kind.
-                num_hidden = max(num_hidden, record.message_count - count)
-                self.num_damaged = max(self.num_damaged, int(num_hidden > 0))
-            elif record is not None:
-                yield record
-            self.num_lost = num_hidden
-            following = self._find_following(data, at)
-            # A wrong length leads to where no record begins, or beyond the next chunk.
-            if record is None or following < end or not _is_record_start(data, end):
-                end = following
-                if end == len(data) and not is_closed:
-                    if self._opens_chunks:
-                        log.warning("%s: ends before its end", self.path)
-                    return
-                self.num_damaged += 1
-            at = end
-
-    def _find_following(self, data: mmap.mmap, at: int) -> int:
-        """Return where the next chunk or record of facts begins after `at`, or the file ends."""
-        if self._following <= at:
-            self._following = _find_record(data, at + 1)
-        return self._following
+def _find_chunk(data: mmap.mmap, at: int) -> int:
+    """Return where the next chunk begins, or the end of the file."""
+    offset = HEAD_BYTES + CHUNK_HEAD_BYTES
+    begin = at - 1
+    while (begin := data.find(COMPRESSION, begin + offset + 1) - offset) >= at:
+        if data[begin] == Opcode.CHUNK:
+            return begin
+    return len(data)
 
 
 def _read_record(data: mmap.mmap, at: int) -> tuple[Any | None, int]:
@@ -298,20 +276,6 @@ def _read_record(data: mmap.mmap, at: int) -> tuple[Any | None, int]:
         return next(reader.records), end
     except Exception:  # damage may raise whatever the parser meets first
         return None, end
-
-
-def _is_record_start(data: mmap.mmap, at: int) -> bool:
-    """Return whether a record, or the end of the file, may be at `at`."""
-    if at + HEAD_BYTES > len(data):
-        return _is_file_end(data, at)
-    length = int.from_bytes(data[at + 1 : at + HEAD_BYTES], "little")
-    return _is_file_end(data, at) or (
-        0 < data[at] <= max(Opcode) and at + HEAD_BYTES + length <= len(data)
-    )
-
-
-def _is_file_end(data: mmap.mmap, at: int) -> bool:
-    return at == len(data) or (at == len(data) - MAGIC_SIZE and data[at:] == MCAP_MAGIC)
 
 
 def _open_chunk(chunk: Chunk) -> list[Any] | None:
@@ -327,20 +291,3 @@ def _open_chunk(chunk: Chunk) -> list[Any] | None:
         return breakup_chunk(chunk, validate_crc=True)
     except Exception:  # as above
         return None
-
-
-def _find_record(data: mmap.mmap, at: int) -> int:
-    """Return where the next chunk or record of facts begins, or the end of the file."""
-    name = len(FACTS).to_bytes(4, "little") + FACTS.encode()
-    facts = _find_mark(data, at, name, HEAD_BYTES, Opcode.METADATA)
-    chunk = _find_mark(data, at, COMPRESSION, CHUNK_HEAD_BYTES + HEAD_BYTES, Opcode.CHUNK)
-    return min(facts, chunk)
-
-
-def _find_mark(data: mmap.mmap, at: int, mark: bytes, offset: int, opcode: int) -> int:
-    """Return where the next record begins that has `mark` at `offset`, or the end of the file."""
-    begin = at - 1
-    while (begin := data.find(mark, begin + offset + 1) - offset) >= at:
-        if data[begin] == opcode and _is_record_start(data, begin):
-            return begin
-    return len(data)

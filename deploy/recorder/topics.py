@@ -31,7 +31,7 @@ TYPES = {
 }
 TIME = "t_s"
 PICTURE, LENS, CLOUD, CAMERA_POSE = "camera", "camera/calibration", "camera/points", "tf/camera"
-"""Topics of the camera, written by `scene_topics`."""
+"""Topics of the camera, written by `camera_topics`."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ TOPICS: dict[str, tuple[TopicField, ...]] = {
         TopicField("seen_s", "number", "when it was measured, s of the monotonic clock", optional=True),
     ),
 }  # fmt: skip
-"""Fields by topic, beside those of the bus and of Foxglove's own schemas (`scene_topics`)."""
+"""Fields by topic, beside those of the bus and of Foxglove's own schemas (`camera_topics`)."""
 
 
 def describe_bus_fields(

@@ -183,10 +183,9 @@ class DeploymentLoop(BusAndPolicySettings):
         # These facts go into every recording, so that it can be read without the run folder.
         facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
         pictures_hz = self.camera.record_hz if self.camera else 0.0
-        shapes = self.limits.envelope.shapes if self.limits.envelope else None
 
         def start(folder: Path) -> ChildProcess:
-            capture = CaptureConfig(folder, self.dbc, machine, facts, pictures_hz, shapes)
+            capture = CaptureConfig(folder, self.dbc, machine, facts, pictures_hz)
             target = "deploy.recorder.capture:run"
             return ChildProcess("log", target, (capture, memory), memory.files)
 

@@ -138,7 +138,7 @@ async def _serve(stop: Stop, video: VideoSettings, path: Path) -> None:
     asyncio.get_running_loop().set_exception_handler(_tell)
     readers = []
     for name, camera in video.cameras.items():
-        readers.append(CameraReader(name, camera.build))
+        readers.append(CameraReader(name, camera))
     watching: set[VideoPeer] = set()
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

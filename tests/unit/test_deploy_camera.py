@@ -316,7 +316,6 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(
             perception_process._publish_frame(exchange.frame, FRAME, PIXELS, 100.0 + number)
             if (frame := pictures.due()) is not None:
                 log.add_frame(frame)
-    pytest.importorskip("foxglove_schemas_protobuf", reason="no viewer's messages without it")
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
     views = capture_reader.read_capture(tmp_path / "capture.mcap", ("camera",)).views["camera"]
