@@ -8,15 +8,14 @@ than a hand can, and an axis passes through neutral before the button changes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
 
-from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.machine import Lever, Machine
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
 
 AXES = (("left", "theta"), ("left", "psi"), ("right", "theta"), ("right", "psi"))
@@ -50,22 +49,20 @@ class LeverGuidance:
     """Mapping and pace of the displayed lever positions.
 
     Attributes:
-        levers: Axis of each joint; `null` for those of the machine.
         dead_zone: Deflection, of full, below which neutral is displayed: a hand cannot hold less.
         max_rate_rad_s: Fastest change of the displayed angle.
     """
 
-    levers: tuple[Lever, ...] | None
     dead_zone: Annotated[float, Interval(ge=0, lt=1)]
     max_rate_rad_s: Positive
 
 
-def find_full_angles_rad(levers: Sequence[Lever]) -> np.ndarray:
+def find_full_angles_rad(machine: Machine) -> np.ndarray:
     """Return the angle at full deflection of each of the four `AXES`, `(4,)`; 1 without a joint."""
     full_rad = np.ones(len(AXES))
     for index, axis in enumerate(AXES):
         angles_rad = []
-        for one in levers:
+        for one in machine.levers:
             if (one.side, one.axis) == axis:
                 angles_rad.append(one.max_angle_rad)
         if angles_rad:
@@ -84,24 +81,18 @@ class LeverMap:
     """Mapping between commands and levers.
 
     Args:
-        levers: Axis of each joint.
-        machine: The machine.
+        machine: The machine, with the axis of each joint.
 
     Raises:
         ConfigError: a joint has no axis, or two that may move together share one.
     """
 
-    def __init__(self, levers: tuple[Lever, ...], machine: Machine) -> None:
+    def __init__(self, machine: Machine) -> None:
         names = machine.joint_names
-        for lever in levers:
-            if lever.joint not in names:
-                raise ConfigError(
-                    f"guidance: machine '{machine.name}' has no joint '{lever.joint}'; {list_choices(lever.joint, names)}"
-                )
-        by_joint = {lever.joint: lever for lever in levers}
+        by_joint = {lever.joint: lever for lever in machine.levers}
         if missing := [name for name in names if name not in by_joint]:
             raise ConfigError(
-                f"guidance: no lever for {', '.join(missing)}; add it to guidance.levers or to the machine's file"
+                f"guidance: no lever for {', '.join(missing)}; add it to the machine's file"
             )
         self._axis = np.array(
             [AXES.index((by_joint[name].side, by_joint[name].axis)) for name in names]
@@ -136,7 +127,7 @@ class LeverDisplay:
 
     def __init__(self, guidance: LeverGuidance, machine: Machine) -> None:
         self._guidance = guidance
-        self.map = LeverMap(guidance.levers or machine.levers, machine)
+        self.map = LeverMap(machine)
         self._angles_rad, self._button = np.zeros(len(AXES)), False
 
     def show(self, u: np.ndarray, period_s: float) -> LeverAngles:

@@ -167,7 +167,7 @@ class TwinDesk:
         )
         bundle = PolicyBundle(ground.policy, machine)
         self._adviser = PolicyAdviser(settings, bundle, self._memory)
-        self._display = LeverMap(ground.guidance.levers or machine.levers, machine)
+        self._display = LeverMap(machine)
         self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
         self._shown = np.zeros(machine.num_joints)
         for _ in range(round(BEFORE_S / machine.period_s)):

@@ -126,9 +126,8 @@ class Desk:
         session = Session(out=str(folder), seed=0, device="cpu")
         self._twin_arguments = (twin, machine, NominalMachine(), session, None)
         page = replace(option("page", "local"), port=0)
-        ages_s = (limits.joints_s, limits.levers_s, limits.round_trip_s, 600.0)
         self._page = PageProcessConfig(
-            page, machine, option("guidance", "machine"), session, *ages_s
+            page, machine, option("guidance", "machine"), session, limits, 600.0
         )
         self._link, self._browser = session.folder / LINK, contextlib.ExitStack()
         self.children: dict[str, ChildProcess] = {}

@@ -122,7 +122,7 @@ class Bridge:
         self._stage = stage
         self._waiting: list[tuple[int, int, CanFrame, bool]] = []
         self._order, self._counts = itertools.count(), Counter[int]()
-        self._remote = RadioRemote(BusDescription(DBC, stage.machine))
+        self._remote = RadioRemote(BusDescription(DBC, stage.machine), stage.machine)
         self._remote.deadman = True
         layouts = self._remote._description.layouts.values()
         self._layouts = {one.frame_id: one for one in layouts}

@@ -34,7 +34,10 @@ def hold_button(stage: Stage) -> None:
 
 def reboot_remote(stage: Stage, trial: int) -> None:
     """The remote reboots, 0.15 to 2.5 s long, and its dead-man is held all the time."""
-    remote, end_s = RadioRemote(stage.twin._description), stage.now_s + OFF_S[trial % 6]
+    remote, end_s = (
+        RadioRemote(stage.twin._description, stage.machine),
+        stage.now_s + OFF_S[trial % 6],
+    )
     stage.twin._remote = remote
     remote.is_ready = False
 

@@ -78,8 +78,8 @@ class BusReceiver:
         )
         self.flow_check = FlowCheck(self.limits.flow, machine.num_joints, self.limits.round_trip_s)
         has_levers = {lever.joint for lever in machine.levers} >= set(machine.joint_names)
-        self._lever_map = LeverMap(machine.levers, machine) if has_levers else None
-        self._lever_full_rad = find_full_angles_rad(machine.levers)
+        self._lever_map = LeverMap(machine) if has_levers else None
+        self._lever_full_rad = find_full_angles_rad(machine)
         self.flow_source = 0
         # Whether the gateway goes by our description and machine; `None` until it says so.
         self.described: bool | None = None

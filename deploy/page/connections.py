@@ -72,64 +72,40 @@ class SendWindow:
         await self._free.wait()
 
 
-class ConnectionBudget(Generic[C]):
-    """Places for connections: watchers, those without their token yet, and operators.
+class Places(Generic[C]):
+    """Places for connections of one kind: where all are taken, who is mute longest goes.
 
-    Nobody can lock out the operator. A new connection takes the place of the oldest one that has
-    not shown its token, an operator that of the operator who came first, and a watcher that of one
-    that has been mute.
+    Nobody can lock out the operator.
 
     Args:
-        clients: Pages that can be open at once.
+        limit: Connections that can be open at once.
+        mute_s: Silence from which a connection loses its place; 0: the oldest one always does.
     """
 
-    def __init__(self, clients: int) -> None:
-        self._clients = clients
-        # When each watcher was heard last; the others in the order in which they came.
-        self._watchers: dict[C, float] = {}
-        self._unproven: dict[C, None] = {}
-        self._operators: dict[C, None] = {}
+    def __init__(self, limit: int, mute_s: float = 0.0) -> None:
+        self._limit, self._mute_s = limit, mute_s
+        self._heard_s: dict[C, float] = {}
 
-    @property
-    def num_watchers(self) -> int:
-        """Number of watchers."""
-        return len(self._watchers)
+    def __len__(self) -> int:
+        return len(self._heard_s)
 
-    def admit_watcher(self, connection: C, now_s: float) -> tuple[bool, C | None]:
-        """Return whether a watcher is let in, and the one that has to go for it."""
+    def admit(self, connection: C, now_s: float) -> tuple[bool, C | None]:
+        """Return whether a connection is let in, and the one that has to go for it."""
         evicted = None
-        if len(self._watchers) >= WATCHING * self._clients:
-            evicted = min(self._watchers, key=lambda one: self._watchers[one])
-            if now_s - self._watchers[evicted] < MUTE_S:
+        if len(self._heard_s) >= self._limit:
+            evicted = min(self._heard_s, key=lambda one: self._heard_s[one])
+            if now_s - self._heard_s[evicted] < self._mute_s:
                 return False, None
-            del self._watchers[evicted]
-        self._watchers[connection] = now_s
+            del self._heard_s[evicted]
+        self._heard_s[connection] = now_s
         return True, evicted
 
     def note_heard(self, connection: C, now_s: float) -> None:
-        """Note that a watcher has answered."""
+        """Note that a connection has said something."""
         # One that has been evicted may still say something.
-        if connection in self._watchers:
-            self._watchers[connection] = now_s
-
-    def admit_unproven(self, connection: C) -> C | None:
-        """Let in a connection that still has to show its token; return the one that has to go."""
-        return _take_place(self._unproven, connection, UNPROVEN)
-
-    def admit_operator(self, connection: C) -> C | None:
-        """Let in a connection that has shown the token; return the one that has to go."""
-        return _take_place(self._operators, connection, OPERATING * self._clients)
+        if connection in self._heard_s:
+            self._heard_s[connection] = now_s
 
     def release(self, connection: C) -> None:
-        """Free the place of a connection, whatever it was."""
-        self._watchers.pop(connection, None)
-        self._unproven.pop(connection, None)
-        self._operators.pop(connection, None)
-
-
-def _take_place(places: dict[C, None], connection: C, limit: int) -> C | None:
-    evicted = next(iter(places)) if len(places) >= limit else None
-    if evicted is not None:
-        del places[evicted]
-    places[connection] = None
-    return evicted
+        """Free the place of a connection."""
+        self._heard_s.pop(connection, None)

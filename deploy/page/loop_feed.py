@@ -25,6 +25,7 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.guidance import LeverGuidance, convert_to_positions, find_full_angles_rad
 from deploy.kernel.bus_process import TEXT
+from deploy.kernel.limits import GuardLimits
 from deploy.page.protocol import (
     BoreholeChoice,
     LoopHealth,
@@ -77,9 +78,7 @@ class PageProcessConfig:
         machine: The machine.
         guidance: How the levers are shown.
         session: Where the link goes.
-        positions_s: Age from which positions are stale.
-        levers_s: Age from which the operator's levers are.
-        delay_s: Delay of messages from which the guard lets nothing pass.
+        limits: The guard's: ages from which positions and levers are stale, and delay of messages.
         borehole_s: Age from which the borehole is.
         camera_s: Age from which the camera's picture is; `None`: there is no camera.
         video_folder: Folder with the socket of the video process; `None`: there is no video.
@@ -89,9 +88,7 @@ class PageProcessConfig:
     machine: Machine
     guidance: LeverGuidance
     session: Session
-    positions_s: float
-    levers_s: float
-    delay_s: float
+    limits: GuardLimits
     borehole_s: float
     camera_s: float | None = None
     video_folder: str | None = None
@@ -135,7 +132,7 @@ class LoopFeed:
         self._guiding, self._stopped_s, self._present_s = True, 0.0, 0.0
         self._turned_s, self._signalling = clock(), threading.Lock()
         machine = config.machine
-        self._full_rad = find_full_angles_rad(config.guidance.levers or machine.levers)
+        self._full_rad = find_full_angles_rad(machine)
         self._exclusive = machine.is_exclusive
 
     def read_advice_number(self) -> int | None:
@@ -270,8 +267,8 @@ class LoopFeed:
         state, advice = snapshot.state, snapshot.advice
         advice_s = ADVICE_PERIODS * config.machine.period_s
         sources: list[tuple[str, float | None, float]] = [
-            ("positions", None if state is None else state.q_t_s, config.positions_s),
-            ("levers", None if state is None else state.levers_t_s, config.levers_s),
+            ("positions", None if state is None else state.q_t_s, config.limits.joints_s),
+            ("levers", None if state is None else state.levers_t_s, config.limits.levers_s),
             ("advice", None if advice is None else advice.t_s, advice_s),
             ("borehole", None if aim is None else float(aim["t_s"]), config.borehole_s),
         ]
@@ -298,7 +295,7 @@ class LoopFeed:
         silent = controls is not None and snapshot.t_s - controls.t_s > SUPERVISOR_S
         return LoopHealth(
             delay_s=0.0 if snapshot.state is None else snapshot.state.held_up_s,
-            delay_limit_s=self._config.delay_s,
+            delay_limit_s=self._config.limits.round_trip_s,
             log_behind=any(pipe.waiting > LOG_BEHIND_BYTES for pipe in memory.logs),
             supervisor_silent=silent,
         )

@@ -119,7 +119,7 @@ class ReplayFeed:
             found = [topic for topic in self._topics.values() if signal in topic.rows.names]
             self._sources[signal] = found[0] if found else None
         self._blank = RecordLayout(OperatorState, machine.num_joints).new()
-        self._full_rad = find_full_angles_rad(machine.levers)
+        self._full_rad = find_full_angles_rad(machine)
         self._marks = _list_marks(self._topics, self._begin_s)
         guard = self._topics.get("guard")
         # Without any other state, the loop could only listen.

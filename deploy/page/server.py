@@ -35,7 +35,15 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.page import access, frame_codec
 from deploy.page.alarms import list_alarms
-from deploy.page.connections import ConnectionBudget, LatestValue, SendWindow
+from deploy.page.connections import (
+    MUTE_S,
+    OPERATING,
+    UNPROVEN,
+    WATCHING,
+    LatestValue,
+    Places,
+    SendWindow,
+)
 from deploy.page.files import FILES, SECURITY, load_files
 from deploy.page.protocol import PageFeed, PageState
 from deploy.page.settings import LINK, PageSettings
@@ -184,7 +192,9 @@ class PageServer:
             self._files |= extension.files
             self._handlers[extension.path] = extension.talk
         self._names = access.list_own_names(page.host, page.names)
-        self._budget = ConnectionBudget[ServerConnection](page.clients)
+        self._watchers = Places[ServerConnection](WATCHING * page.clients, MUTE_S)
+        self._unproven = Places[ServerConnection](UNPROVEN)
+        self._operators = Places[ServerConnection](OPERATING * page.clients)
         self._guess, self._closing = asyncio.Lock(), set[asyncio.Task[None]]()
 
     async def run(self, stop: Callable[[], bool], begin: Callable[[int], None]) -> None:
@@ -262,7 +272,7 @@ class PageServer:
         while True:
             # Pictures are large; they are encoded only while somebody looks.
             await asyncio.sleep(FRAME_POLL_S)
-            if not self._budget.num_watchers or time.monotonic() < due_s:
+            if not len(self._watchers) or time.monotonic() < due_s:
                 continue
             frame = self._feed.read_frame(taken_s)
             if frame is None:
@@ -302,13 +312,16 @@ class PageServer:
         path = connection.request.path.partition("?")[0]
         with contextlib.suppress(ConnectionClosed):
             if path in (STATE, FRAMES):
-                await self._serve_watcher(connection, self._handlers[path])
+                await self._serve(self._watchers, connection, self._handlers[path])
             elif await self._check_token(connection):
-                await self._serve_operator(connection, self._handlers[path])
+                await connection.send(json.dumps({"ready": True}))
+                await self._serve(self._operators, connection, self._handlers[path])
 
-    async def _serve_watcher(self, connection: ServerConnection, handle: Handler) -> None:
+    async def _serve(
+        self, places: Places[ServerConnection], connection: ServerConnection, handle: Handler
+    ) -> None:
         # Compared after the handshake: before it, handshakes at the same time would all be let in.
-        admitted, evicted = self._budget.admit_watcher(connection, time.monotonic())
+        admitted, evicted = places.admit(connection, time.monotonic())
         self._close_later(evicted)
         if not admitted:
             await connection.close(TRY_AGAIN_LATER, "too many pages; see page.clients")
@@ -316,15 +329,7 @@ class PageServer:
         try:
             await handle(connection)
         finally:
-            self._budget.release(connection)
-
-    async def _serve_operator(self, connection: ServerConnection, handle: Handler) -> None:
-        self._close_later(self._budget.admit_operator(connection))
-        try:
-            await connection.send(json.dumps({"ready": True}))
-            await handle(connection)
-        finally:
-            self._budget.release(connection)
+            places.release(connection)
 
     def _close_later(self, connection: ServerConnection | None) -> None:
         """Close a connection without waiting for its answer: a mute one gives none."""
@@ -342,7 +347,7 @@ class PageServer:
 
         async def listen() -> None:
             async for text in connection:
-                self._budget.note_heard(connection, time.monotonic())
+                self._watchers.note_heard(connection, time.monotonic())
                 if not str(text).isdecimal():
                     await connection.close(POLICY_VIOLATION, "malformed")
                     return
@@ -365,13 +370,13 @@ class PageServer:
 
     async def _check_token(self, connection: ServerConnection) -> bool:
         """Ask for the token; close the connection where it is wrong or does not come."""
-        self._close_later(self._budget.admit_unproven(connection))
+        self._close_later(self._unproven.admit(connection, time.monotonic())[1])
         try:
             given = json.loads(await asyncio.wait_for(connection.recv(), TOKEN_PATIENCE_S))
         except (ValueError, TimeoutError):
             given = None
         finally:
-            self._budget.release(connection)
+            self._unproven.release(connection)
         token = given.get("token") if isinstance(given, dict) else None
         if access.compare_tokens(token, self._token):
             return True

@@ -120,7 +120,7 @@ class BusAndPolicySettings:
         """
         check_command_rate(self.limits, machine)
         BusDescription(self.dbc, machine)
-        LeverMap(self.guidance.levers or machine.levers, machine)
+        LeverMap(machine)
         PolicyBundle(self.policy, machine)
 
     def start_processes(

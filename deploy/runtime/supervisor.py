@@ -170,9 +170,7 @@ class DeploymentLoop(BusAndPolicySettings):
             machine=machine,
             guidance=self.guidance,
             session=session,
-            positions_s=self.limits.joints_s,
-            levers_s=self.limits.levers_s,
-            delay_s=self.limits.round_trip_s,
+            limits=self.limits,
             borehole_s=self.target_s,
             camera_s=self.camera.stale_s if self.camera else None,
         )

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -48,11 +48,12 @@ class TargetPosition:
 class TargetProvider(Protocol):
     """Reports the configured borehole."""
 
-    def news(self, holes: list[Any]) -> TargetPosition | None:
+    def news(self, holes: list[Any], known: TargetPosition | None) -> TargetPosition | None:
         """Return the borehole if it is new, else `None`; called several times a second.
 
         Args:
             holes: Boreholes from perception, records of `deploy.runtime.shm_layout.HOLE`.
+            known: Target until now.
 
         Raises:
             ConfigError: its source is invalid.
@@ -78,9 +79,15 @@ class GivenTarget:
 
     center_in_base_m: tuple[float, float, float]
 
-    def build(self) -> TargetProvider:
-        """Return it at work; see `TargetSource`."""
-        return _FixedTarget(TargetPosition(np.array(self.center_in_base_m), 0.0, None))
+    def build(self) -> Self:
+        """Return it at work."""
+        return self
+
+    def news(self, holes: list[Any], known: TargetPosition | None) -> TargetPosition | None:
+        """See `TargetProvider`."""
+        if known is not None:
+            return None
+        return TargetPosition(np.array(self.center_in_base_m), 0.0, None)
 
 
 @spec
@@ -94,7 +101,7 @@ class FileTarget:
     path: str
 
     def build(self) -> TargetProvider:
-        """Return it at work; see `TargetSource`."""
+        """Return it at work."""
         return _WatchedFile(Path(self.path))
 
 
@@ -108,9 +115,17 @@ class DetectedTarget:
 
     score: Share
 
-    def build(self) -> TargetProvider:
-        """Return it at work; see `TargetSource`."""
-        return _SurestHole(self.score)
+    def build(self) -> Self:
+        """Return it at work."""
+        return self
+
+    def news(self, holes: list[Any], known: TargetPosition | None) -> TargetPosition | None:
+        """See `TargetProvider`."""
+        sure = max(holes, key=lambda hole: float(hole["score"]), default=None)
+        # The first one is followed; only the operator changes to a surer one.
+        if known is not None or sure is None or float(sure["score"]) < self.score:
+            return None
+        return locate_hole(sure)
 
 
 class TargetSelector:
@@ -135,7 +150,7 @@ class TargetSelector:
             ConfigError: the configured source is invalid now.
         """
         before, known = self._place, read_holes(self._holes)
-        news = self._target.news(known)
+        news = self._target.news(known, before)
         self._place = news or self._seen(known) or before
         if self._place is not None and (self._place is not before or self._place.t_s is None):
             self._place.write(self._slot)
@@ -179,34 +194,12 @@ def locate_hole(hole: Any) -> TargetPosition:
     )
 
 
-class _FixedTarget:
-    def __init__(self, place: TargetPosition) -> None:
-        self._place: TargetPosition | None = place
-
-    def news(self, holes: list[Any]) -> TargetPosition | None:
-        place, self._place = self._place, None
-        return place
-
-
-class _SurestHole:
-    def __init__(self, score: float) -> None:
-        self._score, self._said = score, False
-
-    def news(self, holes: list[Any]) -> TargetPosition | None:
-        sure = max(holes, key=lambda hole: float(hole["score"]), default=None)
-        if self._said or sure is None or float(sure["score"]) < self._score:
-            return None
-        # From now on this one is followed; only the operator changes to a surer one.
-        self._said = True
-        return locate_hole(sure)
-
-
 class _WatchedFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._changed: int | None = None
 
-    def news(self, holes: list[Any]) -> TargetPosition | None:
+    def news(self, holes: list[Any], known: TargetPosition | None) -> TargetPosition | None:
         try:
             changed = self._path.stat().st_mtime_ns
             if changed == self._changed:

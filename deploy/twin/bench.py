@@ -10,10 +10,26 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.guidance import LeverGuidance, LeverMap
 from deploy.runtime.supervisor import CompanionProcess
 from deploy.twin.remote import GamepadRemote
 from deploy.twin.twin import TWIN_PRIORITY, Twin
+
+
+def list_companions(
+    twin: Twin,
+    plant: Connection,
+    machine: Machine,
+    session: Session,
+    target: str = "",
+    *arguments: Any,
+) -> list[CompanionProcess]:
+    """Return the process of a twin, and of who plays its remote, where `target` names that."""
+    own = (twin, machine, plant, session)
+    found = [CompanionProcess("twin", "deploy.twin.twin:run", own, TWIN_PRIORITY)]
+    if target:
+        others = (twin.wire, twin.dbc, machine, *arguments)
+        found.append(CompanionProcess("operator", target, others, TWIN_PRIORITY))
+    return found
 
 
 @spec
@@ -25,16 +41,11 @@ class TwinBench:
         plant: The simulated machine behind it.
         operator: Simulated person who moves the levers as they are shown; `null`: none, the levers
             stay in neutral.
-        guidance: How the levers are shown.
-        assumed: Assumptions of policies for such an operator (`conf/advice.yaml`), for the record;
-            `null` without one.
     """
 
     twin: Twin
     plant: Connection
     operator: Follower | None
-    guidance: LeverGuidance
-    assumed: dict[str, Any] | None
 
     def check(self) -> None:
         if self.twin.remote == (self.operator is not None):
@@ -44,15 +55,11 @@ class TwinBench:
 
     def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
         """Return the processes to run beside the loop."""
-        arguments = (self.twin, machine, self.plant, session)
-        twin = CompanionProcess("twin", "deploy.twin.twin:run", arguments, TWIN_PRIORITY)
         if self.operator is None:
-            return [twin]
-        levers = LeverMap(self.guidance.levers or machine.levers, machine)
-        wire, dbc, seed = self.twin.wire, self.twin.dbc, session.stream("operator")
-        arguments = (wire, dbc, machine, self.operator, levers, seed)
+            return list_companions(self.twin, self.plant, machine, session)
+        arguments = (self.operator, session.stream("operator"))
         target = "deploy.twin.remote:run_operator"
-        return [twin, CompanionProcess("operator", target, arguments, TWIN_PRIORITY)]
+        return list_companions(self.twin, self.plant, machine, session, target, *arguments)
 
 
 @spec
@@ -83,9 +90,5 @@ class GamepadBench:
         """
         # Before anything starts: a person who has forgotten to plug it in is told so at once.
         self.gamepad.open_device().close()
-        twin = self.twin
-        arguments: tuple[Any, ...] = (twin, machine, self.plant, session)
-        found = [CompanionProcess("twin", "deploy.twin.twin:run", arguments, TWIN_PRIORITY)]
-        arguments = (twin.wire, twin.dbc, machine, self.gamepad)
         target = "deploy.twin.remote:run_gamepad"
-        return [*found, CompanionProcess("gamepad", target, arguments, TWIN_PRIORITY)]
+        return list_companions(self.twin, self.plant, machine, session, target, self.gamepad)

@@ -75,8 +75,8 @@ class Gateway:
         for layout in (self._command, self._remote):
             self._channels[layout.name] = layout.open_channel()
         self._most_s = {self._command.name: ROUND_TRIP_S, self._remote.name: REMOTE_S}
-        self._map = LeverMap(machine.levers, machine)
-        self._axis_full_rad = find_full_angles_rad(machine.levers)
+        self._map = LeverMap(machine)
+        self._axis_full_rad = find_full_angles_rad(machine)
         self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0
         self._lever, self._remote_s = np.zeros(len(AXES)), -np.inf
         self._button = self._deadman = self._on = False

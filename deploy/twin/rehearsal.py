@@ -7,7 +7,6 @@ emergency stop, one joint after the other, each both ways. They can fail one cho
 from __future__ import annotations
 
 import contextlib
-from typing import Any
 
 import numpy as np
 
@@ -18,13 +17,13 @@ from brokk_rl.session import Session
 from brokk_rl.spec import Positive, spec
 from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
-from deploy.guidance import LeverMap, find_full_angles_rad
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.supervisor import CompanionProcess
+from deploy.twin.bench import list_companions
 from deploy.twin.faults import request_fault
 from deploy.twin.remote import RadioRemote
-from deploy.twin.twin import TWIN_PRIORITY, Twin
+from deploy.twin.twin import Twin
 
 CHECKS = ("bus", "positions", "dead-man", "e-stop", "joints", "shadow")
 """Checks that can be failed."""
@@ -78,12 +77,9 @@ class RehearsalBench:
 
     def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
         """Return the processes to run beside the checklist."""
-        twin, port = self.twin, self.twin.fault_port
-        arguments: tuple[Any, ...] = (twin, machine, self.plant, session)
-        found = [CompanionProcess("twin", "deploy.twin.twin:run", arguments, TWIN_PRIORITY)]
-        arguments = (twin.wire, twin.dbc, machine, port, self.rest_s, self.fails)
+        arguments = (self.twin.fault_port, self.rest_s, self.fails)
         target = "deploy.twin.rehearsal:run_person"
-        return [*found, CompanionProcess("operator", target, arguments, TWIN_PRIORITY)]
+        return list_companions(self.twin, self.plant, machine, session, target, *arguments)
 
 
 class ScriptedPerson:
@@ -99,8 +95,6 @@ class ScriptedPerson:
 
     def __init__(self, machine: Machine, fails: str | None) -> None:
         self._machine, self._fails = machine, fails
-        self._map = LeverMap(machine.levers, machine)
-        self._full_rad = find_full_angles_rad(machine.levers)
         self.round_s = JOINTS_S + machine.num_joints * PART_S
 
     def holds(self, switch: str, t_s: float) -> bool:
@@ -123,8 +117,7 @@ class ScriptedPerson:
 
     def move(self, remote: RadioRemote, t_s: float) -> None:
         """Move the remote's levers and hold its dead-man as at `t_s`."""
-        angles_rad, remote.button_right = self._map.levers(self.command(t_s))
-        remote.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
+        remote.move_levers(self.command(t_s))
         remote.deadman = self.holds("dead-man", t_s)
 
     def spoil(self, t_s: float, rest_s: float) -> dict[str, object] | None:
@@ -162,7 +155,10 @@ def run_person(
         fails: Check that the person fails; `None`: none.
         memory: Tells that the loop has heard positions.
     """
-    remote, person = RadioRemote(BusDescription(dbc, machine)), ScriptedPerson(machine, fails)
+    remote, person = (
+        RadioRemote(BusDescription(dbc, machine), machine),
+        ScriptedPerson(machine, fails),
+    )
     begun_s, pressed, spoiled = np.inf, False, False
     with wire.open(remote.frame_ids) as bus:
         for now_s in remote.iterate_cycles(stop, bus):

@@ -42,7 +42,8 @@ class RadioRemote:
             those of late copies, so it sends nothing.
     """
 
-    def __init__(self, description: BusDescription) -> None:
+    def __init__(self, description: BusDescription, machine: Machine) -> None:
+        self._map, self._full_rad = LeverMap(machine), find_full_angles_rad(machine)
         self._description = description
         self._layout = description.layouts[description.message_of("DeadMan")]
         self.period_s = self._layout.period_s
@@ -57,6 +58,11 @@ class RadioRemote:
     def frame_ids(self) -> list[int]:
         """Identifier of the message from which it takes the gateway's clock."""
         return [self._heard.frame_id]
+
+    def move_levers(self, u: np.ndarray) -> None:
+        """Move the levers to where they stand for commands, `(J,)`; press the button with them."""
+        angles_rad, self.button_right = self._map.levers(u)
+        self.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
 
     def hear(self, frame: CanFrame) -> None:
         """Take the gateway's clock from its status; other frames are ignored."""
@@ -101,7 +107,6 @@ def run_operator(
     dbc: str,
     machine: Machine,
     follower: Follower,
-    levers: LeverMap,
     seed: int,
     memory: LoopMemory,
 ) -> None:
@@ -115,19 +120,16 @@ def run_operator(
         dbc: Its description.
         machine: The machine.
         follower: The operator.
-        levers: Mapping of the displayed levers.
         seed: Of the operator.
         memory: Source of the advice.
     """
     import torch  # only here: the machine's computer has none
 
     torch.manual_seed(seed)
-    remote = RadioRemote(BusDescription(dbc, machine))
+    remote = RadioRemote(BusDescription(dbc, machine), machine)
     hands = follower.build(machine, 1, torch.device("cpu"))
     cycles_a_period = round(machine.period_s / remote.period_s)
-    full_rad = find_full_angles_rad(machine.levers)
-    # the hands move the machine's own remote, whatever pattern is displayed
-    own = LeverMap(machine.levers, machine)
+    levers = LeverMap(machine)
     remote.deadman = True
     with wire.open(remote.frame_ids) as bus:
         for cycle, _ in enumerate(remote.iterate_cycles(stop, bus)):
@@ -136,8 +138,7 @@ def run_operator(
                 proposed = torch.as_tensor(displayed, dtype=torch.float32)[None]
                 with torch.inference_mode():
                     given = hands.step(proposed)[0].numpy().astype(float)
-                angles_rad, remote.button_right = own.levers(given)
-                remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
+                remote.move_levers(given)
 
 
 def _read_displayed_command(memory: LoopMemory, levers: LeverMap) -> np.ndarray:
@@ -208,7 +209,7 @@ def run_gamepad(
         settings: Of the gamepad.
         memory: Not needed: the person looks at the page.
     """
-    remote, gamepad = RadioRemote(BusDescription(dbc, machine)), settings.open_device()
+    remote, gamepad = RadioRemote(BusDescription(dbc, machine), machine), settings.open_device()
     with wire.open(remote.frame_ids) as bus:
         for _ in remote.iterate_cycles(stop, bus):
             settings.move(remote, gamepad)

@@ -149,9 +149,9 @@ class RunningTwin:
         self._description = BusDescription(twin.dbc, machine)
         self._gateway, self._remote = (
             Gateway(self._description, machine),
-            RadioRemote(self._description),
+            RadioRemote(self._description, machine),
         )
-        self._second, self._second_due_s = RadioRemote(self._description), -np.inf
+        self._second, self._second_due_s = RadioRemote(self._description, machine), -np.inf
         self._second.deadman = True
         self._faults, self._timer = ActiveFaults(), CycleTimer(CYCLE_S)
         self._counters: dict[str, int] = {}

@@ -139,7 +139,10 @@ def test_a_dead_time_beyond_the_commands_of_the_history_fails_the_check(
 
 def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -> None:
     """Does what the checklist asks for: dead-man, emergency stop, then each joint both ways."""
-    remote, person = RadioRemote(BusDescription(DBC, machine)), ScriptedPerson(machine, None)
+    remote, person = (
+        RadioRemote(BusDescription(DBC, machine), machine),
+        ScriptedPerson(machine, None),
+    )
     begun_s, asked = time.monotonic(), False
     with wire.open(remote.frame_ids) as bus:
         for now_s in remote.iterate_cycles(stop.is_set, bus):
@@ -205,7 +208,7 @@ def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
     """Its stamps would jump at the first message it hears, and look like those of late copies."""
     machine = option("machine", "brokk170")
     description = BusDescription(DBC, machine)
-    remote = RadioRemote(description)
+    remote = RadioRemote(description, machine)
     status = description.layouts[description.message_of("EStop")]
     assert not remote.is_ready
     remote.hear(CanFrame(status.frame_id, bytes(8)))
@@ -241,9 +244,10 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     begins = np.flatnonzero(moves.any(1)[1:] & ~moves.any(1)[:-1]) + 1
     for begin in begins:
         assert not moves[begin - 50 : begin].any()
-    person = ScriptedPerson(option("machine", "brokk170"), None)
+    machine = option("machine", "brokk170")
+    person = ScriptedPerson(machine, None)
     assert not person.command(-1.0).any() and not person.holds("dead-man", -person.round_s + 0.5)
-    remote = RadioRemote(BusDescription(DBC, option("machine", "brokk170")))
+    remote = RadioRemote(BusDescription(DBC, machine), machine)
     person.move(remote, 2.2 + 1.2)
     assert min(remote.levers) == pytest.approx(-0.6) and not remote.button_right
     person.move(remote, 2.2 + 4.8 + 1.2)

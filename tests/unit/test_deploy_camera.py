@@ -39,6 +39,7 @@ from deploy.runtime.target import (
 )
 
 MACHINE = option("machine", "brokk170")
+OPTIONS = (option("page", "local"), MACHINE, option("guidance", "machine"))
 FRAME = BlockCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 12.0)
 PIXELS = 640 * 360
 
@@ -170,18 +171,7 @@ def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(
 def feed(exchange: LoopMemory, tmp_path: Path) -> LoopFeed:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     return LoopFeed(
-        PageProcessConfig(
-            option("page", "local"),
-            MACHINE,
-            option("guidance", "machine"),
-            session,
-            0.15,
-            0.15,
-            0.15,
-            600.0,
-            1.0,
-        ),
-        exchange,
+        PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0, 1.0), exchange
     )
 
 

@@ -41,8 +41,7 @@ class Watch:
         session = Session(out=str(folder), seed=0, device="cpu")
         page, guidance = option("page", "local"), option("guidance", "machine")
         limits = option("guard", "default")
-        ages_s = (limits.joints_s, limits.levers_s, limits.round_trip_s, 600.0)
-        config = PageProcessConfig(page, stage.machine, guidance, session, *ages_s)
+        config = PageProcessConfig(page, stage.machine, guidance, session, limits, 600.0)
         self.stage, self.told_ms = stage, dict[str, int]()
         self._feed = LoopFeed(config, stage.memory, lambda: stage.now_s)
 

@@ -24,6 +24,7 @@ from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
+OPTIONS = (option("page", "local"), MACHINE, option("guidance", "machine"))
 FULL_RAD = 0.35
 
 
@@ -37,19 +38,7 @@ def memory() -> Iterator[LoopMemory]:
 @pytest.fixture
 def feed(memory: LoopMemory, tmp_path: Path) -> LoopFeed:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
-    return LoopFeed(
-        PageProcessConfig(
-            option("page", "local"),
-            MACHINE,
-            option("guidance", "machine"),
-            session,
-            0.15,
-            0.15,
-            0.15,
-            600.0,
-        ),
-        memory,
-    )
+    return LoopFeed(PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0), memory)
 
 
 def say(memory: LoopMemory, **changes: Any) -> None:
@@ -241,10 +230,7 @@ def test_a_start_that_was_asked_for_before_a_stop_does_not_undo_it(
 def test_a_loop_that_sends_nothing_has_nothing_to_confirm(tmp_path: Path) -> None:
     memory = LoopMemory.new(MACHINE.num_joints, commands=False)
     session = Session(out=str(tmp_path), seed=1, device="cpu")
-    guidance = option("guidance", "machine")
-    config = PageProcessConfig(
-        option("page", "local"), MACHINE, guidance, session, 0.15, 0.15, 0.15, 600.0
-    )
+    config = PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0)
     feed = LoopFeed(config, memory)
     assert feed.submit(OperatorRequest("stop", "")) and feed.confirms_stop()
     memory.close()
@@ -298,21 +284,3 @@ def test_a_log_that_died_is_not_started_again_in_secret(
     feed.submit(OperatorRequest("record", "on"))
     supervisor.refresh()
     assert feed.read_state().recording.on and not feed.read_state().recording.failed
-
-
-def test_other_lever_patterns_have_their_own_full_angles(
-    memory: LoopMemory, tmp_path: Path
-) -> None:
-    session = Session(out=str(tmp_path), seed=1, device="cpu")
-    guidance = option("guidance", "iso")
-    wide = replace(
-        guidance, levers=tuple(replace(one, max_angle_rad=0.5) for one in guidance.levers)
-    )
-    feed = LoopFeed(
-        PageProcessConfig(option("page", "local"), MACHINE, wide, session, 0.15, 0.15, 0.15, 600.0),
-        memory,
-    )
-    say(memory)
-    advise(memory, lever_rad=[0.25, 0.0, 0.0, 0.0])
-    advice = feed.read_state().advice
-    assert advice is not None and advice.levers.left_theta == pytest.approx(0.5)

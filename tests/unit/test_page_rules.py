@@ -28,7 +28,7 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page import access, alarms, frame_codec
-from deploy.page.connections import ConnectionBudget
+from deploy.page.connections import Places
 from deploy.page.files import load_files
 from deploy.page.protocol import (
     BoreholeChoice,
@@ -318,15 +318,16 @@ def test_both_languages_say_everything() -> None:
 
 
 def test_places_are_kept_apart_and_the_mute_and_the_oldest_give_way() -> None:
-    budget = ConnectionBudget[str](clients=1)
-    assert budget.admit_watcher("a", 0.0) == (True, None)
-    assert budget.admit_watcher("b", 0.5) == (True, None)
-    assert budget.admit_watcher("c", 1.9) == (False, None), "nobody has been mute for two seconds"
-    budget.note_heard("a", 1.9)
-    assert budget.admit_watcher("c", 2.5) == (True, "b")
-    budget.note_heard("b", 2.6)
-    assert budget.num_watchers == 2
-    budget.release("a")
-    assert budget.admit_watcher("d", 2.5) == (True, None)
-    assert [budget.admit_unproven(str(number)) for number in range(9)] == [None] * 8 + ["0"]
-    assert [budget.admit_operator(name) for name in "wxyz"] == [None, None, None, "w"]
+    places = Places[str](2, mute_s=2.0)
+    assert places.admit("a", 0.0) == (True, None)
+    assert places.admit("b", 0.5) == (True, None)
+    assert places.admit("c", 1.9) == (False, None), "nobody has been mute for two seconds"
+    places.note_heard("a", 1.9)
+    assert places.admit("c", 2.5) == (True, "b")
+    places.note_heard("b", 2.6)
+    assert len(places) == 2
+    places.release("a")
+    assert places.admit("d", 2.5) == (True, None)
+    open_ones = Places[str](3)
+    gone = [open_ones.admit(name, t_s)[1] for t_s, name in enumerate("wxyz")]
+    assert gone == [None, None, None, "w"]
