@@ -151,8 +151,6 @@ def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -
                 with contextlib.suppress(TimeoutError):
                     request_fault(port, {"fault": "estop", "seconds": 0.3})
             asked = person.holds("e-stop", now_s - begun_s)
-            if remote.is_ready:
-                bus.send(remote.build_frame())
 
 
 @pytest.mark.slow
