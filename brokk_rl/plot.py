@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Literal
-
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Literal
 
 from brokk_rl.session import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#8c8c8c"
 PURPLE = "#cc79a7"
@@ -21,6 +22,8 @@ DPI = 150
 
 def make_figure(width_inches: float, height_inches: float) -> Figure:
     """Return an empty figure whose layout leaves room for labels."""
+    from matplotlib.figure import Figure  # this import takes 0.4 s
+
     return Figure(figsize=(width_inches, height_inches), layout="constrained")
 
 
