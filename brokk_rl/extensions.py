@@ -182,17 +182,9 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
         text = read_plain_file(Path(name).expanduser(), MOST_BYTES).decode()
         check_yaml_size(text)
         loaded = OmegaConf.create(text)
-    except FileNotFoundError as error:
-        raise ConfigError(f"{where}: there is no such file (seen from {Path.cwd()})") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"{where}: cannot be read as text ({getattr(error, 'strerror', None) or error})"
-        ) from error
-    except yaml.MarkedYAMLError as error:
-        line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
-        raise ConfigError(f"{where}: {line}no valid YAML ({error.problem})") from error
-    except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
-        raise ConfigError(f"{where}: no valid YAML ({error})") from error
+    except (OSError, yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{where}: no valid YAML (seen from {Path.cwd()}): {reason}") from error
     node = OmegaConf.to_container(loaded, resolve=False) if isinstance(loaded, DictConfig) else None
     if not isinstance(node, dict) or not node:
         raise ConfigError(f"{where}: expected a mapping, as in a file of conf/{group}")

@@ -240,14 +240,9 @@ def write_recording(recording: Recording, path: Path) -> None:
     import pyarrow.parquet as pq
 
     check_recording(recording, str(path))
-    columns: dict[str, np.ndarray] = {"t_s": recording.t_s.astype(np.float64)}
-    for j, joint in enumerate(recording.joints):
-        columns[name_command_column(joint)] = recording.u[:, j].astype(np.float32)
-    for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
-        columns[name_position_column(joint, unit)] = recording.q[:, j].astype(np.float32)
-    columns.update(
-        {name: np.asarray(values, dtype=np.float32) for name, values in recording.extra.items()}
-    )
+    columns = {"t_s": recording.t_s.astype(np.float64)}
+    for name, values in (_list_columns(recording) | dict(recording.extra)).items():
+        columns[name] = np.asarray(values, dtype=np.float32)
     metadata = {
         "schema": SCHEMA,
         "machine": recording.machine,
@@ -299,11 +294,8 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
         if key.startswith(b"brokk."):
             metadata[key.removeprefix(b"brokk.").decode()] = value.decode()
     units = tuple(joint.unit for joint in machine.joints)
-    commands = [name_command_column(name) for name in machine.joint_names]
-    positions = [
-        name_position_column(name, unit)
-        for name, unit in zip(machine.joint_names, units, strict=True)
-    ]
+    commands = list(map(name_command_column, machine.joint_names))
+    positions = list(map(name_position_column, machine.joint_names, units))
     required = ["t_s", *commands, *positions]
     found = [*check_metadata(metadata, machine.name), *check_names(required, table.column_names)]
     columns: dict[str, np.ndarray] = {}
@@ -377,13 +369,18 @@ def check_recording(recording: Recording, where: str) -> None:
             raise RecordingError(
                 f"{where}: {name} has shape {values.shape}, expected {shape} (samples, joints)"
             )
-    columns = {"t_s": recording.t_s}
-    for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
-        columns[name_command_column(joint)] = recording.u[:, j]
-        columns[name_position_column(joint, unit)] = recording.q[:, j]
+    columns = {"t_s": recording.t_s} | _list_columns(recording)
     required = list(columns)
     for breach in check_columns(columns | dict(recording.extra), required, recording.rate_hz):
         raise RecordingError(f"{where}: {breach}")
+
+
+def _list_columns(recording: Recording) -> dict[str, np.ndarray]:
+    """Return commands, then positions, of all joints by the names of their columns."""
+    joints, units = recording.joints, recording.units
+    positions = map(name_position_column, joints, units)
+    names = [*map(name_command_column, joints), *positions]
+    return dict(zip(names, [*recording.u.T, *recording.q.T], strict=True))
 
 
 def format_now() -> str:

@@ -111,7 +111,7 @@ def test_a_target_that_is_moved_takes_block_estimate_and_arm_with_it(made: Calla
     np.testing.assert_allclose(state.estimate_m - state.target_m, error, atol=1e-5)
     np.testing.assert_array_equal(state.q, before.q)
     np.testing.assert_array_equal(state.target_m[1], before.target_m[1])
-    block = session.loop.world._mocap_pos[0, 0].numpy()
+    block = session.loop.world._views["mocap_pos"][0, 0].numpy()
     np.testing.assert_allclose(block, place, atol=1e-5)
     run(session, 1)
     # One more noisy sample in the mean of 22.
