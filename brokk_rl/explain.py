@@ -96,9 +96,7 @@ def _explain_missing_option(error: MissingConfigException) -> str:
     if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
     # Hydra lists none where a list of options was given.
-    offered = error.options or [
-        option.name for option in registry.list_options() if option.group == group
-    ]
+    offered = error.options or [option.name for option in registry.list_options(group)]
     if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
     return f"there is no {group}={name}; {_list_options(group, name, offered)}"
@@ -153,7 +151,7 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
 
 
 def _explain_missing_choice(group: str) -> str:
-    names = [option.name for option in registry.list_options() if option.group == group]
+    names = [option.name for option in registry.list_options(group)]
     return f"{explain_missing_value(group)}; {_list_options(group, '', names)}"
 
 

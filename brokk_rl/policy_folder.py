@@ -154,11 +154,10 @@ def describe_task(task: object) -> TaskDescription:
 
 def name_target(target: str) -> str:
     """Return the name of the task's option with the class `target`, else the class itself."""
-    for option in registry.list_options():
-        if option.group == "task":
-            offered = yaml.safe_load(option.path.read_text()) or {}
-            if offered.get(TARGET) == target:
-                return option.name
+    for option in registry.list_options("task"):
+        offered = yaml.safe_load(option.path.read_text()) or {}
+        if offered.get(TARGET) == target:
+            return option.name
     return target
 
 

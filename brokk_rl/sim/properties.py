@@ -74,13 +74,9 @@ class WorldProperties:
         links = [int(model.joint(name).bodyid[0]) for name in machine.joint_names]
         self._links = torch.tensor(links, device=device)
         carried = np.zeros((model.nbody, model.nbody))
-        for body in range(model.nbody):
-            above = body
-            while True:
-                carried[body, above] = 1.0
-                if above == 0:
-                    break
-                above = model.body_parentid[above]
+        for body in range(model.nbody):  # parents come first
+            carried[body] = carried[model.body_parentid[body]]
+            carried[body, body] = 1.0
         self._carried = constant(carried)
         self._stiffness = constant(model.actuator_gainprm[:, 0])
         self._damping = constant(-model.actuator_biasprm[:, 2])

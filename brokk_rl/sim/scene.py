@@ -7,6 +7,7 @@ corners. The slabs serve as block and as wall of the hole, which halves the geom
 ring of eight walls.
 """
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -144,10 +145,7 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         name="block", mocap=True, pos=make_nominal_scenes(1)[0, :3].numpy()
     )
     block = build_collision_geoms(1.0, HOLE_RADIUS_M)
-    corners = []
-    for scale in SCALE_BOUNDS:
-        for radius in HOLE_RADIUS_BOUNDS_M:
-            corners.append((scale, radius))
+    corners = itertools.product(SCALE_BOUNDS, HOLE_RADIUS_BOUNDS_M)
     largest = np.max([build_collision_geoms(*corner).size for corner in corners], axis=0)
     for name, box in _list_boxes(replace(block, size=largest)):
         is_shown = name.startswith("slab") or name == "plug"
