@@ -118,12 +118,12 @@ class CommandParts:
 class PlannableModel(ParametricModel):
     """Base of models whose step is a planned run of one command.
 
-    A model overrides `ask`, `solve`, `begin` and `advance`.
+    A model overrides `solve`, `begin` and `advance`.
     """
 
     def ask(self, commands: torch.Tensor) -> torch.Tensor:
-        """Return what commands `(K, N, J)` ask for."""
-        raise NotImplementedError
+        """Return what commands `(K, N, J)` ask for; the commands themselves unless a model says otherwise."""
+        return commands
 
     def solve(self, drive: CommandParts) -> Any:
         """Return all that steps of a run have in common."""

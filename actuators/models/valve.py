@@ -17,24 +17,16 @@ cylinder are in the pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from actuators.models.joint_model import JointMemory, PlannableModel
+from actuators.models.joint_model import CommandParts, JointMemory, PlannableModel
 from actuators.models.joint_weight import build_joint_weight
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import (
-    PerJoint,
-    check_interface,
-    read_parameters,
-    select_commands_in_force,
-    split_run_commands,
-)
+from actuators.models.parameters import PerJoint, check_interface, read_parameters
 from brokk_rl.errors import ConfigError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -42,9 +34,6 @@ NUMBERS = ("dead_time_s", "play", "spool_s", "speed_s", "demand")
 CELLS = 512
 """The curves are tabulated in so many equal steps of the spool's whole stroke: a step is finer than
 any valve repeats."""
-STEPS_AT_ONCE = 8
-"""Steps of a run whose flow is looked up together: their tables stay in the core's cache. Chosen by
-hand; 4 to 16 take the same time within a tenth."""
 BEYOND = 1.2
 """Positions, in halves of the travel from its middle, beyond which the pose counts no further."""
 
@@ -192,77 +181,45 @@ class ValveModel(PlannableModel):
                 sides.append(_expand_rows(rows, machine, pose.size, f"actuator.{name}"))
             self._pose, self._slopes = pose, tensor(np.stack(sides))
 
-    def step(self, history: History) -> torch.Tensor:
-        """Return the joint positions one control period later, shape `(N, J)`."""
-        q = history.q[:, -1]
-        earlier, later, part = select_commands_in_force(
-            history.u, self.delay_s / self.plant.period_s
-        )
-        begun = {"pilot": earlier, "spool": earlier, "step": q - history.q[:, -2]}
-        memory = self.recall(begun)
-        commands = torch.lerp(later, earlier, part)[None]
-        pilot, spool = self._follow(commands, memory["pilot"], memory["spool"])
-        drive = ValveDrive(self._want(spool), spool > 0)
-        held, after = self.advance(0, q, drive, self.solve(drive), memory)
-        self.keep(after | {"pilot": pilot, "spool": spool[-1]})
-        return held
+    def solve(self, drive: CommandParts) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the parts of spool and speed that are left after a period."""
+        return self._compute_decay("spool_s"), self._compute_decay("speed_s")
 
-    def drive(self, u: torch.Tensor, first: int) -> ValveDrive:
-        """Return the demand of the commands of a run `(T, N, J)`, whatever the positions are."""
-        delay_periods = self.delay_s / self.plant.period_s
-        earlier, later, part = split_run_commands(u, delay_periods, first)
-        _, spool = self._follow(torch.lerp(later, earlier, part), earlier[0], earlier[0])
-        wanted = torch.empty_like(spool)
-        for k in range(0, len(spool), STEPS_AT_ONCE):
-            rows = slice(k, k + STEPS_AT_ONCE)
-            wanted[rows] = self._want(spool[rows])
-        return ValveDrive(wanted, spool > 0)
-
-    def solve(self, drive: ValveDrive) -> torch.Tensor:
-        """Return the part of the speed that is left after a period."""
-        return self._compute_decay("speed_s")
-
-    def begin(self, drive: ValveDrive, q: torch.Tensor, before: torch.Tensor) -> JointMemory:
-        """Return the motion that the history shows."""
-        return {"step": q - before}
+    def begin(self, drive: CommandParts, q: torch.Tensor, before: torch.Tensor) -> JointMemory:
+        """Return spools at the command in force, and the motion that the history shows."""
+        return {"pilot": drive.earlier[0], "spool": drive.earlier[0], "step": q - before}
 
     def advance(
         self,
         k: int,
         q: torch.Tensor,
-        drive: ValveDrive,
-        solution: torch.Tensor,
+        drive: CommandParts,
+        solution: tuple[torch.Tensor, torch.Tensor],
         memory: JointMemory,
     ) -> tuple[torch.Tensor, JointMemory]:
-        """Return positions after step `k`, and the motion that the next one begins with."""
-        wanted = drive.wanted[k]
+        """Return positions, spools and the motion after step `k`."""
+        spool_kept, step_kept = solution
+        command = torch.lerp(drive.later[k], drive.earlier[k], drive.part)
+        play = 0.5 * self.parameters["play"]
+        pilot = memory["pilot"].clamp(command - play, command + play)
+        spool = torch.lerp(pilot, memory["spool"], spool_kept)
+        wanted = self._want(spool)
         if self._pose:
             both = (self._slopes[:, None] * self._pose.features(q)).sum(-1)
-            change = torch.where(drive.extends[k], both[0], both[1])
+            change = torch.where(spool > 0, both[0], both[1])
             wanted = wanted * (1.0 + change).clamp(min=0.0)
-        step = torch.lerp(wanted, memory["step"], solution)
+        step = torch.lerp(wanted, memory["step"], step_kept)
         moved = q + step
         held = self.plant.hold_from(q, moved)
-        return held, {"step": step.masked_fill(held != moved, 0.0)}
-
-    def _follow(
-        self, commands: torch.Tensor, pilot: torch.Tensor, spool: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the last pilot, and the strokes of the spools after commands `(K, N, J)`."""
-        play, kept = 0.5 * self.parameters["play"], self._compute_decay("spool_s")
-        low, high = commands - play, commands + play
-        found = torch.empty_like(commands)
-        for k in range(len(commands)):
-            pilot = pilot.clamp(low[k], high[k])
-            spool = torch.lerp(pilot, spool, kept, out=found[k])
-        return pilot, found
+        step = step.masked_fill(held != moved, 0.0)
+        return held, {"pilot": pilot, "spool": spool, "step": step}
 
     def _compute_decay(self, name: str) -> torch.Tensor:
         """Return the part of a first-order lag's state that is left after a period."""
         return torch.exp(-self.plant.period_s / self.parameters[name].clamp(min=1e-6))
 
     def _want(self, spool: torch.Tensor) -> torch.Tensor:
-        """Return the motion in a period that spools `(…, N, J)` ask for in the mean pose."""
+        """Return the motion in a period that spools `(N, J)` ask for in the mean pose."""
         flow = self._flow(spool)
         full = torch.where(spool > 0, self._full_extend, self._full_retract)
         asked = (self.parameters["demand"] * (flow / full).abs()).sum(-1, keepdim=True)
@@ -273,19 +230,6 @@ class ValveModel(PlannableModel):
         cell = place.floor().clamp(max=CELLS - 1)
         at = cell.to(torch.int64) + self._row
         return torch.lerp(self._table[at], self._table[at + 1], place - cell)
-
-
-@dataclass(frozen=True, eq=False)
-class ValveDrive:
-    """Demand of commands on a valve in each step of a run.
-
-    Attributes:
-        wanted: Motion in a period in the mean pose, `(K, N, J)`.
-        extends: Whether the valve opens to the positive side, `(K, N, J)`.
-    """
-
-    wanted: torch.Tensor
-    extends: torch.Tensor
 
 
 def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.ndarray:
