@@ -83,59 +83,62 @@ def estimate_dead_times(
     usable = [recording for recording in recordings if recording.duration_s > 2.0 * LONGEST_S]
     if not usable:
         raise RecordingError(f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s")
+    runs = list(group_by_run(usable).values())
     grid_s = np.arange(0.0, LONGEST_S + 1e-9, RESOLUTION_S)
-    estimate = _estimate_servo_delay if machine.interface == "position" else _estimate_dead_time
+    search = _search_loops if machine.interface == "position" else _search_curves
     estimates = {}
     for joint, name in enumerate(machine.joint_names):
-        estimates[name] = estimate(usable, joint, grid_s, machine, generator)
+        found = search(runs, joint, grid_s, machine)
+        estimates[name] = found and _bound_delay(grid_s, *found, generator)
     return estimates
 
 
-def _estimate_servo_delay(
-    recordings: Sequence[Recording],
-    joint: int,
+def _bound_delay(
     grid_s: np.ndarray,
-    machine: Machine,
+    left: np.ndarray,
+    total: float,
+    resolution_s: float,
     generator: np.random.Generator,
-) -> DeadTimeEstimate | None:
-    """Return the delay of a joint that follows targets, `None` where they hardly change."""
-    pairs, runs = [], []
-    for name, several in group_by_run(recordings).items():
+) -> DeadTimeEstimate:
+    """Return the best delay with its interval.
+
+    Args:
+        grid_s: Delays that were tried, `(D,)`.
+        left: Sum of squares that each leaves of each run, `(R, D)`.
+        total: Sum of squares of all runs.
+        resolution_s: No interval is narrower.
+        generator: Draws the resamples.
+    """
+    best = int(left.sum(0).argmin())
+    picks = generator.integers(len(left), size=(RESAMPLED, len(left)))
+    low, high = np.percentile(grid_s[left[picks].sum(1).argmin(1)], (2.5, 97.5))
+    value_s = float(grid_s[best])
+    low_s, high_s = value_s - 0.5 * resolution_s, value_s + 0.5 * resolution_s
+    interval_s = float(max(0.0, min(low, low_s))), float(max(high, high_s))
+    explained = float(1.0 - left.sum(0)[best] / total)
+    return DeadTimeEstimate(value_s, interval_s, explained, is_found=best < len(grid_s) - 1)
+
+
+def _search_loops(
+    runs: Sequence[Sequence[Recording]], joint: int, grid_s: np.ndarray, machine: Machine
+) -> tuple[np.ndarray, float, float] | None:
+    """Return what the best loop behind each delay leaves, `(R, D)`, of what in all, and the resolution, s.
+
+    `None` for a joint whose targets hardly change.
+    """
+    pairs, source = [], []
+    for number, several in enumerate(runs):
         for one in several:
             target = read_targets(one.u.astype(float), machine)[:, joint]
-            if np.ptp(target) > 0:
-                pairs.append((target[:MOST_ROWS], one.q[:MOST_ROWS, joint].astype(float)))
-                runs.append(name)
+            pairs.append((target[:MOST_ROWS], one.q[:MOST_ROWS, joint].astype(float)))
+            source.append(number)
     if sum(int((np.diff(target) != 0).sum()) for target, _ in pairs) < MIN_CHANGES:
         return None
     loops = ServoLoops(pairs, machine.period_s, grid_s)
-    _, left = loops.search()
-    names = list(dict.fromkeys(runs))
-    by_run = np.stack([left[[run == name for run in runs]].sum(0) for name in names])
-    best = int(by_run.sum(0).argmin())
-    picks = generator.integers(len(names), size=(RESAMPLED, len(names)))
-    again = grid_s[by_run[picks].sum(1).argmin(1)]
+    left = np.zeros((len(runs), len(grid_s)))
+    np.add.at(left, source, loops.search()[1])
     total = sum(float(((q - q.mean()) ** 2).sum()) for _, q in pairs)
-    left = float(by_run.sum(0)[best] / total)
-    return _bound_delay(grid_s, best, again, max(RESOLUTION_S, loops.step_s) / 2, left)
-
-
-def _bound_delay(
-    grid_s: np.ndarray, best: int, again: np.ndarray, half_s: float, left: float
-) -> DeadTimeEstimate:
-    """Return the estimate with its interval.
-
-    Args:
-        grid_s: Delays that were tried.
-        best: Place of the best one.
-        again: Best delays of resamples, s.
-        half_s: Half of the resolution: no interval is narrower to either side.
-        left: Part of the variance that the best delay leaves unexplained.
-    """
-    low, high = np.percentile(again, (2.5, 97.5))
-    value_s = float(grid_s[best])
-    interval_s = float(max(0.0, min(low, value_s - half_s))), float(max(high, value_s + half_s))
-    return DeadTimeEstimate(value_s, interval_s, 1.0 - left, is_found=best < len(grid_s) - 1)
+    return left, total, max(RESOLUTION_S, loops.step_s)
 
 
 class ServoLoops:
@@ -200,35 +203,29 @@ def discretise_loop(w: float, damping: float, step_s: float) -> tuple[np.ndarray
     return np.array([0.0, first, second + denominator[1] * first - first]), denominator
 
 
-def _estimate_dead_time(
-    recordings: Sequence[Recording],
-    joint: int,
-    grid_s: np.ndarray,
-    machine: Machine,
-    generator: np.random.Generator,
-) -> DeadTimeEstimate | None:
-    moving, num_moving = [], 0
-    for recording in recordings:
-        count = int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum())
-        num_moving += count
-        if count:
-            moving.append(recording)
-    if num_moving < MIN_MOVING:
+def _search_curves(
+    runs: Sequence[Sequence[Recording]], joint: int, grid_s: np.ndarray, machine: Machine
+) -> tuple[np.ndarray, float, float] | None:
+    """Return what the best curve behind each delay leaves, `(R, D)`, of what in all, and the resolution, s.
+
+    `None` for a joint that is hardly commanded.
+    """
+    commanded = 0
+    moments = np.zeros((len(runs), len(grid_s), 2 * len(KNOTS) + 1, 2 * len(KNOTS) + 1))
+    for number, several in enumerate(runs):
+        for one in several:
+            commanded += int((np.abs(one.u[:, joint]) > KNOTS[1]).sum())
+            moments[number] += _compute_moments(one, joint, grid_s, machine)
+    if commanded < MIN_MOVING:
         return None
-    runs = group_by_run(moving).values()
-    # (R, D, F + 1, F + 1)
-    moments = np.stack(
-        [
-            np.sum([_compute_moments(part, joint, grid_s, machine) for part in parts], 0)
-            for parts in runs
-        ]
-    )
-    value = _find_best_delay(moments.sum(0))
-    picks = (generator.integers(len(moments), size=len(moments)) for _ in range(RESAMPLED))
-    again = grid_s[[_find_best_delay(moments[pick].sum(0)) for pick in picks]]
-    total = moments.sum(0)
-    left = float(_compute_residual(total)[value] / total[value, -1, -1])
-    return _bound_delay(grid_s, value, again, RESOLUTION_S / 2, left)
+    gram, cross, total = moments[..., :-1, :-1], moments[..., :-1, -1], moments[..., -1, -1]
+    every = gram.sum(0)
+    ridge = 1e-6 * np.trace(every, axis1=1, axis2=2)[:, None, None] / every.shape[1] + 1e-12
+    curve = np.linalg.solve(every + ridge * np.eye(every.shape[1]), cross.sum(0)[..., None])[..., 0]
+    by_curve = np.einsum("di,rdij,dj->rd", curve, gram, curve)
+    left = total - 2.0 * np.einsum("di,rdi->rd", curve, cross) + by_curve
+    best = int(left.sum(0).argmin())
+    return left, float(total[:, best].sum()), RESOLUTION_S
 
 
 def _compute_moments(
@@ -256,15 +253,3 @@ def _compute_moments(
         features = np.concatenate([delayed, moved[now, None]], 1)
         found.append(features.T @ features)
     return np.stack(found)
-
-
-def _compute_residual(moments: np.ndarray) -> np.ndarray:
-    """Return the sum of squares that the best curve leaves, for each delay, shape `(D,)`."""
-    gram, cross, total = moments[:, :-1, :-1], moments[:, :-1, -1], moments[:, -1, -1]
-    ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / gram.shape[1] + 1e-12
-    weight = np.linalg.solve(gram + ridge * np.eye(gram.shape[1]), cross[..., None])[..., 0]
-    return total - 2.0 * (weight * cross).sum(1) + np.einsum("di,dij,dj->d", weight, gram, weight)
-
-
-def _find_best_delay(moments: np.ndarray) -> int:
-    return int(np.argmin(_compute_residual(moments)))

@@ -14,6 +14,7 @@ import torch
 from scipy.optimize import least_squares
 from scipy.signal import butter, filtfilt
 
+from actuators.identify.standard_errors import estimate_standard_errors
 from actuators.models.friction import LOADS, STRIBECK_SPEED, compute_dry_friction
 from actuators.models.machine_tensors import read_pose
 from brokk_rl.errors import RecordingError
@@ -194,7 +195,7 @@ class _JointRegression:
             forces.append(one.filter(one.force))
             folds.append(np.arange(len(forces[-1])) * NUM_FOLDS // max(1, len(forces[-1])))
         self._x, self._y = np.concatenate(columns), np.concatenate(forces)
-        self._fold = np.concatenate(folds)
+        self._fold, self._lengths = np.concatenate(folds), [len(one) for one in forces]
         if len(self._y) < LEAST_ROWS:
             raise RecordingError(
                 f"too little data: {len(self._y)} rows of joint {name} after filtering, {LEAST_ROWS} or more are needed"
@@ -258,16 +259,13 @@ class _JointRegression:
 
     def estimate_errors(self, found: dict[str, float]) -> dict[str, float]:
         """Return the standard errors of the numbers."""
-        names, here = list(found), self._predict(found)
-        slopes = []
-        for name in names:
-            step = 1e-4 * self._size[name]
-            moved = self._predict({**found, name: found[name] + step})
-            slopes.append((moved - here) / 1e-4)
-        freedom = max(1, len(self._y) - len(names))
-        variance = np.square(here - self._y).sum() / freedom
-        covariance = variance * np.linalg.pinv(np.array(slopes) @ np.array(slopes).T)
-        errors = np.sqrt(np.diag(covariance)) * [self._size[name] for name in names]
+        names = tuple(found)
+        errors = estimate_standard_errors(
+            lambda x: self._predict(dict(zip(names, x, strict=True))) - self._y,
+            np.array([*found.values()]),
+            1e-4 * np.array([self._size[name] for name in names]),
+            self._lengths,
+        )
         return dict(zip(names, errors.tolist(), strict=True))
 
     def _bound(self, name: str) -> tuple[float, float]:

@@ -7,7 +7,6 @@ Parameter Identification of Robot Dynamics", 2013, section II. A logged force is
 Other terms are tried beside these four, see `actuators.identify.drive_regression`.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 import torch
 
 from actuators.identify.drive_regression import TERMS, DriveMotion, filter_low_pass, fit_drive
-from actuators.identify.option_file import round_by_joint, write_option
+from actuators.identify.option_file import write_numbers
 from actuators.models.force_drive import ForceDrive
 from actuators.models.friction import STRIBECK_SPEED
 from actuators.models.parameters import expand_per_joint
@@ -88,28 +87,23 @@ class ForceFit:
         delays_s = expand_per_joint(
             machine.dead_time_s if given is None else given, machine, "fit.actuator.dead_time_s"
         )
-        values: dict[str, dict[str, float]] = {}
-        told: dict[str, dict[str, dict[str, float]]] = {}
-        tried = {}
         least = 4 * round(EDGE_S / machine.period_s)
         long = [one for one in (*train, *validation) if one.num_samples >= least]
+        found = {}
         for j, joint in enumerate(machine.joint_names):
             motions = [self._read_motion(machine, one, j, delays_s[j]) for one in long]
-            found = fit_drive(machine, j, motions, self.terms)
-            tried[joint] = found.tried
-            for name, value in found.value.items():
-                values.setdefault(name, {})[joint] = float(f"{value:.5g}")
-                error = {"value": value, "standard_error": found.error[name]}
-                told.setdefault(name, {})[joint] = error
-        for name, mine in values.items():  # joints that lack a term of another one
-            off = np.zeros(machine.num_joints)
-            if name == "stribeck_m_s":
-                off = STRIBECK_SPEED * machine.max_speed
-            values[name] = round_by_joint(machine, off) | mine
-        fitted = dataclasses.replace(self.actuator, **values)  # pyright: ignore[reportArgumentType]
-        facts = {"schema": 1, "parameters": told, "terms": tried}
-        write_option(folder, self.name, fitted, f"fitted to {machine.name}", facts)
-        return fitted
+            found[joint] = fit_drive(machine, j, motions, self.terms)
+        tried = {joint: one.tried for joint, one in found.items()}
+        numbers, errors = {}, {}
+        for name in dict.fromkeys(key for one in found.values() for key in one.value):
+            # joints that lack a term of another one
+            off = STRIBECK_SPEED * machine.max_speed * (name == "stribeck_m_s")
+            pairs = zip(found.values(), off, strict=True)
+            numbers[name] = np.array([one.value.get(name, none) for one, none in pairs])
+            errors[name] = np.array([one.error.get(name, np.nan) for one in found.values()])
+        return write_numbers(
+            folder, self.name, self.actuator, machine, numbers, errors, terms=tried
+        )
 
     def _read_motion(
         self, machine: Machine, recording: Recording, j: int, delay_s: float

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from actuators.identify import training_data
+from actuators.identify.option_file import write_option
 from actuators.identify.training_data import TrainingWindows, list_sources
 from actuators.models import checkpoint
 from actuators.models.machine_tensors import MachineTensors
@@ -87,7 +88,7 @@ class NetworkFit:
         seed: int,
         device: torch.device,
     ) -> Mlp:
-        """Fit to `train`, keep the best weights on `validation`, write `<name>.safetensors`.
+        """Fit to `train`, keep the best weights on `validation`, write `<name>.safetensors` and `<name>.yaml`.
 
         Raises:
             RecordingError: too little data.
@@ -120,7 +121,9 @@ class NetworkFit:
         }
         path = folder / f"{self.name}.safetensors"
         checkpoint.write_checkpoint(path, "mlp", machine, tensors, facts)
-        return Mlp(checkpoint=str(path))
+        fitted = Mlp(checkpoint=str(path))
+        write_option(folder, self.name, fitted, f"fitted to recordings of {machine.name}")
+        return fitted
 
 
 class _HorizonStage(NamedTuple):

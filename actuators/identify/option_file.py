@@ -15,31 +15,60 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import write_json, write_text
 
 
-def round_by_joint(machine: Machine, values: np.ndarray) -> dict[str, Any]:
-    """Return numbers `(J,)`, or rows of them `(J, M)`, with five digits, by name of the joint."""
-    found = {}
-    for name, value in zip(machine.joint_names, values, strict=True):
-        if np.ndim(value):
-            found[name] = tuple(float(f"{one:.5g}") for one in value)
-        else:
-            found[name] = float(f"{value:.5g}")
-    return found
+def write_option(folder: Path, name: str, actuator: Any, comment: str) -> None:
+    """Write `<name>.yaml` for `actuator=@…`.
+
+    Raises:
+        StorageError: the file could not be written.
+    """
+    kind = type(actuator)
+    # through JSON, which makes lists of tuples as YAML wants them
+    numbers = json.loads(json.dumps(dataclasses.asdict(actuator)))
+    node = {"_target_": f"{kind.__module__}.{kind.__qualname__}", **numbers}
+    text = yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=130)
+    write_text(folder / f"{name}.yaml", f"# {comment}\n{text}")
 
 
-def write_option(
-    folder: Path, name: str, fitted: Any, comment: str, facts: Mapping[str, Any] | None = None
-) -> None:
-    """Write `<name>.yaml` for `actuator=@…`, and `<name>.json` with facts where there are some.
+def write_numbers(
+    folder: Path,
+    name: str,
+    actuator: Any,
+    machine: Machine,
+    numbers: Mapping[str, np.ndarray],
+    errors: Mapping[str, np.ndarray],
+    **facts: Any,
+) -> Any:
+    """Write `<name>.yaml` with fitted numbers, and `<name>.json` with their standard errors, if there are any.
+
+    Args:
+        folder: Where to.
+        name: Name of the model.
+        actuator: The model with the numbers that are not fitted.
+        machine: The machine.
+        numbers: By name, `(J,)`, or rows of them `(J, M)`; written with five digits.
+        errors: Standard errors of some of them, `(J,)`; NaN for a joint that lacks the number.
+        **facts: Further facts for the second file.
+
+    Returns:
+        The fitted actuator.
 
     Raises:
         StorageError: a file could not be written.
     """
-    kind = type(fitted)
-    # through JSON, which makes lists of tuples as YAML wants them
-    numbers = json.loads(json.dumps(dataclasses.asdict(fitted)))
-    node = {"_target_": f"{kind.__module__}.{kind.__qualname__}", **numbers}
-    text = yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=130)
-    lines = [f"# {line}" for line in comment.splitlines()]
-    if facts is not None:
-        write_json(folder / f"{name}.json", facts)
-    write_text(folder / f"{name}.yaml", "\n".join(lines) + f"\n{text}")
+    values = {}
+    for key, column in numbers.items():
+        values[key] = {}
+        for joint, row in zip(machine.joint_names, column, strict=True):
+            found = tuple(float(f"{one:.5g}") for one in np.atleast_1d(row))
+            values[key][joint] = found if np.ndim(row) else found[0]
+    told: dict[str, dict[str, dict[str, float]]] = {}
+    for key, column in errors.items():
+        told[key] = {}
+        for joint, value, error in zip(machine.joint_names, numbers[key], column, strict=True):
+            if np.isfinite(error):
+                told[key][joint] = {"value": float(value), "standard_error": float(error)}
+    fitted = dataclasses.replace(actuator, **values)
+    if errors:
+        write_json(folder / f"{name}.json", {"schema": 1, "parameters": told, **facts})
+    write_option(folder, name, fitted, f"fitted to recordings of {machine.name}")
+    return fitted

@@ -4,7 +4,6 @@ A position loop forgets where it began, so a recording is one free run, less its
 for the dead time (`actuators.identify.dead_time`) gives the start; nonlinear least squares do the rest.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +13,8 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from actuators.identify.dead_time import LONGEST_S, RESOLUTION_S, ServoLoops, discretise_loop
-from actuators.identify.option_file import round_by_joint, write_option
+from actuators.identify.option_file import write_numbers
+from actuators.identify.standard_errors import estimate_standard_errors
 from actuators.models.servo import Servo
 from actuators.open_loop import WARM_UP_S
 from brokk_rl.commands import read_targets
@@ -90,8 +90,7 @@ class ServoFit:
         low, high = np.array([self.free[name] for name in NUMBERS]).T
         # a joint answers no earlier than its history reaches back
         high[0] = min(high[0], (machine.num_history - 1) * machine.period_s)
-        found = []
-        told = {name: {} for name in NUMBERS}
+        found, errors = [], []
         for j, joint in enumerate(machine.joint_names):
             pairs = []
             for target, one in zip(targets, recordings, strict=True):
@@ -101,18 +100,13 @@ class ServoFit:
                     f"too little data: joint {joint} is never commanded in the {len(recordings)} recordings to fit to"
                 )
             middle = 0.5 * (machine.lower[j] + machine.upper[j])
-            runs = _JointRuns(pairs, machine.period_s, middle)
-            x, error = runs.fit(low, high)
+            x, error = _JointRuns(pairs, machine.period_s, middle).fit(low, high)
             found.append(x)
-            for name, value, deviation in zip(NUMBERS, x, error, strict=True):
-                told[name][joint] = {"value": float(value), "standard_error": float(deviation)}
-        values = {}
-        for name, column in zip(NUMBERS, np.array(found).T, strict=True):
-            values[name] = round_by_joint(machine, column)
-        fitted = dataclasses.replace(self.actuator, **values)  # pyright: ignore[reportArgumentType]
-        comment = f"fitted to {len(recordings)} recordings of {machine.name}"
-        write_option(folder, self.name, fitted, comment, {"schema": 1, "parameters": told})
-        return fitted
+            errors.append(error)
+        numbers, told = (
+            dict(zip(NUMBERS, np.array(one).T, strict=True)) for one in (found, errors)
+        )
+        return write_numbers(folder, self.name, self.actuator, machine, numbers, told)
 
 
 class _JointRuns:
@@ -149,7 +143,8 @@ class _JointRuns:
             if best is None or found.cost < best.cost:
                 best = found
         assert best is not None, "there is a delay to begin at"
-        return best.x, self._estimate_errors(best.x)
+        lengths = [len(q) - self._skip for _, q in self._pairs]
+        return best.x, estimate_standard_errors(self._compute_errors, best.x, 0.1 * STEPS, lengths)
 
     def _compute_errors(self, x: np.ndarray) -> np.ndarray:
         """Return simulated less measured positions of all recordings, one after the other."""
@@ -166,28 +161,6 @@ class _JointRuns:
             seen = np.interp(places, np.arange(len(fine)) / self._num_steps, followed)
             errors.append((seen - q)[self._skip :])
         return np.concatenate(errors)
-
-    def _estimate_errors(self, x: np.ndarray) -> np.ndarray:
-        """Return standard errors by the sandwich over recordings (Liang and Zeger 1986).
-
-        The errors of a model that is not quite right hang together: the spread of the recordings' own
-        gradients says how far a number would move with others. It is never less than white errors give.
-        """
-        errors = self._compute_errors(x)
-        slopes = []
-        for number, step in enumerate(0.1 * STEPS):
-            moved = x.copy()
-            moved[number] += step
-            slopes.append((self._compute_errors(moved) - errors) / step * STEPS[number])
-        jacobian = np.stack(slopes, 1)
-        inverse = np.linalg.pinv(jacobian.T @ jacobian)
-        ends = np.cumsum([len(q) - self._skip for _, q in self._pairs])[:-1]
-        scores = []
-        for part in np.split(jacobian * errors[:, None], ends):
-            scores.append(part.sum(0))
-        spread = inverse @ np.array(scores).T @ np.array(scores) @ inverse
-        white = inverse * np.square(errors).mean()
-        return STEPS * np.sqrt(np.maximum(np.diag(spread), np.diag(white)))
 
 
 def apply_play(target: np.ndarray, width: float) -> np.ndarray:

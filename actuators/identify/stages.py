@@ -17,12 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 
 from actuators import open_loop
 from actuators.contracts import ActuatorFit
-from brokk_rl import registry
-from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -71,8 +68,7 @@ class FittedModel:
     Attributes:
         predicted: Positions in free runs through the stage's windows, `(W, K, J)`.
         seconds: Time the fit took in the process that finished it.
-        use: Overrides that make other modes use the model; empty where no option of `actuator` can
-            load it.
+        use: Override that makes other modes use the model; empty where its fit left no option.
     """
 
     predicted: np.ndarray
@@ -119,7 +115,8 @@ def fit_or_restore(
     predicted = np.zeros((0, 0, machine.num_joints))
     if cut is not None:
         predicted = open_loop.roll_out(actuator, machine, cut, device)
-    found = FittedModel(predicted, seconds, find_overrides(actuator, folder, name))
+    option = folder / f"{name}.yaml"
+    found = FittedModel(predicted, seconds, f"actuator=@{option}" if option.exists() else "")
     part = path.with_name(f".{path.name}.{os.getpid()}.npz")
     try:
         path.parent.mkdir(exist_ok=True)
@@ -132,22 +129,6 @@ def fit_or_restore(
     finally:
         part.unlink(missing_ok=True)
     return found
-
-
-def find_overrides(actuator: Actuator, folder: Path, name: str) -> str:
-    """Return the overrides that use a fitted actuator in other modes; empty if none."""
-    if (folder / f"{name}.yaml").exists():
-        return f"actuator=@{folder / f'{name}.yaml'}"
-    target = f"{type(actuator).__module__}.{type(actuator).__qualname__}"
-    checkpoint = getattr(actuator, "checkpoint", None)
-    if checkpoint is None:
-        return ""
-    for option in registry.list_options():
-        if option.group != "actuator":
-            continue
-        if (yaml.safe_load(option.path.read_text()) or {}).get("_target_") == target:
-            return f"actuator={option.name} actuator.checkpoint={checkpoint}"
-    return ""
 
 
 def _restore(path: Path, key: str) -> FittedModel:
