@@ -43,13 +43,23 @@ from typing import Annotated, Literal
 import torch
 from annotated_types import Ge, Interval
 
-from actuators.models.hydraulic import OilModel
-from actuators.models.parameters import PerJoint, open_valve
+from actuators.models.hydraulic import OilModel, OverlapPerJoint
+from actuators.models.parameters import (
+    NonNegativePerJoint,
+    PositivePerJoint,
+    SharePerJoint,
+    open_valve,
+)
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
 
+Ratio = Annotated[float, Interval(ge=0.05, le=1)]
+RatioPerJoint = Ratio | dict[str, Ratio]
+# at 0 and pi the cylinder has no lever arm
+Linkage = Annotated[float, Interval(ge=0.15, le=math.pi - 0.15)]
+LinkagePerJoint = Linkage | dict[str, Linkage]
 LAMINAR = 1e-4
 """Drop, of relief pressure, below which an orifice is laminar: it gives the flow a finite slope."""
 DEAD_VOLUME = 0.1
@@ -107,31 +117,31 @@ class HydraulicCircuit:
     """
 
     compensation: Literal["pre", "post", "none"]
-    transport_s: PerJoint
-    hysteresis: PerJoint
-    spool_hz: PerJoint
-    spool_damping: PerJoint
-    overlap_extend: PerJoint
-    overlap_retract: PerJoint
-    notch: PerJoint
-    speed_scale: PerJoint
-    rod_area: PerJoint
-    linkage_lower_rad: PerJoint
-    linkage_upper_rad: PerJoint
-    linkage_sides: PerJoint
-    flow_share: PerJoint
-    supply_ratio: PerJoint
-    mode_hz: PerJoint
-    leak: PerJoint
-    outlet: PerJoint
-    counterbalance_setting: PerJoint
-    counterbalance_ratio: PerJoint
-    counterbalance_range: PerJoint
-    counterbalance_s: PerJoint
-    coulomb: PerJoint
-    breakaway: PerJoint
-    stribeck_speed: PerJoint
-    viscous: PerJoint
+    transport_s: NonNegativePerJoint
+    hysteresis: SharePerJoint
+    spool_hz: PositivePerJoint
+    spool_damping: PositivePerJoint
+    overlap_extend: OverlapPerJoint
+    overlap_retract: OverlapPerJoint
+    notch: SharePerJoint
+    speed_scale: PositivePerJoint
+    rod_area: RatioPerJoint
+    linkage_lower_rad: LinkagePerJoint
+    linkage_upper_rad: LinkagePerJoint
+    linkage_sides: RatioPerJoint
+    flow_share: PositivePerJoint
+    supply_ratio: PositivePerJoint
+    mode_hz: PositivePerJoint
+    leak: NonNegativePerJoint
+    outlet: PositivePerJoint
+    counterbalance_setting: NonNegativePerJoint
+    counterbalance_ratio: NonNegativePerJoint
+    counterbalance_range: PositivePerJoint
+    counterbalance_s: PositivePerJoint
+    coulomb: NonNegativePerJoint
+    breakaway: NonNegativePerJoint
+    stribeck_speed: PositivePerJoint
+    viscous: NonNegativePerJoint
     margin: Positive
     standby: Positive
     pump_s: Positive
@@ -150,21 +160,6 @@ class HydraulicCircuit:
         return CircuitModel(self, machine, num_envs, device)
 
 
-BOUNDS: dict[str, tuple[float, float]] = dict.fromkeys(
-    (
-        "spool_hz", "spool_damping", "speed_scale", "flow_share", "supply_ratio", "mode_hz", "outlet",
-        "counterbalance_range", "counterbalance_s", "stribeck_speed",
-    ),
-    (1e-6, math.inf),
-)  # fmt: skip
-BOUNDS |= dict.fromkeys(("rod_area", "linkage_sides"), (0.05, 1.0))
-BOUNDS |= dict.fromkeys(("hysteresis", "notch"), (0.0, 1.0))
-BOUNDS |= dict.fromkeys(("overlap_extend", "overlap_retract"), (0.0, 0.9))
-# at 0 and pi the cylinder has no lever arm
-BOUNDS |= dict.fromkeys(("linkage_lower_rad", "linkage_upper_rad"), (0.15, math.pi - 0.15))
-"""Range of numbers in which the equations mean something."""
-
-
 class CircuitModel(OilModel):
     """The circuit at work in `N` environments; see the module for its equations.
 
@@ -180,7 +175,7 @@ class CircuitModel(OilModel):
     def __init__(
         self, config: HydraulicCircuit, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        super().__init__(config, machine, num_envs, device, BOUNDS)
+        super().__init__(config, machine, num_envs, device)
         self._state["supply"] = torch.zeros(num_envs, 1, device=device)
         self._kinematics = Kinematics(machine, device) if config.outrigger_nm_rad else None
         home = torch.as_tensor(machine.home, dtype=torch.float32, device=device)

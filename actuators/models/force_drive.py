@@ -16,12 +16,13 @@ from typing import Any, ClassVar
 
 import torch
 
-from actuators.models.friction import LOADS, STRIBECK_SPEED, compute_dry_friction
+from actuators.models.friction import STRIBECK_SPEED, compute_dry_friction
 from actuators.models.joint_model import ParametricModel
 from actuators.models.parameters import (
+    NonNegativePerJoint,
     PerJoint,
+    PositivePerJoint,
     check_interface,
-    read_parameters,
     select_commands_in_force,
 )
 from brokk_rl.errors import ConfigError
@@ -29,10 +30,6 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
-NUMBERS = (
-    "dead_time_s", "mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n", "pose_sin_n", "pose_cos_n", "stribeck_n",
-    "stribeck_m_s", "stribeck_power", *LOADS,
-)  # fmt: skip
 SPEED_SAMPLES = 5
 """Positions from which a free run takes the speed that it begins with, by a parabola. Fewer take up the
 noise of the encoder, more its acceleration; on the linear drive EMPS 4 to 7 differ by 2 % of the mass."""
@@ -68,22 +65,22 @@ class ForceDrive:
     interfaces: ClassVar = frozenset({"torque"})
 
     dead_time_s: PerJoint | None
-    mass_kg: PerJoint
-    viscous_n_s_m: PerJoint
-    coulomb_n: PerJoint
+    mass_kg: PositivePerJoint
+    viscous_n_s_m: NonNegativePerJoint
+    coulomb_n: NonNegativePerJoint
     offset_n: PerJoint
     # Files from before these numbers lack them; neutral.
     pose_sin_n: PerJoint = 0.0
     pose_cos_n: PerJoint = 0.0
-    stribeck_n: PerJoint = 0.0
-    stribeck_m_s: PerJoint | None = None
-    stribeck_power: PerJoint = 1.0
-    motor_load: PerJoint = 0.0
-    outside_load: PerJoint = 0.0
-    motor_load_at_rest: PerJoint = 0.0
-    outside_load_at_rest: PerJoint = 0.0
-    motor_load_square: PerJoint = 0.0
-    outside_load_square: PerJoint = 0.0
+    stribeck_n: NonNegativePerJoint = 0.0
+    stribeck_m_s: PositivePerJoint | None = None
+    stribeck_power: PositivePerJoint = 1.0
+    motor_load: NonNegativePerJoint = 0.0
+    outside_load: NonNegativePerJoint = 0.0
+    motor_load_at_rest: NonNegativePerJoint = 0.0
+    outside_load_at_rest: NonNegativePerJoint = 0.0
+    motor_load_square: NonNegativePerJoint = 0.0
+    outside_load_square: NonNegativePerJoint = 0.0
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> ForceDriveModel:
         """Return a model for `num_envs` environments on `device`.
@@ -108,15 +105,8 @@ class ForceDriveModel(ParametricModel):
         self, config: ForceDrive, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         check_interface(machine, "torque", "a force drive takes torques")
-        nominal = read_parameters(
-            config,
-            NUMBERS,
-            machine,
-            positive=("mass_kg", "stribeck_m_s", "stribeck_power"),
-            not_negative=("viscous_n_s_m", "coulomb_n", "stribeck_n", *LOADS),
-            absent={"stribeck_m_s": STRIBECK_SPEED * machine.max_speed},
-        )
-        super().__init__(nominal, machine, num_envs, device)
+        absent = {"stribeck_m_s": STRIBECK_SPEED * machine.max_speed}
+        super().__init__(config, machine, num_envs, device, absent)
         self.drive_changes: dict[str, torch.Tensor] = {}
         self._max_force = torch.as_tensor(machine.max_force, dtype=torch.float32, device=device)
         count = min(SPEED_SAMPLES, machine.num_history)

@@ -24,18 +24,17 @@ pushing, and the simulator's drive yields.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
 
 from actuators.models.joint_model import ParametricModel
 from actuators.models.parameters import (
-    PerJoint,
-    check_dead_time,
+    NonNegativePerJoint,
+    PositivePerJoint,
+    SharePerJoint,
     check_interface,
-    expand_per_joint,
     open_valve,
     select_commands_in_force,
 )
@@ -44,6 +43,9 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
+
+Overlap = Annotated[float, Interval(ge=0, le=0.9)]
+OverlapPerJoint = Overlap | dict[str, Overlap]
 
 
 @spec
@@ -84,24 +86,24 @@ class Hydraulic:
             them.
     """
 
-    transport_s: PerJoint
-    hysteresis: PerJoint
-    spool_hz: PerJoint
-    spool_damping: PerJoint
-    overlap_extend: PerJoint
-    overlap_retract: PerJoint
-    notch: PerJoint
-    speed_scale: PerJoint
-    retract_ratio: PerJoint
-    flow_share: PerJoint
-    supply_ratio: PerJoint
-    load_sensitivity: PerJoint
-    mode_hz: PerJoint
-    leak_hz: PerJoint
-    coulomb: PerJoint
-    breakaway: PerJoint
-    stribeck_speed: PerJoint
-    viscous: PerJoint
+    transport_s: NonNegativePerJoint
+    hysteresis: SharePerJoint
+    spool_hz: PositivePerJoint
+    spool_damping: PositivePerJoint
+    overlap_extend: OverlapPerJoint
+    overlap_retract: OverlapPerJoint
+    notch: SharePerJoint
+    speed_scale: PositivePerJoint
+    retract_ratio: PositivePerJoint
+    flow_share: PositivePerJoint
+    supply_ratio: PositivePerJoint
+    load_sensitivity: SharePerJoint
+    mode_hz: PositivePerJoint
+    leak_hz: NonNegativePerJoint
+    coulomb: NonNegativePerJoint
+    breakaway: NonNegativePerJoint
+    stribeck_speed: PositivePerJoint
+    viscous: NonNegativePerJoint
     oil_start_c: float
     oil_ambient_c: float
     oil_rise_c: float
@@ -120,43 +122,24 @@ class Hydraulic:
 
 
 class OilModel(ParametricModel):
-    """Base of hydraulic plants: numbers within bounds, weight, stiffness, substeps.
+    """Base of hydraulic plants: numbers, weight, stiffness, substeps.
 
     Args:
         config: The spec, with `substep_s`.
         machine: A machine with known masses.
         num_envs: Number of environments, `N`.
         device: Where the tensors live.
-        bounds: Smallest and largest value of numbers by name; 0 and more for the others.
     """
 
     DELAY = "transport_s"
 
-    def __init__(
-        self,
-        config: Any,
-        machine: Machine,
-        num_envs: int,
-        device: torch.device,
-        bounds: Mapping[str, tuple[float, float]],
-    ) -> None:
+    def __init__(self, config: Any, machine: Machine, num_envs: int, device: torch.device) -> None:
         check_interface(machine, "speed", "hydraulics set speeds")
-        nominal = {}
-        for name, hint in get_type_hints(type(config)).items():
-            if hint == PerJoint:
-                nominal[name] = expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
-        for name, value in nominal.items():
-            low, high = bounds.get(name, (0.0, math.inf))
-            if not ((value >= low) & (value <= high)).all():
-                raise ConfigError(
-                    f"actuator.{name}: expected {low:g} to {high:g}, got {value.tolist()}"
-                )
-        if (nominal["breakaway"] < nominal["coulomb"]).any():
+        super().__init__(config, machine, num_envs, device)
+        if (self.parameters["breakaway"] < self.parameters["coulomb"]).any():
             raise ConfigError(
                 "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)"
             )
-        check_dead_time(float(nominal["transport_s"].max()), machine, "actuator.transport_s")
-        super().__init__(nominal, machine, num_envs, device)
         self._config = config
         self._num_substeps = max(1, round(machine.period_s / config.substep_s))
         self._dt_s = machine.period_s / self._num_substeps
@@ -178,18 +161,6 @@ class OilModel(ParametricModel):
         return trailing
 
 
-BOUNDS: dict[str, tuple[float, float]] = dict.fromkeys(
-    (
-        "spool_hz", "spool_damping", "speed_scale", "retract_ratio", "flow_share", "supply_ratio", "mode_hz",
-        "stribeck_speed",
-    ),
-    (1e-6, math.inf),
-)  # fmt: skip
-BOUNDS |= dict.fromkeys(("hysteresis", "notch", "load_sensitivity"), (0.0, 1.0))
-BOUNDS |= dict.fromkeys(("overlap_extend", "overlap_retract"), (0.0, 0.9))
-"""Range of numbers in which the equations mean something."""
-
-
 class HydraulicModel(OilModel):
     """The plant at work in `N` environments; see the module for its equations.
 
@@ -201,7 +172,7 @@ class HydraulicModel(OilModel):
     def __init__(
         self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        super().__init__(config, machine, num_envs, device, BOUNDS)
+        super().__init__(config, machine, num_envs, device)
         self._state["oil_c"] = torch.zeros(num_envs, device=device)
         self.reset(self._fresh.clone())
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import split_run_commands
+from actuators.models.parameters import check_dead_time, read_parameters, split_run_commands
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
@@ -37,10 +38,14 @@ class ParametricModel:
     """Base of models with numbers and a state by joint.
 
     Args:
-        nominal: Numbers by name, `(J,)`.
+        config: The spec that holds the numbers; see `read_parameters`.
         machine: The machine.
         num_envs: Number of environments, `N`.
         device: Where the tensors live.
+        absent: Values `(J,)` of fields that are `None`.
+
+    Raises:
+        ConfigError: a joint is missing or unknown, or the history does not hold the dead time.
 
     Attributes:
         STATES: Names of the state of each joint, `(N, J)`.
@@ -55,12 +60,15 @@ class ParametricModel:
 
     def __init__(
         self,
-        nominal: Mapping[str, np.ndarray],
+        config: Any,
         machine: Machine,
         num_envs: int,
         device: torch.device,
+        absent: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
         self.parameters: dict[str, torch.Tensor] = {}
+        nominal = read_parameters(config, machine, absent)
+        check_dead_time(float(nominal[self.DELAY].max()), machine, f"actuator.{self.DELAY}")
         for name, value in nominal.items():
             row = torch.as_tensor(value, dtype=torch.float32, device=device)
             self.parameters[name] = row.expand(num_envs, -1).clone()

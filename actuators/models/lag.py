@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
+from annotated_types import Interval
 
 from actuators.models.joint_model import CommandParts, JointMemory, MemorylessModel, PlannableModel
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import PerJoint, check_interface, open_valve, read_parameters
-from brokk_rl.errors import ConfigError
+from actuators.models.parameters import NonNegativePerJoint, PerJoint, check_interface, open_valve
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
+
+Band = Annotated[float, Interval(ge=0, lt=1)]
+BandPerJoint = Band | dict[str, Band]
 
 
 @spec
@@ -64,17 +67,16 @@ class FirstOrderLag:
     label: ClassVar = "lag"
 
     dead_time_s: PerJoint | None
-    dead_band_extend: PerJoint
-    dead_band_retract: PerJoint
+    dead_band_extend: BandPerJoint
+    dead_band_retract: BandPerJoint
     gain: PerJoint
-    time_constant_s: PerJoint
+    time_constant_s: NonNegativePerJoint
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> FirstOrderLagModel:
         """Return a model for `num_envs` environments on `device`.
 
         Raises:
-            ConfigError: the dead time does not fit the machine's history, or a number makes no
-                sense.
+            ConfigError: the dead time does not fit the machine's history, or a joint is unknown.
         """
         return FirstOrderLagModel(self, machine, num_envs, device)
 
@@ -104,19 +106,7 @@ class FirstOrderLagModel(PlannableModel):
         self, config: FirstOrderLag, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         check_interface(machine, "speed", "a lagging drive follows speeds")
-        bands = ("dead_band_extend", "dead_band_retract")
-        nominal = read_parameters(
-            config,
-            (*bands, "gain", "time_constant_s", "dead_time_s"),
-            machine,
-            not_negative=("time_constant_s",),
-        )
-        for name in bands:
-            if ((nominal[name] < 0) | (nominal[name] >= 1)).any():
-                raise ConfigError(
-                    f"actuator.{name}: expected dead bands in [0, 1), got {nominal[name].tolist()}"
-                )
-        super().__init__(nominal, machine, num_envs, device)
+        super().__init__(config, machine, num_envs, device)
         self.reset(self._fresh.clone())
 
     def ask(self, commands: torch.Tensor) -> torch.Tensor:

@@ -8,15 +8,16 @@ be memory outside the state, which the contract of an actuator model forbids.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import torch
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.spec import NonNegative, Positive, Share
 
 OTHER = "other"
 """Key for the joints that a per-joint table does not name."""
@@ -33,6 +34,9 @@ COMMANDS = {"speed": "valve or velocity", "position": "position", "torque": "tor
 PerJoint = float | dict[str, float]
 """One number for all joints, or a table by joint name; `other` stands for the joints it does not
 name."""
+PositivePerJoint = Positive | dict[str, Positive]
+NonNegativePerJoint = NonNegative | dict[str, NonNegative]
+SharePerJoint = Share | dict[str, Share]
 
 
 def check_interface(machine: Machine, interface: str, title: str) -> None:
@@ -80,42 +84,26 @@ def expand_per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarra
 
 
 def read_parameters(
-    config: Any,
-    names: Sequence[str],
-    machine: Machine,
-    *,
-    positive: Collection[str] = (),
-    not_negative: Collection[str] = (),
-    absent: Mapping[str, np.ndarray] = MappingProxyType({}),
+    config: Any, machine: Machine, absent: Mapping[str, np.ndarray] = MappingProxyType({})
 ) -> dict[str, np.ndarray]:
-    """Return the numbers of an actuator's spec for every joint, `(J,)` each, checked.
+    """Return the numbers of an actuator's spec for every joint, `(J,)` each.
 
     Args:
-        config: The spec. A `dead_time_s` of `None` takes the machine's.
-        names: Fields to read, `dead_time_s` among them.
-        machine: The machine.
-        positive: Fields that must be above 0.
-        not_negative: Fields that must be 0 or more.
-        absent: Values `(J,)` of other fields that are `None`.
+        config: The spec. Its fields of one number, or one for each joint, are read.
+        machine: The machine, whose `dead_time_s` stands for one that is `None`.
+        absent: Values `(J,)` of other fields that are `None`; without one such a field is left out.
 
     Raises:
-        ConfigError: a number is out of its range, a joint is missing or unknown, or the machine's
-            history does not hold the dead time.
+        ConfigError: a joint is missing or unknown.
     """
+    given = {"dead_time_s": np.full(machine.num_joints, machine.dead_time_s), **absent}
     found = {}
-    for name in names:
-        value = getattr(config, name)
-        if name == "dead_time_s" and value is None:
-            value = machine.dead_time_s
-        if value is None:
-            found[name] = absent[name]
-        else:
+    for name, hint in get_type_hints(type(config)).items():
+        value = getattr(config, name, None)
+        if hint in (PerJoint, PerJoint | None) and value is not None:
             found[name] = expand_per_joint(value, machine, f"actuator.{name}")
-        if name in positive and (found[name] <= 0).any():
-            raise ConfigError(f"actuator.{name}: expected > 0, got {found[name].tolist()}")
-        if name in not_negative and (found[name] < 0).any():
-            raise ConfigError(f"actuator.{name}: expected 0 or more, got {found[name].tolist()}")
-    check_dead_time(float(found["dead_time_s"].max()), machine, "actuator.dead_time_s")
+        elif hint == PerJoint | None and name in given:
+            found[name] = given[name]
     return found
 
 

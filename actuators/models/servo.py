@@ -25,14 +25,15 @@ from typing import ClassVar, NamedTuple
 import torch
 
 from actuators.models.joint_model import CommandParts, JointMemory, PlannableModel
-from actuators.models.parameters import PerJoint, check_interface, read_parameters
+from actuators.models.parameters import (
+    NonNegativePerJoint,
+    PerJoint,
+    PositivePerJoint,
+    check_interface,
+)
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
-NUMBERS = (
-    "dead_time_s", "response_s", "damping", "top_speed", "play_rad", "sag_rad", "sag_slope",
-)  # fmt: skip
-LIMIT_NUMBERS = ("limit_rad", "firmware_damping")
 SHORTEST_RESPONSE_S = 1e-5
 """Response from which a loop is at its target within a period, to the last bit; avoids 0 / 0."""
 NEAR_CRITICAL = 1e-4
@@ -76,15 +77,15 @@ class Servo:
     interfaces: ClassVar = frozenset({"position"})
 
     dead_time_s: PerJoint | None
-    response_s: PerJoint
-    damping: PerJoint
-    top_speed: PerJoint
-    play_rad: PerJoint
+    response_s: NonNegativePerJoint
+    damping: PositivePerJoint
+    top_speed: PositivePerJoint
+    play_rad: NonNegativePerJoint
     sag_rad: PerJoint
     sag_slope: PerJoint
     # Files from before there was a limit lack it; neutral.
-    limit_rad: PerJoint | None = None
-    firmware_damping: PerJoint = 0.5
+    limit_rad: PositivePerJoint | None = None
+    firmware_damping: NonNegativePerJoint = 0.5
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> ServoModel:
         """Return a model for `num_envs` environments on `device`.
@@ -99,7 +100,7 @@ class ServoModel(PlannableModel):
     """Exact solution of the loop over each part of a period with one command.
 
     Attributes:
-        parameters: Numbers by name, `(N, J)`, those of `LIMIT_NUMBERS` only where there is a limit.
+        parameters: Numbers by name, `(N, J)`, `limit_rad` only where there is a limit.
         drive_changes: Changes by effects, `(N, J)` by name: `shortage`, the error of 5 % of the travel
             over another limit, 0 for none, and its `firmware_damping`. The lower limit counts.
     """
@@ -110,14 +111,7 @@ class ServoModel(PlannableModel):
         self, config: Servo, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         check_interface(machine, "position", "a servo follows positions")
-        nominal = read_parameters(
-            config,
-            NUMBERS if config.limit_rad is None else (*NUMBERS, *LIMIT_NUMBERS),
-            machine,
-            positive=("damping", "top_speed", "limit_rad"),
-            not_negative=("response_s", "play_rad", "firmware_damping"),
-        )
-        super().__init__(nominal, machine, num_envs, device)
+        super().__init__(config, machine, num_envs, device)
         self.drive_changes: dict[str, torch.Tensor] = {}
         self.reset(self._fresh.clone())
 

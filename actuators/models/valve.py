@@ -25,12 +25,11 @@ import torch
 from actuators.models.joint_model import CommandParts, JointMemory, PlannableModel
 from actuators.models.joint_weight import build_joint_weight
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import PerJoint, check_interface, read_parameters
+from actuators.models.parameters import NonNegativePerJoint, check_interface
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
-NUMBERS = ("dead_time_s", "play", "spool_s", "speed_s", "demand")
 CELLS = 512
 """The curves are tabulated in so many equal steps of the spool's whole stroke: a step is finer than
 any valve repeats."""
@@ -59,11 +58,11 @@ class ValveActuator:
 
     label: ClassVar = "valve"
 
-    dead_time_s: PerJoint | None
-    play: PerJoint
-    spool_s: PerJoint
-    speed_s: PerJoint
-    demand: PerJoint
+    dead_time_s: NonNegativePerJoint | None
+    play: NonNegativePerJoint
+    spool_s: NonNegativePerJoint
+    speed_s: NonNegativePerJoint
+    demand: NonNegativePerJoint
     knots: tuple[float, ...]
     curve_extend: tuple[float, ...] | dict[str, tuple[float, ...]]
     curve_retract: tuple[float, ...] | dict[str, tuple[float, ...]]
@@ -93,7 +92,7 @@ class ValveActuator:
             ConfigError: as `build`, or the weight on the joints is no sum of sines and cosines.
         """
         model = self.build(machine, 1, torch.device("cpu"))
-        found: dict[str, Any] = {name: model.parameters[name][0].tolist() for name in NUMBERS}
+        found: dict[str, Any] = {key: row[0].tolist() for key, row in model.parameters.items()}
         found["knots"] = list(self.knots)
         for name, value in _list_curves(self):
             rows = _expand_rows(value, machine, len(self.knots), f"actuator.{name}")
@@ -159,8 +158,7 @@ class ValveModel(PlannableModel):
         self, config: ValveActuator, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         check_interface(machine, "speed", "a valve sets speeds")
-        nominal = read_parameters(config, NUMBERS, machine, not_negative=NUMBERS)
-        super().__init__(nominal, machine, num_envs, device)
+        super().__init__(config, machine, num_envs, device)
 
         def tensor(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
