@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -118,26 +119,43 @@ def roll_out(
     Raises:
         BrokkError: the model ran into NaN.
     """
-    count, size, before = len(cut.q), cut.num_history, cut.num_before
-    model = actuator.build(machine, count, device)
-    u = torch.as_tensor(cut.u, dtype=torch.float32, device=device)
-    q = torch.as_tensor(cut.q[:, :before], dtype=torch.float32, device=device)
-    # Before the first push_u the newest command is one back.
-    history = History(q=q[:, :size].clone(), u=u[:, :size].roll(1, 1))
-    path = []
-    with torch.inference_mode():
-        model.reset(torch.ones(count, dtype=torch.bool, device=device))
-        for k in range(size, u.shape[1] + 1):
-            history.push_u(u[:, k - 1])
-            position = model.step(history)
-            if k < before:
-                history.push_q(q[:, k])
-            else:
-                history.push_q(position)
-                path.append(position)
-    found = torch.stack(path, 1).cpu().numpy()
+    model = actuator.build(machine, len(cut.q), device)
+    u, known = (torch.as_tensor(one, dtype=torch.float32, device=device) for one in (cut.u, cut.q))
+    known = known[:, : cut.num_before].transpose(0, 1)
+    path = run_freely(model, u.transpose(0, 1).contiguous(), known, cut.num_history)
+    found = path.transpose(0, 1).cpu().numpy()
     if not np.isfinite(found).all():
         raise BrokkError(
             f"{type(actuator).__name__} ran into NaN in a free run; look at its fit, or fit it again with another seed"
         )
     return found
+
+
+@torch.inference_mode()
+def run_freely(model: Any, u: torch.Tensor, known: torch.Tensor, size: int) -> torch.Tensor:
+    """Return the positions of free runs as sensors read them, `(K, N, J)`.
+
+    Args:
+        model: The model, of all runs side by side; it begins anew.
+        u: Commands, time first, so that a step reads one piece of memory, `(T, N, J)`.
+        known: Positions up to the beginning of the free runs, `(L, N, J)`.
+        size: Length of the model's history.
+    """
+    is_measured = "measurement" in getattr(model, "sides", ())
+    q = u.new_empty(len(u) + 1, *u.shape[1:])
+    q[: len(known)] = model.truth(known.transpose(0, 1)).transpose(0, 1) if is_measured else known
+    seen = torch.empty_like(q[len(known) :])
+    model.reset(torch.ones(u.shape[1], dtype=torch.bool, device=u.device))
+    plan = getattr(model, "plan_run", None)
+    run = plan(u, size, q) if plan else None
+    for k in range(size, len(q)):
+        if run is None:
+            past = slice(k - size, k)
+            history = History(q=q[past].transpose(0, 1), u=u[past].transpose(0, 1))
+            position = model.step(history)
+        else:
+            position = run.step(k, q)
+        if k >= len(known):
+            q[k] = position
+            seen[k - len(known)] = model.measure(position) if is_measured else position
+    return seen

@@ -20,7 +20,7 @@ import torch
 import yaml
 
 from actuators.models.linear import Hold
-from actuators.open_loop import FreeRunWindows
+from actuators.open_loop import FreeRunWindows, run_freely
 from brokk_rl import registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.errors import BrokkError, ConfigError, group_by_reason, list_choices
@@ -364,22 +364,9 @@ class EffectSimulator:
                     model.parameters[kind.running].copy_(
                         torch.as_tensor(begun_s, dtype=torch.float32)[:, None]
                     )
-        measure, truth = (getattr(model, name, None) for name in ("measure", "truth"))
-        measure = measure if "measurement" in getattr(model, "sides", ()) else None
-        q = torch.empty(len(u) + 1, count, u.shape[2])
         known = torch.as_tensor(np.tile(cut.q[:, :before], (len(candidates), 1, 1)))
-        q[:before] = (truth(known) if measure and truth else known).transpose(0, 1)
-        seen = torch.empty_like(q[before:])
-        with torch.inference_mode():
-            model.reset(torch.ones(count, dtype=torch.bool))
-            plan = getattr(model, "plan_run", None)
-            run = (plan(u, size, q) if plan else None) or _SteppedRun(model, u, size)
-            for k in range(size, len(q)):
-                position = run.step(k, q)
-                if k >= before:
-                    q[k] = position
-                    seen[k - before] = measure(position) if measure else position
-        return seen.numpy().swapaxes(0, 1).reshape(len(candidates), windows, *seen.shape[::2])
+        seen = run_freely(model, u, known.transpose(0, 1), size).numpy()
+        return seen.swapaxes(0, 1).reshape(len(candidates), windows, *seen.shape[::2])
 
     @cached_property
     def plain_runs(self) -> np.ndarray:
@@ -391,15 +378,3 @@ class EffectSimulator:
         """Recorded commands of the windows, `(T, W, J)`: time comes first, so that a step reads one piece of memory."""
         u = torch.as_tensor(self.cut.u, dtype=torch.float32)
         return u.transpose(0, 1).contiguous()
-
-
-class _SteppedRun:
-    """A run of a model that is stepped through its history."""
-
-    def __init__(self, model: ActuatorModel, u: torch.Tensor, size: int) -> None:
-        self._model, self._u, self._size = model, u, size
-
-    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
-        """Return positions `k`, `(N, J)`."""
-        past = slice(k - self._size, k)
-        return self._model.step(History(q=q[past].transpose(0, 1), u=self._u[past].transpose(0, 1)))
