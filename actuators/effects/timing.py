@@ -30,7 +30,9 @@ class _Delayed(EffectSpec):
         u = now.history.u
         return {"older": u[:, :1].expand(-1, u.shape[1] - 1, -1)}
 
-    def _shifted(self, now: StepInputs, shift_s: torch.Tensor) -> tuple[torch.Tensor, Memory]:
+    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
+        """The commands of as long ago as its number says."""
+        (shift_s,) = now.value.values()
         u = now.history.u
         known, size = torch.cat((now.memory["older"], u), 1), u.shape[1]
         shifted = _delay_commands(known, shift_s / now.plant.period_s, size)
@@ -51,10 +53,6 @@ class DeadTime(_Delayed):
         "dead_time_s": EffectNumber("s", none=0.0, typical=0.1, bounds=(-0.3, 0.5), scale="time")
     }
 
-    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """`u(t - dead_time)`."""
-        return self._shifted(now, now.value["dead_time_s"])
-
 
 @spec
 class ClockOffset(_Delayed):
@@ -74,10 +72,6 @@ class ClockOffset(_Delayed):
     numbers: ClassVar = {
         "offset_s": EffectNumber("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3), scale="time")
     }
-
-    def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """`u(t - offset)`."""
-        return self._shifted(now, now.value["offset_s"])
 
 
 @spec

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 import math
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -96,28 +95,13 @@ class NetworkFit:
         """
         training_data.check_enough(train, machine)
         fitting = _NetworkFitting(self, machine, train, validation, seed, device)
-        began = time.monotonic()
         fitting.run()
-        seconds = time.monotonic() - began
         tensors, errors = fitting.result
-        names = machine.joint_names
-        commanded = training_data.measure_commanded_each_way_s(train).sum(0) / 60.0
         facts = {
             "width": self.width,
-            "data": {
-                "recordings": len(train),
-                "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
-                "commanded_minutes": dict(zip(names, commanded.round(1).tolist(), strict=True)),
-                "sources": list_sources(train),
-            },
-            "fit": {
-                "loss": self.loss,
-                "seed": seed,
-                "device": device.type,
-                "seconds": round(seconds, 1),
-                "validation_rmse": dict(zip(names, errors, strict=True)),
-                "validation_s": self.validation_s,
-            },
+            "sources": list_sources(train),
+            "fit": {"loss": self.loss, "seed": seed, "device": device.type},
+            "validation_rmse": dict(zip(machine.joint_names, errors, strict=True)),
         }
         path = folder / f"{self.name}.safetensors"
         checkpoint.write_checkpoint(path, "mlp", machine, tensors, facts)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from actuators.contracts import ActuatorFit
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.session import write_bytes
 
 log = logging.getLogger(__name__)
 
@@ -117,17 +118,10 @@ def fit_or_restore(
         predicted = open_loop.roll_out(actuator, machine, cut, device)
     option = folder / f"{name}.yaml"
     found = FittedModel(predicted, seconds, f"actuator=@{option}" if option.exists() else "")
-    part = path.with_name(f".{path.name}.{os.getpid()}.npz")
-    try:
-        path.parent.mkdir(exist_ok=True)
-        np.savez_compressed(
-            part, predicted=predicted.astype(np.float32), seconds=seconds, use=found.use, key=key
-        )
-        part.replace(path)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    content = BytesIO()
+    predicted = predicted.astype(np.float32)
+    np.savez_compressed(content, predicted=predicted, seconds=seconds, use=found.use, key=key)
+    write_bytes(path, content.getvalue())
     return found
 
 
