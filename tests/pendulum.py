@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import torch
 from composed import option
+from motion import roll
 
 from brokk_rl import record
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -105,12 +105,5 @@ def log_pendulum(
 
 def run_drive(model: Any, machine: Machine, u: np.ndarray, start: float) -> np.ndarray:
     """Returns positions after each command `(T,)`, from rest."""
-    history = History(
-        q=torch.full((1, machine.num_history, 1), start), u=torch.zeros(1, machine.num_history, 1)
-    )
-    found = []
-    for command in u:
-        history.push_u(torch.full((1, 1), float(command)))
-        history.push_q(model.step(history))
-        found.append(float(history.q[0, -1, 0]))
-    return np.array(found)
+    commands = torch.as_tensor(u, dtype=torch.float32)[:, None, None]
+    return roll(model, machine, commands, [start])[1:, 0, 0].numpy().astype(float)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
+import motion
 import numpy as np
 import pytest
 import torch
@@ -23,19 +24,9 @@ CPU = torch.device("cpu")
 ALL = ("ideal", "lag", "hydraulic", "mlp")
 
 
-def roll(
-    actuator: Any, machine: Machine, u: torch.Tensor, q: torch.Tensor | None = None
-) -> torch.Tensor:
+def roll(actuator: Any, machine: Machine, u: torch.Tensor, q: Any = None) -> torch.Tensor:
     """Returns the positions `(T + 1, N, J)` under the commands `u` `(T, N, J)`, from rest at `q` or at home."""
-    model = actuator.build(machine, u.shape[1], CPU)
-    at = torch.as_tensor(machine.home, dtype=torch.float32).expand(u.shape[1:]) if q is None else q
-    history = rest(machine, at)
-    path = [at]
-    for command in u:
-        history.push_u(command)
-        history.push_q(model.step(history))
-        path.append(history.q[:, -1].clone())
-    return torch.stack(path)
+    return motion.roll(actuator.build(machine, u.shape[1], CPU), machine, u, q)
 
 
 def rest(machine: Machine, q: torch.Tensor) -> History:

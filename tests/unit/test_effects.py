@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from composed import option
+from motion import draw_commands, roll
 
 from actuators.effects.effect import EffectChain, EffectSpec
 from brokk_rl.checks import NUM_ENVS, check_actuator_model
@@ -41,39 +42,6 @@ def neutral(name: str) -> Any:
     return effect(
         name, **{key: number.none for key, number in numbers.items() if number.none is not None}
     )
-
-
-def commands(machine: Machine, steps: int, num: int, seed: int = 0) -> torch.Tensor:
-    """Returns random commands that hold for five periods, `(T, N, J)`, some of them zero and some full."""
-    u = (
-        torch.rand(
-            math.ceil(steps / 5),
-            num,
-            machine.num_joints,
-            generator=torch.Generator().manual_seed(seed),
-        )
-        * 3.0
-        - 1.5
-    )
-    u = u.clamp(-1.0, 1.0) * (u.abs() > 0.2)
-    return u.repeat_interleave(5, 0)[:steps]
-
-
-def roll(model: Any, machine: Machine, u: torch.Tensor, moving: bool = False) -> torch.Tensor:
-    """Returns the positions `(T + 1, N, J)` under `u` `(T, N, J)`, from rest at home or in the middle of a motion."""
-    home = torch.as_tensor(machine.home, dtype=torch.float32).expand(u.shape[1:])
-    shape = (u.shape[1], machine.num_history, machine.num_joints)
-    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-    history.reset(torch.ones(u.shape[1], dtype=torch.bool), home)
-    if moving:
-        history.q += 0.01 * torch.arange(-shape[1] + 1, 1)[None, :, None]
-        history.u.fill_(0.5)
-    path = [home]
-    for command in u:
-        history.push_u(command)
-        history.push_q(model.step(history))
-        path.append(history.q[:, -1].clone())
-    return torch.stack(path)
 
 
 def places(model: Any, q: torch.Tensor) -> torch.Tensor:
@@ -111,12 +79,12 @@ def test_the_neutral_value_changes_nothing(
     name: str, actuator: str, moving: bool, machine: Machine
 ) -> None:
     build = shipped("actuator", actuator).build
-    u = commands(machine, 25, 2, seed=3)
+    u = draw_commands(machine, 25, 2, seed=3)
     model = neutral(name).wrap(build(machine, 2, CPU), machine, 2, CPU)
     with torch.no_grad():
         expected, path = (
-            roll(build(machine, 2, CPU), machine, u, moving),
-            roll(model, machine, u, moving),
+            roll(build(machine, 2, CPU), machine, u, moving=moving),
+            roll(model, machine, u, moving=moving),
         )
     assert torch.equal(path, expected)
     assert torch.equal(model.measure(path[-1]), path[-1])
@@ -128,7 +96,7 @@ def test_the_neutral_value_changes_nothing(
 @pytest.mark.parametrize("name", FIXED)
 def test_the_typical_value_changes_something(name: str, machine: Machine) -> None:
     build = shipped("actuator", "ideal").build
-    u = commands(machine, 60, 2)
+    u = draw_commands(machine, 60, 2)
     # Seldom seen at their typical size.
     seldom = {"frame_loss": {"probability": 0.5}, "stiction": {"start": 0.5}}
     model = effect(name, **seldom.get(name, {})).wrap(build(machine, 2, CPU), machine, 2, CPU)
@@ -254,7 +222,7 @@ def test_a_run_goes_on_exactly_from_its_state(name: str, machine: Machine) -> No
         )
 
     torch.manual_seed(0)
-    model, u = fresh(), commands(machine, 30, 2)
+    model, u = fresh(), draw_commands(machine, 30, 2)
     roll(model, machine, u)
     model.measure(u[0])
     kept = {key: value.clone() for key, value in model.state.items()}
@@ -306,7 +274,7 @@ def test_actuators_and_effects_can_be_captured_in_a_cuda_graph(
 ) -> None:
     device, num = torch.device("cuda"), 8
     torch.manual_seed(0)
-    u = commands(machine, 40, num).to(device)
+    u = draw_commands(machine, 40, num).to(device)
     paths = []
     for captured in (False, True):
         model = shipped("actuator", actuator).build(machine, num, device)

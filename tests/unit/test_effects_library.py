@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from motion import draw_commands, roll
 
 from actuators.effects.composition import Library
 from actuators.identify import dead_time
@@ -34,36 +35,11 @@ def library(share: float | dict[str, float], *specs: Any) -> Library:
     return Library(share=share, effects={spec.name(): spec for spec in specs})
 
 
-def commands(machine: Machine, steps: int, num: int) -> torch.Tensor:
-    """Returns random commands that hold for five periods, `(T, N, J)`, some of them zero and some full."""
-    u = (
-        torch.rand(steps // 5, num, machine.num_joints, generator=torch.Generator().manual_seed(1))
-        * 3.0
-        - 1.5
-    )
-    return (u.clamp(-1.0, 1.0) * (u.abs() > 0.2)).repeat_interleave(5, 0)
-
-
-@torch.no_grad()
-def roll(model: Any, machine: Machine, u: torch.Tensor) -> torch.Tensor:
-    """Returns the positions from rest at home, `(T, N, J)`."""
-    num = u.shape[1]
-    shape = (num, machine.num_history, machine.num_joints)
-    history, path = History(q=torch.zeros(shape), u=torch.zeros(shape)), []
-    home = torch.as_tensor(machine.home, dtype=torch.float32)
-    history.reset(torch.ones(num, dtype=torch.bool), home.expand(num, -1))
-    for command in u:
-        history.push_u(command)
-        history.push_q(model.step(history))
-        path.append(history.q[:, -1].clone())
-    return torch.stack(path)
-
-
 @pytest.mark.parametrize(
     "name", [name for name in EFFECTS if name not in ("frame_loss", "delay_jitter", "sensor_noise")]
 )
 def test_an_effect_does_in_the_library_what_it_does_alone(name: str, machine: Machine) -> None:
-    build, u, spec = option("actuator", "lag").build, commands(machine, 60, 3), fixed(name)
+    build, u, spec = option("actuator", "lag").build, draw_commands(machine, 60, 3, 1), fixed(name)
     alone = spec.wrap(build(machine, 3, CPU), machine, 3, CPU)
     together = library(1.0, spec).wrap(build(machine, 3, CPU), machine, 3, CPU)
     assert torch.equal(roll(together, machine, u), roll(alone, machine, u))
@@ -75,7 +51,7 @@ def test_all_together_are_one_around_the_other(machine: Machine) -> None:
     chance = ("frame_loss", "delay_jitter", "sensor_noise")
     build, u, specs = (
         option("actuator", "lag").build,
-        commands(machine, 100, 3),
+        draw_commands(machine, 100, 3, 1),
         [fixed(n) for n in EFFECTS if n not in chance],
     )
     stacked = build(machine, 3, CPU)
@@ -91,7 +67,7 @@ def test_all_together_are_one_around_the_other(machine: Machine) -> None:
 
 @pytest.mark.parametrize("actuator", ["mlp", "lag"])
 def test_where_no_effect_is_there_nothing_changes(actuator: str, machine: Machine) -> None:
-    build, u = option("actuator", "mlp").build, commands(machine, 60, 3)
+    build, u = option("actuator", "mlp").build, draw_commands(machine, 60, 3, 1)
     model = replace(option("effect", "library"), share=0.0).wrap(
         build(machine, 3, CPU), machine, 3, CPU
     )
@@ -136,7 +112,7 @@ def test_a_run_goes_on_exactly_from_its_state(machine: Machine) -> None:
         )
 
     torch.manual_seed(0)
-    model, u = fresh(), commands(machine, 30, 4)
+    model, u = fresh(), draw_commands(machine, 30, 4, 1)
     roll(model, machine, u)
     kept = {key: value.clone() for key, value in model.state.items()}
     on, seen = roll(model, machine, u), model.measure(u[0])
@@ -149,7 +125,7 @@ def test_a_run_goes_on_exactly_from_its_state(machine: Machine) -> None:
 
 def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: Machine) -> None:
     """Both would break the trace; a CUDA graph can hold what is left."""
-    u = commands(machine, 20, 4)
+    u = draw_commands(machine, 20, 4, 1)
     torch.manual_seed(0)
     plain, traced = (
         option("effect", "library").wrap(
@@ -183,12 +159,7 @@ def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
         u = (torch.rand(150, 4, 5, generator=generator) * 1.4 - 0.7).repeat_interleave(8, 0) * (
             torch.arange(5) == 0
         )
-        q = torch.cat(
-            (
-                torch.as_tensor(machine.home, dtype=torch.float32).expand(1, 4, 5),
-                roll(model, machine, u)[:-1],
-            )
-        )
+        q = roll(model, machine, u)[:-1]
         t_s = machine.period_s * np.arange(len(u))
         recordings = [
             Recording(

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import motion
 import numpy as np
 import pytest
 import torch
@@ -75,21 +76,9 @@ def roll(
     at: Any = None,
 ) -> torch.Tensor:
     """Returns positions `(T + 1, N, J)` from rest at home, or `at`, with the same levels for all of `joints`."""
-    q = torch.as_tensor(machine.home if at is None else at, dtype=torch.float32).expand(
-        num, machine.num_joints
-    )
-    history = History(
-        q=q[:, None].repeat(1, machine.num_history, 1),
-        u=torch.zeros(num, machine.num_history, machine.num_joints),
-    )
-    path = [q]
-    for level in levels:
-        u = torch.zeros_like(q)
-        u[:, list(joints)] = level
-        history.push_u(u)
-        history.push_q(model.step(history))
-        path.append(history.q[:, -1].clone())
-    return torch.stack(path)
+    u = torch.zeros(len(levels), num, machine.num_joints)
+    u[:, :, list(joints)] = torch.tensor(levels, dtype=torch.float32)[:, None, None]
+    return motion.roll(model, machine, u, at)
 
 
 def steps(model: Any, machine: Machine, levels: list[float]) -> list[float]:
