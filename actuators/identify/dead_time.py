@@ -210,14 +210,16 @@ def _search_curves(
 
     `None` for a joint that is hardly commanded.
     """
-    commanded = 0
-    moments = np.zeros((len(runs), len(grid_s), 2 * len(KNOTS) + 1, 2 * len(KNOTS) + 1))
-    for number, several in enumerate(runs):
-        for one in several:
-            commanded += int((np.abs(one.u[:, joint]) > KNOTS[1]).sum())
-            moments[number] += _compute_moments(one, joint, grid_s, machine)
+    commanded, found = 0, []
+    for several in runs:
+        counts = [int((np.abs(one.u[:, joint]) > KNOTS[1]).sum()) for one in several]
+        commanded += sum(counts)
+        if any(counts):
+            parts = [_compute_moments(one, joint, grid_s, machine) for one in several]
+            found.append(np.sum(parts, 0))
     if commanded < MIN_MOVING:
         return None
+    moments = np.stack(found)  # (R, D, F + 1, F + 1)
     gram, cross, total = moments[..., :-1, :-1], moments[..., :-1, -1], moments[..., -1, -1]
     every = gram.sum(0)
     ridge = 1e-6 * np.trace(every, axis1=1, axis2=2)[:, None, None] / every.shape[1] + 1e-12
@@ -246,10 +248,15 @@ def _compute_moments(
     now = np.flatnonzero(free[reach:]) + reach
     found = []
     for delay_s in grid_s:
-        whole, part = divmod(delay_s / machine.period_s + 1e-9, 1.0)
-        back = int(whole)
-        # The command changes inside the period.
-        delayed = part * curve[now - back - 1] + (1.0 - part) * curve[now - back]
+        delayed = delay_signal(curve, delay_s / machine.period_s)[now]
         features = np.concatenate([delayed, moved[now, None]], 1)
         found.append(features.T @ features)
     return np.stack(found)
+
+
+def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
+    """Return `u` `(T, …)` later by a fractional number of samples, its mean over each period."""
+    whole = int(np.floor(periods + 5e-7))
+    part = periods - whole
+    known = np.concatenate([np.repeat(u[:1], whole + 1, 0), u])
+    return (1.0 - part) * known[1 : len(u) + 1] + part * known[: len(u)]

@@ -11,7 +11,7 @@ import numpy as np
 from actuators import open_loop
 from actuators.identify import dead_time, pictures
 from actuators.identify.scores import FreeRunScores, average_joints
-from actuators.identify.stages import FitStage, FittedModel, list_recordings
+from actuators.identify.stages import FitStage, list_recordings
 from actuators.identify.training_data import list_sources
 from actuators.recordings.split import measure_commanded_s
 from brokk_rl.machine import Machine
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+HORIZONS_S = (1.0, 2.0, 5.0, 10.0)
+"""Horizons of `identification.json`."""
 HOLD, LINEAR = "hold", "arx"
 """The baselines that stand beside every model."""
 HEADLINE_S = 5.0
@@ -157,80 +159,64 @@ def _name_joints(some: list[str], every: list[str]) -> str:
     return f"{len(some)} of {len(every)} joints ({', '.join(some)})"
 
 
-@dataclass(frozen=True)
-class IdentificationRun:
-    """All fits of an identification.
-
-    Attributes:
-        machine: The machine.
-        model: Name of the model that is kept; the others are compared with it.
-        stages: Fits in their order; the last one made the model that is kept.
-        cuts: Windows of each stage, `None` where it judges nothing.
-        done: Results of each stage's fits, by model.
-        horizons_s: Horizons that fit into the recordings judged by.
-        wanted_s: Horizons that were wanted.
-    """
-
-    machine: Machine
-    model: str
-    stages: Sequence[FitStage]
-    cuts: Sequence[open_loop.FreeRunWindows | None]
-    done: Sequence[dict[str, FittedModel]]
-    horizons_s: tuple[float, ...]
-    wanted_s: tuple[float, ...]
-
-
 def build_results(
-    identified: IdentificationRun, resampling: np.random.Generator, delaying: np.random.Generator
+    machine: Machine,
+    model: str,
+    stages: Sequence[FitStage],
+    horizons_s: Sequence[float],
+    resampling: np.random.Generator,
+    delaying: np.random.Generator,
 ) -> tuple[dict[str, Any], list[VerdictSentence], Figure]:
     """Return `identification.json`, the verdict, and the picture of the predictions.
 
     Args:
-        identified: All fits.
+        machine: The machine.
+        model: Name of the model that is kept; the others are compared with it.
+        stages: Fits in their order; the last one made the model that is kept.
+        horizons_s: Those of `HORIZONS_S` that fit into the recordings judged by.
         resampling: Draws the resamples of the errors.
         delaying: Draws those of the dead times.
 
     Raises:
         RecordingError: no recording is long enough to search for a dead time in.
     """
-    machine, model = identified.machine, identified.model
-    scores = _join_stages(identified, resampling)
-    kept = identified.done[-1][model]
-    last = identified.stages[-1]
+    judging = [(stage.cut, stage.fitted) for stage in stages if stage.cut is not None]
+    predicted = {}
+    for name in judging[0][1]:
+        predicted[name] = np.concatenate([fitted[name].predicted for _, fitted in judging])
+    cut = open_loop.join_windows([one for one, _ in judging])
+    scores = FreeRunScores(predicted, cut, machine, resampling)
+    last = stages[-1]
     fitted_to = list_recordings(last.train) + list_recordings(last.validation)
+    judged = []
+    for stage in stages:
+        judged += list_recordings(stage.test)
     delays = dead_time.estimate_dead_times(fitted_to, machine, delaying)
+    kept = last.fitted[model]
     result: dict[str, Any] = {
         "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
-        "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
+        "fold_seconds": [round(stage.fitted[model].seconds, 2) for stage in stages[:-1]],
     }  # fmt: skip
-    result |= _tabulate_errors(scores, identified)
+    result |= _tabulate_errors(scores, model, horizons_s)
+    longest_s = open_loop.find_longest_horizon_s(judged, machine)
+    before_s = open_loop.count_samples_before(machine) * machine.period_s
+    reason = f"the longest recording judged by leaves {longest_s:.1f} s after the {before_s:.2f} s before a free run"
+    result["missing"] = {f"{h:g}": reason for h in HORIZONS_S if h not in horizons_s}
     result["delay_s"] = {joint: delay and delay.plain() for joint, delay in delays.items()}
-    result["data"] = _describe_data(identified, fitted_to, scores)
+    result["data"] = _describe_data(stages, fitted_to, judged, scores)
     findings = write_verdict(result, machine)
     result["verdict"] = [{"tone": finding.tone, "text": finding.text} for finding in findings]
     return result, findings, pictures.draw_prediction(scores, model)
 
 
-def _join_stages(identified: IdentificationRun, resampling: np.random.Generator) -> FreeRunScores:
-    """Return the scores over the windows of all stages that judge something."""
-    cuts, judging = [], []
-    for cut, done in zip(identified.cuts, identified.done, strict=True):
-        if cut is not None:
-            cuts.append(cut)
-            judging.append(done)
-    predicted = {}
-    for name in judging[0]:
-        predicted[name] = np.concatenate([done[name].predicted for done in judging])
-    return FreeRunScores(predicted, open_loop.join_windows(cuts), identified.machine, resampling)
-
-
-def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> dict[str, Any]:
-    """Return `joints`, `overall`, `against` and `missing`."""
-    machine, model = identified.machine, identified.model
+def _tabulate_errors(
+    scores: FreeRunScores, model: str, horizons_s: Sequence[float]
+) -> dict[str, Any]:
+    """Return `joints`, `overall` and `against`; `None` at a horizon that does not fit."""
+    machine = scores.machine
     names, units = machine.joint_names, [joint.unit for joint in machine.joints]
-    horizons = {f"{horizon_s:g}": horizon_s for horizon_s in identified.wanted_s}
-    fitting = {key: h for key, h in horizons.items() if h in identified.horizons_s}
-    absent = dict.fromkeys(horizons)
+    fitting = {f"{horizon_s:g}": horizon_s for horizon_s in horizons_s}
+    absent = dict.fromkeys(f"{horizon_s:g}" for horizon_s in HORIZONS_S)
     joints: dict[str, Any] = {joint: {} for joint in names}
     overall, against = {}, {}
     for name in scores.predicted:
@@ -243,39 +229,27 @@ def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> di
             against[name] = {}
             for j, joint in enumerate((*names, "overall")):
                 against[name][joint] = absent | {key: row[j] for key, row in compared.items()}
-    longest_s = open_loop.find_longest_horizon_s(_list_judged(identified), machine)
-    before_s = open_loop.count_samples_before(machine) * machine.period_s
-    reason = f"the longest recording judged by leaves {longest_s:.1f} s after the {before_s:.2f} s before a free run"
-    return {
-        "joints": joints,
-        "overall": overall,
-        "against": against,
-        "missing": {key: reason for key in horizons if key not in fitting},
-    }
-
-
-def _list_judged(identified: IdentificationRun) -> list[Recording]:
-    judged = []
-    for stage in identified.stages:
-        judged.extend(list_recordings(stage.test))
-    return judged
+    return {"joints": joints, "overall": overall, "against": against}
 
 
 def _describe_data(
-    identified: IdentificationRun, fitted_to: Sequence[Recording], scores: FreeRunScores
+    stages: Sequence[FitStage],
+    fitted_to: Sequence[Recording],
+    judged: Sequence[Recording],
+    scores: FreeRunScores,
 ) -> dict[str, Any]:
     """Return facts on the data: amount, runs of each part, excitation of each joint."""
-    last, judged = identified.stages[-1], _list_judged(identified)
+    last = stages[-1]
     u = np.concatenate([recording.u for recording in fitted_to])
     q = np.concatenate([recording.q for recording in fitted_to])
     moved_s, judged_s = measure_commanded_s(fitted_to), measure_commanded_s(judged)
     tested, runs = set(), []
-    for stage in identified.stages:
+    for stage in stages:
         tested.update(stage.test)
         parts = {part: list(getattr(stage, part)) for part in ("train", "validation", "test")}
         runs.append({"stage": stage.name or "fit"} | parts)
     excitation = {}
-    for j, joint in enumerate(identified.machine.joint_names):
+    for j, joint in enumerate(scores.machine.joint_names):
         excitation[joint] = {
             "commanded_s": float(moved_s[j]),
             "judged_s": float(judged_s[j]),

@@ -10,7 +10,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -31,9 +31,9 @@ FREE_RUNS = "free_runs"
 """Folder of what a stage's models predicted."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class FitStage:
-    """Recordings by run for one fit, and the folder of its results.
+    """Recordings by run for one fit, the folder of its results, and what came of it.
 
     Attributes:
         name: Name in the log.
@@ -42,6 +42,8 @@ class FitStage:
         train: To fit to.
         validation: To stop the fit by.
         test: To judge by; none where a model is only made to be kept.
+        cut: Windows of `test`; `None` where it judges nothing.
+        fitted: Results of its fits, by model.
     """
 
     name: str
@@ -50,6 +52,8 @@ class FitStage:
     train: Mapping[str, Sequence[Recording]]
     validation: Mapping[str, Sequence[Recording]]
     test: Mapping[str, Sequence[Recording]]
+    cut: open_loop.FreeRunWindows | None = None
+    fitted: dict[str, FittedModel] = field(default_factory=dict)
 
     @cached_property
     def digest(self) -> str:
@@ -91,7 +95,6 @@ def fit_or_restore(
     fit: ActuatorFit,
     folder: Path,
     machine: Machine,
-    cut: open_loop.FreeRunWindows | None,
     device: torch.device,
 ) -> FittedModel:
     """Fit a model and roll it out through windows, or restore an earlier result.
@@ -101,7 +104,7 @@ def fit_or_restore(
         RecordingError: too little data to fit to.
     """
     path = folder / FREE_RUNS / f"{name}.npz"
-    shape = () if cut is None else cut.q.shape
+    shape = () if stage.cut is None else stage.cut.q.shape
     stamp = repr((fit, machine.fingerprint(), stage.digest, shape))
     key = hashlib.sha256(stamp.encode()).hexdigest()
     if path.exists():
@@ -114,8 +117,8 @@ def fit_or_restore(
     actuator = fit.fit(machine, train, validation, folder, stage.seed, device)
     seconds = time.monotonic() - began
     predicted = np.zeros((0, 0, machine.num_joints))
-    if cut is not None:
-        predicted = open_loop.roll_out(actuator, machine, cut, device)
+    if stage.cut is not None:
+        predicted = open_loop.roll_out(actuator, machine, stage.cut, device)
     option = folder / f"{name}.yaml"
     found = FittedModel(predicted, seconds, f"actuator=@{option}" if option.exists() else "")
     content = BytesIO()

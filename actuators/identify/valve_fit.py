@@ -15,6 +15,7 @@ import torch
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from actuators.identify.dead_time import delay_signal, estimate_dead_times
 from actuators.identify.option_file import write_numbers
 from actuators.models.valve import PoseFeatures, ValveActuator
 from brokk_rl.errors import RecordingError
@@ -35,6 +36,8 @@ POSE = 0.03
 """Prior: relative change of speed per feature of the pose."""
 DEMAND = 10.0
 """Prior of the demand, in errors of an increment: without evidence a joint asks for nothing."""
+FIRST_DEMAND = 0.8
+"""Demand of each joint from which the search starts: a demand that is too low has no slope."""
 TOGETHER = 15.0
 """Increments whose errors hang together: a speed that wanders for some seconds is no evidence for a
 bend of the curve or a pose."""
@@ -154,9 +157,12 @@ class _ValveRuns:
         self._parts = np.cumsum([NUM_DYNAMICS, 2 * half])
         first = np.concatenate([START, knots[1:], knots[1:], np.zeros(2 * size)])
         self._x = np.tile(first, (machine.num_joints, 1))
-        self.demand = np.zeros(machine.num_joints)
+        self.demand = np.full(machine.num_joints, FIRST_DEMAND)
         self._share = [np.ones(len(one.q)) for one in used]
-        self._is_begun = False
+        delays = estimate_dead_times(used, machine, np.random.default_rng(0))
+        for row, delay in zip(self._x, delays.values(), strict=True):
+            # the search counts lags as delay
+            row[0] = machine.dead_time_s if delay is None else delay.value_s - START[2:].sum()
 
     @property
     def numbers(self) -> list[np.ndarray]:
@@ -169,17 +175,10 @@ class _ValveRuns:
         found = map_parallel(lambda j: self._fit_joint(j, most, iterations), joints)
         for j, (x, noise) in enumerate(found):
             self._x[j], self._noise[j] = x, noise
-        self._is_begun = True
 
     def _fit_joint(self, j: int, most: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
         """Return the numbers of a joint, and the error of an increment that they leave."""
         x, noise, free = self._x[j].copy(), self._noise[j], self._free[j]
-        delays_s = np.arange(0.0, most[0], self._period_s)
-        if not self._is_begun:
-            costs = [self._solve_linear(j, np.append(one, START[1:]))[1] for one in delays_s]
-            x[0] = delays_s[int(np.argmin(costs))]
-            curve = slice(*self._parts)
-            x[curve] = self._solve_linear(j, x[:NUM_DYNAMICS])[0]
         low, high = np.full(len(x), -np.inf), np.full(len(x), np.inf)
         low[:NUM_DYNAMICS], high[:NUM_DYNAMICS] = 0.0, most
         x[:NUM_DYNAMICS] = np.clip(x[:NUM_DYNAMICS], 1e-6, most - 1e-6)
@@ -211,15 +210,6 @@ class _ValveRuns:
         typical = SIGMA_OVER_MEDIAN * np.median(np.abs(left[moves]))
         least = 1e-3 * np.sqrt(np.mean(self._way[j] ** 2))
         return found, float(np.sqrt(TOGETHER) * max(typical, least))
-
-    def _solve_linear(self, j: int, dynamics: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the curve in the mean pose that fits best, and the squared error that it leaves."""
-        x = np.concatenate([dynamics, self._x[j, NUM_DYNAMICS:]])
-        columns = self._differentiate(j, x)[:, : self._parts[1] - NUM_DYNAMICS]
-        rows = np.vstack([columns / self._noise[j], self._bend])
-        wanted = np.append(self._way[j] / self._noise[j], np.zeros(len(self._bend)))
-        curve = np.linalg.lstsq(rows, wanted, rcond=1e-9)[0]
-        return curve, float(np.square(wanted - rows @ curve).sum())
 
     def _list_parts(self, j: int, x: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield basis of the curve, slopes by the pose and factor of the pose for each recording."""
@@ -265,12 +255,8 @@ class _ValveRuns:
                 rows.append(left * self._free[j] / self._noise[j])
             return np.concatenate(rows)
 
-        starts = [self.demand] if self.demand.any() else []
-        starts += [np.full(len(joints), level) for level in (0.3, 0.55, 0.8)]
-        begin = min(starts, key=lambda demand: float(np.square(compute_errors(demand)).sum()))
-        begin = np.clip(begin, 1e-3, 1.99)
         self.demand = least_squares(
-            compute_errors, begin, bounds=(0.0, 2.0), diff_step=1e-3, max_nfev=12
+            compute_errors, self.demand, bounds=(0.0, 2.0), diff_step=1e-3, max_nfev=12
         ).x
         self._share = [_compute_pump_share(self.demand, one) for one in opened]
 
@@ -306,14 +292,6 @@ class _ValveRuns:
         """Sum steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""
         count = len(steps) // WIDTH
         return steps[: count * WIDTH].reshape(count, WIDTH, *steps.shape[1:]).sum(1)[self._skip :]
-
-
-def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
-    """Return `u` `(T,)` later by a fractional number of samples, its mean over each period."""
-    whole = int(np.floor(periods + 5e-7))
-    part = periods - whole
-    known = np.pad(u, (whole + 1, 0), mode="edge")
-    return (1.0 - part) * known[1 : len(u) + 1] + part * known[: len(u)]
 
 
 def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.ndarray:

@@ -14,14 +14,8 @@ from actuators import open_loop
 from actuators.contracts import ActuatorFit
 from actuators.identify import page
 from actuators.identify.request import Identification
-from actuators.identify.results import (
-    HOLD,
-    LINEAR,
-    IdentificationRun,
-    VerdictSentence,
-    build_results,
-)
-from actuators.identify.stages import FitStage, FittedModel, fit_or_restore, list_recordings
+from actuators.identify.results import HOLD, HORIZONS_S, LINEAR, VerdictSentence, build_results
+from actuators.identify.stages import FitStage, fit_or_restore, list_recordings
 from actuators.recordings.split import check_commanded, group_by_run, split_runs
 from brokk_rl import record
 from brokk_rl.console_table import TableCell, print_table, print_text
@@ -33,8 +27,6 @@ from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
-HORIZONS_S = (1.0, 2.0, 5.0, 10.0)
-"""Horizons of `identification.json`."""
 TONES = {"good": "green", "bad": "red", "warn": "yellow", "plain": "default"}
 
 Runs = Mapping[str, Sequence[Recording]]
@@ -92,23 +84,23 @@ class Identify:
         for h in HORIZONS_S:
             if h <= open_loop.find_longest_horizon_s(judged, self.machine) + 1e-9:
                 horizons_s.append(h)
-        cuts = [self._cut(stage, horizons_s) for stage in stages]
+        for stage in stages:
+            if stage.test or not self.identify.folds:
+                stage.cut = self._cut(stage, horizons_s or HORIZONS_S[:1])
         models = {self.fit.name: self.fit, **self.baselines}
-        done: list[dict[str, FittedModel]] = []
         device = self.session.torch_device()
         with _limit_threads(self.identify.threads):
-            for stage, cut in zip(stages, cuts, strict=True):
-                chosen = models if cut or not self.identify.folds else {self.fit.name: self.fit}
-                fitted = {}
-                for name, fit in chosen.items():
-                    fitted[name] = self._fitted(stage, name, fit, cut, device)
-                done.append(fitted)
-        identified = IdentificationRun(
-            self.machine, self.fit.name, stages, cuts, done, tuple(horizons_s), HORIZONS_S
-        )
+            for stage in stages:
+                for name in models if stage.cut else (self.fit.name,):
+                    is_kept = name == self.fit.name
+                    folder = stage.folder if is_kept else stage.folder / "baselines" / name
+                    stage.fitted[name] = fit_or_restore(
+                        stage, name, models[name], folder, self.machine, device
+                    )
         result, findings, prediction = build_results(
-            identified, self.session.generator("resample"), self.session.generator("delay")
-        )
+            self.machine, self.fit.name, stages, horizons_s,
+            self.session.generator("resample"), self.session.generator("delay"),
+        )  # fmt: skip
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
         folder = self.session.folder
         write_json(folder / "identification.json", result)
@@ -181,23 +173,9 @@ class Identify:
                 f"identify.test: {min(shared)} is also among identify.recordings; judge by runs that were not fitted to"
             )
 
-    def _cut(self, stage: FitStage, horizons_s: Sequence[float]) -> open_loop.FreeRunWindows | None:
-        if not stage.test and self.identify.folds:
-            return None
-        fitting = horizons_s or HORIZONS_S[:1]
+    def _cut(self, stage: FitStage, horizons_s: Sequence[float]) -> open_loop.FreeRunWindows:
         judged, stride_s = list_recordings(stage.test), self.identify.stride_s
-        return open_loop.cut_windows(judged, self.machine, fitting[-1], stride_s, fitting[0])
-
-    def _fitted(
-        self,
-        stage: FitStage,
-        name: str,
-        fit: ActuatorFit,
-        cut: open_loop.FreeRunWindows | None,
-        device: torch.device,
-    ) -> FittedModel:
-        folder = stage.folder if name == self.fit.name else stage.folder / "baselines" / name
-        return fit_or_restore(stage, name, fit, folder, self.machine, cut, device)
+        return open_loop.cut_windows(judged, self.machine, horizons_s[-1], stride_s, horizons_s[0])
 
 
 @contextmanager
