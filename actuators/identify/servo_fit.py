@@ -23,7 +23,14 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.spec import spec
 
-NUMBERS = ("dead_time_s", "response_s", "damping", "play_rad", "sag_rad", "sag_slope")
+NUMBERS: tuple[str, ...] = (
+    "dead_time_s",
+    "response_s",
+    "damping",
+    "play_rad",
+    "sag_rad",
+    "sag_slope",
+)
 STEPS = np.array([5e-3, 2e-3, 5e-2, 2e-3, 1e-3, 1e-2])
 """Size of each number, in its own unit, by which steps of the search count; a tenth is a difference.
 Chosen by hand: above the grain of samples and encoders, below what changes a loop."""

@@ -9,6 +9,7 @@ Axes: `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments.
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -200,10 +201,16 @@ class _ValveRuns:
             priors[len(self._bend) :, self._parts[1] :] = np.eye(len(x) - self._parts[1]) / POSE
             return np.vstack([-slopes * (free / noise)[:, None], priors])
 
+        slopes: Any = compute_slopes  # scipy's types know words only
         found = least_squares(
-            compute_errors, x, compute_slopes, (low, high), loss="soft_l1", max_nfev=iterations,
+            compute_errors,
+            x,
+            slopes,
+            (low, high),
+            loss="soft_l1",
+            max_nfev=iterations,
             x_scale="jac",
-        ).x  # fmt: skip
+        ).x
         left = self._way[j] - self._predict(j, found)
         # increments of a joint at rest fit anyway and would hide the typical error
         moves = np.abs(self._way[j]) > 0.1 * np.sqrt(np.mean(self._way[j] ** 2))
