@@ -31,7 +31,9 @@ from annotated_types import Interval
 
 from actuators.models.joint_model import ParametricModel
 from actuators.models.parameters import (
+    JointBounds,
     NonNegativePerJoint,
+    PerJoint,
     PositivePerJoint,
     SharePerJoint,
     check_interface,
@@ -44,8 +46,7 @@ from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
 
-Overlap = Annotated[float, Interval(ge=0, le=0.9)]
-OverlapPerJoint = Overlap | dict[str, Overlap]
+OverlapPerJoint = Annotated[PerJoint, JointBounds("0 to 0.9", 0.0, 0.9)]
 
 
 @spec

@@ -5,17 +5,19 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, NamedTuple
 
 import torch
-from annotated_types import Interval
 
 from actuators.models.joint_model import CommandParts, JointMemory, MemorylessModel, PlannableModel
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import NonNegativePerJoint, PerJoint, check_interface, open_valve
+from actuators.models.parameters import (
+    JointBounds,
+    NonNegativePerJoint,
+    PerJoint,
+    check_interface,
+    open_valve,
+)
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-
-Band = Annotated[float, Interval(ge=0, lt=1)]
-BandPerJoint = Band | dict[str, Band]
 
 
 @spec
@@ -67,8 +69,8 @@ class FirstOrderLag:
     label: ClassVar = "lag"
 
     dead_time_s: PerJoint | None
-    dead_band_extend: BandPerJoint
-    dead_band_retract: BandPerJoint
+    dead_band_extend: Annotated[PerJoint, JointBounds("0 or more, below 1", 0.0, 0.999)]
+    dead_band_retract: Annotated[PerJoint, JointBounds("0 or more, below 1", 0.0, 0.999)]
     gain: PerJoint
     time_constant_s: NonNegativePerJoint
 

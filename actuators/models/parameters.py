@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 import torch
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.spec import NonNegative, Positive, Share
 
 OTHER = "other"
 """Key for the joints that a per-joint table does not name."""
@@ -34,9 +35,36 @@ COMMANDS = {"speed": "valve or velocity", "position": "position", "torque": "tor
 PerJoint = float | dict[str, float]
 """One number for all joints, or a table by joint name; `other` stands for the joints it does not
 name."""
-PositivePerJoint = Positive | dict[str, Positive]
-NonNegativePerJoint = NonNegative | dict[str, NonNegative]
-SharePerJoint = Share | dict[str, Share]
+
+
+@dataclass(frozen=True)
+class JointBounds:
+    """Constraint of a number, or of each in a table by joint.
+
+    Attributes:
+        text: The bounds in words.
+        low: Smallest value.
+        high: Largest value.
+    """
+
+    text: str
+    low: float
+    high: float = math.inf
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+    def check(self, value: PerJoint) -> PerJoint:
+        """Return the number or table; raise an error of pydantic where one is out of bounds."""
+        numbers = value.values() if isinstance(value, dict) else (value,)
+        if all(self.low <= one <= self.high for one in numbers):
+            return value
+        raise PydanticCustomError("bounds", "expected {text}", {"text": self.text})
+
+
+PositivePerJoint = Annotated[PerJoint, JointBounds("more than 0", 1e-12)]
+NonNegativePerJoint = Annotated[PerJoint, JointBounds("0 or more", 0.0)]
+SharePerJoint = Annotated[PerJoint, JointBounds("0 to 1", 0.0, 1.0)]
 
 
 def check_interface(machine: Machine, interface: str, title: str) -> None:
