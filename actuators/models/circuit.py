@@ -45,8 +45,8 @@ from annotated_types import Ge, Interval
 
 from actuators.models.hydraulic import OilModel, OverlapPerJoint
 from actuators.models.parameters import (
-    JointBounds,
     NonNegativePerJoint,
+    NumberBounds,
     PerJoint,
     PositivePerJoint,
     SharePerJoint,
@@ -57,9 +57,9 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
 
-RatioPerJoint = Annotated[PerJoint, JointBounds("0.05 to 1", 0.05, 1.0)]
+RatioPerJoint = Annotated[PerJoint, NumberBounds("0.05 to 1", 0.05, 1.0)]
 # at 0 and pi the cylinder has no lever arm
-LinkagePerJoint = Annotated[PerJoint, JointBounds("0.15 to 2.99", 0.15, math.pi - 0.15)]
+LinkagePerJoint = Annotated[PerJoint, NumberBounds("0.15 to 2.99", 0.15, math.pi - 0.15)]
 LAMINAR = 1e-4
 """Drop, of relief pressure, below which an orifice is laminar: it gives the flow a finite slope."""
 DEAD_VOLUME = 0.1

@@ -31,8 +31,8 @@ from annotated_types import Interval
 
 from actuators.models.joint_model import ParametricModel
 from actuators.models.parameters import (
-    JointBounds,
     NonNegativePerJoint,
+    NumberBounds,
     PerJoint,
     PositivePerJoint,
     SharePerJoint,
@@ -46,7 +46,7 @@ from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
 
-OverlapPerJoint = Annotated[PerJoint, JointBounds("0 to 0.9", 0.0, 0.9)]
+OverlapPerJoint = Annotated[PerJoint, NumberBounds("0 to 0.9", 0.0, 0.9)]
 
 
 @spec

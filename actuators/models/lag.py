@@ -9,8 +9,8 @@ import torch
 from actuators.models.joint_model import CommandParts, JointMemory, MemorylessModel, PlannableModel
 from actuators.models.machine_tensors import MachineTensors
 from actuators.models.parameters import (
-    JointBounds,
     NonNegativePerJoint,
+    NumberBounds,
     PerJoint,
     check_interface,
     open_valve,
@@ -69,8 +69,8 @@ class FirstOrderLag:
     label: ClassVar = "lag"
 
     dead_time_s: PerJoint | None
-    dead_band_extend: Annotated[PerJoint, JointBounds("0 or more, below 1", 0.0, 0.999)]
-    dead_band_retract: Annotated[PerJoint, JointBounds("0 or more, below 1", 0.0, 0.999)]
+    dead_band_extend: Annotated[PerJoint, NumberBounds("0 or more, below 1", 0.0, 0.999)]
+    dead_band_retract: Annotated[PerJoint, NumberBounds("0 or more, below 1", 0.0, 0.999)]
     gain: PerJoint
     time_constant_s: NonNegativePerJoint
 

@@ -38,7 +38,7 @@ name."""
 
 
 @dataclass(frozen=True)
-class JointBounds:
+class NumberBounds:
     """Constraint of a number, or of each in a table by joint.
 
     Attributes:
@@ -62,9 +62,9 @@ class JointBounds:
         raise PydanticCustomError("bounds", "expected {text}", {"text": self.text})
 
 
-PositivePerJoint = Annotated[PerJoint, JointBounds("more than 0", 1e-12)]
-NonNegativePerJoint = Annotated[PerJoint, JointBounds("0 or more", 0.0)]
-SharePerJoint = Annotated[PerJoint, JointBounds("0 to 1", 0.0, 1.0)]
+PositivePerJoint = Annotated[PerJoint, NumberBounds("more than 0", 1e-12)]
+NonNegativePerJoint = Annotated[PerJoint, NumberBounds("0 or more", 0.0)]
+SharePerJoint = Annotated[PerJoint, NumberBounds("0 to 1", 0.0, 1.0)]
 
 
 def check_interface(machine: Machine, interface: str, title: str) -> None:
