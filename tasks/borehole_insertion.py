@@ -107,7 +107,7 @@ class BoreholeInsertion(ToolPoseTask):
         success: Criteria.
     """
 
-    depth_m: Finite
+    depth_m: Positive
     hole: BoreholeRanges
     row: HoleRow | None
     success: InsertionCriteria

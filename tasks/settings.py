@@ -161,8 +161,9 @@ class ObservationNoise:
     ) -> torch.Tensor | float:
         if growth_1_m == 0.0:
             return near_m
-        seen_m = target_m - target_m.new_tensor(self.camera_in_base_m)
-        return near_m + growth_1_m * seen_m.square().sum(1, keepdim=True)
+        # axis by axis: a captured graph cannot copy the place of the camera from the host
+        axes = zip(target_m.split(1, 1), self.camera_in_base_m, strict=True)
+        return near_m + growth_1_m * sum((axis_m - at_m).square() for axis_m, at_m in axes)
 
 
 @spec

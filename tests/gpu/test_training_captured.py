@@ -17,6 +17,7 @@ from brokk_rl.contracts.task import REWARD
 from brokk_rl.machine import Machine
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.ppo import DevicePPO
+from brokk_rl.rl.settings import Teacher
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
 
 pytestmark = [
@@ -38,9 +39,11 @@ WILD = 5
 """The world that diverges."""
 
 
-def make_loop(machine: Machine, sim: Any = WARP, device: torch.device = CUDA) -> ControlLoop:
+def make_loop(
+    machine: Machine, sim: Any = WARP, device: torch.device = CUDA, task: Any = None
+) -> ControlLoop:
     torch.manual_seed(0)
-    task = option("task", "borehole_insertion")
+    task = task or option("task", "borehole_insertion")
     return runs.plant(machine, task, sim).build(device, NUM, 256, 5)
 
 
@@ -66,6 +69,17 @@ def test_a_captured_step_names_why_a_world_diverged(
     assert loop.statistics()["fault_rate"] > 0.0
     assert "the motion of q3 was not finite" in caplog.text
     assert loop.statistics()["fault_rate"] == 0.0
+
+
+@pytest.mark.parametrize("level", ["flat", "several", "slanted", "goal_pose"])
+def test_each_level_is_captured_with_any_noise(machine: Machine, level: str) -> None:
+    measured = option("task/noise", "measured")
+    loop = make_loop(machine, task=replace(option("task", level), noise=measured))
+    loop.capture()
+    assert loop.graph_active
+    push(loop, 30)
+    assert loop.statistics()["fault_rate"] == 0.0
+    assert all(torch.isfinite(value).all() for value in loop.get_observations().values())
 
 
 # --- figures of the reward ---
@@ -131,8 +145,13 @@ def test_paired_episodes_of_the_task_end_alike(
     assert np.median(apart) < 0.1, apart
 
 
-def test_a_training_stays_captured(machine: Machine, tmp_path: Path) -> None:
-    training = replace(runs.small(max_env_steps=NUM * runs.STEPS * 6), num_envs=NUM)
+@pytest.mark.parametrize("teacher", [None, Teacher(weight=1.0, until=0.5)], ids=["alone", "led"])
+def test_a_training_stays_captured(
+    machine: Machine, tmp_path: Path, teacher: Teacher | None
+) -> None:
+    budget = NUM * runs.STEPS * 6
+    training = runs.small(max_env_steps=budget, num_envs=NUM, teacher=teacher)
+    training.runner["obs_groups"]["actor"] = ["guide", "joints"]
     loop = make_loop(machine)
     loop.capture()
     folder = tmp_path / "run"

@@ -38,11 +38,6 @@ def test_the_cap_falls_in_equal_ratios(share: float, cap: float) -> None:
     assert schedule.cap_at(share) == pytest.approx(cap)
 
 
-def test_a_cap_that_falls_at_once() -> None:
-    schedule = Exploration(cap=(0.5, 0.125), over=(0.4, 0.4))
-    assert (schedule.cap_at(0.39), schedule.cap_at(0.4)) == (0.5, 0.125)
-
-
 def test_below_the_cap_it_is_the_gaussian_of_rsl_rl() -> None:
     ours = CappedGaussian(3, 0.4, (0.1, 1.0))
     theirs = GaussianDistribution(3, 0.4, (0.1, 1.0), std_type="log")
@@ -78,12 +73,6 @@ def test_training_moves_the_cap_and_a_checkpoint_keeps_it(machine: Machine, tmp_
 def test_a_schedule_for_another_distribution_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"expected the distribution .*CappedGaussian.*, got Gau"):
         replace(option("rl", "ppo"), exploration=Exploration(cap=(0.5, 0.1), over=(0.0, 1.0)))
-
-
-@pytest.mark.parametrize("over", [(0.6, 0.2), (-0.1, 0.5), (0.5, 1.1)])
-def test_shares_outside_of_the_budget_are_refused(over: tuple[float, float]) -> None:
-    with pytest.raises(ConfigError, match=r"Exploration\.over"):
-        Exploration(cap=(0.5, 0.1), over=over)
 
 
 @pytest.mark.parametrize(("share", "weight"), [(0.0, 4.0), (0.25, 2.0), (0.5, 0.0), (0.9, 0.0)])

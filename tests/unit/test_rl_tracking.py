@@ -13,14 +13,7 @@ import wandb
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.rl.logger import NoTracking, TensorBoardTracking, WandbTracking, _find_sweep
-
-
-def test_without_a_tracker_nothing_is_written(tmp_path: Path) -> None:
-    tracker = NoTracking().open(tmp_path, {}, 0)
-    tracker.log({"a": 1.0}, 0)
-    tracker.close()
-    assert not list(tmp_path.iterdir())
+from brokk_rl.rl.logger import TensorBoardTracking, WandbTracking, _find_sweep
 
 
 def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
