@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from brokk_rl.errors import RecordingError
+from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
 from diagnosis.answer import ANSWER_FILE, Answer, parse_answer
-from exam import dataset, run_cases, score
+from exam import run_cases, score
 from exam.case_distribution import CaseDistribution
-from exam.dataset import end_on_interrupt
+from exam.generate import WITHHELD_FOLDER
 from exam.metrics import compute_metrics
 
 log = logging.getLogger(__name__)
@@ -26,8 +27,8 @@ PUBLISHED = ("schema", "verdict", "reason", "selected", "ranking", "where", "gap
 published file names them as `left_out`."""
 RUN_FILE = "run.json"
 """File beside answers: who gave them, at which commit, to which labels."""
-EXAMINED_FILE = "examined.json"
-"""The examiner's figures, beside a score and beside published answers."""
+EXAMINED_FILE, EXAMINED_FOLDER = "examined.json", "examined"
+"""The examiner's figures, beside a score and beside published answers; those of each case."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
         RecordingError: there is no answer.
     """
     found: dict[str, GivenAnswer] = {}
+    where = path
     try:
         if path.is_file():
             for row in map(json.loads, path.read_text().splitlines()):
@@ -74,12 +76,13 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
                 found[row["case"]] = GivenAnswer(row["note"], row["answer"], left_out)
         elif path.is_dir():
             for place in filter(run_cases.is_begun, path.iterdir()):
-                file = place / ANSWER_FILE
-                content = json.loads(file.read_text()) if file.is_file() else None
+                where = place / ANSWER_FILE
+                content = json.loads(where.read_text()) if where.is_file() else None
                 found[place.name] = GivenAnswer(run_cases.read_note(place), content)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(
-            f"exam.answers: {path}: expected {ANSWER_FILE} in a folder a case, or a line a case of a published file ({error!r})"
+            f"exam.answers: {where}: expected {ANSWER_FILE} in a folder a case, or a line a case of a published file "
+            f"({error!r}); delete what is damaged, and exam.do=run resume=<answers> answers it again"
         ) from error
     if all(one.content is None for one in found.values()):
         raise RecordingError(f"exam.answers: {path} holds no answer to any case")
@@ -104,7 +107,7 @@ def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
             note["error"] = note["error"].strip().splitlines()[-1]
         row: dict[str, Any] = {"case": case, "note": note, "answer": None}
         if one.content is not None:
-            row["answer"] = {key: one.content[key] for key in PUBLISHED}
+            row["answer"] = {key: one.content[key] for key in PUBLISHED if key in one.content}
             row["left_out"] = sorted({*one.left_out, *one.content} - {*PUBLISHED})
         lines.append(json.dumps(row) + "\n")
     write_text(path, "".join(lines))
@@ -144,7 +147,7 @@ def examine_answers(
     labels: Sequence[Mapping[str, Any]],
     folders: Mapping[str, Path],
     examine: Callable[[str, Sequence[Path]], list[dict[str, Any]]],
-    place: Path,
+    out: Path,
     workers: int,
 ) -> dict[str, dict[str, Any]]:
     """Return the examiner's figures by candidate and case; empty without withheld recordings.
@@ -154,7 +157,7 @@ def examine_answers(
         labels: Its opened labels.
         folders: Answers of each candidate. Of a published file the figures beside it are taken.
         examine: Returns the figures of answers to a case.
-        place: File that keeps the figures, so that an interrupted score goes on.
+        out: Folder that gets the figures; those of each case at once, so that an interrupted score goes on.
         workers: Processes.
     """
     found: dict[str, dict[str, Any]] = {}
@@ -162,31 +165,27 @@ def examine_answers(
         beside = folder.parent / EXAMINED_FILE
         is_known = folder.is_file() and beside.is_file()
         found[name] = json.loads(beside.read_text()).get(name, {}) if is_known else {}
-    if place.is_file():
-        found |= json.loads(place.read_text())
-    todo = []
+    cases = []
     for label in labels:
-        case = label["case"]
-        is_withheld = (exam / dataset.WITHHELD_FOLDER / case).is_dir()
-        if label["kind"] not in ("one", "several") or not is_withheld:
-            continue
+        is_withheld = (exam / WITHHELD_FOLDER / label["case"]).is_dir()
+        if label["kind"] in ("one", "several") and is_withheld:
+            cases.append(label["case"])
+
+    def examine_begun(case: str) -> dict[str, Any]:
         begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
-        missing = [name for name in begun if case not in found[name]]
-        if missing:
-            todo.append((case, missing))
-    if not todo:
-        return found
-    with (
-        ItemProgress("repairs examined", len(todo)) as progress,
-        ProcessPoolExecutor(workers, initializer=end_on_interrupt) as pool,
-    ):
-        jobs = {}
-        for case, names in todo:
-            jobs[pool.submit(examine, case, [folders[name] / case for name in names])] = case, names
-        for job in as_completed(jobs):
-            case, names = jobs[job]
-            for name, result in zip(names, job.result(), strict=True):
+        path = out / EXAMINED_FOLDER / f"{case}.json"
+        known = json.loads(path.read_text()) if path.is_file() else {}
+        if begun and {*begun} - {*known}:
+            results = examine(case, [folders[name] / case for name in begun])
+            known = dict(zip(begun, results, strict=True))
+            write_json(path, known)
+        return known
+
+    with ItemProgress("repairs examined", len(cases)) as progress, use_workers(workers):
+        tell = lambda _, share: progress.reach(share * len(cases))  # noqa: E731
+        for case, known in zip(cases, map_parallel(examine_begun, cases, tell), strict=True):
+            for name, result in known.items():
                 found[name][case] = result
-            write_json(place, found)
-            progress.advance()
+    write_json(out / EXAMINED_FILE, found)
+    shutil.rmtree(out / EXAMINED_FOLDER, ignore_errors=True)
     return found

@@ -72,9 +72,7 @@ class CaseDesign:
         chance: Draws everything else about its recordings.
         faults: Effects that the field has and the reference has not.
         outside_fault: The same for a fault outside the library.
-        size: Of the outside_fault.
         tracked: Whether the tool point is recorded.
-        joints: Joints with the outside_fault.
     """
 
     kind: str
@@ -82,9 +80,7 @@ class CaseDesign:
     chance: int
     faults: tuple[CaseFault, ...] = ()
     outside_fault: UnknownFault | None = None
-    size: float | None = None
     tracked: bool = False
-    joints: tuple[str, ...] = ()
 
 
 @spec
@@ -113,9 +109,8 @@ class CaseDistribution:
     troubles: dict[str, EffectDistribution]
 
     def check(self) -> None:
-        if set(self.shares) != set(KINDS) or not math.isclose(
-            sum(self.shares.values()), 1.0, abs_tol=1e-6
-        ):
+        total = sum(self.shares.values())
+        if set(self.shares) != set(KINDS) or not math.isclose(total, 1.0, abs_tol=1e-6):
             raise ConfigError(
                 f"exam.mix.shares: expected {', '.join(KINDS)} with sum 1, got {self.shares}"
             )
@@ -139,8 +134,7 @@ class CaseDistribution:
         for kind in kinds:
             tracked = bool(generator.random() < self.tracked_share)
             faults: list[CaseFault] = []
-            outside_fault, size = None, None
-            joints: tuple[str, ...] = ()
+            outside_fault = None
             if kind in ("one", "faint"):
                 sizes = self.faint_sizes if kind == "faint" else self.sizes
                 faults = [self._fault(next(effects), machine, sizes, generator)]
@@ -156,16 +150,12 @@ class CaseDistribution:
                 # drawn anew only then: cases of earlier exams can be made again from their salt
                 if hidden[chosen].any():
                     chosen = self._some(np.flatnonzero(~machine.is_exclusive & ~hidden), generator)
-                outside_fault = UnknownFault(
-                    name, size * np.isin(np.arange(machine.num_joints), chosen)
-                )
-                joints = tuple(machine.joint_names[j] for j in chosen)
+                has = np.isin(np.arange(machine.num_joints), chosen)
+                outside_fault = UnknownFault(name, size * has)
             tracked = tracked or any(self.troubles[fault.effect].needs_tool for fault in faults)
             machine_seed, chance = generator.integers(2**62, size=2).tolist()
             found.append(
-                CaseDesign(
-                    kind, machine_seed, chance, tuple(faults), outside_fault, size, tracked, joints
-                )
+                CaseDesign(kind, machine_seed, chance, tuple(faults), outside_fault, tracked)
             )
         return [found[i] for i in generator.permutation(len(found))]
 
@@ -177,9 +167,8 @@ class CaseDistribution:
         """Return the number of cases of each kind by largest remainders."""
         exact = {kind: self.shares[kind] * self.num_cases for kind in KINDS}
         counts = {kind: int(value + 1e-9) for kind, value in exact.items()}
-        for kind in sorted(KINDS, key=lambda kind: counts[kind] - exact[kind])[
-            : self.num_cases - sum(counts.values())
-        ]:
+        by_remainder = sorted(KINDS, key=lambda kind: counts[kind] - exact[kind])
+        for kind in by_remainder[: self.num_cases - sum(counts.values())]:
             counts[kind] += 1
         return counts
 

@@ -30,8 +30,7 @@ from diagnosis.answer import ANSWER_FILE, Answer, read_answer
 from diagnosis.case import estimate_running_s
 from diagnosis.effect_library import EffectSimulator
 from diagnosis.effects_file import EFFECTS_FILE
-from exam.dataset import CASES_FOLDER, WITHHELD_FOLDER
-from exam.generate import UNCHANGED_FOLDER
+from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER
 
 HORIZON_S = 5.0
 """Length of the free runs, s: as `closed` of an answer is defined."""

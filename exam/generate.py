@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel, use_workers
+from brokk_rl.progress import ItemProgress
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.case_distribution import CaseDesign
@@ -37,8 +39,12 @@ Half = Literal["reference", "field", "withheld"]
 """Parts of a case. The withheld one is of the machine as it is, and no candidate gets it."""
 STREAMS: dict[Half, int] = {"reference": 0, "field": 1, "withheld": 2}
 """Number of each in the streams of chance."""
+CASES_FOLDER, WITHHELD_FOLDER = "cases", "withheld"
 UNCHANGED_FOLDER = "unchanged"
 """Folder, beside withheld recordings, of the same machine without what the case is about."""
+BLOCK_CASES = 12
+"""Cases recorded side by side: 48 runs of a step in one array. More are hardly faster a case, and
+an interruption loses more."""
 
 
 @spec
@@ -73,213 +79,229 @@ class HalfPlan:
         return bool(self.other_hand) and question.chance % 2 == 1
 
 
+@dataclass(frozen=True)
 class RecordingJob:
     """One file of one case.
 
     Attributes:
         question: The case.
-        case: Its number.
+        half: Which half the file is of.
         number: Number of the file in its half.
-        half: How that is recorded.
-        name: Which half.
-        elapsed_s: How long the machine has run before.
-        created: When, as recordings say it.
-        plan: The excitation.
+        plan: How that half is recorded.
+        path: Where the file goes.
     """
 
-    plan: ExcitationPlan
-    name: Half
-
-    def __init__(
-        self, question: CaseDesign, case: int, number: int, half: HalfPlan, name: Half
-    ) -> None:
-        self.question, self.case, self.number = question, case, number
-        self.half, self.name = half, name
-        share = (number + float(self.stream("elapsed").random())) / len(half.programs)
-        low_s, high_s = half.elapsed_s
-        self.elapsed_s = low_s + share * (
-            high_s - low_s
-        )  # files follow one another through the day
-        self.created = record.add_seconds(
-            FIRST_DAY.isoformat(timespec="milliseconds"), self.elapsed_s + 86400.0 * self.is_field
-        )
+    question: CaseDesign
+    half: Half
+    number: int
+    plan: HalfPlan
+    path: Path
 
     @property
     def is_field(self) -> bool:
         """True if the machine is recorded as it is."""
-        return self.name != "reference"
+        return self.half != "reference"
+
+    @property
+    def unchanged_path(self) -> Path:
+        """Where the same motion of the machine without what the case is about goes."""
+        return self.path.parent / UNCHANGED_FOLDER / self.path.name
+
+    @property
+    def is_finished(self) -> bool:
+        """True if its files were written: their time is set last."""
+        paths = [self.path, *([self.unchanged_path] if self.half == "withheld" else [])]
+        return all(path.is_file() and path.stat().st_mtime == EPOCH_S for path in paths)
+
+    @property
+    def elapsed_s(self) -> float:
+        """How long the machine has run before; files follow one another through the day."""
+        low_s, high_s = self.plan.elapsed_s
+        share = (self.number + float(self.stream("elapsed").random())) / len(self.plan.programs)
+        return low_s + share * (high_s - low_s)
+
+    @property
+    def programs(self) -> tuple[str, ...]:
+        """Names of the excitations."""
+        other = self.plan.has_other_hand(self.question)
+        return (self.plan.other_hand if other else self.plan.programs)[self.number]
 
     def stream(self, name: str) -> np.random.Generator:
         """Return a stream of chance that is this file's alone."""
         return np.random.default_rng(
-            [self.question.chance, self.number, STREAMS[self.name], *name.encode()]
+            [self.question.chance, self.number, STREAMS[self.half], *name.encode()]
+        )
+
+    def describe_run(self, roughness: str) -> PlantRun:
+        """Return the run of the case's machine that the file holds."""
+        question = self.question
+        of_field: dict[str, Any] = {}
+        if self.is_field:
+            faults = {fault.effect: fault.parameters for fault in question.faults}
+            of_field = {"day": 1, "faults": faults, "outside_fault": question.outside_fault}
+        return PlantRun(
+            seed=question.machine_seed,
+            roughness=roughness,
+            chance=int(self.stream("chance").integers(2**62)),
+            elapsed_s=self.elapsed_s,
+            tracked=question.tracked,
+            **of_field,
         )
 
 
+@dataclass(frozen=True)
 class CaseRecorder:
     """Record cases.
 
-    Args:
+    Attributes:
         machine: The machine.
         plants: Its doubles.
         roughness: Which of the family's.
         excitations: By name.
         approach: How start poses are taken up.
+        halves: Plan of each half, and of the withheld part.
+        folder: Of the exam.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        plants: DrawnPlants,
-        roughness: str,
-        excitations: Mapping[str, Excitation],
-        approach: Approach,
-    ) -> None:
-        self._machine, self._plants, self._roughness = machine, plants, roughness
-        self._excitations, self._approach = excitations, approach
-        self._guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
+    machine: Machine
+    plants: DrawnPlants
+    roughness: str
+    excitations: Mapping[str, Excitation]
+    approach: Approach
+    halves: Mapping[Half, HalfPlan]
+    folder: Path
 
-    def planned(
-        self, questions: Sequence[CaseDesign], half: HalfPlan, name: Half
-    ) -> list[RecordingJob]:
-        """Return the files of one half of all cases with their plans, before anything is recorded.
+    def write_all(self, questions: Sequence[CaseDesign], workers: int) -> None:
+        """Record all cases that are not yet, in blocks of machines of one make; `workers`: processes."""
+        todo = [number for number, one in enumerate(questions) if self._lacks_files(number, one)]
+        todo.sort(key=lambda number: self._find_make(questions[number]))
+        # a block for each process at least, so that none is idle
+        size = max(1, min(BLOCK_CASES, -(-len(todo) // workers)))
+        blocks = [todo[begin : begin + size] for begin in range(0, len(todo), size)]
+        num_finished = len(questions) - len(todo)
+        with ItemProgress("cases made", len(questions)) as progress, use_workers(workers):
+            progress.skip(num_finished)
+            map_parallel(
+                lambda block: self.write({number: questions[number] for number in block}),
+                blocks,
+                lambda _, share: progress.reach(num_finished + int(share * len(todo))),
+            )
+
+    def write(self, questions: Mapping[int, CaseDesign]) -> None:
+        """Record cases by number, side by side; the files do not depend on their neighbours.
 
         Raises:
             ConfigError: an excitation is unknown, or finds no room in a file.
         """
-        jobs = []
-        for n, question in enumerate(questions):
-            for k in range(len(half.programs)):
-                job = RecordingJob(question, n, k, half, name)
-                job.plan = self._plan(job)
-                jobs.append(job)
-        return jobs
-
-    def record(self, jobs: Sequence[RecordingJob], folders: Sequence[Path]) -> None:
-        """Write the files of one half of each case into its folder.
-
-        Args:
-            jobs: The files. They are the same whatever is recorded beside them.
-            folders: Where each case's files go.
-        """
         # a faulty machine may be slow on its ways to start poses; this process only records
         logging.getLogger(PlanPlayer.__module__).setLevel(logging.ERROR)
-        runs = list(map(self._specimen, jobs))
-        for places, link in self._plants.build(self._machine, runs, jobs[0].half.file_s):
-            mine = [jobs[i] for i in places]
-            self._batch(mine, [runs[i] for i in places], link, folders)
-
-    def find_make(self, question: CaseDesign) -> str:
-        """Return the make of a case's machine."""
-        run = PlantRun(question.machine_seed, self._roughness, chance=0, elapsed_s=0.0)
-        return self._plants.draw(self._machine, run)[0]
-
-    def _specimen(self, job: RecordingJob) -> PlantRun:
-        question = job.question
-        faults = (
-            {fault.effect: fault.parameters for fault in question.faults} if job.is_field else {}
-        )
-        return PlantRun(
-            seed=question.machine_seed,
-            roughness=self._roughness,
-            chance=int(job.stream("chance").integers(2**62)),
-            elapsed_s=job.elapsed_s,
-            day=int(job.is_field),
-            faults=faults,
-            outside_fault=question.outside_fault if job.is_field else None,
-            tracked=question.tracked,
-        )
-
-    def _plan(self, job: RecordingJob) -> ExcitationPlan:
-        other = job.half.has_other_hand(job.question)
-        names = (job.half.other_hand if other else job.half.programs)[job.number]
-        for name in names:
-            if name not in self._excitations:
-                raise ConfigError(
-                    f"exam: programs: no excitation '{name}'; {list_choices(name, self._excitations)}"
+        # all halves are planned before anything is recorded: a plan without room fails at once
+        planned = []
+        for half in self.halves:
+            jobs = []
+            for number, question in questions.items():
+                jobs += self.list_jobs(number, question, half)
+            planned.append((jobs, list(map(self.plan_run, jobs))))
+        for jobs, plans in planned:
+            runs = [job.describe_run(self.roughness) for job in jobs]
+            for places, link in self.plants.build(self.machine, runs, jobs[0].plan.file_s):
+                self._record(
+                    [jobs[place] for place in places],
+                    [runs[place] for place in places],
+                    [plans[place] for place in places],
+                    link,
                 )
-        chosen = {name: self._excitations[name] for name in names}
+
+    def list_jobs(self, number: int, question: CaseDesign, half: Half) -> list[RecordingJob]:
+        """Return the files of one half of a case."""
+        place, plan = self.folder / CASES_FOLDER / f"{number:04d}" / half, self.halves[half]
+        if half == "withheld":
+            # the withheld part has a folder of its own, beside those of the cases
+            place = self.folder / WITHHELD_FOLDER / f"{number:04d}"
+        jobs = []
+        for file in range(len(plan.programs)):
+            jobs.append(RecordingJob(question, half, file, plan, place / f"{file:02d}.parquet"))
+        return jobs
+
+    def plan_run(self, job: RecordingJob) -> ExcitationPlan:
+        """Return the excitation of a file; raises as `write`."""
+        for name in job.programs:
+            if name not in self.excitations:
+                raise ConfigError(
+                    f"exam: programs: no excitation '{name}'; {list_choices(name, self.excitations)}"
+                )
+        chosen = {name: self.excitations[name] for name in job.programs}
         stream = job.stream("plan")
         tried = 1
         while True:
             try:
-                return plan_runs(chosen, self._machine, self._approach, 1, job.half.file_s, stream)
+                return plan_runs(chosen, self.machine, self.approach, 1, job.plan.file_s, stream)
             except ConfigError:
                 if tried == NUM_PLANS:
                     raise
                 tried += 1
 
-    def _batch(
+    def _lacks_files(self, number: int, question: CaseDesign) -> bool:
+        for half in self.halves:
+            for job in self.list_jobs(number, question, half):
+                if not job.is_finished:
+                    return True
+        return False
+
+    def _find_make(self, question: CaseDesign) -> str:
+        """Return the make of a case's machine."""
+        run = PlantRun(question.machine_seed, self.roughness, chance=0, elapsed_s=0.0)
+        return self.plants.draw(self.machine, run)[0]
+
+    def _record(
         self,
         jobs: Sequence[RecordingJob],
-        specimens: Sequence[PlantRun],
+        runs: Sequence[PlantRun],
+        plans: Sequence[ExcitationPlan],
         link: PlantLink,
-        folders: Sequence[Path],
     ) -> None:
         """Record files of one half, of machines of one make."""
-        half = jobs[0].half
-        machine = self._machine
+        machine, file_s = self.machine, jobs[0].plan.file_s
         plan = ExcitationPlan(
-            runs=tuple(job.plan.runs[0] for job in jobs),
-            run_s=half.file_s,
-            names=tuple(self._excitations),
+            runs=tuple(plan.runs[0] for plan in plans), run_s=file_s, names=tuple(self.excitations)
         )
-        runner = PlanPlayer(plan, machine, self._approach, self._guards)
+        guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
+        player = PlanPlayer(plan, machine, self.approach, guards)
         with link as opened:
-            samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
+            samples = list(drive(opened, player, machine, len(jobs), file_s))
         track = PlanTrack(samples)
         extra = {}
         for name in samples[0].extra:
             extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)
         t_s = track.t_s - track.t_s[0]
-        is_withheld = jobs[0].name == "withheld"
-        if is_withheld:
-            unchanged = self._without(specimens, u, half)
-            for n, job in enumerate(jobs):
-                place = folders[job.case] / UNCHANGED_FOLDER
-                self._write(job, t_s, u[:, n], unchanged[:, n], {}, place)
+        is_withheld = jobs[0].half == "withheld"
+        unchanged = self._repeat_without_faults(runs, u, file_s) if is_withheld else None
         for n, job in enumerate(jobs):
-            columns = {}
-            if job.question.tracked:
-                columns = {name: values[n] for name, values in extra.items()}
-            # the withheld part has a folder of its own, beside those of the cases
-            place = folders[job.case] if is_withheld else folders[job.case] / job.name
-            self._write(job, t_s, u[:, n], q[:, n], columns, place)
+            motion = record.make_motion(machine, "", t_s, u[:, n], q[:, n])
+            if unchanged is not None:
+                self._write_file(job, job.unchanged_path, replace(motion, q=unchanged[:, n]))
+            columns = {name: values[n] for name, values in extra.items() if job.question.tracked}
+            self._write_file(job, job.path, replace(motion, extra=columns))
 
-    def _write(
-        self,
-        job: RecordingJob,
-        t_s: np.ndarray,
-        u: np.ndarray,
-        q: np.ndarray,
-        columns: dict[str, np.ndarray],
-        folder: Path,
-    ) -> None:
-        """Write a file of a job."""
-        machine = self._machine
-        recording = record.Recording(
-            machine=machine.name,
-            joints=machine.joint_names,
-            units=tuple(joint.unit for joint in machine.joints),
-            rate_hz=1.0 / machine.period_s,
-            t_s=t_s,
-            u=u,
-            q=q,
-            extra=columns,
-            metadata={"created": job.created, "fingerprint": record.format_fingerprint(machine)},
-        )
-        path = folder / f"{job.number:02d}.parquet"
-        record.write_recording(recording, path)
+    def _write_file(self, job: RecordingJob, path: Path, motion: record.Recording) -> None:
+        """Write a motion of a job as it was recorded on its day."""
+        elapsed_s = job.elapsed_s + 86400.0 * job.is_field
+        begin = FIRST_DAY.isoformat(timespec="milliseconds")
+        metadata = {
+            "created": record.add_seconds(begin, elapsed_s),
+            "fingerprint": record.format_fingerprint(self.machine),
+        }
+        record.write_recording(replace(motion, metadata=metadata), path)
         # the same time for all cases: the time of a file tells nothing about its case
         os.utime(path, (EPOCH_S, EPOCH_S))
 
-    def _without(self, specimens: Sequence[PlantRun], u: np.ndarray, half: HalfPlan) -> np.ndarray:
+    def _repeat_without_faults(
+        self, runs: Sequence[PlantRun], u: np.ndarray, file_s: float
+    ) -> np.ndarray:
         """Return the positions of the same machines without faults, `(T, N, J)`."""
-        healthy = []
-        for specimen in specimens:
-            healthy.append(replace(specimen, faults={}, outside_fault=None, tracked=False))
-        ((_, link),) = self._plants.build(self._machine, healthy, half.file_s)
+        healthy = [replace(run, faults={}, outside_fault=None, tracked=False) for run in runs]
+        ((_, link),) = self.plants.build(self.machine, healthy, file_s)
         path = []
         with link as opened:
             for command in u:

@@ -11,9 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.record import format_now
-from exam.dataset import append_lines
 
 LEDGER_FILE = "ledger.jsonl"
 BEGUN, OPENED = "answers begin", "labels opened"
@@ -21,9 +20,20 @@ BEGUN, OPENED = "answers begin", "labels opened"
 
 
 def read_ledger(exam: Path) -> list[dict[str, Any]]:
-    """Return the entries of an exam, oldest first."""
+    """Return the entries of an exam, oldest first.
+
+    Raises:
+        RecordingError: a line is damaged.
+    """
     path = exam / LEDGER_FILE
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except FileNotFoundError:
+        return []
+    except ValueError as error:
+        raise RecordingError(
+            f"{path}: expected JSON in each line ({error}); keep a copy, and delete the damaged line"
+        ) from error
 
 
 def append_entry(exam: Path, event: str, facts: Mapping[str, Any]) -> None:
@@ -37,7 +47,12 @@ def append_entry(exam: Path, event: str, facts: Mapping[str, Any]) -> None:
     Raises:
         StorageError: the ledger cannot be written.
     """
-    append_lines(exam / LEDGER_FILE, [{"when": format_now(), "event": event, **facts}])
+    path, line = exam / LEDGER_FILE, json.dumps({"when": format_now(), "event": event, **facts})
+    try:
+        with path.open("a") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror}") from error
 
 
 def describe_registration(exam: Path, answers: Path, run: Mapping[str, Any]) -> str:

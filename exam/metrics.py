@@ -166,30 +166,25 @@ def bootstrap_cases(
 
 def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, dict[str, float | None]]:
     """Return precision, recall and F1 of each effect, strictly, over all cases but those below the noise."""
-    counts: dict[str, dict[str, int]] = {}
+    right, wrong, missed = Counter[str](), Counter[str](), Counter[str]()
     errors: dict[str, list[float]] = {}
     for score in scores:
         for number in score.numbers:
             errors.setdefault(number.effect, []).append(number.error)
-        if score.kind == "faint":
-            continue
-        for effect in {*score.truth, *score.named}:
-            row = counts.setdefault(effect, {"right": 0, "wrong": 0, "missed": 0})
-            if effect not in score.truth:
-                row["wrong"] += 1
-            elif effect in score.named:
-                row["right"] += 1
-            else:
-                row["missed"] += 1
+        if score.kind != "faint":
+            truth, named = {*score.truth}, {*score.named}
+            right.update(truth & named)
+            wrong.update(named - truth)
+            missed.update(truth - named)
     found = {}
-    for effect, row in sorted(counts.items()):
-        right = row["right"]
-        named, there = right + row["wrong"], right + row["missed"]
+    for effect in sorted({*right, *wrong, *missed}):
+        row = {"right": right[effect], "wrong": wrong[effect], "missed": missed[effect]}
+        named, there = row["right"] + row["wrong"], row["right"] + row["missed"]
         found[effect] = {
             **row,
-            "precision": right / named if named else None,
-            "recall": right / there if there else None,
-            "f1": 2.0 * right / (named + there) if there else None,
+            "precision": row["right"] / named if named else None,
+            "recall": row["right"] / there if there else None,
+            "f1": 2.0 * row["right"] / (named + there) if there else None,
             "parameter_error": float(np.median(errors[effect])) if effect in errors else None,
         }
     return found

@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,8 +20,9 @@ import yaml
 from brokk_rl.build import describe_spec
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.progress import ItemProgress
-from brokk_rl.session import write_json, write_text
+from brokk_rl.session import write_bytes, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis.answer import ANSWER_FILE
 
@@ -106,12 +106,7 @@ class CommandCandidate:
 
 
 def answer_cases(
-    candidate: Candidate,
-    cases: Sequence[Path],
-    folder: Path,
-    machine: Machine,
-    workers: int,
-    progress: ItemProgress,
+    candidate: Candidate, cases: Sequence[Path], folder: Path, machine: Machine, workers: int
 ) -> int:
     """Have every case answered that is not yet; returns how many have no answer in the end.
 
@@ -125,31 +120,26 @@ def answer_cases(
         folder: Where the answers go.
         machine: The machine.
         workers: Cases answered at once.
-        progress: Told when a case is done.
     """
     todo = [case for case in cases if not (folder / case.name / ANSWER_FILE).is_file()]
-    progress.skip(len(cases) - len(todo))
-    is_alone = workers == 1 or isinstance(
-        candidate, CommandCandidate
-    )  # a program has processes of its own
-    with ThreadPoolExecutor(workers) if is_alone else ProcessPoolExecutor(workers) as pool:
-        pending = []
-        for case in todo:
-            place = folder / case.name
-            pending.append(pool.submit(_answer_case, candidate, case, place, machine))
-        try:
-            for done in as_completed(pending):
-                done.result()
-                progress.advance()
-        except BaseException:
-            for job in pending:
-                job.cancel()  # those that run are waited for; the rest is for the next time
-            raise
-    return sum(not (folder / case.name / ANSWER_FILE).is_file() for case in cases)
+    num_kept = len(cases) - len(todo)
+    with ItemProgress("cases answered", len(cases)) as progress, use_workers(workers):
+        progress.skip(num_kept)
+        errors = map_parallel(
+            lambda case: _answer_case(candidate, case, folder / case.name, machine),
+            todo,
+            lambda _, share: progress.reach(num_kept + share * len(todo)),
+        )
+    for case, error in zip(todo, errors, strict=True):
+        if error is not None:
+            log.warning("case %s: no answer: %s", case.name, error.splitlines()[-1])
+    return len(errors) - errors.count(None)
 
 
-def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
-    """Answer one case from a copy under a neutral name: no path leads from there to the labels.
+def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) -> str | None:
+    """Answer one case from a copy under a neutral name, and return why there is no answer.
+
+    No path leads from the copy to the labels.
 
     Raises:
         KeyboardInterrupt: the person interrupted the program that answers; nothing is noted then.
@@ -166,14 +156,14 @@ def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) 
             raise KeyboardInterrupt from failure
         except Exception as failure:  # whoever answers may break in any way: that is an answer missed, and no end of the exam
             error = str(failure) or repr(failure)
-        seconds = time.monotonic() - begun
+        note = {"seconds": round(time.monotonic() - begun, 2), "error": error}
+        write_json(out / NOTE_FILE, note)
         if error is None:
-            shutil.copytree(place, out, dirs_exist_ok=True)
-        else:
-            out.mkdir(parents=True, exist_ok=True)
-            log.warning("case %s: no answer: %s", case.name, error.splitlines()[-1])
-    note = {"seconds": round(seconds, 2), "error": error}
-    write_json(out / NOTE_FILE, note)
+            # The answer itself comes last: a case with it is finished.
+            others = shutil.ignore_patterns(ANSWER_FILE)
+            shutil.copytree(place, out, ignore=others, dirs_exist_ok=True)
+            write_bytes(out / ANSWER_FILE, (place / ANSWER_FILE).read_bytes())
+    return error
 
 
 def is_begun(answer: Path) -> bool:

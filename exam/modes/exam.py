@@ -17,12 +17,10 @@ from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
 from exam import dataset, ledger, report, run_cases
 from exam.answer_scoring import (
-    EXAMINED_FILE,
     RUN_FILE,
     build_table,
     examine_answers,
@@ -31,13 +29,18 @@ from exam.answer_scoring import (
     read_run,
 )
 from exam.case_distribution import CaseDesign, CaseDistribution
-from exam.dataset import CaseSet
 from exam.examiner import examine_case
-from exam.generate import CaseRecorder, Half, HalfPlan
+from exam.generate import CASES_FOLDER, CaseRecorder, HalfPlan
 from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
+
+FACTS_FILE = "exam.json"
+"""Facts of an exam that do not tell its labels."""
+MAKE_AGAIN = (
+    "add what is missing by exam.do=make resume=<exam> session.out=<exam> and its own options"
+)
 
 
 @spec
@@ -142,18 +145,11 @@ class Exam:
                 f"session.seed={self.session.seed} with exam.sealed={str(settings.sealed).lower()}: seeds from "
                 f"{settings.first_sealed_seed} on are for exams and need exam.sealed=true, smaller ones are for development"
             )
-        salt = dataset.read_partial_salt(folder) or settings.salt or secrets.token_hex(16)
-        recorder = CaseRecorder(
-            self.machine, settings.plants, settings.roughness, self.excitation, settings.approach
-        )
-        halves: dict[Half, HalfPlan] = {
-            "reference": settings.reference,
-            "field": settings.field,
-            "withheld": settings.withheld,
-        }
-        cases = CaseSet(recorder, self.questions(salt), halves, self.machine, folder)
-        with ItemProgress("cases made", len(cases.questions)) as progress:
-            labels = dataset.write_cases(cases, salt, settings.workers, progress)
+        salt = settings.salt or dataset.read_salt(folder) or secrets.token_hex(16)
+        questions, labels = self.questions(salt), []
+        for number, one in enumerate(questions):
+            other_hand = settings.field.has_other_hand(one)
+            labels.append(dataset.make_label(f"{number:04d}", one, self.machine, other_hand))
         facts = {
             "schema": 2,
             "seed": self.session.seed,
@@ -164,9 +160,22 @@ class Exam:
             "num_cases": len(labels),
         }
         found = dataset.seal_labels(folder, {**facts, "cases": labels}, salt)
-        facts["labels_sha256"] = found
-        write_json(folder / "exam.json", facts)
-        place = folder / dataset.CASES_FOLDER
+        recorder = CaseRecorder(
+            self.machine,
+            settings.plants,
+            settings.roughness,
+            self.excitation,
+            settings.approach,
+            {
+                "reference": settings.reference,
+                "field": settings.field,
+                "withheld": settings.withheld,
+            },
+            folder,
+        )
+        recorder.write_all(questions, settings.workers)
+        write_json(folder / FACTS_FILE, {**facts, "labels_sha256": found})
+        place = folder / CASES_FOLDER
         log.info("%d cases in %s, labels sealed: sha256 %s", len(labels), place, found)
 
     def questions(self, salt: str) -> list[CaseDesign]:
@@ -182,56 +191,69 @@ class Exam:
 
     def _run(self) -> None:
         """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case, and `run.json`."""
-        settings, facts = self.exam, self._read_facts()
-        folder = self._folder / dataset.CASES_FOLDER
-        cases = sorted(filter(Path.is_dir, folder.glob("*")))
-        if not cases:
+        settings, facts, out = self.exam, self._read_facts(), self.session.folder
+        names = [f"{number:04d}" for number in range(facts["num_cases"])]
+        cases = [self._folder / CASES_FOLDER / name for name in names]
+        files = [
+            {str(path.relative_to(case)) for path in case.rglob("*.parquet")} for case in cases
+        ]
+        whole = set[str]().union(*files)
+        damaged = [case.name for case, there in zip(cases, files, strict=True) if there != whole]
+        if damaged or not whole:
             raise RecordingError(
-                f"exam.folder={self._folder}: expected cases in {dataset.CASES_FOLDER}/, as exam.do=make writes them"
+                f"exam.folder={self._folder}: expected the same files in all {len(cases)} folders of {CASES_FOLDER}/, but "
+                f"{', '.join(damaged)} lack some; {MAKE_AGAIN}"
             )
         run = {
             "commit": describe_commit(),
             "labels_sha256": facts["labels_sha256"],
             "candidate": repr(settings.candidate),
         }
+        before = {**run, **read_run(out)}
+        for name in ("candidate", "labels_sha256"):
+            if before[name] != run[name]:
+                raise ConfigError(
+                    f"resume={out}: expected {name}={before[name]}, as in its {RUN_FILE}, got {run[name]}: answers of two "
+                    "candidates or to two exams are not mixed; choose another session.out=<folder>"
+                )
+        if before["commit"] != run["commit"]:
+            log.warning("answers of two commits: %s, then %s", before["commit"], run["commit"])
         if not any(one.get("run") == run for one in ledger.read_ledger(self._folder)):
             entry = {"labels_sha256": facts["labels_sha256"], "run": run}
             ledger.append_entry(self._folder, ledger.BEGUN, entry)
-        write_json(self.session.folder / RUN_FILE, run)
-        with ItemProgress("cases answered", len(cases)) as progress:
-            failed = run_cases.answer_cases(
-                settings.candidate,
-                cases,
-                self.session.folder,
-                self.machine,
-                settings.workers,
-                progress,
-            )
+        write_json(out / RUN_FILE, run)
+        failed = run_cases.answer_cases(
+            settings.candidate, cases, out, self.machine, settings.workers
+        )
         if failed:
             text = "%d of %d cases have no answer; why stands in their %s"
             log.warning(text, failed, len(cases), run_cases.NOTE_FILE)
-        log.info("answers in %s; exam.do=score opens the labels", self.session.folder)
+        log.info("answers in %s; exam.do=score opens the labels", out)
 
     @property
     def _folder(self) -> Path:
         return Path(self.exam.folder or "")
 
     def _read_facts(self) -> dict[str, Any]:
-        """Return the facts of the exam in `exam.folder`.
+        """Return number of cases and hash of the labels of the exam in `exam.folder`.
 
         Raises:
-            RecordingError: there is no exam.
+            RecordingError: there is no exam, or it is not finished.
         """
-        path = self._folder / "exam.json"
+        path = self._folder / FACTS_FILE
         try:
-            return json.loads(path.read_text())
-        except (OSError, ValueError) as error:
+            facts = json.loads(path.read_text())
+            return {key: facts[key] for key in ("num_cases", "labels_sha256")}
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise RecordingError(
-                f"exam.folder={self._folder}: expected exam.json, as exam.do=make writes it ({error})"
+                f"exam.folder={self._folder}: expected {FACTS_FILE}, which exam.do=make writes last ({error!r}); {MAKE_AGAIN}"
             ) from error
 
     def _score(self) -> None:
         """Open the labels; write marks, answers, labels and report; print the table."""
+        is_published = not (self._folder / dataset.LABELS_FILE).is_file()
+        if not is_published:
+            self._read_facts()  # labels of cases that are still being made stay closed
         facts, text = dataset.open_labels(self._folder)
         labels = facts.pop("cases")
         answers = {name: Path(path) for name, path in self.exam.answers.items()}
@@ -240,15 +262,12 @@ class Exam:
         for path in answers.values():
             run = read_run(path)
             facts["ledger"].append(ledger.describe_registration(self._folder, path, run))
-        is_published = not (self._folder / dataset.CASES_FOLDER).is_dir()
         if not is_published:
             hashes = {"labels_sha256": facts["labels_sha256"]}
             ledger.append_entry(self._folder, ledger.OPENED, hashes)
         out = self.session.folder
         examine = partial(examine_case, self._folder, self.exam.fit, self.machine)
-        examined = examine_answers(
-            self._folder, labels, answers, examine, out / EXAMINED_FILE, self.exam.workers
-        )
+        examined = examine_answers(self._folder, labels, answers, examine, out, self.exam.workers)
         tables = {}
         for name, one in given.items():
             tables[name] = build_table(labels, one, examined[name], self.exam.mix)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -55,20 +55,4 @@ def apply_changes(
             continue
         for name, combine, number in change:
             found[name] = combine(found[name], size[number])
-    return found
-
-
-def place_severities(
-    causes: Sequence[str], kinds: Sequence[str | None], severity: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Return the severity of each cause, `(N, J)`, 0 in runs that have another one.
-
-    Args:
-        causes: Causes outside the library of a family.
-        kinds: Cause of each run, or `None`, `(N,)`.
-        severity: Of each run's cause, `(N, J)`.
-    """
-    found = {}
-    for cause in causes:
-        found[cause] = severity * np.array([kind == cause for kind in kinds])[:, None]
     return found

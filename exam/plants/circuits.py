@@ -20,7 +20,7 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import NonNegative, spec
 from exam.plants.changes import PlantParameters
-from exam.plants.family import DrawnPlants, PlantBatch, PlantDraw
+from exam.plants.family import DrawnPlants, PlantBatch, share
 from exam.plants.hydraulics import SPOOL_STEP
 from exam.plants.linkage import Arm
 from exam.plants.valve_arm import ValveArm
@@ -189,21 +189,22 @@ class CircuitPlants(DrawnPlants):
     table = OF_CIRCUITS
     causes = tuple(cause for cause in CAUSES if cause != "back_flow")  # circuits have load checks
 
-    def complete(self, drawn: PlantDraw) -> None:
-        """Add the numbers of the circuit, and what only an effect changes."""
-        numbers, machine, circuit = drawn.numbers, drawn.machine, self.circuits[drawn.make]
-        drawn.share(NEUTRAL | {"warm_change": numbers["warm_change"][0]})  # one tank
-        drawn.share({"extend": 1.0, "retract": 1.0})
+    def complete(
+        self, drawn: PlantParameters, machine: Machine, make: str, chance: np.random.Generator
+    ) -> PlantParameters:
+        """Return the numbers of the circuit, and what only an effect changes."""
+        one_tank = {"warm_change": drawn["warm_change"][0], "extend": 1.0, "retract": 1.0}
+        found, circuit = share(NEUTRAL | one_tank, machine), self.circuits[make]
         for name, spread in self.spread.items():
             typical = expand_per_joint(getattr(circuit, name), machine, name)
-            away = spread * drawn.chance.uniform(-1.0, 1.0, machine.num_joints)
-            numbers[name] = typical * (1.0 + away)
-        numbers["rod_area"] = np.minimum(numbers["rod_area"], 1.0)
-        numbers["breakaway"] = np.maximum(numbers["breakaway"], numbers["coulomb"])
+            away = spread * chance.uniform(-1.0, 1.0, machine.num_joints)
+            found[name] = typical * (1.0 + away)
+        found["rod_area"] = np.minimum(found["rod_area"], 1.0)
+        found["breakaway"] = np.maximum(found["breakaway"], found["coulomb"])
         is_slide = np.array([joint.kind == "slide" for joint in machine.joints])
         for name in ("linkage_lower_rad", "linkage_upper_rad"):
-            numbers[name] = np.where(is_slide, 0.5 * np.pi, numbers[name])
-        numbers["demand"] = numbers["flow_share"]
+            found[name] = np.where(is_slide, 0.5 * np.pi, found[name])
+        return found | {"demand": found["flow_share"]}
 
     def link(self, batch: PlantBatch) -> ValveArm:
         """Return the link to runs on one circuit."""

@@ -76,27 +76,19 @@ class PlantBatch:
     numbers: Sequence[PlantParameters]
     steps: int
 
+    def place_causes(self, causes: Sequence[str]) -> dict[str, np.ndarray]:
+        """Return the severity of each cause outside the library, `(N, J)`, 0 in runs that lack it."""
+        shape = (len(self.runs), self.machine.num_joints)
+        found = {cause: np.zeros(shape) for cause in causes}
+        for number, run in enumerate(self.runs):
+            if run.outside_fault is not None:
+                found[run.outside_fault.kind][number] = run.outside_fault.severity
+        return found
 
-@dataclass(frozen=True)
-class PlantDraw:
-    """A machine that is being drawn.
 
-    Attributes:
-        machine: Geometry, masses, limits.
-        make: Of the machine.
-        chance: Draws its numbers.
-        numbers: Those drawn so far.
-    """
-
-    machine: Machine
-    make: str
-    chance: np.random.Generator
-    numbers: PlantParameters
-
-    def share(self, values: Mapping[str, float]) -> None:
-        """Add numbers that all joints share."""
-        for name, value in values.items():
-            self.numbers[name] = np.full(self.machine.num_joints, value)
+def share(values: Mapping[str, float], machine: Machine) -> PlantParameters:
+    """Return numbers that all joints share."""
+    return {name: np.full(machine.num_joints, value) for name, value in values.items()}
 
 
 class PlantLink:
@@ -114,7 +106,6 @@ class PlantLink:
         self._arm: Arm | None = None  # whose tool is measured
         self._elapsed_s = np.array([run.elapsed_s for run in batch.runs], dtype=float)
         self._tracked = np.array([run.tracked for run in batch.runs])
-        self._kinds = [run.outside_fault and run.outside_fault.kind for run in batch.runs]
 
     @property
     def q(self) -> np.ndarray:
@@ -208,18 +199,24 @@ class DrawnPlants:
             numbers[name] = generator.uniform(*span, count)
         for name, span in self.nuisances.items():
             numbers[name] = roughness * generator.uniform(*span, count)
-        self.complete(PlantDraw(machine, make, generator, numbers))
+        numbers |= self.complete(numbers, machine, make, generator)
         of_day = np.random.default_rng([run.seed, run.day, *b"ageing"])
         for name, spread in self.ageing.items():
             numbers[name] = numbers[name] * np.exp(
                 roughness * spread * of_day.standard_normal(count)
             )
-        if run.outside_fault is not None:
-            numbers["outside_severity"] = run.outside_fault.severity
         return make, apply_changes(numbers, run.faults, self.table, f"a machine of make '{make}'")
 
-    def complete(self, drawn: PlantDraw) -> None:
-        """Add the numbers that are not drawn from a range by joint.
+    def complete(
+        self, drawn: PlantParameters, machine: Machine, make: str, chance: np.random.Generator
+    ) -> PlantParameters:
+        """Return the numbers that are not drawn from a range by joint.
+
+        Args:
+            drawn: Those that are.
+            machine: Geometry, masses, limits.
+            make: Of the machine.
+            chance: Draws them.
 
         Raises:
             ConfigError: the family cannot be drawn for this machine.

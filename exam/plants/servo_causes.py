@@ -12,10 +12,11 @@ warm_delay      commands come later and later as the machine runs
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.changes import place_severities
 from exam.plants.servo_drive import STEP_S
 
 CAUSES = (
@@ -38,15 +39,14 @@ class ServoCauses:
 
     Args:
         machine: Limits and period.
-        kinds: Cause of each run, or `None`, `(N,)`.
-        severity: `(N, J)`.
+        severity: Of each cause, `(N, J)`.
     """
 
-    def __init__(self, machine: Machine, kinds: list[str | None], severity: np.ndarray) -> None:
+    def __init__(self, machine: Machine, severity: Mapping[str, np.ndarray]) -> None:
         self._period_s, self._lower = machine.period_s, machine.lower
         self._travel = machine.upper - machine.lower
-        self._of = place_severities(CAUSES, kinds, severity)
-        none = np.zeros_like(severity)
+        self._of = severity
+        none = np.zeros_like(severity["heat"])
         self._heat, self._strained_s, self._away_s = none.copy(), none.copy(), none.copy()
         self._wound_rad = none.copy()
         self._before: np.ndarray | None = None

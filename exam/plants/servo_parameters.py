@@ -16,7 +16,7 @@ COUNT_RAD = 2.0 * np.pi / 4096
 NEUTRAL = dict.fromkeys(
     (
         "jitter_s", "loss", "filter_s", "stroke_s", "added_friction_n_m", "added_viscous", "added_armature", "pull_n_m",
-        "extra_noise_rad", "outside_severity",
+        "extra_noise_rad",
     ),
     0.0,
 ) | {"step_rad": COUNT_RAD, "duty_cap": 1.0}  # fmt: skip

@@ -19,8 +19,9 @@ from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from diagnosis.mjcf.plant import MjcfPlant
 from exam.plants import servo_parameters
+from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus
-from exam.plants.family import DrawnPlants, PlantBatch, PlantDraw, PlantLink
+from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
 from exam.plants.servo_causes import CAUSES, ServoCauses
 from exam.plants.servo_drive import FRICTIONS, STEP_S, PositionLoop, TargetFilter
 
@@ -60,7 +61,7 @@ class ServoArm(PlantLink):
         self._plant = MjcfPlant(ARM, restrict_to_torques(machine))
         self._noise, self._wander = self._stack_chance("noise"), self._stack_chance("wander")
         self._luck = self._stack_chance("luck")
-        self._causes = ServoCauses(machine, self._kinds, n["outside_severity"])
+        self._causes = ServoCauses(machine, batch.place_causes(CAUSES))
         q = np.tile(machine.home, (len(chance), 1))
         self._state = self._plant.start(q, np.zeros_like(q))
         self._bus = CommandBus(n, machine.period_s)
@@ -148,26 +149,30 @@ class ServoPlants(DrawnPlants):
     table = servo_parameters.FAULTS
     causes = CAUSES
 
-    def complete(self, drawn: PlantDraw) -> None:
-        """Add supply, bus and firmware, and what only a fault changes.
+    def complete(
+        self, drawn: PlantParameters, machine: Machine, make: str, chance: np.random.Generator
+    ) -> PlantParameters:
+        """Return supply, bus and firmware, and what only a fault changes.
 
         Raises:
             ConfigError: the machine is not commanded by position.
         """
-        numbers, chance, machine = drawn.numbers, drawn.chance, drawn.machine
         if machine.interface != "position":
             raise ConfigError(
                 f"exam_plants=servos: machine '{machine.name}' is commanded by {machine.interface}; expected a machine of "
                 "position servos, e.g. machine=so101"
             )
-        drawn.share(servo_parameters.NEUTRAL | {"supply_drop": numbers["supply_drop"][0]})
-        numbers["cogging_phase"] = chance.uniform(0.0, 2.0 * np.pi, machine.num_joints)
-        drawn.share({"transport_s": chance.uniform(*self.shared["transport_s"])})
-        # time steps between two of the firmware's loop
-        drawn.share({"ticks": float(chance.integers(1, 4))})
+        phase = chance.uniform(0.0, 2.0 * np.pi, machine.num_joints)
+        arm = servo_parameters.NEUTRAL | {
+            "supply_drop": drawn["supply_drop"][0],
+            "transport_s": chance.uniform(*self.shared["transport_s"]),
+            # time steps between two of the firmware's loop
+            "ticks": float(chance.integers(1, 4)),
+        }
         # as `diagnosis.mjcf.plant` counts: an error of 5 % of the travel, and full speed
-        numbers["full_n_m"] = 0.05 * numbers["stiffness"] * (machine.upper - machine.lower)
-        numbers["full_rad_s"] = machine.max_speed
+        full_n_m = 0.05 * drawn["stiffness"] * (machine.upper - machine.lower)
+        by_joint = {"cogging_phase": phase, "full_n_m": full_n_m, "full_rad_s": machine.max_speed}
+        return share(arm, machine) | by_joint
 
     def link(self, batch: PlantBatch) -> ServoArm:
         """Return the link to arms of one make."""

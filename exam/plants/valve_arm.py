@@ -16,7 +16,7 @@ from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus, RunChance, SteppedEncoders
-from exam.plants.family import DrawnPlants, PlantBatch, PlantDraw, PlantLink
+from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
 from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
 from exam.plants.valve_causes import CAUSES, OutsideCauses
@@ -54,7 +54,7 @@ class ValveArm(PlantLink):
     """A `Link` to simulated machines with valves.
 
     Args:
-        batch: The runs and their machines; `outside_severity` is that of an outside cause.
+        batch: The runs and their machines.
         step_s: Time step of the hydraulics.
         hydraulics: Builds them from numbers `(N, J)`, machine and causes.
     """
@@ -73,8 +73,8 @@ class ValveArm(PlantLink):
         self._lost, self._queue = self._stack_chance("lost"), self._stack_chance("queue")
         self._noise, self._settling = self._stack_chance("noise"), self._stack_chance("settling")
         phase, luck = np.array([one.phase for one in chance]), self._stack_chance("luck")
-        severity = n["outside_severity"]
-        self._causes = OutsideCauses(machine, self._kinds, severity, phase, luck, step_s)
+        severity = batch.place_causes(CAUSES)
+        self._causes = OutsideCauses(machine, severity, phase, luck, step_s)
         bus = {
             "transport_s": n["transport_s"],
             "jitter_s": 0.5 * n["jitter_s"],  # mean delay of the effect, whose delays are uniform
@@ -169,16 +169,18 @@ class ValvePlants(DrawnPlants):
     table = CHANGES
     causes = CAUSES
 
-    def complete(self, drawn: PlantDraw) -> None:
-        """Add bus, pump, and what only an effect changes."""
-        numbers, chance, count = drawn.numbers, drawn.chance, drawn.machine.num_joints
-        drawn.share(NEUTRAL | {"warm_change": numbers["warm_change"][0]})  # one tank
-        drawn.share({"transport_s": chance.uniform(*self.shared["transport_s"])})
-        numbers["transport_s"] += chance.uniform(
-            -0.015, 0.015, count
-        )  # pilot lines differ in length
-        numbers["demand"] = chance.uniform(*self.shared["demand"], count)
-        drawn.share({name: chance.uniform(*self.shared[name]) for name in ("power", "pump_s")})
+    def complete(
+        self, drawn: PlantParameters, machine: Machine, make: str, chance: np.random.Generator
+    ) -> PlantParameters:
+        """Return bus, pump, and what only an effect changes."""
+        one_tank = {"warm_change": drawn["warm_change"][0]}
+        found, count = share(NEUTRAL | one_tank, machine), machine.num_joints
+        transport_s = chance.uniform(*self.shared["transport_s"])
+        pilot_s = chance.uniform(-0.015, 0.015, count)  # pilot lines differ in length
+        found["transport_s"] = transport_s + pilot_s
+        found["demand"] = chance.uniform(*self.shared["demand"], count)
+        pump = {name: chance.uniform(*self.shared[name]) for name in ("power", "pump_s")}
+        return found | share(pump, machine)
 
     def link(self, batch: PlantBatch) -> ValveArm:
         """Return the link to runs."""

@@ -19,10 +19,11 @@ reversal_pause   after a reversal the valve stays closed for some tenths of a se
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.changes import place_severities
 
 CAUSES = (
     "silted_spool", "ajar_check", "supply_voltage", "moved_stop", "back_flow", "stale_readings", "coarse_driver",
@@ -48,8 +49,7 @@ class OutsideCauses:
 
     Args:
         machine: Limits, period, full speeds.
-        kinds: Cause of each run, or `None`, `(N,)`.
-        severity: `(N, J)`.
+        severity: Of each cause, `(N, J)`.
         phase: Uniform random number of each run, `(N,)`: when its charger begins.
         luck: Uniform random numbers, `(T, N)`, one a control period.
         step_s: Time step of the valves.
@@ -58,16 +58,15 @@ class OutsideCauses:
     def __init__(
         self,
         machine: Machine,
-        kinds: list[str | None],
-        severity: np.ndarray,
+        severity: Mapping[str, np.ndarray],
         phase: np.ndarray,
         luck: np.ndarray,
         step_s: float,
     ) -> None:
         self._step_s = step_s
         self._period_s, self._luck, self._phase = machine.period_s, luck, phase
-        self._of = place_severities(CAUSES, kinds, severity)
-        none = np.zeros_like(severity)
+        self._of = severity
+        none = np.zeros((len(phase), machine.num_joints))
         travel = machine.upper - machine.lower
         cut = STOP_TRAVEL * travel * self._of["moved_stop"]
         # the stop that is farther from home: the machine must reach its home

@@ -13,7 +13,7 @@ NEUTRAL = dict.fromkeys(
     (
         "jitter_s", "loss", "stamp_s", "pilot_s", "stroke_s", "sink_rad_s", "breakaway", "bleed", "sensitivity",
         "soft_s", "soft_damping", "gap_rad", "step_rad", "extra_noise_rad", "bias_rad", "extra_m", "roll_rad",
-        "pitch_rad", "drift", "outside_severity",
+        "pitch_rad", "drift",
     ),
     0.0,
 ) | {"stop": 1.0, "flow": 1.0, "scale": 1.0, "drift_s": 700.0}  # fmt: skip

@@ -22,12 +22,11 @@ from brokk_rl import record
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.extensions import load_mode
 from brokk_rl.machine import Machine
-from brokk_rl.progress import ItemProgress
 from diagnosis.answer import ANSWER_FILE
-from exam import dataset, run_cases
+from exam import dataset, generate, run_cases
 from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.constant_answer import ConstantAnswer
-from exam.generate import UNCHANGED_FOLDER, CaseRecorder
+from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER, CaseRecorder
 from exam.ledger import BEGUN, read_ledger
 
 SEALED = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234")
@@ -86,7 +85,7 @@ def test_a_made_exam_is_sealed_and_its_cases_tell_nothing(exam: Path, machine: M
     assert (exam / dataset.HASH_FILE).read_text().split()[0] == hashlib.sha256(
         labels.read_bytes()
     ).hexdigest()
-    files = sorted((exam / dataset.CASES_FOLDER).rglob("*.parquet"))
+    files = sorted((exam / CASES_FOLDER).rglob("*.parquet"))
     assert len(files) == 2 * 3 and {file.stat().st_mtime for file in files} == {
         files[0].stat().st_mtime
     }
@@ -124,6 +123,8 @@ def test_an_exam_is_sat_and_scored_and_its_ledger_knows_the_engine_before_the_la
     assert brokk(*run).code == 0
     assert brokk(*run, f"resume={answers}").code == 0
     assert brokk(*run).code != 0
+    other = brokk(*run, f"resume={answers}", "exam_candidate=most_frequent")
+    assert other.code == 2 and "answers of two candidates" in other.err
     (begun,) = read_ledger(exam)
     facts = json.loads((exam / "exam.json").read_text())
     assert begun["event"] == BEGUN and begun["run"]["labels_sha256"] == facts["labels_sha256"]
@@ -154,43 +155,48 @@ def test_an_exam_is_sat_and_scored_and_its_ledger_knows_the_engine_before_the_la
 def test_a_make_that_was_interrupted_goes_on_and_gives_the_cases_of_its_salt(
     made: Path, brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    part, (labels, _) = tmp_path / "part", dataset.open_labels(made)
-    again = (*SMALL, *SEALED, f"exam.salt={labels['salt']}", f"session.out={part}")
-    monkeypatch.setattr(dataset, "BLOCK_CASES", 1)
-    write = dataset.CaseSet.write
+    part, (labels, text) = tmp_path / "part", dataset.open_labels(made)
+    again = (*SMALL, *SEALED, f"session.out={part}")
+    monkeypatch.setattr(generate, "BLOCK_CASES", 1)
+    write = CaseRecorder.write
 
-    def fail_on_second(self: Any, numbers: list[int]) -> Any:
-        if numbers == [1]:
+    def fail_on_second(self: Any, questions: dict[int, CaseDesign]) -> None:
+        if 1 in questions:
             raise RecordingError("interrupted")
-        return write(self, numbers)
+        write(self, questions)
 
-    fail_on_second.__name__ = "write"  # another process finds a method by its name
     with monkeypatch.context() as patch:
-        patch.setattr(dataset.CaseSet, "write", fail_on_second)
-        assert brokk(*again).code != 0
-    partial = part / dataset.PARTIAL_FILE
-    assert partial.stat().st_mode & 0o777 == 0o600
-    finished = [json.loads(line).get("case") for line in partial.read_text().splitlines()]
-    assert finished == [None, "0000"] and not (part / dataset.LABELS_FILE).exists()
+        patch.setattr(CaseRecorder, "write", fail_on_second)
+        assert brokk(*again, f"exam.salt={labels['salt']}").code != 0
+    assert [path.name for path in (part / CASES_FOLDER).iterdir()] == ["0000"]
+    sealed = part / dataset.LABELS_FILE
+    assert sealed.read_text() == text and sealed.stat().st_mode & 0o777 == 0o600
+    # nobody answers half of an exam, and its labels stay closed
+    answers = (f"exam.folder={part}", "exam_candidate=always_none", f"session.out={tmp_path / 'x'}")
+    for step in (("exam.do=run",), ("exam.do=score", f"+exam.answers.a={part}")):
+        refused = brokk("mode=exam", *step, *answers)
+        assert refused.code == 2 and "exam.do=make resume=" in refused.err
+    first = part / CASES_FOLDER / "0000/field/01.parquet"
+    first.unlink()  # a file that is lost is made again, a label that was never sealed is not
+    assert brokk(*again, f"resume={part}", "session.seed=1235").code == 2
     done = brokk(*again, f"resume={part}")
     assert done.code == 0, done.err
-    assert dataset.open_labels(part)[0]["cases"] == labels["cases"] and not partial.exists()
-    withheld = {path.parent.name for path in (made / dataset.WITHHELD_FOLDER).rglob("*.parquet")}
+    assert dataset.open_labels(part)[1] == text
+    withheld = {path.parent.name for path in (made / WITHHELD_FOLDER).rglob("*.parquet")}
     assert withheld == {"0000", "0001", UNCHANGED_FOLDER}
-    for path in sorted((made / "cases").rglob("*.parquet")):
+    for path in sorted(made.rglob("*.parquet")):
         assert path.read_bytes() == (part / path.relative_to(made)).read_bytes()
 
 
 def sit(candidate: run_cases.Candidate, cases: list[Path], answers: Path, machine: Machine) -> int:
     """Returns how many cases have no answer."""
-    progress = ItemProgress("", len(cases))
-    return run_cases.answer_cases(candidate, cases, answers, machine, 1, progress)
+    return run_cases.answer_cases(candidate, cases, answers, machine, 1)
 
 
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
     exam: Path, machine: Machine, brokk: Callable[..., Any], tmp_path: Path, caplog: Any
 ) -> None:
-    first, second = sorted((exam / dataset.CASES_FOLDER).iterdir())
+    first, second = sorted((exam / CASES_FOLDER).iterdir())
     answers = tmp_path / "answers"
     answers.mkdir()
     assert sit(Recorder(ValueError("ran away")), [first], answers, machine) == 1
@@ -245,7 +251,7 @@ class Recorder:
 def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_again(
     machine: Machine, tmp_path: Path
 ) -> None:
-    case, answers = tmp_path / "exam" / dataset.CASES_FOLDER / "0000", tmp_path / "answers"
+    case, answers = tmp_path / "exam" / CASES_FOLDER / "0000", tmp_path / "answers"
     (case / "field").mkdir(parents=True)
     (case / "field" / "00.parquet").touch()
     dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
@@ -295,12 +301,16 @@ def test_another_hand_drives_the_field_of_half_of_the_cases_and_never_the_refere
     mode = load_mode(*SMALL, *words, "exam.mix.num_cases=20", f"session.out={tmp_path}")
     exam, questions = mode.exam, mode.questions("")
     assert mode.excitation["holds"].hold_s == 9.0, "as without another hand"
-    recorder = CaseRecorder(mode.machine, exam.plants, "mild", mode.excitation, exam.approach)
-    by_person = set()
-    for job in recorder.planned(questions, exam.field, "field"):
-        if job.plan.runs[0][0].name.startswith("work"):
-            by_person.add(job.case)
+    halves: dict[generate.Half, Any] = {"reference": exam.reference, "field": exam.field}
+    recorder = CaseRecorder(
+        mode.machine, exam.plants, "mild", mode.excitation, exam.approach, halves, tmp_path
+    )
+
+    def name_first(number: int, half: generate.Half) -> str:
+        job = recorder.list_jobs(number, questions[number], half)[0]
+        return recorder.plan_run(job).runs[0][0].name
+
+    by_person = {n for n in range(20) if name_first(n, "field").startswith("work")}
     expected = {n for n, one in enumerate(questions) if exam.field.has_other_hand(one)}
     assert by_person == expected and 3 < len(expected) < 17
-    for job in recorder.planned(questions[:4], exam.reference, "reference"):
-        assert job.plan.runs[0][0].name.startswith("levels")
+    assert all(name_first(n, "reference").startswith("levels") for n in range(4))
