@@ -160,15 +160,12 @@ class PolicyNetwork:
 
     def answer(self, vectors: np.ndarray) -> np.ndarray:
         """Return commands, `(B, J)`, for observation vectors, `(B, O)`; NaN where one holds NaN."""
-        known = np.asarray(np.isfinite(vectors).all(1))
-        given = np.where(known[:, None], vectors, 0.0).astype(np.float32)
-        if self._one_by_one:
-            answers = [self._ask(row[None]) for row in given]
-            return np.where(known[:, None], np.concatenate(answers), np.nan)
-        return np.where(known[:, None], self._ask(given), np.nan)
-
-    def _ask(self, vectors: np.ndarray) -> np.ndarray:
-        return np.asarray(self._session.run(None, {self._input: vectors})[0], float)
+        known = np.asarray(np.isfinite(vectors).all(1))[:, None]
+        given = np.where(known, vectors, 0.0).astype(np.float32)
+        answers = []
+        for batch in np.split(given, len(given)) if self._one_by_one else [given]:
+            answers.append(np.asarray(self._session.run(None, {self._input: batch})[0], float))
+        return np.where(known, np.concatenate(answers), np.nan)
 
 
 @dataclass(frozen=True)

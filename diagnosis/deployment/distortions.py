@@ -1,8 +1,8 @@
-"""Mistakes of deployment code, each as a change of the replay that reproduces it.
+"""Mistakes of deployment code: one table of distortions, each put at its places on the way from log to valve.
 
-What code may do to the values of any `Place` on the way stands in the tables of `mistakes`. A `Distortion`
-is such a mistake at its place: a kind (order, sign, scale, frame, rate, delay, stale, clip, default_pose,
-history, filter, network), the field where it acts, and at most one number.
+A distortion is a kind (order, sign, scale, frame, rate, delay, stale, clip, default_pose, history, filter,
+network), a function that spoils values, and at most one number. `diagnosis.deployment.replay` names the places
+and runs a policy with it.
 Axes: `T` rows, `R` rows that are asked for, `H` samples (oldest first), `C` columns, `J` joints.
 """
 
@@ -11,127 +11,235 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm
-from diagnosis.deployment.mistakes import (
-    ANGLES_RAD,
-    DELAYS,
-    EARLY,
-    LEVELS,
-    ON_COMMANDS,
-    ON_ROWS,
-    ON_SIGNALS,
-    SHIFTS_M,
-    SIGN,
-    Mistake,
-    delay,
-    freeze,
-    make_turn,
-    shift,
-)
 from diagnosis.deployment.orders import Order, invert_order, list_orders, match_order
-from diagnosis.deployment.replay import Change, Network, Transform
+from diagnosis.deployment.replay import Change
 
-Build = Callable[[float], Change]
-Wrap = Callable[[Transform], Change]
-"""Makes the change at a place from a transform of its values."""
-
-
-@dataclass(frozen=True)
-class Distortion:
-    """A mistake at its place.
-
-    Attributes:
-        kind: Kind of mistake.
-        field: Where: `q.q3`, `u`, `target.y`, `command.q2`, `observation`.
-        text: The mistake in words; `{value}` stands for the number.
-        build: Makes the change from the number.
-        values: Numbers to try; one of no meaning where there is no number.
-        parameter: Name of the number, with its unit; empty where it is not told.
-        is_continuous: The number is refined between those of `values`.
-    """
-
-    kind: str
-    field: str
-    text: str
-    build: Build
-    values: tuple[float, ...] = (0.0,)
-    parameter: str = ""
-    is_continuous: bool = False
-
-    @property
-    def num_free(self) -> int:
-        """Numbers that are fitted."""
-        return int(bool(self.parameter))
-
-
-def make_fixed(kind: str, field: str, text: str, change: Change) -> Distortion:
-    """Return a mistake without a number."""
-    return Distortion(kind, field, text, lambda _: change)
+Spoil = Callable[[np.ndarray, float, np.ndarray], np.ndarray]
+"""Makes wrong values of right ones by a number, with the unit of each column, `(C,)`."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Columns on the way from log to valve that code may spoil.
+    """Columns at a point of the way.
 
     Attributes:
-        name: `q`, `u`, `target` or `command`.
-        columns: Names of its columns.
-        unit: Unit of each column in which offsets are tried, `(C,)`.
-        wrap: Makes the change from a transform of its values, `(T, C)`.
+        point: See `diagnosis.deployment.replay`.
+        columns: Those that are spoiled; `None`: all.
+        order: Column that the code takes for each of them; `None`: the right one.
+        unit: Unit of each column of the point in which offsets are tried, `(C,)`.
     """
 
-    name: str
-    columns: list[str]
-    unit: np.ndarray
-    wrap: Wrap
+    point: str
+    columns: tuple[int, ...] | None = None
+    order: Order | None = None
+    unit: np.ndarray | None = None
 
-    def list_groups(self) -> Iterator[tuple[list[int], str]]:
-        """Yield all columns together, then each, with the field that they are."""
-        yield list(range(len(self.columns))), self.name
-        if len(self.columns) > 1:
-            for column, name in enumerate(self.columns):
-                yield [column], f"{self.name}.{name}"
-
-    def spoil(self, mistake: Mistake, columns: list[int], field: str) -> Distortion:
-        """Return a mistake of some columns."""
-
-        def build(value: float) -> Change:
-            def transform(values: np.ndarray) -> np.ndarray:
-                changed = values.copy()
-                changed[:, columns] = mistake.spoil(values[:, columns], value, self.unit[columns])
-                return changed
-
-            return self.wrap(transform)
-
-        text = mistake.text.replace("{field}", field)
-        return Distortion(
-            mistake.kind, field, text, build, mistake.values, mistake.parameter, mistake.is_continuous
-        )  # fmt: skip
-
-    def spoil_each(self, mistakes: Sequence[Mistake]) -> Iterator[Distortion]:
-        """Yield each mistake of all columns together and of each."""
-        for columns, field in self.list_groups():
-            for mistake in mistakes:
-                yield self.spoil(mistake, columns, field)
-
-    def spoil_all(self, mistakes: Iterable[Mistake]) -> Iterator[Distortion]:
-        """Yield each mistake of all columns together."""
-        columns, field = next(self.list_groups())
-        for mistake in mistakes:
-            yield self.spoil(mistake, columns, field)
+    def change(self, spoil: Spoil, number: float, values: np.ndarray) -> np.ndarray:
+        """Return the values of the point with the wrong ones among them."""
+        if self.order is not None:
+            values = values[..., list(self.order)]
+        unit = np.ones(values.shape[-1]) if self.unit is None else self.unit
+        if self.columns is None:
+            return spoil(values, number, unit)
+        columns = list(self.columns)
+        changed = values.copy()
+        changed[..., columns] = spoil(values[..., columns], number, unit[columns])
+        return changed
 
 
-def _watch_terms(terms: Sequence[ObservationTerm], name: str) -> Place:
-    """Return the values of terms that have the same columns as a place."""
+@dataclass(frozen=True)
+class Distortion:
+    """A mistake: a row of the table, and where the code makes it.
 
-    def wrap(transform: Transform) -> Change:
-        return Change(signals={term.name: transform for term in terms})
+    Attributes:
+        kind: Kind of mistake.
+        text: The mistake in words; `{field}` stands for the field, `{value}` for the number.
+        spoil: Makes wrong values of right ones.
+        values: Numbers to try; one of no meaning where there is no number.
+        parameter: Name of the number, with its unit; empty where it is not told.
+        is_continuous: The number is refined between those of `values`.
+        field: Where it acts, in words: `q.q3`, `u`, `target.y`, `command.q2`, `observation`.
+        places: Where it acts.
+    """
 
-    names = [_shorten(terms[0], column) for column in terms[0].columns]
-    return Place(name, names, terms[0].std, wrap)
+    kind: str
+    text: str
+    spoil: Spoil
+    values: tuple[float, ...] = (0.0,)
+    parameter: str = ""
+    is_continuous: bool = False
+    field: str = ""
+    places: tuple[Place, ...] = ()
+
+    def put(self, field: str, *places: Place) -> Distortion:
+        """Return the mistake at some places."""
+        text = self.text.replace("{field}", field)
+        return replace(self, text=text, field=field, places=places)
+
+    def build(self, number: float) -> Change:
+        """Return the change of the replay with this number."""
+        changes = {}
+        for place in self.places:
+            changes[place.point] = partial(place.change, self.spoil, number)
+        return changes
+
+
+def keep(values: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
+    """Return right values: only their order is wrong."""
+    return values
+
+
+def scale(values: np.ndarray, factor: float, unit: np.ndarray) -> np.ndarray:
+    """Return values times a factor."""
+    return factor * values
+
+
+def flip(values: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
+    """Return values times the sign of each column."""
+    return values * unit
+
+
+def shift(values: np.ndarray, offset: float, unit: np.ndarray) -> np.ndarray:
+    """Return values with an offset in the unit of each column."""
+    return values + offset * unit
+
+
+def shift_command(values: np.ndarray, offset: float, unit: np.ndarray) -> np.ndarray:
+    """Return commands with an offset, within full command."""
+    return (values + offset).clip(-1.0, 1.0)
+
+
+def clip(values: np.ndarray, bound: float, unit: np.ndarray) -> np.ndarray:
+    """Return values clipped at plus and minus a bound."""
+    return values.clip(-bound, bound)
+
+
+def delay(values: np.ndarray, periods: float, unit: np.ndarray) -> np.ndarray:
+    """Return values that are whole rows late; the first row stands before. Fewer than 0: early."""
+    return values[np.clip(np.arange(len(values)) - int(periods), 0, len(values) - 1)]
+
+
+def freeze(values: np.ndarray, row: float, unit: np.ndarray) -> np.ndarray:
+    """Return values that stay as they are from a row on."""
+    return values[np.minimum(np.arange(len(values)), int(row))]
+
+
+def hold(values: np.ndarray, phase: float, unit: np.ndarray, every: int) -> np.ndarray:
+    """Return values that are refreshed only every few rows."""
+    rows = np.arange(len(values))
+    return values[np.maximum(rows - (rows - int(phase)) % every, 0)]
+
+
+def smooth(values: np.ndarray, weight: float, unit: np.ndarray) -> np.ndarray:
+    """Return values behind a first-order low-pass; `weight` is that of the newest value."""
+    smoothed = values.copy()
+    for row in range(1, len(values)):
+        smoothed[row] = weight * values[row] + (1.0 - weight) * smoothed[row - 1]
+    return smoothed
+
+
+def turn(points: np.ndarray, angle_rad: float, unit: np.ndarray, axis: int) -> np.ndarray:
+    """Return points `(T, 3)` turned about axis 0, 1 or 2."""
+    one, other = (axis + 1) % 3, (axis + 2) % 3
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    turned = points.copy()
+    turned[:, one] = cos * points[:, one] - sin * points[:, other]
+    turned[:, other] = sin * points[:, one] + cos * points[:, other]
+    return turned
+
+
+def turn_round(window: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
+    """Return a history `(R, H, C)` with the newest sample first."""
+    return window[:, ::-1]
+
+
+def lay_out_by_joint(window: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
+    """Return a history `(R, H, C)` whose numbers stand joint by joint."""
+    return window.transpose(0, 2, 1).reshape(window.shape)
+
+
+def fill_early(window: np.ndarray, times: float, unit: np.ndarray) -> np.ndarray:
+    """Return a history `(R, H, C)` into which each sample was put several times."""
+    samples = window.shape[1]
+    return window[:, samples - 1 - np.arange(samples)[::-1] // int(times)]
+
+
+# Numbers at which a search begins were chosen by hand: it is refined between them.
+MAX_DELAY = 12
+"""Longest delay that is tried, rows; half a second at 20 Hz is more than a history's dead time."""
+DELAYS = tuple(float(number) for number in range(1, MAX_DELAY + 1))
+LEVELS = (0.1, 0.2, 0.35, 0.5, 0.7, 0.85, 1.0, 1.5, 2.0, 3.0)
+FACTORS = (-2.0, -0.5, 0.1, 0.25, 0.5, 0.7, 0.8, 0.9, 1.1, 1.25, 1.5, 2.0, 3.0, 10.0)
+OFFSETS_STD = (-2.0, -1.0, -0.5, -0.2, -0.08, 0.08, 0.2, 0.5, 1.0, 2.0)
+OFFSETS_COMMAND = (-0.3, -0.1, -0.03, 0.03, 0.1, 0.3)
+SMOOTHING = (0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
+DISTANCES_M = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)
+SHIFTS_M = (*(-distance for distance in DISTANCES_M[::-1]), *DISTANCES_M)
+ANGLES_RAD = tuple(np.deg2rad([*range(-165, 0, 15), -4, 4, *range(15, 181, 15)]))
+
+SIGN = Distortion("sign", "{field} has the wrong sign", scale, (-1.0,))
+ON_COLUMNS = (
+    SIGN,
+    Distortion("scale", "{field} is multiplied by {value}", scale, FACTORS, "factor", True),
+    Distortion("stale", "{field} is always zero", scale, (0.0,)),
+)
+ON_SIGNALS = (
+    *ON_COLUMNS,
+    Distortion("scale", "{field} is in degrees for radians", scale, (180.0 / np.pi,)),
+    Distortion("scale", "{field} is in radians for degrees", scale, (np.pi / 180.0,)),
+    Distortion("scale", "{field} is in thousandths for units", scale, (1000.0,)),
+    Distortion("scale", "{field} is in units for thousandths", scale, (0.001,)),
+    Distortion("scale", "{field} is in hundredths for units", scale, (100.0,)),
+    Distortion("default_pose", "{value} standard deviations are added to {field}", shift, OFFSETS_STD, "offset_std", True),
+)  # fmt: skip
+ON_COMMANDS = (
+    *ON_COLUMNS,
+    Distortion("clip", "{field} is clipped at ±{value}", clip, LEVELS[:6], "bound", True),
+    Distortion("default_pose", "{value} is added to {field}", shift_command, OFFSETS_COMMAND, "offset", True),
+)  # fmt: skip
+EARLY = Distortion("delay", "{field} is a period too new", delay, (-1.0,))
+LATE = Distortion("delay", "{field} is {value} periods old", delay, DELAYS, "periods")
+HELD = tuple(
+    Distortion("rate", f"{{field}} is refreshed every {every} periods only", partial(hold, every=every),
+               tuple(float(phase) for phase in range(every)))
+    for every in range(2, 6)
+)  # fmt: skip
+FILTERED = Distortion(
+    "filter", "{field} is low-pass filtered, newest weighs {value}", smooth, SMOOTHING, "weight", True
+)  # fmt: skip
+ON_ROWS = (LATE, *HELD, FILTERED)
+ON_HISTORIES = (
+    Distortion("order", "the history of {field} has the newest sample first", turn_round),
+    Distortion("order", "{field} is laid out joint by joint, not sample by sample", lay_out_by_joint),
+    Distortion("rate", "the history of {field} is filled {value} times a period", fill_early, (2.0, 3.0)),
+)  # fmt: skip
+ALL_FILLED = Distortion(
+    "rate", "the history is filled {value} times a period: the loop runs at {value} times its rate", fill_early, (2.0, 3.0)
+)  # fmt: skip
+ALL_LATE = replace(LATE, text="the whole {field} is {value} periods old")
+CLIPPED = Distortion("clip", "the {field} is clipped at ±{value}", clip, LEVELS, "bound", True)
+STARTS = (
+    Distortion("history", "the history begins with zeros", lambda mean, *_: 0.0 * mean),
+    Distortion("history", "the history begins with zeros after scaling", keep),
+)
+
+
+def spread(
+    rows: Iterable[Distortion], field: str, names: Sequence[str], *places: Place
+) -> Iterator[Distortion]:
+    """Yield each row at all columns of places together, then at each column, whose name joins the field."""
+    rows = tuple(rows)
+    for row in rows:
+        yield row.put(field, *places)
+    for column, name in enumerate(names if len(names) > 1 else ()):
+        single = [replace(place, columns=(column,)) for place in places]
+        for row in rows:
+            yield row.put(f"{field}.{name}", *single)
 
 
 def list_input_distortions(
@@ -146,55 +254,55 @@ def list_input_distortions(
     """
     found = list[Distortion]()
     begins = tuple(float(row) for row in rows)
-    stale = Mistake("stale", "{field} is stale from row {value} on", freeze, begins, "row")
+    stale = Distortion("stale", "{field} is stale from row {value} on", freeze, begins, "row")
     for term in policy.contract.terms:
-        place = _watch_terms([term], term.name)
-        found += place.spoil_each(ON_SIGNALS)
+        place, names = _watch(term), _name_columns(term)
+        found += spread(ON_SIGNALS, term.name, names, place)
         found += _list_normalisations(term)
-        found += place.spoil_all(ON_ROWS if term.newest >= 0 else (EARLY, *ON_ROWS))
-        for columns, field in place.list_groups():
+        for row in ON_ROWS if term.newest >= 0 else (EARLY, *ON_ROWS):
+            found.append(row.put(term.name, place))
+        moves = np.ptp(signals[term.name], axis=0) != 0.0
+        for one in spread([stale], term.name, names, place):
             # What never changes cannot be seen to be stale.
-            if np.ptp(signals[term.name][:, columns], axis=0).any():
-                found.append(place.spoil(stale, columns, field))
-        if term.name != "target" and len(place.columns) > 1:
-            for order in list_orders(place.columns):
-                found += make_orders((term,), place.columns, order)
+            if moves[list(one.places[0].columns or range(len(names)))].any():
+                found.append(one)
+        if term.name != "target" and len(names) > 1:
+            for order in list_orders(names):
+                found += make_orders([term], names, order)
         if term.samples > 1:
-            found += _list_history_mistakes(term)
-    found += _list_joint_mistakes(policy)
-    found += _list_vector_mistakes(policy)
-    return found
+            found += [row.put(term.name, Place(f"scaled {term.name}")) for row in ON_HISTORIES]
+    return [*found, *_list_shared_mistakes(policy), *_list_vector_mistakes(policy)]
+
+
+def _watch(term: ObservationTerm) -> Place:
+    """Return the values of a term as they come in."""
+    return Place(f"signal {term.name}", unit=term.std)
 
 
 def _list_normalisations(term: ObservationTerm) -> Iterator[Distortion]:
     """Yield missing steps of the normalisation; clipped values."""
-    mean, std, name = term.mean, term.std, term.name
+    mean, std, place = term.mean, term.std, Place(f"scaled {term.name}")
     has_mean, has_std = np.abs(mean).max() > 0, np.abs(std - 1.0).max() > 0
-
-    def fix(kind: str, text: str, transform: Transform) -> Distortion:
-        return make_fixed(kind, name, text, Change(windows={name: transform}))
-
+    rows = []
     if has_mean or has_std:
-        yield fix("scale", f"{name} is not normalised", lambda x: x * std + mean)
-        zero = lambda x: np.broadcast_to(mean, x.shape)  # noqa: E731
-        yield fix("stale", f"{name} is missing: zero after scaling", zero)
+        rows.append(Distortion("scale", "{field} is not normalised", lambda x, *_: x * std + mean))
+        missing = "{field} is missing: zero after scaling"
+        rows.append(Distortion("stale", missing, lambda x, *_: np.zeros_like(x)))
     if has_mean:
-        yield fix("default_pose", f"the mean of {name} is not subtracted", lambda x: x + mean)
+        text = "the mean of {field} is not subtracted"
+        rows.append(Distortion("default_pose", text, lambda x, *_: x + mean / std))
     if has_std:
-        text = f"{name} is not divided by its standard deviation"
-        yield fix("scale", text, lambda x: (x - mean) * std + mean)
-
-    def clip_scaled(value: float) -> Change:
-        return Change(windows={name: lambda x: ((x - mean) / std).clip(-value, value) * std + mean})
-
-    text = f"{name} is clipped at ±{{value}} after scaling"
-    yield Distortion("clip", name, text, clip_scaled, LEVELS, "bound", True)
+        text = "{field} is not divided by its standard deviation"
+        rows.append(Distortion("scale", text, lambda x, *_: x * std))
+    rows.append(replace(CLIPPED, text="{field} is clipped at ±{value} after scaling"))
+    for row in rows:
+        yield row.put(term.name, place)
 
 
 def make_orders(
-    terms: Sequence[ObservationTerm], names: list[str], order: Order, network: Network | None = None
-) -> list[Distortion]:
-    """Return the mistake that terms of the observation are in another order.
+    terms: Sequence[ObservationTerm], names: Sequence[str], order: Order, *after: Place
+) -> Iterator[Distortion]:
+    """Yield the mistake that terms of the observation are in another order.
 
     The mean that is subtracted may be in that order too, or in the one of the contract.
 
@@ -202,41 +310,18 @@ def make_orders(
         terms: The terms.
         names: Names of their columns.
         order: The other order.
-        network: The policy's network, where its commands are taken to be in that order too.
+        after: Where the commands are taken to be in that order too.
     """
-    *others, last = [term.name for term in terms]
-    listed = f"{', '.join(others)} and {last}" if others else last
-    verb, place = ("are", "joints") if others else ("is", last)
-    shown = describe_order(names, order)
-    text = f"{listed} {verb} in another order: {shown}"
-    answer = None
-    if network is not None:
-        listed = ", ".join([*others, last])
-        text = f"{listed} and the commands are in another order: {shown}"
-        back = list(invert_order(order))
-        answer = lambda vectors: network(vectors)[:, back]  # noqa: E731
-    raw = Change(signals={term.name: arrange_columns(order) for term in terms}, network=answer)
-    found = [make_fixed("order", place, text, raw)]
+    words = [term.name for term in terms] + ["the commands"] * len(after)
+    listed = " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    verb = "are" if len(words) > 1 else "is"
+    text = f"{listed} {verb} in another order: {describe_order(names, order)}"
+    row = Distortion("order", text, keep)
+    field = "joints" if len(terms) > 1 else terms[0].name
+    yield row.put(field, *(replace(_watch(term), order=order) for term in terms), *after)
     if any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms):
-        windows = {term.name: arrange_scaled(term, order) for term in terms}
-        scaled = Change(windows=windows, network=answer)
-        found.append(make_fixed("order", place, text, scaled))
-    return found
-
-
-def arrange_columns(order: Order) -> Transform:
-    """Return the change that puts columns into another order."""
-    return lambda values: values[:, list(order)]
-
-
-def arrange_scaled(term: ObservationTerm, order: Order) -> Transform:
-    """Return the change that puts columns of a history, `(R, H, C)`, into another order after scaling."""
-
-    def transform(window: np.ndarray) -> np.ndarray:
-        scaled = (window - term.mean) / term.std
-        return scaled[..., list(order)] * term.std + term.mean
-
-    return transform
+        scaled = [Place(f"scaled {term.name}", order=order) for term in terms]
+        yield row.put(field, *scaled, *after)
 
 
 def list_matched_orders(
@@ -257,68 +342,35 @@ def list_matched_orders(
         block = observed[:, contract.term_slices[term.name]]
         seen = block.reshape(len(observed), term.samples, -1)[:, -1]
         known = signals[term.name][np.clip(np.arange(len(observed)) + term.newest, 0, None)]
-        names = _watch_terms([term], term.name).columns
+        names = _name_columns(term)
         by_scaled = match_order((known - term.mean) / term.std, seen)
         by_raw = match_order(known, seen * term.std + term.mean)
         for order in dict.fromkeys(one for one in (by_scaled, by_raw) if one is not None):
-            found += make_orders((term,), names, order)
+            found += make_orders([term], names, order)
             if names == list(contract.joints):
                 shared.setdefault(order, []).append(term)
     for order, terms in shared.items():
         if len(terms) > 1:
-            found += make_orders(terms, list(contract.joints), order)
+            found += make_orders(terms, contract.joints, order)
     return found
 
 
-def _list_history_mistakes(term: ObservationTerm) -> Iterator[Distortion]:
-    """Yield histories that are turned round, sampled at another rate, or laid out otherwise."""
-    name, samples = term.name, term.samples
-    mistakes: list[tuple[str, str, Transform]] = [
-        ("order", f"the history of {name} has the newest sample first", lambda x: x[:, ::-1]),
-        (
-            "order",
-            f"{name} is laid out joint by joint, not sample by sample",
-            lambda x: x.transpose(0, 2, 1).reshape(x.shape),
-        ),
-    ]
-    for step in (2, 3):
-        text = f"the history of {name} is filled {step} times a period"
-        mistakes.append(("rate", text, _slow_history(samples, step)))
-    for kind, text, transform in mistakes:
-        yield make_fixed(kind, name, text, Change(windows={name: transform}))
-
-
-def _slow_history(samples: int, step: int) -> Transform:
-    """Return the change of a history that is filled several times a period."""
-    index = np.maximum(samples - 1 - np.arange(samples)[::-1] // step, 0)
-    return lambda x: x[:, index]
-
-
-def _list_joint_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
-    """Yield mistakes that positions and commands share, and those of the start."""
+def _list_shared_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
+    """Yield mistakes that several terms share, and those of the start."""
     terms, names = policy.contract.terms, list(policy.contract.joints)
-    by_joint = [term for term in terms if _watch_terms([term], "").columns == names]
+    by_joint = [term for term in terms if _name_columns(term) == names]
     if len(by_joint) > 1:
         for order in list_orders(names):
             yield from make_orders(by_joint, names, order)
-            yield from make_orders(by_joint, names, order, policy.network.answer)
-        yield from _watch_terms(by_joint, "joints").spoil_each([SIGN])
-        for step in (2, 3):
-            windows = {
-                term.name: _slow_history(term.samples, step) for term in terms if term.samples > 1
-            }
-            text = f"the history is filled {step} times a period: the loop runs at {step} times its rate"
-            yield make_fixed("rate", "observation", text, Change(windows=windows))
-
-        def delay_all(value: float) -> Change:
-            late = lambda x: delay(x, value, np.ones(1))  # noqa: E731
-            return Change(signals={term.name: late for term in terms})
-
-        text = "the whole observation is {value} periods old"
-        yield Distortion("delay", "observation", text, delay_all, DELAYS, "periods")
-    for before, text in (("zero", "zeros"), ("normalised", "zeros after scaling")):
-        change = Change(before=before)
-        yield make_fixed("history", "observation", f"the history begins with {text}", change)
+            yield from make_orders(
+                by_joint, names, order, Place("answer", order=invert_order(order))
+            )
+        yield from spread([SIGN], "joints", names, *map(_watch, by_joint))
+        long = [Place(f"scaled {term.name}") for term in terms if term.samples > 1]
+        yield ALL_FILLED.put("observation", *long)
+        yield ALL_LATE.put("observation", *map(_watch, terms))
+    for row in STARTS:
+        yield row.put("observation", Place("before"))
 
 
 def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
@@ -327,16 +379,9 @@ def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
     for order in itertools.permutations(slices):
         if list(order) != list(slices):
             places = [np.arange(slices[name].start, slices[name].stop) for name in order]
-            index = np.concatenate(places)
-            change = Change(vector=lambda x, index=index: x[:, index])
-            text = f"the terms are in the order {', '.join(order)}"
-            yield make_fixed("order", "observation", text, change)
-
-    def clip_vector(value: float) -> Change:
-        return Change(vector=lambda x: x.clip(-value, value))
-
-    text = "the observation is clipped at ±{value}"
-    yield Distortion("clip", "observation", text, clip_vector, LEVELS, "bound", True)
+            row = Distortion("order", f"the terms are in the order {', '.join(order)}", keep)
+            yield row.put("observation", Place("vector", order=tuple(np.concatenate(places))))
+    yield CLIPPED.put("observation", Place("vector"))
 
 
 def list_frame_distortions(policy: LoadedPolicy) -> Iterator[Distortion]:
@@ -344,19 +389,7 @@ def list_frame_distortions(policy: LoadedPolicy) -> Iterator[Distortion]:
     terms = {term.name: term for term in policy.contract.terms}
     if "target" not in terms or len(terms["target"].columns) != 3:
         return
-    target = replace(_watch_terms([terms["target"]], "target"), unit=np.ones(3))
-    yield from target.spoil_all(_list_turned_axes())
-    text = "target is in a frame shifted by {value} m along "
-    for axis, letter in enumerate("xyz"):
-        about = f"target is in a frame turned by {{value}} rad about {letter}"
-        turned = Mistake("frame", about, make_turn(axis), ANGLES_RAD, "angle_rad", True)
-        yield from target.spoil_all([turned])
-        shifted = Mistake("frame", text + letter, shift, SHIFTS_M, "shift_m", True)
-        yield target.spoil(shifted, [axis], f"target.{letter}")
-
-
-def _list_turned_axes() -> Iterator[Mistake]:
-    """Yield the points in frames whose axes are those of the base in another order or sense."""
+    place = Place("signal target")
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             if order == (0, 1, 2) and sum(sign < 0 for sign in signs) < 2:
@@ -366,22 +399,29 @@ def _list_turned_axes() -> Iterator[Mistake]:
             kind, text = "frame", f"target is in a frame with the axes {axes}"
             if min(signs) > 0:
                 kind, text = "order", f"target has its axes in the order {axes}"
-            columns, factors = list(order), np.array(signs)
-            yield Mistake(kind, text, lambda x, _, unit, c=columns, f=factors: x[:, c] * f)
+            row = Distortion(kind, text, flip)
+            yield row.put("target", replace(place, order=order, unit=np.array(signs)))
+    for axis, letter in enumerate("xyz"):
+        text = f"target is in a frame turned by {{value}} rad about {letter}"
+        about = partial(turn, axis=axis)
+        yield Distortion("frame", text, about, ANGLES_RAD, "angle_rad", True).put("target", place)
+        text = f"target is in a frame shifted by {{value}} m along {letter}"
+        row = Distortion("frame", text, shift, SHIFTS_M, "shift_m", True)
+        yield row.put(f"target.{letter}", replace(place, columns=(axis,)))
 
 
-def make_command_order(names: list[str], order: Order) -> Distortion:
+def make_command_order(names: Sequence[str], order: Order) -> Distortion:
     """Return the mistake that commands reach the joints in another order."""
     text = "commands reach the joints in another order: " + describe_order(names, order)
-    return make_fixed("order", "command", text, Change(command=arrange_columns(order)))
+    return Distortion("order", text, keep).put("command", Place("command", order=order))
 
 
 def list_command_distortions(policy: LoadedPolicy) -> list[Distortion]:
     """Return mistakes between network and valve."""
-    names = list(policy.contract.joints)
+    names, place = policy.contract.joints, Place("command")
     found = [make_command_order(names, order) for order in list_orders(names)]
-    place = Place("command", names, np.ones(len(names)), lambda change: Change(command=change))
-    return [*found, *place.spoil_each(ON_COMMANDS), *place.spoil_all(ON_ROWS)]
+    found += spread(ON_COMMANDS, "command", names, place)
+    return [*found, *(row.put("command", place) for row in ON_ROWS)]
 
 
 def list_network_distortions(
@@ -391,23 +431,26 @@ def list_network_distortions(
     found = []
     for name, other in others.items():
         if other.contract.size == policy.contract.size:
-            change = Change(network=other.network.answer)
-            text = f"the network is that of {name}"
-            found.append(make_fixed("network", "network", text, change))
+            network = lambda vectors, *_, other=other: other.network.answer(vectors)  # noqa: E731
+            row = Distortion("network", f"the network is that of {name}", network)
+            found.append(row.put("network", Place("network")))
     return found
 
 
-def describe_order(names: list[str], order: Order) -> str:
+def describe_order(names: Sequence[str], order: Order) -> str:
     """Return an order in words."""
     return ", ".join(names[column] for column in order)
 
 
-def _shorten(term: ObservationTerm, column: str) -> str:
-    """Return the name of a column within its term: `q3` for `q_q3_rad`."""
+def _name_columns(term: ObservationTerm) -> list[str]:
+    """Return the names of a term's columns within it: `q3` for `q_q3_rad`."""
     if term.name == "target":
-        return column.split("_")[1]
-    for prefix in (f"{term.name}_", "q_", "u_", "advice_"):
-        column = column.removeprefix(prefix)
-    for unit in ("_rad", "_m"):
-        column = column.removesuffix(unit)
-    return column
+        return [column.split("_")[1] for column in term.columns]
+    names = []
+    for column in term.columns:
+        for prefix in (f"{term.name}_", "q_", "u_", "advice_"):
+            column = column.removeprefix(prefix)
+        for unit in ("_rad", "_m"):
+            column = column.removesuffix(unit)
+        names.append(column)
+    return names

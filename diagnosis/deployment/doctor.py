@@ -61,13 +61,7 @@ class DoctorAnswer:
             "actuator": {
                 "horizon_s": self.motion.horizon_s,
                 "cannot_tell": self.motion.cannot_tell or None,
-                "joints": {
-                    one.joint: {
-                        "rmse": one.recorded, "training_median": one.typical,
-                        "training_largest": one.largest, "moves": one.moves, "blamed": one.blamed,
-                    }
-                    for one in self.motion.joints
-                },
+                "joints": {one.joint: one.to_json() for one in self.motion.joints},
             },
         }  # fmt: skip
 
@@ -115,29 +109,23 @@ def examine_deployment(
 
 def _describe_run(run: RunExamination) -> dict[str, Any]:
     path = run.log.recording.path
-    outside = [
-        {
-            "field": one.field, "share": one.share, "since_s": float(run.log.t_s[one.begin]),
-            "log": [one.lowest, one.highest], "training": [one.low, one.high],
-        }
-        for one in run.task.outside
-    ]  # fmt: skip
     return {
         "path": str(path) if path else None,
-        "findings": [finding.to_json() for finding in run.findings],
+        "findings": [vars(finding) for finding in run.findings],
         "code": [_describe_stage(stage, run.log.t_s) for stage in run.stages],
         "task": {
-            "blamed": run.task.blamed, "outside": outside,
+            "blamed": run.task.blamed,
+            "outside": [vars(one) for one in run.task.outside],
             "cannot_tell": run.task.cannot_tell or None,
         },
-        "cannot_tell": list(run.cannot_tell),
-        "notes": list(run.notes),
-    }  # fmt: skip
+        "cannot_tell": run.cannot_tell,
+        "notes": run.notes,
+    }
 
 
-def _describe_stage(stage: StageResult, t_s: np.ndarray) -> dict[str, Any]:
+def _describe_stage(result: StageResult, t_s: np.ndarray) -> dict[str, Any]:
     ranking = []
-    for one in stage.ranking[:NUM_RANKED]:
+    for one in result.ranking[:NUM_RANKED]:
         ranking.append(
             {
                 "kind": one.distortion.kind, "field": one.distortion.field,
@@ -145,12 +133,15 @@ def _describe_stage(stage: StageResult, t_s: np.ndarray) -> dict[str, Any]:
                 "explained": one.explained, "removes": one.gain,
             }
         )  # fmt: skip
-    departed = stage.departed
+    departed = result.departed
+    where = [
+        {"number": label, "share": share} for label, share in result.rank_labels()[:NUM_RANKED]
+    ]
     return {
-        "stage": stage.stage,
-        "rows": stage.num_rows,
+        "stage": result.stage.name,
+        "rows": result.num_rows,
         "departed": len(departed),
         "since_s": float(t_s[departed[0]]) if len(departed) else None,
-        "where": [{"number": label, "share": share} for label, share in stage.rank_labels()[:NUM_RANKED]],
+        "where": where,
         "ranking": ranking,
-    }  # fmt: skip
+    }

@@ -7,10 +7,11 @@ the training's observations, and the motion under the recorded commands.
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -18,14 +19,13 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.deployment import distortions
 from diagnosis.deployment.contract import LoadedPolicy, PolicyContract
-from diagnosis.deployment.distortions import Distortion
+from diagnosis.deployment.distortions import MAX_DELAY, Distortion
 from diagnosis.deployment.fault_search import (
     FittedDistortion,
     ReplayStage,
     StageResult,
     judge_stage,
 )
-from diagnosis.deployment.mistakes import MAX_DELAY
 from diagnosis.deployment.motion_check import MotionEvidence
 from diagnosis.deployment.orders import match_order
 from diagnosis.deployment.replay import SPREAD_FACTOR, TOLERANCE, VECTOR_TOLERANCE, PolicyReplay
@@ -44,43 +44,32 @@ NUM_RANKED = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """A mistake that was found in the code.
+    """A mistake that was found in the code, as `doctor.json` holds it.
 
     Attributes:
         kind: Kind of mistake (`diagnosis.deployment.distortions`), or `unlisted`.
         field: Where it acts.
         stage: Part of the way where the log departs.
         text: The mistake in words.
-        parameters: Its number, by name.
-        begin_s: When it shows first, s.
-        end_s: When it shows last.
+        time_s: When it shows first and last, s.
         explained: Share of the rows that it explains.
-        alike: Kinds and fields that explain the log as well.
+        parameters: Its number, by name.
+        same_as: Kinds and fields that explain the log as well.
     """
 
     kind: str
     field: str
     stage: str
     text: str
-    parameters: Mapping[str, float]
-    begin_s: float
-    end_s: float
-    explained: float
-    alike: tuple[tuple[str, str], ...] = ()
+    time_s: tuple[float, float]
+    explained: float = 1.0
+    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    same_as: Sequence[Mapping[str, str]] = ()
 
     @property
     def is_named(self) -> bool:
         """True if the mistake has a name."""
         return self.kind != UNLISTED
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the finding as plain JSON data."""
-        same = [{"kind": kind, "field": field} for kind, field in self.alike]
-        return {
-            "kind": self.kind, "field": self.field, "stage": self.stage, "text": self.text,
-            "parameters": dict(self.parameters), "time_s": [self.begin_s, self.end_s],
-            "explained": self.explained, "same_as": same,
-        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -106,7 +95,7 @@ class RunExamination:
     @property
     def is_judged(self) -> bool:
         """True if at least the way from observation to command could be replayed."""
-        return any(stage.stage in ("policy", "network") for stage in self.stages)
+        return any(one.stage.name in ("policy", "network") for one in self.stages)
 
 
 def examine_run(
@@ -132,30 +121,23 @@ def examine_run(
     contract = policy.contract
     log = read_run_log(recording, contract, target_m)
     is_sent = is_sent and not log.is_measured
-    lacking, notes = _list_lacking(log, is_sent), list[str]()
+    notes, stages = list[str](), list[StageResult]()
     findings = _check_without_replay(policy, log)
-    stages = []
     is_other = any(finding.kind == "network" for finding in findings)
     for stage in () if is_other else _list_stages(policy, log, others, is_sent, generator):
         result = judge_stage(stage)
         stages.append(result)
-        if result.departs:
-            rests = log.rests_at_start(machine.dead_time_s, machine.upper - machine.lower)
-            if result.only_start and not result.named and not rests:
-                notes.append(
-                    "the log begins while the machine moves: its first "
-                    f"{contract.num_samples / contract.rate_hz:.2g} s cannot be judged"
-                )
-            else:
-                findings += _describe_findings(result, log, rests)
-    return RunExamination(
-        log=log,
-        stages=tuple(stages),
-        findings=tuple(findings),
-        task=compare_with_training(log, contract),
-        cannot_tell=tuple(lacking),
-        notes=tuple(notes),
-    )
+        rests = log.rests_at_start(machine.dead_time_s, machine.upper - machine.lower)
+        if result.only_start and not result.named and not rests:
+            notes.append(
+                "the log begins while the machine moves: its first "
+                f"{contract.num_samples / contract.rate_hz:.2g} s cannot be judged"
+            )
+        elif result.departs:
+            findings += _describe_findings(result, log)
+    task = compare_with_training(log, contract)
+    lacking = tuple(_list_lacking(log, is_sent))
+    return RunExamination(log, tuple(stages), tuple(findings), task, lacking, tuple(notes))
 
 
 def decide_verdict(
@@ -168,7 +150,9 @@ def decide_verdict(
         return "code", "; ".join(texts) + "."
     outside = [one for run in runs if run.task.blamed for one in run.task.outside]
     places = ", ".join(
-        f"{one.field} from {one.lowest:.3g} to {one.highest:.3g}, in training {one.low:.3g} to {one.high:.3g}"
+        "{} from {:.3g} to {:.3g}, in training {:.3g} to {:.3g}".format(
+            one.field, *one.log, *one.training
+        )
         for one in outside[:3]
     )
     is_judged = all(run.is_judged for run in runs)
@@ -199,8 +183,8 @@ def _list_stages(
     others: Mapping[str, LoadedPolicy],
     is_sent: bool,
     generator: np.random.Generator,
-) -> list[ReplayStage]:
-    """Return the parts of the way that the log lets one judge."""
+) -> Iterator[ReplayStage]:
+    """Yield the parts of the way that the log lets one judge."""
     contract, observed, in_force = policy.contract, log.observed, log.in_force
     commanded = log.commanded
     if commanded is None and is_sent:
@@ -208,37 +192,25 @@ def _list_stages(
     replay = PolicyReplay(policy, log, generator)
     after = distortions.list_command_distortions(policy)
     networks = distortions.list_network_distortions(policy, others)
-    stages, start = list[ReplayStage](), contract.num_samples
+    start, joints = contract.num_samples, contract.joints
     if log.is_complete and observed is not None:
         floor = VECTOR_TOLERANCE + SPREAD_FACTOR * replay.spread[0]
-        labels = [name for term in contract.terms for name in term.list_numbers()]
-        inputs = _list_inputs(policy, log, replay.encoded, observed, floor)
-        inputs += distortions.list_matched_orders(policy, log.signals, observed)
-        stages.append(
-            ReplayStage("observation", replay.encode, observed, floor, tuple(labels), tuple(inputs), start)
-        )  # fmt: skip
-    if commanded is not None and observed is not None:
-        matched = _match_commands(contract, replay.nominal, commanded)
-        floor = np.full(commanded.shape, TOLERANCE)
-        every = (*networks, *after, *matched)
-        stages.append(
-            ReplayStage("network", replay.command, commanded, floor, contract.joints, every, 0)
-        )
-    elif commanded is not None and log.is_complete:
-        matched = _match_commands(contract, replay.nominal, commanded)
-        floor = TOLERANCE + SPREAD_FACTOR * replay.spread[1]
-        inputs = _list_inputs(policy, log, replay.nominal, commanded, floor)
-        every = (*inputs, *networks, *after, *matched)
-        stages.append(
-            ReplayStage("policy", replay.command, commanded, floor, contract.joints, every, start)
-        )
+        labels = tuple(name for term in contract.terms for name in term.list_numbers())
+        every = _list_inputs(policy, log, replay.encoded, observed, floor)
+        every += distortions.list_matched_orders(policy, log.signals, observed)
+        yield ReplayStage("observation", replay.encode, observed, floor, labels, every, start)
+    if commanded is not None and (observed is not None or log.is_complete):
+        name, floor, every = "network", np.full(commanded.shape, TOLERANCE), list[Distortion]()
+        if observed is None:
+            name, floor = "policy", floor + SPREAD_FACTOR * replay.spread[1]
+            every = _list_inputs(policy, log, replay.nominal, commanded, floor)
+        every += [*networks, *after, *_match_commands(contract, replay.nominal, commanded)]
+        start = 0 if observed is not None else start
+        yield ReplayStage(name, replay.command, commanded, floor, joints, every, start)
     if log.commanded is not None and in_force is not None and is_sent:
-        every = (*after, *_match_commands(contract, log.commanded, in_force))
         floor = np.full(in_force.shape, TOLERANCE)
-        stages.append(
-            ReplayStage("delivery", replay.deliver, in_force, floor, contract.joints, every, 0)
-        )
-    return stages
+        every = [*after, *_match_commands(contract, log.commanded, in_force)]
+        yield ReplayStage("delivery", replay.deliver, in_force, floor, joints, every, 0)
 
 
 def _list_inputs(
@@ -258,64 +230,60 @@ def _match_commands(
 ) -> list[Distortion]:
     """Return the order of the joints, whatever it is, in which commands come out as they were logged."""
     order = match_order(known, seen)
-    names = list(contract.joints)
-    return [] if order is None else [distortions.make_command_order(names, order)]
+    return [] if order is None else [distortions.make_command_order(contract.joints, order)]
 
 
-def _describe_findings(result: StageResult, log: RunLog, rests: bool) -> list[Finding]:
+def _describe_findings(result: StageResult, log: RunLog) -> list[Finding]:
     """Return the mistakes of a stage that departs."""
-    if result.named:
-        first, *others = result.named
-        alike = dict.fromkeys((one.distortion.kind, one.distortion.field) for one in result.alike)
-        alike.pop((first.distortion.kind, first.distortion.field), None)
-        found = replace(_describe_named(first, result, log), alike=tuple(alike)[:NUM_RANKED])
-        return [found, *(_describe_named(one, result, log) for one in others)]
-    stage, departed = result.stage, result.departed
-    labels = [label for label, _ in result.rank_labels()[:3]]
-    if result.only_start and rests:
+    stage, departed = result.stage.name, result.departed
+    found = [_describe_named(one, result, log) for one in result.named]
+    if found:
+        alike = [(one.distortion.kind, one.distortion.field) for one in result.alike]
+        others = [one for one in dict.fromkeys(alike) if one != (found[0].kind, found[0].field)]
+        same = [{"kind": kind, "field": field} for kind, field in others[:NUM_RANKED]]
+        return [dataclasses.replace(found[0], same_as=same), *found[1:]]
+    time_s = _find_times(log, departed)
+    if result.only_start:
         text = "only the beginning departs: the history did not begin as the contract says"
-        return [_find("history", "observation", stage, text, log, departed)]
+        return [Finding("history", "observation", stage, text, time_s)]
     if stage == "network":
         text = (
             "the commands do not follow from what the network saw, and no change of the command "
             "explains them: another network"
         )
-        return [_find("network", "network", stage, text, log, departed, 0.0)]
-    share = len(departed) / result.num_rows
+        return [Finding("network", "network", stage, text, time_s, 0.0)]
+    labels = [label for label, _ in result.rank_labels()[:3]]
     departing = "observation" if stage == "observation" else "command"
     text = (
-        f"the {departing} departs in {share:.0%} of the rows, most in {', '.join(labels)}, by none "
-        "of the mistakes that are known here"
+        f"the {departing} departs in {len(departed) / result.num_rows:.0%} of the rows, most in "
+        f"{', '.join(labels)}, by none of the mistakes that are known here"
     )
-    return [_find(UNLISTED, labels[0] if labels else stage, stage, text, log, departed, 0.0)]
+    return [Finding(UNLISTED, labels[0] if labels else stage, stage, text, time_s, 0.0)]
 
 
 def _describe_named(one: FittedDistortion, result: StageResult, log: RunLog) -> Finding:
-    distortion, value = one.distortion, one.value
+    """Return a mistake with its number."""
+    distortion, number = one.distortion, one.value
     inside = result.departed[(result.departed >= one.begin) & (result.departed <= one.end)]
-    shown = inside if len(inside) else result.departed
-    parameters = {distortion.parameter: value} if distortion.parameter else {}
-    text = distortion.text.format(value=f"{value:.4g}")
+    text = distortion.text.format(value=f"{number:.4g}")
+    parameters = {distortion.parameter: number} if distortion.parameter else {}
     if distortion.parameter == "row":
-        since_s = float(log.t_s[int(value)])
-        parameters = {"since_s": since_s}
-        text = distortion.text.replace("row {value}", f"{since_s:.2f} s")
-    found = _find(distortion.kind, distortion.field, result.stage, text, log, shown, one.explained)
-    return replace(found, parameters=parameters)
+        parameters = {"since_s": float(log.t_s[int(number)])}
+        text = distortion.text.replace("row {value}", f"{parameters['since_s']:.2f} s")
+    return Finding(
+        distortion.kind,
+        distortion.field,
+        result.stage.name,
+        text,
+        _find_times(log, inside if len(inside) else result.departed),
+        one.explained,
+        parameters,
+    )
 
 
-def _find(
-    kind: str,
-    field: str,
-    stage: str,
-    text: str,
-    log: RunLog,
-    rows: np.ndarray | None = None,
-    explained: float = 1.0,
-) -> Finding:
-    """Return a mistake that shows in some rows, or in the whole log."""
-    t_s = log.t_s if rows is None else log.t_s[rows]
-    return Finding(kind, field, stage, text, {}, float(t_s[0]), float(t_s[-1]), explained)
+def _find_times(log: RunLog, rows: np.ndarray) -> tuple[float, float]:
+    """Return the times of the first and the last row."""
+    return float(log.t_s[rows[0]]), float(log.t_s[rows[-1]])
 
 
 def _list_lacking(log: RunLog, is_sent: bool) -> list[str]:
@@ -338,6 +306,7 @@ def _list_lacking(log: RunLog, is_sent: bool) -> list[str]:
 def _check_without_replay(policy: LoadedPolicy, log: RunLog) -> list[Finding]:
     """Return what bundle, rate and length of the logged vector show."""
     contract, found = policy.contract, list[Finding]()
+    whole_s = (float(log.t_s[0]), float(log.t_s[-1]))
     path = contract.source.parent / GOLDEN
     if path.is_file():
         # Answers that the training recorded.
@@ -346,18 +315,18 @@ def _check_without_replay(policy: LoadedPolicy, log: RunLog) -> list[Finding]:
         difference = np.abs(answers - np.array(golden["command"])).max()
         if difference > TOLERANCE:
             text = f"the bundle is mixed: its network departs from {GOLDEN} by {difference:.2g}"
-            found.append(_find("network", "bundle", "network", text, log))
+            found.append(Finding("network", "bundle", "network", text, whole_s))
     rate_hz = 1.0 / float(np.median(np.diff(log.t_s)))
     if abs(contract.rate_hz / rate_hz - 1.0) > RATE_TOLERANCE:
         text = (
             f"the loop ran at {rate_hz:.4g} Hz, the policy was trained at {contract.rate_hz:g} Hz"
         )
-        rate = _find("rate", "loop", "policy", text, log)
-        found.append(replace(rate, parameters={"rate_hz": rate_hz}))
+        number = {"rate_hz": rate_hz}
+        found.append(Finding("rate", "loop", "policy", text, whole_s, parameters=number))
     if log.num_observed not in (0, contract.size):
         text = (
             f"the network got {log.num_observed} numbers, the contract has {contract.size}: another "
             "policy ran"
         )
-        found.append(_find("network", "observation", "observation", text, log))
+        found.append(Finding("network", "observation", "observation", text, whole_s))
     return found

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from diagnosis.deployment.distortions import Distortion
-from diagnosis.deployment.mistakes import MAX_DELAY
+from diagnosis.deployment.distortions import MAX_DELAY, Distortion
 from diagnosis.deployment.replay import Change
 
 Predict = Callable[[Sequence[Change], np.ndarray], np.ndarray]
@@ -73,7 +72,7 @@ class ReplayStage:
     logged: np.ndarray
     floor: np.ndarray
     labels: tuple[str, ...]
-    distortions: tuple[Distortion, ...]
+    distortions: Sequence[Distortion]
     num_start: int
 
     @property
@@ -116,26 +115,20 @@ class StageResult:
     """Result of a stage.
 
     Attributes:
-        stage: Its name.
+        stage: The stage.
         num_rows: Rows compared.
         departed: Rows that depart.
-        logged: What the log holds, `(T, D)`.
         residual: Difference to the log, `(T, D)`; NaN where nothing was compared.
-        floor: Floor, `(T, D)`.
-        labels: Names of the `D` numbers.
-        named: Mistakes that together explain the log; empty where none does or none is needed.
-        alike: Mistakes that explain it as well as the first of `named`.
-        ranking: Best mistakes, whether they explain enough or not.
-        only_start: Only the beginning departs, which the log's history does not reach.
+        named: Mistakes that explain the log: none, one, or two at once.
+        alike: Others that explain it as well as the first.
+        ranking: All mistakes that come near, best first.
+        only_start: Only the beginning departs.
     """
 
-    stage: str
+    stage: ReplayStage
     num_rows: int
     departed: np.ndarray
-    logged: np.ndarray
     residual: np.ndarray
-    floor: np.ndarray
-    labels: tuple[str, ...]
     named: tuple[FittedDistortion, ...]
     alike: tuple[FittedDistortion, ...]
     ranking: tuple[FittedDistortion, ...]
@@ -150,10 +143,10 @@ class StageResult:
         """Return the compared numbers by their share of departing rows, largest first."""
         if not len(self.departed):
             return []
-        over = np.abs(self.residual[self.departed]) > self.floor[self.departed]
+        over = np.abs(self.residual[self.departed]) > self.stage.floor[self.departed]
         shares = over.mean(0)
         order = np.argsort(-shares, kind="stable")
-        return [(self.labels[column], float(shares[column])) for column in order if shares[column]]
+        return [(self.stage.labels[k], float(shares[k])) for k in order if shares[k]]
 
 
 def is_departure(num_departed: int, num_rows: int) -> bool:
@@ -173,27 +166,13 @@ def judge_stage(stage: ReplayStage) -> StageResult:
     num_early = len(departed) - len(later)
     is_start = num_early >= max(LEAST_ROWS, LEAST_START_SHARE * stage.num_start)
     only_start = is_start and not is_departure(len(later), len(rows))
-    named: tuple[FittedDistortion, ...] = ()
-    alike: tuple[FittedDistortion, ...] = ()
-    ranking: tuple[FittedDistortion, ...] = ()
+    named = alike = ranking = ()
     if only_start or is_departure(len(departed), len(rows)):
         judged = rows if only_start or len(settled) < LEAST_ROWS else settled
         search = _FaultSearch(stage, residual, judged)
         ranking = search.rank(())
         named, alike = search.choose(ranking)
-    return StageResult(
-        stage=stage.name,
-        num_rows=len(rows),
-        departed=departed,
-        logged=stage.logged,
-        residual=residual,
-        floor=stage.floor,
-        labels=stage.labels,
-        named=named,
-        alike=alike,
-        ranking=ranking[:NUM_REFINED],
-        only_start=only_start,
-    )
+    return StageResult(stage, len(rows), departed, residual, named, alike, ranking, only_start)
 
 
 class _FaultSearch:
@@ -201,7 +180,7 @@ class _FaultSearch:
 
     def __init__(self, stage: ReplayStage, residual: np.ndarray, rows: np.ndarray) -> None:
         self._stage, self._rows = stage, rows
-        self._ok = (np.abs(residual[rows]) <= stage.floor[rows]).all(1)
+        self._ok = np.asarray((np.abs(residual[rows]) <= stage.floor[rows]).all(1))
         self._loss = _measure_loss(residual[rows])
         self._screen = self._choose_sample(SCREEN_ROWS)
         self._sample = self._choose_sample(SEARCH_ROWS)
@@ -213,23 +192,19 @@ class _FaultSearch:
         return np.sort(np.concatenate(parts))
 
     def rank(self, given: tuple[Change, ...]) -> tuple[FittedDistortion, ...]:
-        """Return all mistakes, beside those of `given`, best first."""
+        """Return the mistakes that come nearest, beside those of `given`, best first."""
         screened = []
         for distortion in self._stage.distortions:
-            gains = [
-                self._measure(distortion, value, given, self._screen)[1]
-                for value in distortion.values
-            ]
-            screened.append((max(gains), int(np.argmax(gains)), distortion))
-        screened.sort(key=lambda one: -one[0])
-        first = []
-        for _, best, distortion in screened[:NUM_SCREENED]:
-            value, gain = self._refine_value(distortion, best, given)
-            first.append((gain, distortion, value))
-        first.sort(key=lambda one: -one[0])
-        found = [self._judge(one, value, given) for _, one, value in first[:NUM_REFINED]]
-        found.sort(key=_rank_fit)
-        return tuple(found)
+            tried = [self._try(distortion, one, given, self._screen) for one in distortion.values]
+            screened.append(max(tried, key=_get_gain))
+        screened.sort(key=_get_gain, reverse=True)
+        refined = [self._refine(one, given) for one in screened[:NUM_SCREENED]]
+        refined.sort(key=_get_gain, reverse=True)
+        everywhere = np.arange(len(self._rows))
+        found = []
+        for one in refined[:NUM_REFINED]:
+            found.append(self._try(one.distortion, one.value, given, everywhere))
+        return tuple(sorted(found, key=_rank_fit))
 
     def choose(
         self, ranking: tuple[FittedDistortion, ...]
@@ -240,7 +215,7 @@ class _FaultSearch:
             best = fitting[0]
             alike = [one for one in fitting[1:] if one.explained >= best.explained - ALIKE]
             return (best,), tuple(alike)
-        for first in sorted(ranking, key=lambda one: -one.gain)[:NUM_FIRST]:
+        for first in sorted(ranking, key=_get_gain, reverse=True)[:NUM_FIRST]:
             if first.gain < PAIR_GAIN:
                 break
             change = first.distortion.build(first.value)
@@ -249,65 +224,52 @@ class _FaultSearch:
                     return (first, second), ()
         return (), ()
 
-    def _refine_value(
-        self, distortion: Distortion, best: int, given: tuple[Change, ...]
-    ) -> tuple[float, float]:
-        """Return the number of a distortion, near value `best` of its grid, and its gain."""
+    def _refine(self, screened: FittedDistortion, given: tuple[Change, ...]) -> FittedDistortion:
+        """Return a distortion with a number near that of its grid."""
+        distortion, values = screened.distortion, screened.distortion.values
+        found = self._try(distortion, screened.value, given, self._sample)
+        if not distortion.is_continuous:
+            return found
+        place = values.index(screened.value)
+        low, high = values[max(0, place - 1)], values[min(len(values) - 1, place + 1)]
+        best = minimize_scalar(
+            lambda number: -self._try(distortion, float(number), given, self._sample).gain,
+            bounds=(low, high),
+            method="bounded",
+            options={"xatol": TOLERANCE_REFINED * max(abs(low), abs(high))},
+        )
+        return max(found, self._try(distortion, float(best.x), given, self._sample), key=_get_gain)
 
-        def measure_gain(value: float) -> float:
-            return self._measure(distortion, value, given, self._sample)[1]
-
-        values = distortion.values
-        value, gain = values[best], measure_gain(values[best])
-        if distortion.is_continuous:
-            low, high = values[max(0, best - 1)], values[min(len(values) - 1, best + 1)]
-            found = minimize_scalar(
-                lambda x: -measure_gain(float(x)),
-                bounds=(low, high),
-                method="bounded",
-                options={"xatol": TOLERANCE_REFINED * max(abs(low), abs(high))},
-            )
-            if -found.fun > gain:
-                value, gain = float(found.x), -float(found.fun)
-        return value, gain
-
-    def _measure(
+    def _try(
         self, distortion: Distortion, value: float, given: tuple[Change, ...], places: np.ndarray
-    ) -> tuple[np.ndarray, float, tuple[int, int]]:
-        """Return residual at places of the judged rows, gain, and the segment where it holds."""
-        rows = self._rows[places]
+    ) -> FittedDistortion:
+        """Return a distortion with what it explains at some places of the judged rows."""
+        rows, was_ok, before = self._rows[places], self._ok[places], self._loss[places]
         predicted = self._stage.predict((*given, distortion.build(value)), rows)
         residual = predicted - self._stage.logged[rows]
-        before = self._loss[places]
-        segment, gained = _find_segment(before - _measure_loss(residual))
-        return residual, gained / max(float(before.sum()), 1e-12), segment
-
-    def _judge(
-        self, distortion: Distortion, value: float, given: tuple[Change, ...]
-    ) -> FittedDistortion:
-        """Return a distortion with what it explains of all judged rows."""
-        everywhere = np.arange(len(self._rows))
-        residual, gain, (begin, end) = self._measure(distortion, value, given, everywhere)
-        floor = self._stage.floor[self._rows]
-        inside = (everywhere >= begin) & (everywhere < end)
+        (begin, end), gained = _find_segment(before - _measure_loss(residual))
         with np.errstate(invalid="ignore"):
-            ok = np.where(inside, (np.abs(residual) <= floor).all(1), self._ok)
-        departed = ~self._ok
+            is_ok = np.asarray((np.abs(residual) <= self._stage.floor[rows]).all(1))
+        ok = np.concatenate([was_ok[:begin], is_ok[begin:end], was_ok[end:]])
         return FittedDistortion(
             distortion=distortion,
             value=value,
             # A mistake from the first judged row on has held from the beginning.
-            begin=int(self._rows[min(begin, len(self._rows) - 1)]) if begin else 0,
-            end=int(self._rows[max(begin, end - 1)]),
+            begin=int(rows[min(begin, len(rows) - 1)]) if begin else 0,
+            end=int(rows[max(begin, end - 1)]),
             explained=float(ok.mean()),
-            explained_departed=float(ok[departed].mean()) if departed.any() else 1.0,
-            gain=gain,
+            explained_departed=1.0 if was_ok.all() else float(ok[~was_ok].mean()),
+            gain=gained / max(float(before.sum()), 1e-12),
         )
+
+
+def _get_gain(one: FittedDistortion) -> float:
+    return one.gain
 
 
 def _rank_fit(one: FittedDistortion) -> tuple[float, int, float]:
     """Return the key by which fits are ordered: explained share, free numbers, gain."""
-    return -round(one.explained / ALIKE), one.distortion.num_free, -one.gain
+    return -round(one.explained / ALIKE), int(bool(one.distortion.parameter)), -one.gain
 
 
 def _measure_loss(residual: np.ndarray) -> np.ndarray:

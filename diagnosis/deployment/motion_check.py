@@ -10,13 +10,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from actuators import open_loop
-from actuators.open_loop import FreeRunWindows
-from actuators.recordings.split import group_by_run
 from actuators.scales import choose_horizon_s
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.errors import RecordingError
@@ -52,22 +51,28 @@ class JointMotion:
 
     Attributes:
         joint: Its name.
-        recorded: Departure of the recorded machine.
-        typical: Median departure of the machines of training.
-        largest: The largest of theirs.
+        rmse: Departure of the recorded machine.
+        training_median: Median departure of the machines of training.
+        training_largest: The largest of theirs.
         moves: Whether it moved enough to be judged.
     """
 
     joint: str
-    recorded: float
-    typical: float
-    largest: float
+    rmse: float
+    training_median: float
+    training_largest: float
     moves: bool
 
     @property
     def blamed(self) -> bool:
         """True if it departs further than the machines of the training."""
-        return self.moves and self.recorded > BEYOND * self.largest
+        return self.moves and self.rmse > BEYOND * self.training_largest
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all but its name as plain JSON data, as `doctor.json` holds it."""
+        return {key: value for key, value in vars(self).items() if key != "joint"} | {
+            "blamed": self.blamed
+        }
 
 
 @dataclass(frozen=True)
@@ -107,18 +112,20 @@ def check_motion(
         seed: Of the draws.
     """
     horizon_s = HORIZON_SHARE * choose_horizon_s(machine)
+    lacking = ""
     if actuator is None:
-        return MotionEvidence((), horizon_s, "no simulator was given: actuator=<its actuator>")
-    if not effects:
-        return MotionEvidence(
-            (), horizon_s, "no effects of the training were given: effect=[library]"
-        )
+        lacking = "no simulator was given: actuator=<its actuator>"
+    elif not effects:
+        lacking = "no effects of the training were given: effect=[library]"
+    if actuator is None or lacking:
+        return MotionEvidence((), horizon_s, lacking)
     try:
         apart_s = max(machine.period_s, WINDOWS_APART * horizon_s)
-        cut = open_loop.cut_windows(recordings, machine, horizon_s, apart_s)
+        free_parts = [_cut_out_contact(recording, machine) for recording in recordings]
+        cut = open_loop.cut_windows(free_parts, machine, horizon_s, apart_s)
     except RecordingError as error:
         return MotionEvidence((), horizon_s, str(error))
-    free = _find_free_windows(recordings, cut, machine, apart_s)
+    free = np.isfinite(cut.q).all((1, 2))
     if not free.any():
         return MotionEvidence(
             (), horizon_s, f"no {horizon_s:g} s without an end of travel or possible contact"
@@ -129,48 +136,31 @@ def check_motion(
     plain = open_loop.roll_out(actuator, machine, cut, cpu)
     # A simulator of one's own can take minutes here.
     log.info("running the log on %d machines that the training draws", NUM_MACHINES)
-    many = _repeat_windows(cut, NUM_MACHINES)
+    many = open_loop.join_windows([cut] * NUM_MACHINES)
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)
         drawn = open_loop.roll_out(
             _DrawnMachines(actuator, effects, len(cut.q)), machine, many, cpu
         )
     drawn = drawn.reshape(NUM_MACHINES, *plain.shape)
-    recorded = _measure_rms(cut.measured - plain)
-    departures = _measure_rms(drawn - plain)
-    travel = machine.upper - machine.lower
+    rmse, of_training = _measure_rms(cut.measured - plain), _measure_rms(drawn - plain)
     moved = np.ptp(np.concatenate([plain, cut.measured], 1), axis=1).max(0)
+    moves = moved > MIN_TRAVEL_SHARE * (machine.upper - machine.lower)
     joints = []
     for j, name in enumerate(machine.joint_names):
-        joints.append(
-            JointMotion(
-                joint=name,
-                recorded=float(recorded[j]),
-                typical=float(np.median(departures[:, j])),
-                largest=float(departures[:, j].max()),
-                moves=bool(moved[j] > MIN_TRAVEL_SHARE * travel[j]),
-            )
-        )
+        median, largest = float(np.median(of_training[:, j])), float(of_training[:, j].max())
+        joints.append(JointMotion(name, float(rmse[j]), median, largest, bool(moves[j])))
     return MotionEvidence(tuple(joints), horizon_s, "")
 
 
-def _find_free_windows(
-    recordings: Sequence[Recording], cut: FreeRunWindows, machine: Machine, apart_s: float
-) -> np.ndarray:
-    """Return the windows in which no joint is at its end and the tool touches nothing, `(W,)`."""
+def _cut_out_contact(recording: Recording, machine: Machine) -> Recording:
+    """Return a recording without positions where a joint is at its end or the tool may touch something."""
     margin = END_SHARE * (machine.upper - machine.lower)
-    stride, length = max(1, round(apart_s / machine.period_s)), cut.q.shape[1]
-    found = []
-    for parts in group_by_run(recordings).values():
-        for recording in parts:
-            q = recording.q.astype(float)
-            inside = (q > machine.lower + margin) & (q < machine.upper - margin)
-            free = np.asarray(inside.all(1))
-            if machine.has_bodies:
-                free = free & ~_may_touch(recording, machine)
-            for start in range(0, recording.num_samples - length + 1, stride):
-                found.append(bool(free[start : start + length].all()))
-    return np.array(found)
+    q = recording.q.astype(float)
+    free = np.all((q > machine.lower + margin) & (q < machine.upper - margin), 1, keepdims=True)
+    if machine.has_bodies:
+        free = free & ~_may_touch(recording, machine)[:, None]
+    return replace(recording, q=np.where(free, recording.q, np.nan))
 
 
 def _may_touch(recording: Recording, machine: Machine) -> np.ndarray:
@@ -187,15 +177,6 @@ def _may_touch(recording: Recording, machine: Machine) -> np.ndarray:
 def _measure_rms(difference: np.ndarray) -> np.ndarray:
     """Return the root mean square over windows and steps, `(…, J)`."""
     return np.sqrt(np.nanmean(difference**2, axis=(-3, -2)))
-
-
-def _repeat_windows(cut: FreeRunWindows, count: int) -> FreeRunWindows:
-    """Return all windows `count` times, one machine after the other."""
-    repeats = (count, 1, 1)
-    return FreeRunWindows(
-        np.tile(cut.u, repeats), np.tile(cut.q, repeats), np.tile(cut.run, count),
-        cut.num_history, cut.num_before,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)

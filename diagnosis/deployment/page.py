@@ -53,10 +53,10 @@ def write_page(answer: DoctorAnswer, folder: Path) -> None:
     title, tone = TITLES[answer.verdict]
     pictures = {}
     for number, run in enumerate(answer.runs):
-        for stage in run.stages:
-            if stage.departs or stage.stage in ("policy", "network"):
-                figure = _draw_departure(stage, run.log.t_s)
-                pictures[number, stage.stage] = embed_picture(figure)
+        for result in run.stages:
+            name = result.stage.name
+            if result.departs or name in ("policy", "network"):
+                pictures[number, name] = embed_picture(_draw_departure(result, run.log.t_s))
     values = {
         "title": f"Deployment doctor: {title}",
         "tone": tone,
@@ -76,19 +76,19 @@ def describe_remedies(findings: Sequence[Finding]) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def _draw_departure(stage: StageResult, t_s: np.ndarray) -> Figure:
+def _draw_departure(result: StageResult, t_s: np.ndarray) -> Figure:
     """Return a figure of the number in which most rows depart, or that moves most, in log and replay."""
-    ranked = stage.rank_labels()
+    stage, ranked = result.stage, result.rank_labels()
     column = int(np.argmax(np.nan_to_num(np.nanstd(stage.logged, axis=0))))
     if ranked:
         column = stage.labels.index(ranked[0][0])
     logged = stage.logged[:, column]
     figure = make_figure(9.0, 2.8)
     axis = figure.subplots()
-    axis.plot(t_s, logged + stage.residual[:, column], color=BLUE, label="replay of the contract")
+    axis.plot(t_s, logged + result.residual[:, column], color=BLUE, label="replay of the contract")
     axis.plot(t_s, logged, color=ORANGE, linestyle="--", label="log")
     departed = np.zeros(len(t_s), bool)
-    departed[stage.departed] = True
+    departed[result.departed] = True
     low, high = axis.get_ylim()
     axis.fill_between(
         t_s, low, high, where=departed, color=RED, alpha=0.12, label="departs", linewidth=0

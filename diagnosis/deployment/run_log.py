@@ -13,7 +13,6 @@ import numpy as np
 from brokk_rl.record import Recording, name_command_column, name_position_column
 from diagnosis.deployment.contract import (
     OBSERVATION_COLUMN,
-    PITCH_COLUMN,
     TARGET_COLUMNS,
     ObservationTerm,
     PolicyContract,
@@ -157,6 +156,3 @@ def measure_resolution(values: np.ndarray) -> float:
     ratio = steps[steps < MAX_STEPS * step] / step
     is_rounded = np.abs(ratio - np.round(ratio)).max() < STEP_TOLERANCE and step > 100 * exact
     return step if is_rounded else exact
-
-
-__all__ = ["PITCH_COLUMN", "RunLog", "measure_resolution", "read_run_log"]

@@ -27,25 +27,21 @@ LEAST_SHARE = 0.1
 
 @dataclass(frozen=True)
 class OutsideValue:
-    """A value that lies outside the range of training.
+    """A value that lies outside the range of training, as `doctor.json` holds it.
 
     Attributes:
         field: Which one, such as `target.distance` or `q.q3`.
         share: Share of the rows outside.
-        begin: First row outside.
-        lowest: Lowest value of the log.
-        highest: Highest one.
-        low: Lowest value of the training.
-        high: Highest one.
+        since_s: Time of the first row outside, s.
+        log: Its lowest and highest value in the log.
+        training: The same in training.
     """
 
     field: str
     share: float
-    begin: int
-    lowest: float
-    highest: float
-    low: float
-    high: float
+    since_s: float
+    log: tuple[float, float]
+    training: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -85,17 +81,10 @@ def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidenc
         known = np.isfinite(values)
         outside = known & ((values < low - margin) | (values > high + margin))
         if outside.any():
-            found.append(
-                OutsideValue(
-                    field=name,
-                    share=float(outside.sum() / known.sum()),
-                    begin=int(np.flatnonzero(outside)[0]),
-                    lowest=float(values[known].min()),
-                    highest=float(values[known].max()),
-                    low=low,
-                    high=high,
-                )
-            )
+            share = float(outside.sum() / known.sum())
+            since_s = float(log.t_s[np.flatnonzero(outside)[0]])
+            seen = (float(values[known].min()), float(values[known].max()))
+            found.append(OutsideValue(name, share, since_s, seen, (low, high)))
     found.sort(key=lambda one: -one.share)
     return RangeEvidence(tuple(found), "")
 

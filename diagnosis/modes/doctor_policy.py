@@ -112,7 +112,7 @@ def print_answer(found: DoctorAnswer, folder: Path) -> None:
     if found.findings:
         rows = []
         for one in found.findings:
-            shown = f"{one.begin_s:.2f} to {one.end_s:.2f} s"
+            shown = "{:.2f} to {:.2f} s".format(*one.time_s)
             rows.append((one.kind, one.field, shown, f"{one.explained:.1%}"))
         print_table(("kind", "field", "shows", "rows explained"), rows)
         for line in page.describe_remedies(found.findings):

@@ -164,7 +164,7 @@ def test_a_mistake_is_named_with_its_field(
     found = ask(policy, run_loop(policy, machine, detail=detail, **hooks), machine)
     assert found.verdict == "code"
     assert [(one.kind, one.field) for one in found.findings] == [(kind, place)]
-    assert found.findings[0].begin_s < 0.5
+    assert found.findings[0].time_s[0] < 0.5
 
 
 @pytest.mark.parametrize("detail", ["command", "advice", "observation"])
@@ -190,7 +190,7 @@ def test_a_signal_that_stops_is_told_with_its_time(policy: LoadedPolicy, machine
 
     (finding,) = ask(policy, run_loop(policy, machine, see_q=stop), machine).findings
     assert (finding.kind, finding.field) == ("stale", "q.q5")
-    assert finding.begin_s == pytest.approx(3.55, abs=0.16)
+    assert finding.time_s[0] == pytest.approx(3.55, abs=0.16)
 
 
 def test_a_mistake_without_a_name_gets_none(policy: LoadedPolicy, machine: Machine) -> None:
