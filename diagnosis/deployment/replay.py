@@ -114,7 +114,9 @@ class PolicyReplay:
         return largest_vector, largest
 
 
-def _shift_values(rounding: np.ndarray, jitter: np.ndarray | None, values: np.ndarray) -> np.ndarray:
+def _shift_values(
+    rounding: np.ndarray, jitter: np.ndarray | None, values: np.ndarray
+) -> np.ndarray:
     """Return values as they may have been before the log lost something, `(T, C)`.
 
     Args:
