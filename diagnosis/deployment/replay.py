@@ -107,16 +107,14 @@ class PolicyReplay:
                 share = self._generator.uniform(-0.5, 0.5, shape)
                 jitter = self._generator.uniform(-1.0, 1.0, shape) if self.log.is_measured else None
                 units = np.array([self.log.units[name] for name in term.columns])
-                change[f"signal {term.name}"] = partial(_shift_values, share * units, jitter)
+                change[f"signal {term.name}"] = partial(_vary, share * units, jitter)
             drawn = self._encode([change], self._all)
             largest_vector = np.maximum(largest_vector, np.abs(drawn - self.encoded))
             largest = np.maximum(largest, np.abs(answer(drawn) - nominal))
         return largest_vector, largest
 
 
-def _shift_values(
-    rounding: np.ndarray, jitter: np.ndarray | None, values: np.ndarray
-) -> np.ndarray:
+def _vary(rounding: np.ndarray, jitter: np.ndarray | None, values: np.ndarray) -> np.ndarray:
     """Return values as they may have been before the log lost something, `(T, C)`.
 
     Args:
