@@ -240,7 +240,7 @@ def write_recording(recording: Recording, path: Path) -> None:
     import pyarrow.parquet as pq
 
     check_recording(recording, str(path))
-    columns = {"t_s": recording.t_s.astype(np.float64)}
+    columns: dict[str, np.ndarray] = {"t_s": recording.t_s.astype(np.float64)}
     for name, values in (_list_columns(recording) | dict(recording.extra)).items():
         columns[name] = np.asarray(values, dtype=np.float32)
     metadata = {
