@@ -47,17 +47,9 @@ def register_options(arguments: Sequence[str]) -> None:
     """Make Hydra know the options of extensions and the option files in `arguments`.
 
     Raises:
-        ConfigError: A file is invalid, or two packages offer an option and none of them is named.
+        ConfigError: A file is invalid, or several packages offer an option.
     """
-    options = registry.list_options()
-    groups = {option.group for option in options}
-    for option in options:
-        name = f"{option.prefix}/{option.path.stem}"
-        if option.name == name or any(name in argument for argument in arguments):
-            text = option.path.read_text()
-            node = OmegaConf.to_container(OmegaConf.create(text))
-            stated = PACKAGE.search(text)
-            store_option(option.group, name, node, stated[1] if stated else None)
+    groups = {option.group for option in registry.list_options()}
     Plugins.instance().register(Extensions)
     for override in parse_words(arguments):
         group, names = override.key_or_group, list_names(override)
@@ -75,21 +67,19 @@ def store_option(group: str, name: str, node: Any, package: str | None = None) -
 
 
 def refuse_ambiguous(choices: Mapping[str, Any]) -> None:
-    """Refuse options that several packages offer by one name: Hydra would take the first.
+    """Refuse options that several extensions offer by one name: Hydra would take the first.
 
     Args:
         choices: Option, or options with commas between, by group, with or without `@package`.
     """
     options = registry.list_options()
-    known = {(option.group, option.name) for option in options}
     for key, value in choices.items():
         group = key.partition("@")[0]
         for name in re.split(r"[\[\],]", str(value)):
-            offered = [one.name for one in options if one.group == group and one.path.stem == name]
-            if offered and (group, name) not in known:
-                raise ConfigError(
-                    f"{key}={value}: several packages offer '{name}'; {list_choices(name, offered)}"
-                )
+            offered = [one for one in options if (one.group, one.name) == (group, name)]
+            if len(offered) > 1 and registry.CORE not in {one.package for one in offered}:
+                files = " or ".join(f"{key}=@{one.path}" for one in offered)
+                raise ConfigError(f"{key}={value}: several packages offer '{name}'; give {files}")
 
 
 def load_option(group: str, name: str, **fields: object) -> Any:

@@ -13,7 +13,7 @@ import inspect
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import metadata, resources, util
 from pathlib import Path
 from typing import Any
@@ -43,11 +43,6 @@ class Option:
     name: str
     package: str
     path: Path
-
-    @property
-    def prefix(self) -> str:
-        """Name of the package, which stands before that of an option where two packages have it."""
-        return self.package.split(".")[0]
 
     def summary(self) -> str:
         """Return the first sentence of the file's comment, else the first line of its target."""
@@ -84,25 +79,14 @@ def _find_packages(paths: tuple[str, ...]) -> dict[str, Path]:
 
 
 def list_options(only: str | None = None) -> list[Option]:
-    """Return every option of every group, or of one group, sorted by group and name.
-
-    Where two packages offer an option of the same name, those of extensions have the name of their
-    package before their own: `machine=mine/arm`.
-    """
-    found: dict[tuple[str, str], list[Option]] = {}
+    """Return every option of every group, or of one group, sorted by group and name."""
+    found = []
     for package, folder in find_packages().items():
         for path in sorted(folder.rglob("*.yaml")):
             group = path.parent.relative_to(folder).as_posix()
             if group != "." and group.split("/")[0] not in SETTINGS and only in (None, group):
-                option = Option(group, path.stem, package, path)
-                found.setdefault((group, path.stem), []).append(option)
-    listed = []
-    for options in found.values():
-        for option in options:
-            if len(options) > 1 and option.package != CORE:
-                option = replace(option, name=f"{option.prefix}/{option.name}")
-            listed.append(option)
-    return sorted(listed, key=lambda option: (option.group, option.name))
+                found.append(Option(group, path.stem, package, path))
+    return sorted(found, key=lambda option: (option.group, option.name))
 
 
 def read_mode_name(cfg: Mapping[Any, Any]) -> str:

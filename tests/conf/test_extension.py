@@ -98,27 +98,23 @@ def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 
 
 def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
-    assert brokk("mode=show", "actuator=mine/sticky", "session.out=run").code == 0
+    assert brokk("mode=show", "actuator=sticky", "session.out=run").code == 0
     assert (tmp_path / "run" / "seen.json").read_text() == '["Sticky", "Wave", "Dowser"]'
     assert brokk("mode=show", "perception=truth", "session.out=ours").code == 0
     assert (tmp_path / "ours" / "seen.json").read_text() == '["Sticky", "Wave", "TruthPerception"]'
 
 
-def test_an_option_that_two_packages_offer_is_chosen_with_its_package(
+def test_an_option_that_two_packages_offer_is_chosen_by_its_file(
     mine: Path, brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sticky = "_target_: mine.parts.Sticky\nshare: 0.5\n"
     install_package(mine, "yours", {"conf/actuator/sticky.yaml": sticky}, monkeypatch)
-    listed = brokk("mode=list").out
-    assert "mine/sticky" in listed and "yours/sticky" in listed
-    for name, share in (("mine", 0.25), ("yours", 0.5)):
-        words = ("mode=train", f"actuator={name}/sticky")
-        done = brokk(*words, "--cfg", "job", "--package", "actuator")
-        assert f"share: {share}" in done.out
     for words in (("mode=train", "actuator=sticky"), ("mode=show",)):
         done = brokk(*words, "session.out=run")
-        assert done.code == 2
-        assert "actuator=sticky" in done.err and "mine/sticky, yours/sticky" in done.err
+        assert done.code == 2 and "actuator=sticky: several packages" in done.err
+    told = done.err.rpartition("actuator=@")[2].strip()
+    done = brokk("mode=train", f"actuator=@{told}", "--cfg", "job", "--package", "actuator")
+    assert "share: 0.5" in done.out
 
 
 def test_an_entry_point_without_its_package_is_named(mine: Path, brokk: Callable[..., Any]) -> None:
