@@ -37,8 +37,10 @@ Activation = Literal[
     "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish",
     "identity",
 ]  # fmt: skip
+NUM_STEPS = "num_steps_per_env"
+"""Control steps of a rollout; rsl-rl has no default for it."""
 RUNNER_VALUES: dict[str, Any] = {
-    "num_steps_per_env": Count,
+    NUM_STEPS: Count,
     "algorithm.num_learning_epochs": Count,
     "algorithm.num_mini_batches": Count,
     "algorithm.clip_param": Positive,
@@ -223,12 +225,13 @@ class TrainingConfig:
 
     def check(self) -> None:
         for path, allowed in RUNNER_VALUES.items():
-            *above, name = path.split(".")
-            holder = self._read_runner(".".join(above)) if above else self.runner
-            if holder and holder.get(name) is not None:  # rsl-rl has a default of its own
-                value = require_value(f"runner.{path}", allowed, holder[name])
-                if isinstance(value, int):  # 1e2 was given for a whole number
-                    holder[name] = value
+            value = self._read_runner(path)
+            if value is None and path != NUM_STEPS:  # rsl-rl has a default of its own
+                continue
+            value = require_value(f"runner.{path}", allowed, value)
+            if isinstance(value, int):  # 1e2 was given for a whole number
+                above, _, name = path.rpartition(".")
+                (self._read_runner(above) if above else self.runner)[name] = value
         for name in ("algorithm", "actor", "critic", "obs_groups"):
             if not isinstance(self.runner.get(name), dict):
                 raise ConfigError(f"runner.{name}: expected a table, got {self.runner.get(name)}")
@@ -263,7 +266,7 @@ class TrainingConfig:
             self._check_batches(max(worlds))
 
     def _check_batches(self, num_envs: int) -> None:
-        num_steps = num_envs * self.runner["num_steps_per_env"]
+        num_steps = num_envs * self.runner[NUM_STEPS]
         num_batches = self._read_runner("algorithm.num_mini_batches") or 1
         if num_batches > num_steps:
             raise ConfigError(
