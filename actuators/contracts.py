@@ -1,4 +1,4 @@
-"""Contracts of fits and of models that plan a run; a package from elsewhere may bring either.
+"""Contracts of fits and of planned runs; a package from elsewhere may bring either.
 
 Axes: `N` environments, `J` joints, `T` control periods.
 """
@@ -6,12 +6,13 @@ Axes: `N` environments, `J` joints, `T` control periods.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 import torch
 
-from brokk_rl.contracts.actuator import Actuator, ActuatorModel
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -22,36 +23,35 @@ class PlannedRun(Protocol):
     def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
         """Return positions `k`, `(N, J)`, from those before in `q`, `(T + 1, N, J)`.
 
-        It is called once for each `k`, rising from `first` of `PlannedModel.plan_run` on.
+        It is called once for each `k`, rising from `first` of `PlannableModel.plan_run` on.
         """
         ...
 
 
-class PlannedModel(ActuatorModel, Protocol):
-    """An actuator model that computes what depends on commands alone for a whole run at once.
+@dataclass(frozen=True)
+class FitTask:
+    """Recordings that a model is fitted to, and where the results go.
 
-    It looks at the newest position only, and at the two newest in its first step.
+    Attributes:
+        machine: The machine.
+        train: Recordings to fit to.
+        validation: Recordings to stop the fit by.
+        folder: Where the fit writes.
+        seed: Of its random numbers.
+        device: Where it computes.
     """
 
+    machine: Machine
+    train: Sequence[Recording]
+    validation: Sequence[Recording]
+    folder: Path
+    seed: int = 0
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
     @property
-    def delay_s(self) -> torch.Tensor:
-        """Time until a command begins to act, `(N, J)`, s."""
-        ...
-
-    def plan_run(
-        self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
-    ) -> PlannedRun | None:
-        """Return the run that begins after a `reset` of all environments; `None`: `step` through it.
-
-        The positions are those of `step`. The state stays as it was.
-
-        Args:
-            u: Commands of the run, `(T, N, J)`; position `k` follows command `k - 1`.
-            first: Number of the first position that is asked for: the length of the history.
-            q: Positions up to there, `(first, N, J)` or more, for effects that begin where a joint is;
-                `None`: a model with such an effect has to be stepped.
-        """
-        ...
+    def recordings(self) -> list[Recording]:
+        """All recordings, for a fit that nothing stops."""
+        return [*self.train, *self.validation]
 
 
 class ActuatorFit(Protocol):
@@ -60,17 +60,6 @@ class ActuatorFit(Protocol):
     name: str
     """Name of the model in tables and files."""
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> Actuator:
-        """Fit to `train`, choose by `validation`, write results into `folder`.
-
-        Returns the fitted actuator.
-        """
+    def fit(self, task: FitTask) -> Actuator:
+        """Return the fitted actuator; results lie in the folder of the task."""
         ...

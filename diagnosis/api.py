@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from actuators import open_loop
-from actuators.contracts import ActuatorFit
+from actuators.contracts import ActuatorFit, FitTask
 from actuators.recordings import log_draft
 from actuators.recordings.guess import CommandKind, GivenColumns
 from actuators.recordings.name_evidence import UNITS, read_unit
@@ -157,9 +157,8 @@ def identify(
     if len(given) < 2:
         raise RecordingError(f"identify: expected two recordings or more, got {len(given)}")
     train = [one for number, one in enumerate(given) if number % HELD_OUT]
-    machine, cpu = recordings.machine, torch.device("cpu")
-    chosen = _choose_fit(fit, machine)
-    return chosen.fit(machine, train, given[::HELD_OUT], Path(folder), seed, cpu)
+    task = FitTask(recordings.machine, train, given[::HELD_OUT], Path(folder), seed)
+    return _choose_fit(fit, recordings.machine).fit(task)
 
 
 def diagnose(

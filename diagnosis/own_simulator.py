@@ -189,7 +189,7 @@ class OwnSimulatorModel:
     def plan_run(
         self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
     ) -> PlannedRun | None:
-        """See `actuators.contracts.PlannedModel`.
+        """See `PlannableModel.plan_run`.
 
         `q` holds the positions of the warm-up too. The run begins behind it, where it does in
         `actuators.open_loop`.

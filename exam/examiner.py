@@ -20,7 +20,7 @@ import torch
 import yaml
 
 from actuators import open_loop
-from actuators.contracts import ActuatorFit
+from actuators.contracts import ActuatorFit, FitTask
 from brokk_rl import record
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.machine import Machine
@@ -89,7 +89,7 @@ class ExaminerSimulator:
         withheld = record.read_recordings(str(hidden / "*.parquet"), machine)
         unchanged = record.read_recordings(str(hidden / UNCHANGED_FOLDER / "*.parquet"), machine)
         with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
-            self._actuator = fit.fit(machine, reference, [], Path(scratch), 0, torch.device("cpu"))
+            self._actuator = fit.fit(FitTask(machine, reference, [], Path(scratch)))
         # of the field an answer knows how long the machine had run; the withheld part goes on
         running = estimate_running_s([*field, *withheld])[len(field) :]
         self._runs = self._cut_runs(withheld, running)

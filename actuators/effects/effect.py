@@ -305,7 +305,7 @@ class EffectChain:
     def plan_run(
         self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
     ) -> PlannedRun | None:
-        """See `actuators.contracts.PlannedModel`; effects on commands are applied to the whole run first."""
+        """See `PlannableModel.plan_run`; effects on commands are applied to the whole run first."""
         self._change_drives()
         if not self.is_plannable:
             return None
@@ -331,7 +331,7 @@ class EffectChain:
 
     @property
     def delay_s(self) -> torch.Tensor:
-        """See `actuators.contracts.PlannedModel`."""
+        """See `PlannableModel.plan_run`."""
         own_s = [value for name in self._delays for value in self.get_values(name).values()]
         return (self.inner.delay_s + sum(own_s)).clamp(min=0.0)
 

@@ -7,12 +7,10 @@ Parameter Identification of Robot Dynamics", 2013, section II. A logged force is
 Other terms are tried beside these four, see `actuators.identify.drive_regression`.
 """
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 import torch
 
+from actuators.contracts import FitTask
 from actuators.identify.drive_regression import TERMS, DriveMotion, filter_low_pass, fit_drive
 from actuators.identify.option_file import write_numbers
 from actuators.models.force_drive import ForceDrive
@@ -57,15 +55,7 @@ class ForceFit:
                 f"force_hz: expected motion_hz={self.motion_hz} or less, got {self.force_hz}"
             )
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> ForceDrive:
+    def fit(self, task: FitTask) -> ForceDrive:
         """Fit to all recordings; write `<name>.yaml` and `<name>.json` with standard errors.
 
         Raises:
@@ -73,7 +63,7 @@ class ForceFit:
             RecordingError: the recordings are too short, or a joint never moves.
             StorageError: a file could not be written.
         """
-        del seed, device  # deterministic, numpy
+        machine = task.machine
         if machine.interface != "torque":
             raise ConfigError(
                 f"fit={self.name}: machine '{machine.name}' is commanded by {machine.interface}, not by torque"
@@ -88,7 +78,7 @@ class ForceFit:
             machine.dead_time_s if given is None else given, machine, "fit.actuator.dead_time_s"
         )
         least = 4 * round(EDGE_S / machine.period_s)
-        long = [one for one in (*train, *validation) if one.num_samples >= least]
+        long = [one for one in task.recordings if one.num_samples >= least]
         found = {}
         for j, joint in enumerate(machine.joint_names):
             motions = [self._read_motion(machine, one, j, delays_s[j]) for one in long]
@@ -102,7 +92,7 @@ class ForceFit:
             numbers[name] = np.array([one.value.get(name, none) for one, none in pairs])
             errors[name] = np.array([one.error.get(name, np.nan) for one in found.values()])
         return write_numbers(
-            folder, self.name, self.actuator, machine, numbers, errors, terms=tried
+            task.folder, self.name, self.actuator, machine, numbers, errors, terms=tried
         )
 
     def _read_motion(

@@ -5,13 +5,12 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 
+from actuators.contracts import FitTask
 from actuators.identify import training_data
 from actuators.identify.option_file import write_option
 from actuators.identify.training_data import TrainingWindows, list_sources
@@ -20,9 +19,7 @@ from actuators.models.machine_tensors import MachineTensors
 from actuators.models.network import JointNetworks, Mlp
 from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import BrokkError, ConfigError
-from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
-from brokk_rl.record import Recording
 from brokk_rl.spec import Count, Share, spec
 
 log = logging.getLogger(__name__)
@@ -78,35 +75,28 @@ class NetworkFit:
         if self.loss == "rollout" and not self.horizons_s:
             raise ConfigError("horizons_s: loss=rollout needs at least one horizon")
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> Mlp:
+    def fit(self, task: FitTask) -> Mlp:
         """Fit to `train`, keep the best weights on `validation`, write `<name>.safetensors` and `<name>.yaml`.
 
         Raises:
             RecordingError: too little data.
             StorageError: a file could not be written.
         """
-        training_data.check_enough(train, machine)
-        fitting = _NetworkFitting(self, machine, train, validation, seed, device)
+        machine = task.machine
+        training_data.check_enough(task.train, machine)
+        fitting = _NetworkFitting(self, task)
         fitting.run()
         tensors, errors = fitting.result
         facts = {
             "width": self.width,
-            "sources": list_sources(train),
-            "fit": {"loss": self.loss, "seed": seed, "device": device.type},
+            "sources": list_sources(task.train),
+            "fit": {"loss": self.loss, "seed": task.seed, "device": task.device.type},
             "validation_rmse": dict(zip(machine.joint_names, errors, strict=True)),
         }
-        path = folder / f"{self.name}.safetensors"
+        path = task.folder / f"{self.name}.safetensors"
         checkpoint.write_checkpoint(path, "mlp", machine, tensors, facts)
         fitted = Mlp(checkpoint=str(path))
-        write_option(folder, self.name, fitted, f"fitted to recordings of {machine.name}")
+        write_option(task.folder, self.name, fitted, f"fitted to recordings of {machine.name}")
         return fitted
 
 
@@ -121,18 +111,11 @@ class _HorizonStage(NamedTuple):
 class _NetworkFitting:
     """One fit at work: Adam on free runs, with a running average of the weights, which is validated and kept."""
 
-    def __init__(
-        self,
-        config: NetworkFit,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        seed: int,
-        device: torch.device,
-    ) -> None:
-        self._config, self._machine, self._train, self._device = config, machine, train, device
-        self._generator = torch.Generator().manual_seed(seed)
-        joints = machine.num_joints
+    def __init__(self, config: NetworkFit, task: FitTask) -> None:
+        self._config, self._machine, self._train = config, task.machine, task.train
+        self._generator = torch.Generator().manual_seed(task.seed)
+        machine, device = task.machine, task.device
+        self._device, joints = device, machine.num_joints
         networks = JointNetworks(joints, machine.num_history, config.width, self._generator)
         self._normalise(networks)
         self._networks = networks.to(device)
@@ -142,7 +125,7 @@ class _NetworkFitting:
         self._kept = {name: value.clone() for name, value in self._averaged.named_parameters()}
         self._best = torch.full((joints,), math.inf, device=device)
         steps, purpose = self._steps(config.validation_s), "held out to stop the fit by"
-        held = TrainingWindows(validation, machine, steps, device, purpose)
+        held = TrainingWindows(task.validation, machine, steps, device, purpose)
         self._held = held.draw(VALIDATED, 0.2, self._generator)
         self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
         for horizon_s in config.horizons_s if config.loss == "rollout" else ():

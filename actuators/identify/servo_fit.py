@@ -5,13 +5,13 @@ for the dead time (`actuators.identify.dead_time`) gives the start; nonlinear le
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from actuators.contracts import FitTask
 from actuators.identify.dead_time import LONGEST_S, RESOLUTION_S, ServoLoops, discretise_loop
 from actuators.identify.option_file import write_numbers
 from actuators.identify.standard_errors import estimate_standard_errors
@@ -19,8 +19,6 @@ from actuators.models.servo import Servo
 from actuators.open_loop import WARM_UP_S
 from brokk_rl.commands import read_targets
 from brokk_rl.errors import ConfigError, RecordingError
-from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from brokk_rl.spec import spec
 
 NUMBERS: tuple[str, ...] = (
@@ -70,15 +68,7 @@ class ServoFit:
                     f"free.{name}: expected [low, high] with low < high, got [{low}, {high}]"
                 )
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> Servo:
+    def fit(self, task: FitTask) -> Servo:
         """Fit to all recordings; validation chooses nothing.
 
         Raises:
@@ -86,9 +76,9 @@ class ServoFit:
             RecordingError: too little data.
             StorageError: a file could not be written.
         """
-        del seed, device  # deterministic, numpy
+        machine = task.machine
         self.actuator.build(machine, 1, torch.device("cpu"))  # refuses numbers that make no sense
-        recordings = [one for one in (*train, *validation) if one.duration_s > 2.0 * LONGEST_S]
+        recordings = [one for one in task.recordings if one.duration_s > 2.0 * LONGEST_S]
         if not recordings:
             raise RecordingError(
                 f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s"
@@ -113,7 +103,7 @@ class ServoFit:
         numbers, told = (
             dict(zip(NUMBERS, np.array(one).T, strict=True)) for one in (found, errors)
         )
-        return write_numbers(folder, self.name, self.actuator, machine, numbers, told)
+        return write_numbers(task.folder, self.name, self.actuator, machine, numbers, told)
 
 
 class _JointRuns:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from actuators import open_loop
-from actuators.contracts import ActuatorFit
+from actuators.contracts import ActuatorFit, FitTask
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -114,7 +114,7 @@ def fit_or_restore(
     folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     train, validation = list_recordings(stage.train), list_recordings(stage.validation)
-    actuator = fit.fit(machine, train, validation, folder, stage.seed, device)
+    actuator = fit.fit(FitTask(machine, train, validation, folder, stage.seed, device))
     seconds = time.monotonic() - began
     predicted = np.zeros((0, 0, machine.num_joints))
     if stage.cut is not None:

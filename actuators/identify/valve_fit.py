@@ -8,7 +8,6 @@ Axes: `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments.
 """
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ import torch
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from actuators.contracts import FitTask
 from actuators.identify.dead_time import delay_signal, estimate_dead_times
 from actuators.identify.option_file import write_numbers
 from actuators.models.valve import PoseFeatures, ValveActuator
@@ -72,24 +72,15 @@ class ValveFit:
     sweeps: Count
     iterations: Count
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> ValveActuator:
-        """Fit to all recordings and write `<name>.yaml` into `folder`; validation chooses nothing.
+    def fit(self, task: FitTask) -> ValveActuator:
+        """Fit to all recordings and write `<name>.yaml`; validation chooses nothing.
 
         Raises:
             RecordingError: a joint never moves.
             StorageError: the file could not be written.
         """
-        del seed, device  # deterministic, numpy
-        recordings = [*train, *validation]
-        runs = _ValveRuns(recordings, machine, np.array(self.actuator.knots))
+        machine = task.machine
+        runs = _ValveRuns(task.recordings, machine, np.array(self.actuator.knots))
         longest_s = (machine.num_history - 2) * machine.period_s
         most = np.array([longest_s, PLAYS[-1], self.longest_lag_s, self.longest_lag_s])
         with ItemProgress(f"{self.name}: joints and pump", self.sweeps) as progress:
@@ -111,7 +102,7 @@ class ValveFit:
             "pose_extend": pose[:, : pose.shape[1] // 2],
             "pose_retract": pose[:, pose.shape[1] // 2 :],
         }
-        return write_numbers(folder, self.name, self.actuator, machine, columns, {})
+        return write_numbers(task.folder, self.name, self.actuator, machine, columns, {})
 
 
 class _ValveRuns:

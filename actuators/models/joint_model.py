@@ -163,7 +163,17 @@ class PlannableModel(ParametricModel):
         return moved
 
     def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> JointRun:
-        """See `actuators.contracts.PlannedModel`."""
+        """Return the run that begins after a `reset` of all environments; the state stays as it was.
+
+        What depends on commands alone is computed at once. The positions are those of `step`. Another
+        model may have this method, and `delay_s`, too; one that returns `None` is stepped.
+
+        Args:
+            u: Commands of the run, `(T, N, J)`; position `k` follows command `k - 1`.
+            first: Number of the first position that is asked for: the length of the history.
+            q: Positions up to there, `(first, N, J)` or more, for effects that begin where a joint is;
+                `None`: a model with such an effect has to be stepped.
+        """
         return JointRun(self, self.drive(u, first), first)
 
 

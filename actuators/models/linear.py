@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import numpy as np
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
+from actuators.contracts import FitTask
 from actuators.models import checkpoint
 from actuators.models.joint_model import MemorylessModel
 from actuators.models.machine_tensors import MachineTensors
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from brokk_rl.spec import NonNegative, spec
 
 
@@ -47,15 +44,7 @@ class HoldFit:
 
     name: str
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> Hold:
+    def fit(self, task: FitTask) -> Hold:
         """Return `Hold`."""
         return Hold()
 
@@ -121,23 +110,15 @@ class ArxFit:
     name: str
     ridge: NonNegative
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> Arx:
-        """Fit to `train` and write `<name>.safetensors` into `folder`.
+    def fit(self, task: FitTask) -> Arx:
+        """Fit to `task.train` and write `<name>.safetensors`.
 
         Raises:
             RecordingError: too little data.
         """
-        size = machine.num_history
+        machine, size = task.machine, task.machine.num_history
         rows, targets = [], []
-        for recording in train:
+        for recording in task.train:
             if recording.num_samples <= size:
                 continue
             u, q = recording.u.astype(np.float64), recording.q.astype(np.float64)
@@ -151,7 +132,7 @@ class ArxFit:
             targets.append(q[size:] - q[size - 1 : -1])
         if not rows:
             raise RecordingError(
-                f"too little data: none of {len(train)} recordings is longer than the history of {size} samples"
+                f"too little data: none of {len(task.train)} recordings is longer than the history of {size} samples"
             )
         inputs, target = np.concatenate(rows), np.concatenate(targets)
         weight = np.zeros((machine.num_joints, inputs.shape[2]))
@@ -160,7 +141,7 @@ class ArxFit:
             scale = np.sqrt(np.mean(x**2, 0)) + 1e-9
             gram = (x / scale).T @ (x / scale) / len(x) + self.ridge * np.eye(x.shape[1])
             weight[j] = np.linalg.solve(gram, (x / scale).T @ target[:, j] / len(x)) / scale
-        path = folder / f"{self.name}.safetensors"
+        path = task.folder / f"{self.name}.safetensors"
         tensors = {"weight": torch.as_tensor(weight, dtype=torch.float32)}
         checkpoint.write_checkpoint(path, "arx", machine, tensors, {"ridge": self.ridge})
         return Arx(checkpoint=str(path))

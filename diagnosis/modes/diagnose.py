@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from actuators.contracts import ActuatorFit
+from actuators.contracts import ActuatorFit, FitTask
 from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator
@@ -169,7 +169,7 @@ class Diagnose:
         seed, device = self.session.stream("base"), self.session.torch_device()
         folder = self.session.folder / "base"
         known = pieces[:-1] or pieces
-        return self.fit.fit(self.machine, known, pieces[-1:], folder, seed, device)
+        return self.fit.fit(FitTask(self.machine, known, pieces[-1:], folder, seed, device))
 
 
 def _print_answer(found: Answer, folder: Path) -> None:

@@ -15,6 +15,7 @@ import torch
 from composed import option
 from pendulum import run_drive
 
+from actuators.contracts import FitTask
 from actuators.models.friction import LOADS, compute_dry_friction
 from brokk_rl.machine import Machine
 from diagnosis import api
@@ -106,7 +107,7 @@ def test_a_fit_takes_the_terms_that_withheld_parts_ask_for(arm: Machine, tmp_pat
     ):
         budget = pendulum.compute_bam_friction(numbers)
         logs = [pendulum.log_pendulum(arm, budget, 0.08, seed, 10.0) for seed in range(2)]
-        fitted = fit.fit(arm, logs, [], tmp_path / title, 0, CPU)
+        fitted = fit.fit(FitTask(arm, logs, [], tmp_path / title))
         told = json.loads((tmp_path / title / "force.json").read_text())
         assert [row["term"] for row in told["terms"]["arm"] if row["taken"]] == terms
         for name in ("mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n", "pose_cos_n"):
@@ -121,7 +122,7 @@ def test_a_fit_takes_the_terms_that_withheld_parts_ask_for(arm: Machine, tmp_pat
 def test_a_fit_recovers_the_whole_of_m5(arm: Machine, tmp_path: Path) -> None:
     budget = pendulum.compute_bam_friction(BAM)
     logs = [pendulum.log_pendulum(arm, budget, 0.08, seed, 15.0) for seed in range(3)]
-    fitted = option("fit", "force").fit(arm, logs, [], tmp_path, 0, CPU)
+    fitted = option("fit", "force").fit(FitTask(arm, logs, [], tmp_path))
     for name, value in TRUE.items():
         assert getattr(fitted, name)["arm"] == pytest.approx(value, rel=0.05), name
 

@@ -14,6 +14,7 @@ from axis import driven
 from composed import option
 from safetensors.torch import load_file
 
+from actuators.contracts import FitTask
 from actuators.identify import training_data
 from actuators.identify.network_fit import NetworkFit
 from actuators.identify.training_data import TrainingWindows
@@ -49,7 +50,7 @@ def runs(machine: Machine) -> Runs:
 
 def test_a_fit_repeats_with_its_seed(machine: Machine, runs: Runs, tmp_path: Path) -> None:
     for folder, seed in (("a", 1), ("b", 1), ("c", 2)):
-        tiny("mlp").fit(machine, *runs, tmp_path / folder, seed, CPU)
+        tiny("mlp").fit(FitTask(machine, *runs, tmp_path / folder, seed))
     a, b, c = (weights(tmp_path / folder, "mlp") for folder in "abc")
     assert all(torch.equal(a[key], b[key]) for key in a)
     assert not torch.equal(a["weight.0"], c["weight.0"])

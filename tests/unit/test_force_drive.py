@@ -13,6 +13,7 @@ from composed import option
 from pendulum import run_drive
 from scipy.integrate import solve_ivp
 
+from actuators.contracts import FitTask
 from actuators.recordings.log_signals import Signal
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError
@@ -84,15 +85,15 @@ def test_mass_friction_and_offset_are_read_off_a_controllers_log(
     drive: Machine, tmp_path: Path
 ) -> None:
     logs = [log_controller(drive, seed) for seed in range(2)]
-    fitted = option("fit", "force").fit(drive, logs, [], tmp_path, 0, CPU)
+    fitted = option("fit", "force").fit(FitTask(drive, logs, [], tmp_path))
     for name, value in TRUE.items():
         assert getattr(fitted, name)["carriage"] == pytest.approx(value, rel=0.05), name
     assert (tmp_path / "force.yaml").is_file()
     still = replace(logs[0], q=np.full_like(logs[0].q, 0.1))
     with pytest.raises(RecordingError, match="carriage never moves"):
-        option("fit", "force").fit(drive, [still], [], tmp_path, 0, CPU)
+        option("fit", "force").fit(FitTask(drive, [still], [], tmp_path))
     with pytest.raises(ConfigError, match="cannot be filtered at a period"):
-        option("fit", "force", motion_hz=95.0).fit(drive, logs, [], tmp_path, 0, CPU)
+        option("fit", "force", motion_hz=95.0).fit(FitTask(drive, logs, [], tmp_path))
     assert not GapCase(drive, [], logs).doubts()
 
 

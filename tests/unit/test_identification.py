@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import torch
 from axis import driven
 from composed import option
 
+from actuators.contracts import FitTask
 from actuators.identify import page
 from actuators.identify.request import Identification
 from actuators.identify.results import write_verdict
@@ -58,18 +58,10 @@ class Fit:
     def __repr__(self) -> str:
         return "Fit"
 
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: Any,
-    ) -> Any:
+    def fit(self, task: FitTask) -> Any:
         if len(self.fitted_to) == self.interrupted_at:
             raise KeyboardInterrupt
-        self.fitted_to.append(({r.run for r in train}, {r.run for r in validation}))
+        self.fitted_to.append(({r.run for r in task.train}, {r.run for r in task.validation}))
         return self.actuator
 
 

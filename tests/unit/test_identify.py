@@ -14,6 +14,7 @@ import torch
 from axis import PLANT, driven, make_axis
 
 from actuators import open_loop
+from actuators.contracts import FitTask
 from actuators.identify import dead_time
 from actuators.models.linear import ArxFit, Hold
 from brokk_rl import record
@@ -54,7 +55,7 @@ def test_a_linear_machine_is_learned_by_the_linear_model(machine: Machine, tmp_p
         u=u,
         q=q,
     )
-    actuator = ArxFit(name="arx", ridge=1e-8).fit(machine, [run], [run], tmp_path, 0, CPU)
+    actuator = ArxFit(name="arx", ridge=1e-8).fit(FitTask(machine, [run], [run], tmp_path))
     cut = open_loop.cut_windows([run], machine, 5.0, 1.0)
     error, still = (
         np.abs(open_loop.roll_out(model, machine, cut, CPU) - cut.measured).max()

@@ -15,6 +15,7 @@ import yaml
 from arm import make_machine, run_servo
 from composed import option
 
+from actuators.contracts import FitTask
 from actuators.models.servo import Servo
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.machine import Machine
@@ -51,7 +52,7 @@ def test_known_numbers_are_found_and_an_option_holds_them(
 ) -> None:
     truth = LOOPS[name]
     runs = record(replace(option("actuator", "servo"), **truth), ARM, 2)
-    fitted = option("fit", "servo").fit(ARM, runs, [], tmp_path, 0, CPU)
+    fitted = option("fit", "servo").fit(FitTask(ARM, runs, [], tmp_path))
     told = json.loads((tmp_path / "servo.json").read_text())["parameters"]
     for number, value in truth.items():
         for joint in ARM.joint_names:
@@ -67,9 +68,8 @@ def test_a_joint_that_was_blocked_for_a_while_hardly_moves_the_numbers(tmp_path:
     runs = record(replace(option("actuator", "servo"), **LOOPS["slow"]), ARM, 2)
     blocked = runs[0].q.copy()
     blocked[400:460] = blocked[400]
-    fitted = option("fit", "servo").fit(
-        ARM, [replace(runs[0], q=blocked), *runs[1:]], [], tmp_path, 0, CPU
-    )
+    runs = [replace(runs[0], q=blocked), *runs[1:]]
+    fitted = option("fit", "servo").fit(FitTask(ARM, runs, [], tmp_path))
     assert list(fitted.dead_time_s.values()) == pytest.approx([0.1] * 2, abs=0.005)
     assert list(fitted.response_s.values()) == pytest.approx([0.05] * 2, abs=0.005)
 
@@ -89,5 +89,5 @@ def test_what_cannot_be_fitted_is_refused(
     if not seconds:
         runs = [replace(runs[0], u=runs[0].u * np.float32([1.0, 0.0]))]
     with pytest.raises(error, match=told):
-        option("fit", "servo").fit(machine, runs, [], tmp_path, 0, CPU)
+        option("fit", "servo").fit(FitTask(machine, runs, [], tmp_path))
     assert list(tmp_path.iterdir()) == []

@@ -12,6 +12,7 @@ from axis import driven
 from composed import option
 
 from actuators import open_loop
+from actuators.contracts import FitTask
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 
@@ -25,7 +26,7 @@ def test_a_known_valve_is_found(machine: Machine, tmp_path: Path) -> None:
     curves = {"curve_extend": (0.0, 0.0, 0.3, 1.0), "curve_retract": (0.0, 0.02, 0.25, 0.7)}
     truth = replace(truth, demand=0.8, knots=(0.0, 0.1, 0.4, 1.0), **curves)
     runs = driven(pair, 6, 120.0, 0, truth)
-    fitted = option("fit", "valve").fit(pair, runs[:5], [], tmp_path, 0, CPU)
+    fitted = option("fit", "valve").fit(FitTask(pair, runs[:5], [], tmp_path))
     cut = open_loop.cut_windows(runs[5:], pair, 5.0, 2.0)
     path, ideal = (open_loop.roll_out(one, pair, cut, CPU) for one in (fitted, truth))
     error, least = (np.sqrt(np.square(one - cut.measured).mean()) for one in (path, ideal))
@@ -40,4 +41,4 @@ def test_a_known_valve_is_found(machine: Machine, tmp_path: Path) -> None:
             np.testing.assert_allclose(found, expected, atol=0.04, err_msg=side)
     still = [replace(runs[0], q=np.full_like(runs[0].q, 0.1))]
     with pytest.raises(RecordingError, match="q4, q5 never moves"):
-        option("fit", "valve").fit(pair, still, [], tmp_path, 0, CPU)
+        option("fit", "valve").fit(FitTask(pair, still, [], tmp_path))
