@@ -18,8 +18,8 @@ from actuators.identify.standard_errors import estimate_standard_errors
 from actuators.models.servo import Servo
 from actuators.open_loop import WARM_UP_S
 from brokk_rl.commands import read_targets
-from brokk_rl.errors import ConfigError, RecordingError
-from brokk_rl.spec import spec
+from brokk_rl.errors import RecordingError
+from brokk_rl.spec import Range, spec
 
 NUMBERS: tuple[str, ...] = (
     "dead_time_s",
@@ -43,6 +43,18 @@ OUTLIER = 3.0
 
 
 @spec
+class ServoBounds:
+    """Lower and upper bound of each number of `actuator=servo` that is fitted, by its name."""
+
+    dead_time_s: Range
+    response_s: Range
+    damping: Range
+    play_rad: Range
+    sag_rad: Range
+    sag_slope: Range
+
+
+@spec
 class ServoFit:
     """Fits `actuator=servo` by free runs.
 
@@ -55,18 +67,7 @@ class ServoFit:
 
     name: str
     actuator: Servo
-    free: dict[str, tuple[float, float]]
-
-    def check(self) -> None:
-        if set(self.free) != set(NUMBERS):
-            raise ConfigError(
-                f"free: expected bounds of {', '.join(NUMBERS)}, got {list(self.free)}"
-            )
-        for name, (low, high) in self.free.items():
-            if not low < high:
-                raise ConfigError(
-                    f"free.{name}: expected [low, high] with low < high, got [{low}, {high}]"
-                )
+    free: ServoBounds
 
     def fit(self, task: FitTask) -> Servo:
         """Fit to all recordings; validation chooses nothing.
@@ -84,7 +85,7 @@ class ServoFit:
                 f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s"
             )
         targets = [read_targets(one.u.astype(float), machine) for one in recordings]
-        low, high = np.array([self.free[name] for name in NUMBERS]).T
+        low, high = np.array([getattr(self.free, name) for name in NUMBERS]).T
         # a joint answers no earlier than its history reaches back
         high[0] = min(high[0], (machine.num_history - 1) * machine.period_s)
         found, errors = [], []

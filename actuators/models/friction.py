@@ -26,7 +26,6 @@ LOADS = (
     "motor_load", "outside_load", "motor_load_at_rest", "outside_load_at_rest",
     "motor_load_square", "outside_load_square",
 )  # fmt: skip
-FRICTION_NUMBERS = ("coulomb_n", "stribeck_n", "stribeck_m_s", "stribeck_power", *LOADS)
 STRIBECK_SPEED = 0.05
 """Stribeck speed over the machine's `max_speed` where none is given: BAM's range for servos of some
 rad/s is 0.1 to 1 rad/s."""
@@ -42,7 +41,7 @@ def compute_dry_friction(
     """Return the largest dry friction, N or Nm; all arrays have one shape, or broadcast to it.
 
     Args:
-        value: `FRICTION_NUMBERS` by name.
+        value: `coulomb_n`, `stribeck_n`, `stribeck_m_s`, `stribeck_power` and `LOADS` by name.
         speed: Speed, m/s or rad/s.
         motor: Force of the motor in the positive direction, N or Nm.
         outside: Force from outside against the positive direction.
