@@ -51,8 +51,9 @@ LEAST_SHARE = 0.1
 a weight over the travel takes 0.03, and its authors publish none; true terms take 0.3 and more."""
 FOLD_STEPS = 5
 """Evaluations of a fit without one part; it begins at the fit to all parts, which is near."""
-STRIBECK_RANGE = (0.1, 10.0)
-"""Stribeck speeds that are searched, over `STRIBECK_SPEED`."""
+BOUNDS = dict.fromkeys(("offset_n", "pose_sin_n", "pose_cos_n"), (-np.inf, np.inf))
+BOUNDS |= dict.fromkeys(FITTED_LOADS, (0.0, 1.0)) | {"stribeck_m_s": (0.1, 10.0)}
+"""Bounds of numbers over their sizes, that of `stribeck_m_s` is `STRIBECK_SPEED`; 0 and more for the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +235,7 @@ class _JointRegression:
         """Return the numbers `names` that fit `rows` best, by nonlinear least squares within their bounds."""
         use = slice(None) if rows is None else rows
         size = np.array([self._size[name] for name in names])
-        low, high = (np.array(side) for side in zip(*map(self._bound, names), strict=True))
+        low, high = np.array([BOUNDS.get(name, (0.0, np.inf)) for name in names]).T * size
         found = least_squares(
             lambda x: self._predict(dict(zip(names, x, strict=True)))[use] - self._y[use],
             np.clip([start[name] for name in names], low + 1e-9 * size, high),
@@ -267,16 +268,6 @@ class _JointRegression:
             self._lengths,
         )
         return dict(zip(names, errors.tolist(), strict=True))
-
-    def _bound(self, name: str) -> tuple[float, float]:
-        if name in ("offset_n", "pose_sin_n", "pose_cos_n"):
-            return -np.inf, np.inf
-        if name == "stribeck_m_s":
-            low, high = STRIBECK_RANGE
-            return low * self._size[name], high * self._size[name]
-        if name in FITTED_LOADS:
-            return 0.0, 1.0
-        return 0.0, np.inf
 
     def _predict(self, numbers: dict[str, float]) -> np.ndarray:
         """Return the force of the motor at all rows, N or Nm."""
