@@ -1,8 +1,9 @@
 """Errors of geometry and encoders, from measured tool points and forward kinematics alone.
 
 No simulator takes part, so the actuators do not matter. `find_geometry_errors` compares sets of errors
-by least squares: the errors are small, so their effects add up.
-Axes: `S` samples, `J` joints, `D` coordinates of all samples (`S` times 3).
+by least squares: the errors are small, so their effects add up. The sizes of the best set are then
+fitted to the tool points of a machine that has them.
+Axes: `S` samples, `J` joints, `D` coordinates of all samples (`S` times 3), `P` numbers.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,12 +28,11 @@ TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SECONDS = 40
 """Least time with measured tool points, s; chosen by hand."""
 NUM_ROUNDS = 3
-"""Rounds of linearisation: about no error, then about the errors of the round before. Chosen by
-hand."""
+"""Steps of Gauss and Newton by which the sizes of the best set are fitted. Chosen by hand."""
 MAX_ERRORS = 3
 """Most errors in a set: all sets are compared, and their number grows with this power."""
 DIFFERENCE_STEP = 0.2
-"""Step of the finite difference, of the typical size; the rounds correct the curvature."""
+"""Step of the finite difference, of the typical size."""
 MIN_NOISE_M = 3e-4
 """Smallest noise of a tool point, m: chosen by hand, no instrument outdoors is better."""
 MIN_SIZE = 0.3
@@ -51,7 +52,7 @@ class SetFit:
 
     Attributes:
         gain: Gain in log likelihood.
-        sizes: Size of each parameter, as a difference from neutral, `(P,)`.
+        sizes: Size of each number, as a difference from neutral, `(P,)`.
         covariance: Of the sizes, `(P, P)`.
     """
 
@@ -61,293 +62,291 @@ class SetFit:
 
 
 @dataclass(frozen=True)
-class _GeometryError:
-    """One error: an effect on one joint or of the whole machine; `columns` `(D, P)` per unit."""
+class _GeometryNumber:
+    """A number of an effect on one joint; `None`: of the whole machine."""
 
     kind: EffectType
+    name: str
     joint: int | None
-    names: tuple[str, ...]
+
+    @property
+    def typical(self) -> float:
+        """Its typical size, positive."""
+        return abs(self.kind.size_on(self.name, self.joint))
+
+
+@dataclass(frozen=True, eq=False)
+class _GeometryError:
+    """One error: the numbers of an effect on one joint or of the whole machine; `columns` `(D, P)` per unit."""
+
+    numbers: tuple[_GeometryNumber, ...]
     columns: np.ndarray
+
+    @property
+    def kind(self) -> EffectType:
+        """The effect."""
+        return self.numbers[0].kind
 
 
 def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
     """Return whether there are enough measured tool points, of a machine with known geometry."""
     if not machine.has_bodies:
         return False
-    given = [
-        np.isfinite(np.stack([r.extra[column] for column in TOOL_COLUMNS])).all(0).sum() / r.rate_hz
-        for r in recordings
-        if _is_measured(r)
-    ]
-    return sum(given) >= MIN_SECONDS
+    total_s = 0.0
+    for one in recordings:
+        if _is_measured(one):
+            total_s += np.isfinite(_stack_tool_points(one)).all(1).sum() / one.rate_hz
+    return total_s >= MIN_SECONDS
 
 
 def find_geometry_errors(
     case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
 ) -> list[DetectedEffect]:
     """Return the errors of geometry and encoders that the measured tool points show."""
-    field, reference, machine = case.field, case.reference, case.machine
-    if not is_tracked(field, machine):
+    machine = case.machine
+    if not is_tracked(case.field, machine):
         return []
-    kinds = [
-        k
-        for k in kinds
-        if not k.target.stochastic
-        and k.target.smooth
-        and k.target.side in ("kinematics", "measurement")
-    ]
-    q, off, ways = _measure_errors(field, machine)
-    causes = _list_errors(kinds, q, ways, machine)
+    field = _TrackedPoints(case.field, machine)
+    causes = field.list_errors([kind for kind in kinds if _is_geometric(kind)])
     everything = np.concatenate([cause.columns for cause in causes], 1)
-    left = off - everything @ np.linalg.lstsq(everything, off, rcond=1e-9)[0]
+    left = field.off - everything @ np.linalg.lstsq(everything, field.off, rcond=1e-9)[0]
     size_m = max(MIN_NOISE_M, float(np.std(left)))
-    if is_tracked(reference, machine):
-        size_m = max(size_m, float(np.std(_measure_errors(reference, machine)[1])))
-    straight, chosen = off, ()
-    for _ in range(NUM_ROUNDS):  # errors act linearly about the sizes of the round before
-        fits, worth = _score_sets(causes, straight, size_m, price, name_price)
-        before, chosen = chosen, max(worth, key=worth.__getitem__)
-        if chosen in ((), before):
-            break
-        values = _split(causes, chosen, fits[chosen].sizes)
-        bent = [
-            _compute_nonlinearity(causes[c], own, q, machine)
-            for c, own in zip(chosen, values, strict=True)
-        ]
-        straight = off - _remove_timing(np.sum(bent, 0), ways)
-    large = _select_relevant(causes, chosen, fits, size_m, len(off))
-    names = dict.fromkeys(causes[c].kind.name for c in large)
-    return [_describe_effect(name, large, causes, fits, worth, machine) for name in names]
-
-
-def _select_relevant(
-    causes: Sequence[_GeometryError],
-    chosen: tuple[int, ...],
-    fits: Mapping[tuple[int, ...], SetFit],
-    size_m: float,
-    count: int,
-) -> tuple[int, ...]:
-    """Return those of the errors `chosen` that matter: large, and beyond what instruments err by.
-
-    Args:
-        causes: All errors.
-        chosen: Places of the errors that were chosen together.
-        fits: Fits of all sets of errors.
-        size_m: Noise of tool points for which gains were computed, m; an error explains as much
-            beside the others.
-        count: Coordinates, `D`.
-    """
-    relevant = []
-    if not chosen:
-        return ()
-    for c, own in zip(chosen, _split(causes, chosen, fits[chosen].sizes), strict=True):
-        rest = tuple(one for one in chosen if one != c)
-        gain = fits[chosen].gain - fits[rest].gain
-        # undoes the scale of `_fit`: a gain is a sum of squares over 2 * 3 * size_m ** 2
-        explained_m = np.sqrt(max(gain, 0.0) * 6.0 * size_m**2 / count)
-        if _measure_size(causes[c], own) >= MIN_SIZE and explained_m >= MIN_RATIO * size_m:
-            relevant.append(c)
-    return tuple(relevant)
-
-
-def _score_sets(
-    causes: Sequence[_GeometryError],
-    off: np.ndarray,
-    size_m: float,
-    price: float,
-    name_price: float,
-) -> tuple[dict[tuple[int, ...], SetFit], dict[tuple[int, ...], float]]:
-    """Return the fits of all sets of errors, and their gains less the penalties."""
-    fits: dict[tuple[int, ...], SetFit] = {(): SetFit(0.0, np.zeros(0), np.zeros((0, 0)))}
-    worth: dict[tuple[int, ...], float] = {(): 0.0}
-    for count in range(1, MAX_ERRORS + 1):
-        for chosen in combinations(range(len(causes)), count):
-            fits[chosen] = _fit([causes[c] for c in chosen], off, size_m)
-            names = {causes[c].kind.name for c in chosen}
-            worth[chosen] = fits[chosen].gain - price * count - name_price * len(names)
-    return fits, worth
-
-
-def _describe_effect(
-    name: str,
-    best: tuple[int, ...],
-    causes: Sequence[_GeometryError],
-    fits: Mapping[tuple[int, ...], SetFit],
-    worth: Mapping[tuple[int, ...], float],
-    machine: Machine,
-) -> DetectedEffect:
-    gain, values, covariance = fits[best].gain, fits[best].sizes, fits[best].covariance
-    deviation, parameters, mask, place = (
-        np.sqrt(np.diag(covariance)),
-        {},
-        np.zeros(machine.num_joints, dtype=bool),
-        0,
-    )
-    kind = next(causes[c].kind for c in best if causes[c].kind.name == name)
-    for c in best:
-        cause = causes[c]
-        for number in cause.names:
-            if cause.kind is kind:
-                mean, half = kind.numbers[number].none + values[place], 1.96 * deviation[place]
-                joint = "machine" if cause.joint is None else machine.joint_names[cause.joint]
-                estimate = Estimate(float(mean), (float(mean - half), float(mean + half)))
-                parameters.setdefault(number, {})[joint] = estimate
-                mask[slice(None) if cause.joint is None else cause.joint] = True
-            place += 1
-    mine = tuple(c for c in best if causes[c].kind is kind)
-    rest = tuple(c for c in best if c not in mine)
-    own = gain - fits[rest].gain
-    without = max(
-        value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
-    )
-    closed = float(np.clip(own / max(gain, 1e-9), 0.0, 1.0))
-    return DetectedEffect(kind, mask, parameters, worth[best] - without, own, closed)
-
-
-def _list_errors(
-    kinds: Sequence[EffectType], q: np.ndarray, ways: np.ndarray, machine: Machine
-) -> list[_GeometryError]:
-    """Return the errors that move the tool point at all, other than along the ways that it goes."""
-    plain, found = _compute_tool_points(None, {}, q, machine), []
-    for kind in kinds:
-        joined = all(not kind.numbers[name].per_joint for name in kind.fitted)
-        for joint in [None] if joined else range(machine.num_joints):
-            columns = []
-            for name in kind.fitted:
-                step = DIFFERENCE_STEP * kind.size_on(name, joint)
-                moved = (
-                    _compute_tool_points(
-                        kind,
-                        {name: _shift_from_neutral(kind, name, joint, step, machine)},
-                        q,
-                        machine,
-                    )
-                    - plain
-                )
-                columns.append(_remove_timing(moved.ravel() / step, ways))
-            column = np.stack(columns, 1)
-            if np.abs(column).max() > 1e-6:
-                found.append(_GeometryError(kind, joint, kind.fitted, column))
+    if is_tracked(case.reference, machine):
+        size_m = max(size_m, float(np.std(_TrackedPoints(case.reference, machine).off)))
+    sets = _ErrorSets(field, causes, size_m, price, name_price)
+    named = sets.choose()
+    fit = field.refine(named, size_m)
+    found = []
+    for kind in dict.fromkeys(cause.kind for cause in named):
+        rest = tuple(cause for cause in named if cause.kind is not kind)
+        gain = sets.gains[named] - sets.gains[rest]
+        without = [w for some, w in sets.worth.items() if all(one.kind is not kind for one in some)]
+        joints, parameters = _describe_numbers(kind, named, fit, machine)
+        closed = float(np.clip(gain / max(sets.gains[named], 1e-9), 0.0, 1.0))
+        net = sets.worth[named] - max(without)
+        found.append(DetectedEffect(kind, joints, parameters, net, gain, closed))
     return found
 
 
-def _shift_from_neutral(
-    kind: EffectType, name: str, joint: int | None, by: float, machine: Machine
-) -> np.ndarray:
-    """Return a parameter `by` above neutral on one joint or on all, `(J,)` or `(1,)`."""
-    value = np.full(
-        machine.num_joints if kind.numbers[name].per_joint else 1,
-        kind.numbers[name].none,
-        dtype=float,
-    )
-    value[slice(None) if joint is None else joint] += by
-    return value
+class _ErrorSets:
+    """All sets of errors, with what each earns.
+
+    Args:
+        field: The tool points.
+        causes: The errors.
+        size_m: Noise of tool points, m.
+        price: Cost of an error.
+        name_price: Cost of an effect, on however many joints.
+    """
+
+    def __init__(
+        self,
+        field: _TrackedPoints,
+        causes: Sequence[_GeometryError],
+        size_m: float,
+        price: float,
+        name_price: float,
+    ) -> None:
+        self._field, self._causes, self._size_m = field, causes, size_m
+        self._price, self._name_price = price, name_price
+        self.gains: dict[tuple[_GeometryError, ...], float] = {(): 0.0}
+        """Gain in log likelihood."""
+        self.worth = dict(self.gains)
+        """The same less all costs."""
+
+    def choose(self) -> tuple[_GeometryError, ...]:
+        """Return the errors of the best set that matter: large, and beyond what instruments err by."""
+        straight, best = self._field.off, ()
+        for _ in range(NUM_ROUNDS):
+            self._weigh(straight)
+            before, best = best, max(self.worth, key=self.worth.__getitem__)
+            if best in ((), before):
+                break
+            straight = self._field.straighten(best, self._size_m)
+        fit = self._field.refine(best, self._size_m)
+        found = []
+        for cause in best:
+            rest = tuple(other for other in best if other is not cause)
+            # Undoes the scale of `_solve`: a gain is a sum of squares over 2 * 3 * size_m ** 2.
+            gain = max(self.gains[best] - self.gains[rest], 0.0)
+            explained_m = np.sqrt(6.0 * gain * self._size_m**2 / len(self._field.off))
+            sizes = _select_sizes(cause, best, fit)[0]
+            share = max(abs(s) / n.typical for s, n in zip(sizes, cause.numbers, strict=True))
+            if share >= MIN_SIZE and explained_m >= MIN_RATIO * self._size_m:
+                found.append(cause)
+        return tuple(found)
+
+    def _weigh(self, off: np.ndarray) -> None:
+        """Set what all sets earn on errors of tool points `(D,)`."""
+        for count in range(1, MAX_ERRORS + 1):
+            for some in combinations(self._causes, count):
+                self.gains[some] = _fit_set(some, off, self._size_m).gain
+                names = {cause.kind.name for cause in some}
+                cost = self._price * count + self._name_price * len(names)
+                self.worth[some] = self.gains[some] - cost
 
 
-def _compute_nonlinearity(
-    cause: _GeometryError, values: np.ndarray, q: np.ndarray, machine: Machine
-) -> np.ndarray:
-    """Return the displacement by an error beyond the linear one, `(D,)`."""
-    given = {
-        n: _shift_from_neutral(cause.kind, n, cause.joint, value, machine)
-        for n, value in zip(cause.names, values, strict=True)
-    }
-    steps = {n: DIFFERENCE_STEP * cause.kind.size_on(n, cause.joint) for n in cause.names}
-    small = [
-        _compute_tool_points(
-            cause.kind,
-            {n: _shift_from_neutral(cause.kind, n, cause.joint, by, machine)},
-            q,
-            machine,
-        )
-        for n, by in steps.items()
-    ]
-    plain = _compute_tool_points(None, {}, q, machine)
-    line = sum(
-        (
-            value / by * (one - plain)
-            for value, by, one in zip(values, steps.values(), small, strict=True)
-        ),
-        np.zeros(()),
-    )
-    return (_compute_tool_points(cause.kind, given, q, machine) - plain - line).ravel()
+def _is_geometric(kind: EffectType) -> bool:
+    sides = ("kinematics", "measurement")
+    return kind.target.side in sides and kind.target.smooth and not kind.target.stochastic
 
 
-def _remove_timing(off: np.ndarray, ways: np.ndarray) -> np.ndarray:
-    """Return errors `(D,)` without their part along the ways `(D, 2)` that the tool point goes.
+def _select_sizes(
+    cause: _GeometryError, named: Sequence[_GeometryError], fit: SetFit
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return sizes and standard errors of one error of a fitted set, `(P,)` each."""
+    place = named.index(cause)
+    first = sum(len(one.numbers) for one in named[:place])
+    rows = slice(first, first + len(cause.numbers))
+    return fit.sizes[rows], np.sqrt(np.diag(fit.covariance))[rows]
+
+
+def _describe_numbers(
+    kind: EffectType, named: Sequence[_GeometryError], fit: SetFit, machine: Machine
+) -> tuple[np.ndarray, dict[str, dict[str, Estimate]]]:
+    """Return which joints have an effect, `(J,)` bool, and its numbers by name and joint or `machine`."""
+    joints = np.zeros(machine.num_joints, dtype=bool)
+    parameters: dict[str, dict[str, Estimate]] = {}
+    for cause in named:
+        if cause.kind is not kind:
+            continue
+        sizes, errors = _select_sizes(cause, named, fit)
+        for number, size, error in zip(cause.numbers, sizes, errors, strict=True):
+            mean, half = float(kind.numbers[number.name].none + size), 1.96 * float(error)
+            joint = "machine" if number.joint is None else machine.joint_names[number.joint]
+            own = parameters.setdefault(number.name, {})
+            own[joint] = Estimate(mean, (mean - half, mean + half))
+            joints[slice(None) if number.joint is None else number.joint] = True
+    return joints, parameters
+
+
+class _TrackedPoints:
+    """Measured tool points, once a second, and those that forward kinematics gives.
 
     Instruments beside the machine have a clock of their own: a period between them and the encoders
-    moves the tool by centimetres.
+    moves the tool by centimetres. Errors along the way that the tool point goes are therefore left out.
+
+    Args:
+        recordings: The recordings.
+        machine: The machine.
     """
-    return off - ways @ np.linalg.lstsq(ways, off, rcond=1e-9)[0]
+
+    def __init__(self, recordings: Sequence[Recording], machine: Machine) -> None:
+        self.machine = machine
+        having = [r for r in recordings if _is_measured(r)]
+        every = max(1, round(having[0].rate_hz))
+        q, errors, ways = [], [], []
+        for recording in having:
+            seen = _stack_tool_points(recording)[::every]
+            points = _compute_tool_points({}, recording.q, machine)
+            step = np.diff(points, axis=0)
+            none = np.zeros((1, 3))
+            way = np.stack([np.concatenate([none, step]), np.concatenate([step, none])], -1)
+            given = np.isfinite(seen).all(1)
+            q.append(recording.q[::every][given].astype(float))
+            errors.append((seen - points[::every])[given])
+            ways.append(way[::every][given])
+        self._q = np.concatenate(q)
+        self._ways = np.concatenate(ways).reshape(-1, 2)
+        self._plain = _compute_tool_points({}, self._q, machine)
+        self.off = self._remove_timing(np.concatenate(errors).ravel())
+        """Errors of the tool points, `(D,)`, m."""
+
+    def _remove_timing(self, off: np.ndarray) -> np.ndarray:
+        return off - self._ways @ np.linalg.lstsq(self._ways, off, rcond=1e-9)[0]
+
+    def _displace(self, numbers: Sequence[_GeometryNumber], sizes: np.ndarray) -> np.ndarray:
+        """Return how far errors of these sizes move the tool points, `(D,)`."""
+        effects: dict[EffectType, dict[str, np.ndarray]] = {}
+        for number, size in zip(numbers, sizes, strict=True):
+            kind, facts = number.kind, number.kind.numbers[number.name]
+            count = self.machine.num_joints if facts.per_joint else 1
+            values = effects.setdefault(kind, {})
+            row = values.setdefault(number.name, np.full(count, facts.none, dtype=float))
+            row[slice(None) if number.joint is None else number.joint] += size
+        moved = _compute_tool_points(effects, self._q, self.machine) - self._plain
+        return self._remove_timing(moved.ravel())
+
+    def _differentiate(self, numbers: Sequence[_GeometryNumber], sizes: np.ndarray) -> np.ndarray:
+        """Return the displacement per unit of each number around these sizes, `(D, P)`."""
+        columns, before = [], self._displace(numbers, sizes)
+        for place, number in enumerate(numbers):
+            step = np.zeros(len(numbers))
+            step[place] = DIFFERENCE_STEP * number.typical
+            columns.append((self._displace(numbers, sizes + step) - before) / step[place])
+        return np.stack(columns, 1)
+
+    def list_errors(self, kinds: Sequence[EffectType]) -> list[_GeometryError]:
+        """Return the errors that move the tool point at all, other than along the ways that it goes."""
+        found = []
+        for kind in kinds:
+            is_joined = all(not kind.numbers[name].per_joint for name in kind.fitted)
+            for joint in [None] if is_joined else range(self.machine.num_joints):
+                numbers = tuple(_GeometryNumber(kind, name, joint) for name in kind.fitted)
+                columns = self._differentiate(numbers, np.zeros(len(numbers)))
+                if np.abs(columns).max() > 1e-6:
+                    found.append(_GeometryError(numbers, columns))
+        return found
+
+    def straighten(self, causes: Sequence[_GeometryError], size_m: float) -> np.ndarray:
+        """Return the errors of the tool points as if these causes acted in proportion to their sizes, `(D,)`."""
+        numbers = [number for cause in causes for number in cause.numbers]
+        columns = np.concatenate([cause.columns for cause in causes], 1)
+        sizes = self.refine(causes, size_m).sizes
+        return self.off - self._displace(numbers, sizes) + columns @ sizes
+
+    def refine(self, causes: Sequence[_GeometryError], size_m: float) -> SetFit:
+        """Return the fit of a set of errors as they act on the machine, by Gauss's and Newton's method."""
+        numbers = [number for cause in causes for number in cause.numbers]
+        fit = SetFit(0.0, np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers))))
+        for _ in range(NUM_ROUNDS if numbers else 0):
+            columns = self._differentiate(numbers, fit.sizes)
+            straight = self.off - self._displace(numbers, fit.sizes) + columns @ fit.sizes
+            fit = _solve(numbers, columns, straight, size_m)
+        return fit
 
 
-def _fit(causes: Sequence[_GeometryError], off: np.ndarray, size_m: float) -> SetFit:
-    """Fit a set of errors by least squares with a normal prior."""
-    x = np.concatenate([cause.columns for cause in causes], 1)
-    unit = np.concatenate(
-        [[abs(one.kind.size_on(name, one.joint)) for name in one.names] for one in causes]
-    )
-    # instruments err together for a while: a sample a second counts as a third of one
-    normal = x.T @ x / size_m**2 / 3.0 + np.diag(1.0 / (3.0 * unit) ** 2)
+def _fit_set(causes: Sequence[_GeometryError], off: np.ndarray, size_m: float) -> SetFit:
+    """Return the fit of a set of errors that act in proportion to their sizes."""
+    numbers = [number for cause in causes for number in cause.numbers]
+    return _solve(numbers, np.concatenate([cause.columns for cause in causes], 1), off, size_m)
+
+
+def _solve(
+    numbers: Sequence[_GeometryNumber], columns: np.ndarray, off: np.ndarray, size_m: float
+) -> SetFit:
+    """Return the sizes by least squares with a normal prior."""
+    typical = np.array([number.typical for number in numbers])
+    # Instruments err together for a while: a sample a second counts as a third of one.
+    normal = columns.T @ columns / size_m**2 / 3.0 + np.diag(1.0 / (3.0 * typical) ** 2)
     covariance = np.linalg.inv(normal)
-    values = covariance @ (x.T @ off) / size_m**2 / 3.0
-    left = off - x @ values
+    sizes = covariance @ (columns.T @ off) / size_m**2 / 3.0
+    left = off - columns @ sizes
     gain = float((off @ off - left @ left) / 2.0 / size_m**2 / 3.0)
-    return SetFit(gain, values, covariance)
-
-
-def _split(
-    causes: Sequence[_GeometryError], chosen: Sequence[int], values: np.ndarray
-) -> list[np.ndarray]:
-    return np.split(values, np.cumsum([len(causes[c].names) for c in chosen])[:-1])
-
-
-def _measure_size(cause: _GeometryError, values: np.ndarray) -> float:
-    return max(
-        abs(value / cause.kind.size_on(name, cause.joint))
-        for name, value in zip(cause.names, values, strict=True)
-    )
-
-
-def _measure_errors(
-    recordings: Sequence[Recording], machine: Machine
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return positions `(S, J)`, errors of the tool points `(D,)`, and how they travel `(D, 2)`, once a second.
-
-    Errors along the way that the tool goes are left out.
-    """
-    having = [r for r in recordings if _is_measured(r)]
-    every = max(1, round(having[0].rate_hz))
-    q, errors, ways = [], [], []
-    for recording in having:
-        seen = np.stack([recording.extra[column] for column in TOOL_COLUMNS], 1)[::every]
-        points = _compute_tool_points(None, {}, recording.q, machine)
-        step = np.diff(points, axis=0)
-        none = np.zeros((1, 3))
-        way = np.stack([np.concatenate([none, step]), np.concatenate([step, none])], -1)
-        given = np.isfinite(seen).all(1)
-        q.append(recording.q[::every][given].astype(float))
-        errors.append((seen - points[::every])[given])
-        ways.append(way[::every][given])
-    both = np.concatenate(ways).reshape(-1, 2)
-    return np.concatenate(q), _remove_timing(np.concatenate(errors).ravel(), both), both
+    return SetFit(gain, sizes, covariance)
 
 
 def _is_measured(recording: Recording) -> bool:
     return all(column in recording.extra for column in TOOL_COLUMNS)
 
 
+def _stack_tool_points(recording: Recording) -> np.ndarray:
+    """Return the measured tool points, `(T, 3)`."""
+    return np.stack([recording.extra[column] for column in TOOL_COLUMNS], 1)
+
+
 def _compute_tool_points(
-    kind: EffectType | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
+    effects: Mapping[EffectType, Mapping[str, np.ndarray]], q: np.ndarray, machine: Machine
 ) -> np.ndarray:
-    """Return where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
+    """Return where the tool point is at measured positions, with some effects, `(S, 3)`."""
     at, device = torch.as_tensor(q, dtype=torch.float32), torch.device("cpu")
-    kinematics = Kinematics(machine, device)
-    if kind is None:
-        return kinematics.pose(at).tip_in_base_m.numpy().astype(float)
-    model = kind.wrap(Hold(), machine, len(q), device)
-    for name, value in values.items():
-        model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
+    pose = Kinematics(machine, device).pose
+    if not effects:
+        return pose(at).tip_in_base_m.numpy().astype(float)
+    model: Any = Hold()
+    for kind in sorted(effects, key=lambda one: one.order):
+        model = kind.wrap(model, machine, len(q), device)
+        for name, value in effects[kind].items():
+            model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
     true = model.truth(at)
-    return model.tool(kinematics.pose(true).tip_in_base_m, true).numpy().astype(float)
+    return model.tool(pose(true).tip_in_base_m, true).numpy().astype(float)

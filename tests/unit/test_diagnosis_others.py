@@ -13,7 +13,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library, geometry, sensors
 from diagnosis.case import GapCase
-from diagnosis.effect_library import estimate_interval
+from diagnosis.effect_library import DetectedEffect, estimate_interval
 from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.side import stack_side
 
@@ -75,34 +75,34 @@ def tracked(
     )
 
 
+def find(machine: Machine, reference: Recording, field: Recording) -> list[DetectedEffect]:
+    """Returns the errors of geometry that a field shows."""
+    kinds = effect_library.load_effects(machine)
+    return geometry.find_geometry_errors(GapCase(machine, [reference], [field]), kinds, 8.0, 12.0)
+
+
 def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Machine) -> None:
     none, bias = np.zeros(5), np.array([0.0, 0.0, 0.015, 0.0, 0.0])
     reference = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 6)
-    kinds = effect_library.load_effects(machine)
     biased, tilted = (
         tracked(swept(machine, 120.0, 7), machine, b, tilt, 8)
         for b, tilt in ((bias, 0.0), (none, 0.03))
     )
-    one = geometry.find_geometry_errors(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    one = find(machine, reference, biased)
     assert [found.kind.name for found in one] == ["encoder_bias"]
     assert one[0].parameters["bias_rad"]["q3"].mean == pytest.approx(0.015, abs=0.002)
-    other = geometry.find_geometry_errors(GapCase(machine, [reference], [tilted]), kinds, 8.0, 12.0)
+    other = find(machine, reference, tilted)
     assert [found.kind.name for found in other] == ["base_tilt"]
     assert other[0].parameters["roll_rad"]["machine"].mean == pytest.approx(0.03, abs=0.003)
-    assert not geometry.find_geometry_errors(
-        GapCase(machine, [reference], [reference]), kinds, 8.0, 12.0
-    )
+    assert not find(machine, reference, reference)
     # two milliradians are seen, explained, and not worth a name; nothing else is named in their
     # place
-    faint = geometry.find_geometry_errors(
-        GapCase(
-            machine, [reference], [tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)]
-        ),
-        kinds,
-        8.0,
-        12.0,
-    )
-    assert not faint
+    faint = tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)
+    assert not find(machine, reference, faint)
+    # What a tilt and a zero do to a point is more than the sum of both.
+    found = find(machine, reference, tracked(swept(machine, 120.0, 7), machine, 2 * bias, 0.05, 8))
+    (roll,) = [one.parameters["roll_rad"]["machine"] for one in found if len(one.parameters) == 2]
+    assert roll.ci95[0] <= 0.05 <= roll.ci95[1]
 
 
 def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine: Machine) -> None:
@@ -120,21 +120,18 @@ def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine:
         late(tracked(swept(machine, 120.0, seed), machine, b, 0.0, seed))
         for seed, b in ((5, none), (7, none), (7, bias))
     )
-    kinds = effect_library.load_effects(machine)
-    one = geometry.find_geometry_errors(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    one = find(machine, reference, biased)
     assert [found.kind.name for found in one] == ["encoder_bias"]
     assert one[0].joints.tolist() == [False, False, False, True, False]
     assert one[0].parameters["bias_rad"]["q4"].mean == pytest.approx(0.012, abs=0.001)
     # the clock itself is no error of geometry, even where the reference is not late at all
     plain = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 5)
-    assert not geometry.find_geometry_errors(GapCase(machine, [plain], [field]), kinds, 8.0, 12.0)
+    assert not find(machine, plain, field)
 
 
 def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) -> None:
     one = swept(machine, 20.0, 9)
-    case = GapCase(machine, [one], [one])
-    kinds = effect_library.load_effects(machine)
-    assert not geometry.find_geometry_errors(case, kinds, 8.0, 12.0)
+    assert not find(machine, one, one)
 
 
 def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:
