@@ -12,7 +12,6 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -241,18 +240,17 @@ class DetectedEffect:
     gain: float
     closed: float
 
-    def values(self, count: int = 1) -> dict[str, np.ndarray]:
-        """Return the numbers of `count` candidates that all have the effect, each `(C, J)` or `(C, 1)`."""
+    def values(self) -> dict[str, np.ndarray]:
+        """Return its numbers, each `(J,)` or `(1,)`."""
         found = {}
         for name, estimates in self.parameters.items():
             if "machine" in estimates:
-                row = np.array([estimates["machine"].mean])
-            else:
-                number = self.kind.numbers[name]
-                off = self.kind.typical(name) if number.none is None else number.none
-                row = np.broadcast_to(off, len(self.joints)).astype(float)
-                row[self.joints] = [one.mean for one in estimates.values()]
-            found[name] = np.repeat(row[None], count, 0)
+                found[name] = np.array([estimates["machine"].mean])
+                continue
+            number = self.kind.numbers[name]
+            off = self.kind.typical(name) if number.none is None else number.none
+            found[name] = np.broadcast_to(off, len(self.joints)).astype(float)
+            found[name][self.joints] = [one.mean for one in estimates.values()]
         return found
 
 
@@ -288,7 +286,6 @@ class EffectSimulator:
         cut: FreeRunWindows.
         running_s: Time since the machine was started at the beginning of each window, `(W,)`.
         seed: Of the random numbers that stochastic effects draw.
-        fixed: Effects that all candidates have, with numbers `(1, J)`.
     """
 
     base: Actuator
@@ -296,35 +293,26 @@ class EffectSimulator:
     cut: FreeRunWindows
     running_s: np.ndarray
     seed: int
-    fixed: Sequence[tuple[EffectType, EffectValues]] = ()
 
     def simulate(
-        self,
-        effects: Sequence[tuple[EffectType, EffectValues]],
-        count: int = 1,
-        own: EffectValues = MappingProxyType({}),
+        self, effects: Sequence[tuple[EffectType, EffectValues]], count: int = 1
     ) -> np.ndarray:
         """Return measured positions of free runs, `(C, W, K, J)`.
 
         Args:
             effects: Effects with the numbers of each candidate.
             count: Number of candidates, `C`.
-            own: Numbers of the base itself that candidates change, of those in its `parameters`.
 
         Raises:
             BrokkError: the model ran into NaN.
         """
-        fixed = [
-            (kind, {name: np.repeat(value, count, 0) for name, value in values.items()})
-            for kind, values in self.fixed
-        ]
-        effects = sorted([*effects, *fixed], key=lambda one: one[0].order)
+        effects = sorted(effects, key=lambda one: one[0].order)
         found = np.empty((count, *self.cut.measured.shape), dtype=np.float32)
         at_once = max(1, BATCH_ROWS // len(self.cut.q))
         batches = [
             np.arange(start, min(start + at_once, count)) for start in range(0, count, at_once)
         ]
-        runs = map_parallel(lambda batch: self._run(effects, own, batch), batches)
+        runs = map_parallel(lambda batch: self._run(effects, batch), batches)
         for batch, paths in zip(batches, runs, strict=True):
             found[batch] = paths
         if not np.isfinite(found).all():
@@ -335,10 +323,7 @@ class EffectSimulator:
         return found
 
     def _run(
-        self,
-        effects: Sequence[tuple[EffectType, EffectValues]],
-        own: EffectValues,
-        candidates: np.ndarray,
+        self, effects: Sequence[tuple[EffectType, EffectValues]], candidates: np.ndarray
     ) -> np.ndarray:
         """Return the free runs of some candidates, `(C, W, K, J)`."""
         cut, windows, device = self.cut, len(self.cut.q), torch.device("cpu")
@@ -350,8 +335,6 @@ class EffectSimulator:
             # seeds of GPUs that nothing here uses, which takes longer than a step.
             torch.default_generator.manual_seed(self.seed + int(candidates[0]))
             model: Any = self.base.build(self.machine, count, device)
-            for name, value in own.items():
-                model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))
             for kind, values in effects:
                 model = kind.wrap(model, self.machine, count, device)
                 for name, value in values.items():
@@ -370,7 +353,7 @@ class EffectSimulator:
 
     @cached_property
     def plain_runs(self) -> np.ndarray:
-        """Free runs without any effect but the fixed ones, `(W, K, J)`."""
+        """Free runs without any effect, `(W, K, J)`."""
         return self.simulate([])[0]
 
     @cached_property
