@@ -225,10 +225,7 @@ def _build_answer(found: dict[str, Any]) -> Answer:
         )
     where = Where(
         joints,
-        tuple(
-            RegimeGap(one["joint"], one["regime"], one["share"])
-            for one in found["where"]["regimes"]
-        ),
+        tuple(RegimeGap(**one) for one in found["where"]["regimes"]),
         found["where"]["stage"],
         units,
     )
@@ -256,34 +253,23 @@ def _build_answer(found: dict[str, Any]) -> Answer:
 
 
 def _serialize_selected(one: Selected) -> dict[str, Any]:
-    return {
-        "effect": one.effect,
-        "joints": list(one.joints),
-        "probability": one.probability,
+    return _serialize_tuples(dataclasses.asdict(one)) | {
         "parameters": {
             name: {joint: serialize_estimate(value) for joint, value in values.items()}
             for name, values in one.parameters.items()
         },
-        "gap_closed": None if one.gap_closed is None else serialize_estimate(one.gap_closed),
-        "same_as": list(one.same_as),
-        "decided_by": one.decided_by,
-        "identified": one.identified,
-        "edit": one.edit,
+        "gap_closed": serialize_estimate(one.gap_closed),
     }
 
 
 def _read_selected(one: dict[str, Any]) -> Selected:
-    return Selected(
-        effect=one["effect"],
-        joints=tuple(one["joints"]),
-        probability=one["probability"],
-        parameters=_read_parameters(one["parameters"]),
-        gap_closed=read_estimate(one["gap_closed"]),
-        same_as=tuple(one["same_as"]),
-        decided_by=one.get("decided_by"),
-        identified=one.get("identified"),
-        edit=one.get("edit"),
-    )
+    read = {
+        "joints": tuple(one["joints"]),
+        "parameters": _read_parameters(one["parameters"]),
+        "gap_closed": read_estimate(one["gap_closed"]),
+        "same_as": tuple(one["same_as"]),
+    }
+    return Selected(**one | read)
 
 
 def _read_parameters(given: Mapping[str, Any]) -> dict[str, dict[str, Estimate]]:

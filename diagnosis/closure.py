@@ -66,13 +66,12 @@ class Gap:
             reference that of an ARX on field recordings that it was not fitted to, or of the
             repaired simulator; `None` where none is known.
         closed: `(before - after) / (before - floor)`; above 1 where `after` is below the floor, which
-            is an estimate and no bound; `None` together with `closed_reason`.
+            is an estimate and no bound; `None` where no effect is named.
         unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
             over their travel.
         floor_of: `reference` or `field`.
         joints: The same joint by joint.
-        reduced: `(before - after) / before`; `None`: computed from both, without an interval.
-        closed_reason: Why `closed` is `None`.
+        reduced: `(before - after) / before`.
     """
 
     before: float
@@ -83,27 +82,19 @@ class Gap:
     floor_of: str = "reference"
     joints: Mapping[str, JointClosed] = field(default_factory=dict)
     reduced: Estimate | None = None
-    closed_reason: str = ""
 
     @property
     def key(self) -> str:
         """Name of the errors in `diagnosis.json`."""
         return f"rmse_{self.unit}"
 
-    @property
-    def reduction(self) -> Estimate:
-        """`reduced`, or the bare number."""
-        share = (self.before - self.after) / max(self.before, 1e-12)
-        return self.reduced or Estimate(share, (share, share))
-
     def to_json(self) -> dict[str, Any]:
         """Return the field `gap` of `diagnosis.json`."""
         errors = {name: {self.key: getattr(self, name)} for name in ("before", "after", "floor")}
         return {
             **errors,
-            "closed": None if self.closed is None else serialize_estimate(self.closed),
-            "closed_reason": self.closed_reason or None,
-            "reduced": serialize_estimate(self.reduction),
+            "closed": serialize_estimate(self.closed),
+            "reduced": serialize_estimate(self.reduced),
             "floor_of": self.floor_of,
             "joints": {name: dataclasses.asdict(one) for name, one in self.joints.items()},
         }
@@ -113,7 +104,6 @@ def read_gap(given: Mapping[str, Any]) -> Gap:
     """Return the gap of a `diagnosis.json`; earlier ones have no `reduced`."""
     key = next(iter(given["before"]))
     before, after, floor = (given[name][key] for name in ("before", "after", "floor"))
-    reduced = read_estimate(given.get("reduced"))
     return Gap(
         before,
         after,
@@ -122,13 +112,14 @@ def read_gap(given: Mapping[str, Any]) -> Gap:
         key.removeprefix("rmse_"),
         given.get("floor_of", "reference"),
         {name: JointClosed(**one) for name, one in given.get("joints", {}).items()},
-        reduced if reduced and reduced.has_interval else None,
-        given.get("closed_reason") or "",
+        read_estimate(given.get("reduced")),
     )
 
 
-def serialize_estimate(value: Estimate) -> dict[str, Any]:
+def serialize_estimate(value: Estimate | None) -> dict[str, Any] | None:
     """Return a number as plain JSON data; `ci95` is null where no interval could be computed."""
+    if value is None:
+        return None
     found = {"mean": value.mean, "ci95": list(value.ci95) if value.has_interval else None}
     return found | ({"at_bound": True} if value.at_bound else {})
 

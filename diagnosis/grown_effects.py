@@ -17,8 +17,6 @@ SIZES = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0, 7.0)
 """Sizes that are tried, over the typical one; less is within what a machine repeats."""
 SHAPES = (0.35, 0.6, 1.0, 1.7)
 """Values of a number that only shapes an effect, over the typical one."""
-FACTORS = (0.5, 0.7, 0.85, 0.93, 1.0, 1.07, 1.18, 1.4, 2.0)
-"""Factors on a number by which it is fitted first."""
 DAMPINGS = (1e-4, 1e-2, 0.3, 10.0)
 
 
@@ -41,6 +39,14 @@ class GrownEffect:
     def repeat(self, count: int) -> dict[str, np.ndarray]:
         """Return its numbers for some candidates, `(C, J)` or `(C, 1)` each."""
         return {name: np.repeat(value[None], count, 0) for name, value in self.values.items()}
+
+    def count_numbers(self) -> int:
+        """Return how many numbers make the effect; one that joints share counts once."""
+        count = 0
+        for name in self.kind.fitted:
+            value = self.values[name]
+            count += len(np.unique(value[value != self.kind.numbers[name].none]))
+        return count
 
     def summarise(self) -> EffectFinding:
         """Return its name and its joints, and what it earned."""
@@ -99,23 +105,6 @@ def _place(
     for name, factor in shape.items():
         found[name] = kind.clipped(name, factor * kind.typical(name))
     return found
-
-
-def list_trials(one: GrownEffect, name: str) -> np.ndarray:
-    """Return values of a number that are tried around its present one, `(C, J)` or `(C, 1)`."""
-    kind, value = one.kind, one.values[name]
-    none = kind.numbers[name].none
-    if none is None:
-        tried = np.array(FACTORS)[:, None] * value
-        return kind.clipped(name, tried)
-    off = value - none
-    sizes = kind.size(name)
-    steps = []
-    for factor in FACTORS:
-        # One that is not there may begin either way.
-        small = (2.0 * factor - 2.0) * 0.5 * sizes
-        steps.append(np.where(off == 0.0, small, factor * off))
-    return kind.clipped(name, none + np.stack(steps))
 
 
 @dataclass(frozen=True)
@@ -187,21 +176,6 @@ class NumberSlopes:
                     change = np.array([move[where] for move in moves]) * self.steps[number][own]
                     rows[:, own] = effects[place].values[name][own] + change
             found[place, name] = kind.clipped(name, rows)
-        return found
-
-    def follow(self, errors: np.ndarray, effects: Sequence[GrownEffect]) -> np.ndarray:
-        """Return errors `(C, E, J)` less what the numbers of the effects can explain of them."""
-        found = errors.copy()
-        for j, row in enumerate(self._list_unknowns(effects)):
-            if not row:
-                continue
-            columns = self.changes[[number for number, _ in row], :, j]
-            left = np.abs(self.errors[:, j])
-            weight = 1.0 / np.maximum(left, max(float(left.mean()), 1e-12))
-            normal = (columns * weight) @ columns.T
-            normal += np.diag(DAMPINGS[0] * np.diag(normal) + 1e-9)
-            shares = np.linalg.solve(normal, (columns * weight) @ errors[..., j].T)
-            found[..., j] -= shares.T @ columns
         return found
 
     def estimate_deviations(

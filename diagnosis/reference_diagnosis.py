@@ -5,7 +5,7 @@ Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -22,16 +22,18 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import gates, geometry, sensors
-from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected
+from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, Verdict
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.engine.decide import Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import SIGMAS, describe_numbers
-from diagnosis.repair_proof import EngineProof
+from diagnosis.repair_proof import EngineProof, RepairProof
 from diagnosis.where import find_stage, locate_gap
 
+SizesByName = Mapping[str, Mapping[str, Estimate]]
+"""Sizes by number and joint, or `machine`."""
 ProgressCallback = Callable[[str, float], None]
 """Receives the name of a step and the share of the whole that is done."""
 DIRECT_NATS = 4.0
@@ -67,8 +69,8 @@ class NamedEffect:
 
 
 @dataclass(frozen=True)
-class ReferenceDiagnosis:
-    """A diagnosis of a machine of which earlier recordings are known.
+class Diagnosis:
+    """What every diagnosis does, however it finds effects.
 
     Attributes:
         case: The recordings.
@@ -82,12 +84,75 @@ class ReferenceDiagnosis:
     thresholds: InspectionThresholds
     generator: np.random.Generator
 
+    @cached_property
+    def remarks(self) -> list[RecordingRemark]:
+        """Findings about the field's recordings."""
+        return examine_recordings(self.case.field, self.case.machine, self.thresholds)
+
+    def judge_recordings(self) -> list[Gate]:
+        """Return the gates of the recordings."""
+        case = self.case
+        known = examine_recordings(case.reference, case.machine, self.thresholds)
+        return gates.judge_recordings(self.remarks, known, case.field, case.reference, case.machine)
+
+    def describe_simulated(
+        self, kind: str, one: EffectFinding, numbers: SizesByName, proof: RepairProof
+    ) -> Selected:
+        """Return the answer about an effect `kind` of the registry that was simulated."""
+        part = proof.parts.get(one.effect)
+        like, decided_by = list_alike(kind, one.joints, self.case, self.kinds)
+        return Selected(
+            effect=kind,
+            joints=name_joints(one.joints, self.case.machine),
+            probability=estimate_probability(one.nats),
+            parameters=numbers,
+            gap_closed=None if part is None else part["closed"],
+            same_as=like,
+            decided_by=decided_by,
+            identified=None if part is None else part["identified"],
+            edit=None if part is None else part["edit"],
+        )
+
+    def build_outcome(
+        self,
+        verdict: Verdict,
+        selected: Sequence[Selected],
+        rivals: Sequence[EffectFinding],
+        proof: RepairProof,
+        told: Sequence[Gate],
+        reason: str,
+        evidence: Mapping[str, Any],
+    ) -> Outcome:
+        """Return the outcome of effects that are `selected`, with what else was weighed."""
+        machine = self.case.machine
+        before, floor = proof.view(proof.before), proof.view_floor()
+        weighed = {"rivals": describe_rivals(rivals, machine), "unit": "log likelihood"}
+        answer = Answer(
+            verdict=verdict,
+            selected=tuple(selected),
+            ranking=rank_effects(selected, rivals, verdict, machine),
+            where=locate_gap(before, floor, machine, find_stage(selected, self.kinds)),
+            gap=proof.measure_gap(bool(selected)),
+            rivals=proof.rivals,
+            gates=tuple(told),
+            next_experiment=propose_measurement(selected),
+            reason=reason,
+            more={
+                "sanity": [remark.plain() for remark in self.remarks],
+                "evidence": {**weighed, **evidence},
+            },
+        )
+        return Outcome(answer, before, proof.view(proof.after) if selected else None, floor)
+
+
+class ReferenceDiagnosis(Diagnosis):
+    """A diagnosis of a machine of which earlier recordings are known."""
+
     def run(self, tell: ProgressCallback) -> Outcome:
         """Return the outcome; `tell` receives the name and the progress of each step."""
         case, machine = self.case, self.case.machine
         tell("recordings", 0.05)
-        known = examine_recordings(case.reference, machine, self.thresholds)
-        told = gates.judge_recordings(self.remarks, known, case.field, case.reference, machine)
+        told = self.judge_recordings()
         tell("sensors and tool points", 0.1)
         detected = self._detect()
         tell("fitting the reference", 0.2)
@@ -109,7 +174,12 @@ class ReferenceDiagnosis:
             decision = replace(decision, verdict="unknown", named=())
             named = [one for one in named if one.finding is None]
             proof = EngineProof(case, decider, [], self.generator)
-        return self._build_outcome(decision, named, proof, (*told, *judged), failed)
+        selected = [self._describe(one, proof) for one in sorted(named, key=_get_nats)]
+        verdict = "effects" if selected else decision.verdict
+        reason = _explain(verdict, selected, decision, failed)
+        told = (*told, *judged)
+        evidence = _describe_evidence(decision)
+        return self.build_outcome(verdict, selected, decision.rivals, proof, told, reason, evidence)
 
     def _detect(self) -> list[DetectedEffect]:
         """Return the effects that tool points and the scatter of samples show."""
@@ -150,11 +220,6 @@ class ReferenceDiagnosis:
         return found
 
     @cached_property
-    def remarks(self) -> list[RecordingRemark]:
-        """Findings about the field's recordings."""
-        return examine_recordings(self.case.field, self.case.machine, self.thresholds)
-
-    @cached_property
     def clock_late_s(self) -> float:
         """By how much the encoders lag behind the tool tracker more than on the reference, s; 0 within its own wandering."""
         now = measure_clock_shift(self.case.field, self.case.machine)
@@ -163,37 +228,6 @@ class ReferenceDiagnosis:
             return 0.0
         late_s = now - (then or 0.0)
         return late_s if abs(late_s) > CLOCK_SHIFT_S else 0.0
-
-    def _build_outcome(
-        self,
-        decision: Decision,
-        named: Sequence[NamedEffect],
-        proof: EngineProof,
-        told: Sequence[Gate],
-        failed: str,
-    ) -> Outcome:
-        machine = self.case.machine
-        before = proof.view(proof.before)
-        after = proof.view(proof.after) if named else None
-        floor = proof.view_floor()
-        selected = [self._describe(one, proof) for one in sorted(named, key=_get_nats)]
-        verdict = "effects" if selected else decision.verdict
-        answer = Answer(
-            verdict=verdict,
-            selected=tuple(selected),
-            ranking=rank_effects(selected, decision.rivals, verdict, machine),
-            where=locate_gap(before, floor, machine, find_stage(selected, self.kinds)),
-            gap=proof.measure_gap(bool(named)),
-            rivals=proof.rivals,
-            gates=tuple(told),
-            next_experiment=propose_measurement(selected),
-            reason=_explain(verdict, selected, decision, failed),
-            more={
-                "sanity": [remark.plain() for remark in self.remarks],
-                "evidence": _describe_evidence(decision, machine),
-            },
-        )
-        return Outcome(answer, before, after, floor)
 
     def _describe(self, one: NamedEffect, proof: EngineProof) -> Selected:
         machine = self.case.machine
@@ -210,19 +244,7 @@ class ReferenceDiagnosis:
         else:
             rows = proof.sizes[finding.effect]
             parameters = describe_numbers(one.kind, rows, finding.hold, machine)
-        part = proof.parts.get(finding.effect)
-        like, decided_by = list_alike(one.kind.name, finding.joints, self.case, self.kinds)
-        return Selected(
-            effect=one.kind.name,
-            joints=name_joints(finding.joints, machine),
-            probability=estimate_probability(finding.nats),
-            parameters=parameters,
-            gap_closed=None if part is None else part["closed"],
-            same_as=like,
-            decided_by=decided_by,
-            identified=None if part is None else part["identified"],
-            edit=None if part is None else part["edit"],
-        )
+        return self.describe_simulated(one.kind.name, finding, parameters, proof)
 
 
 def describe_detected(one: DetectedEffect, machine: Machine) -> Selected:
@@ -411,14 +433,12 @@ def _explain(verdict: str, selected: Sequence[Selected], decision: Decision, fai
     )
 
 
-def _describe_evidence(decision: Decision, machine: Machine) -> dict[str, Any]:
-    """Return what each effect earns, plain JSON data."""
+def _describe_evidence(decision: Decision) -> dict[str, Any]:
+    """Return what each effect earns beside the first, and each cause outside the library, plain JSON data."""
     outside = decision.outside
     return {
-        "rivals": describe_rivals(decision.rivals, machine),
         "second": [{"effect": one.name, "score": one.nats} for one in decision.seconds[:5]],
         "outside": None if outside is None else {"cause": outside.effect, "score": outside.nats},
         "generic": {"group": decision.generic[0], "score": decision.generic[1]},
         "left": decision.left,
-        "unit": "log likelihood",
     }

@@ -125,10 +125,7 @@ class RepairProof(ABC):
         """Return the errors and the share that is closed; 0 where only effects beside the motion are named."""
         before, after = self.measure_errors(self.before), self.measure_errors(self.after)
         floor = combine_joints(self.floor_squares, self.machine)
-        closed, reason = None, "no effect is named"
-        if is_named:
-            closed = summarise_draws(self._share(before - after))
-            reason = ""
+        closed = summarise_draws(self._share(before - after)) if is_named else None
         joints = describe_joints(
             self.machine,
             np.sqrt(self.measure_squares(self.before)[0]),
@@ -144,7 +141,6 @@ class RepairProof(ABC):
             floor_of=self.floor_of,
             joints=joints,
             reduced=summarise_draws((before - after) / np.maximum(before, 1e-12)),
-            closed_reason=reason,
         )
 
     def _share(self, fewer: np.ndarray) -> np.ndarray:

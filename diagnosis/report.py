@@ -58,10 +58,8 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
     closed = gap.closed if gap else None
     tone: Tone = "good" if closed is not None and closed.ci95[0] > GOOD_CLOSED else "warn"
     it = "it" if len(answer.selected) == 1 else "them"
-    if closed is None or gap is None:
-        fewer = f" Adding {it} removes {_format_share(gap.reduction)} of the error." if gap else ""
-        why = f" No share of the gap is told: {gap.closed_reason}." if gap else ""
-        return f"The simulator lacks {names}.{fewer}{why}{told}", tone
+    if closed is None:
+        return f"The simulator lacks {names}.{told}", tone
     share = f"{_format_share(closed, ' of the gap')}"
     below = " The error is then below its floor." if closed.mean > 1.0 else ""
     return f"The simulator lacks {names}; adding {it} closes {share}.{below}{told}", tone

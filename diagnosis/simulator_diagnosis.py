@@ -13,15 +13,13 @@ from typing import Any
 import numpy as np
 
 from actuators.models.linear import Hold
-from actuators.recordings.inspection import InspectionThresholds
-from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.machine import Machine
 from diagnosis import gates, geometry, sensors
-from diagnosis.answer import Answer, Outcome, Ranked, Selected, Where
+from diagnosis.answer import Answer, Outcome, Ranked, Selected, Verdict, Where
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
-from diagnosis.effect_library import DetectedEffect, EffectType
+from diagnosis.effect_library import DetectedEffect
 from diagnosis.engine.sizes import SIGMAS
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import combine_joints
@@ -31,20 +29,15 @@ from diagnosis.reference_diagnosis import (
     ACCEPTED_FINDINGS,
     DIRECT_NATS,
     NAME_NATS,
+    Diagnosis,
     ProgressCallback,
     accept_named_joints,
     describe_detected,
-    describe_rivals,
-    estimate_probability,
-    list_alike,
     name_joints,
-    propose_measurement,
-    rank_effects,
 )
 from diagnosis.repair_proof import NOISE_FACTOR, RepairProof
 from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
 from diagnosis.simulator_search import SimulatorSearch
-from diagnosis.where import find_stage, locate_gap
 
 FORM_ERROR = 0.1
 """Relative error of a size that its form makes, 1 sigma. Chosen by hand: no comparison is recorded."""
@@ -81,7 +74,7 @@ class SimulatorProof(RepairProof):
         self._reference = reference
         if reference is None:
             self.floor_of = "field"
-        self._fitted = [search.improve(effects, self.half != half) for half in (0, 1)]
+        self._fitted = [search.fit(effects, self.half != half) for half in (0, 1)]
 
     @property
     def measured(self) -> np.ndarray:
@@ -138,31 +131,22 @@ class SimulatorProof(RepairProof):
 
 
 @dataclass(frozen=True)
-class SimulatorDiagnosis:
-    """A diagnosis of what a simulator lacks.
+class SimulatorDiagnosis(Diagnosis):
+    """A diagnosis of what a simulator lacks; a reference is one that the simulator was fitted to.
 
     Attributes:
-        case: The recordings; a reference is one that the simulator was fitted to.
         base: The simulator.
-        kinds: The library.
-        thresholds: When a stretch of a recording is worth telling.
-        generator: Draws bootstraps.
         seed: Of the effects that draw.
     """
 
-    case: GapCase
     base: Actuator
-    kinds: Sequence[EffectType]
-    thresholds: InspectionThresholds
-    generator: np.random.Generator
     seed: int
 
     def run(self, tell: ProgressCallback) -> Outcome:
         """Return the outcome; `tell` receives the name and the progress of each step."""
         case, machine = self.case, self.case.machine
         tell("recordings", 0.02)
-        known = examine_recordings(case.reference, machine, self.thresholds)
-        told = gates.judge_recordings(self.remarks, known, case.field, case.reference, machine)
+        told = self.judge_recordings()
         runs = self._cut(case.field)
         reference = self._cut(case.reference) if case.reference else None
         search = SimulatorSearch(runs, reference, self.kinds)
@@ -184,16 +168,17 @@ class SimulatorDiagnosis:
             found = []
             proof = SimulatorProof(case, search, found, reference, self.generator)
         sizes = estimate_numbers(search, found, machine) if found else []
-        selected = []
+        selected = [describe_detected(one, machine) for one in on_tool]
         for one, numbers in zip(found, sizes, strict=True):
-            selected.append(self._describe(one, numbers, proof))
-        selected += [describe_detected(one, machine) for one in on_tool]
-        return self._build_outcome(selected, search, proof, (*told, *judged), failed)
-
-    @cached_property
-    def remarks(self) -> list[RecordingRemark]:
-        """Findings about the field's recordings."""
-        return examine_recordings(self.case.field, self.case.machine, self.thresholds)
+            finding = one.summarise()
+            selected.append(self.describe_simulated(finding.name, finding, numbers, proof))
+        selected.sort(key=lambda one: -one.probability)
+        verdict: Verdict = "effects" if selected else "none"
+        if failed and not selected:
+            verdict = "unknown"
+        rivals = [one.summarise() for one in search.rivals]
+        reason = _explain(verdict, selected, failed)
+        return self.build_outcome(verdict, selected, rivals, proof, (*told, *judged), reason, {})
 
     def _cut(self, recordings: Sequence[Any]) -> SimulatorRuns:
         return cut_simulator_runs(self.base, recordings, self.case.machine, self.seed)
@@ -219,56 +204,6 @@ class SimulatorDiagnosis:
                 return proof, found
             _, worst = min(weak)
             found = search.fit([one for place, one in enumerate(found) if place != worst])
-
-    def _describe(
-        self, one: GrownEffect, numbers: dict[str, dict[str, Estimate]], proof: SimulatorProof
-    ) -> Selected:
-        machine = self.case.machine
-        joints = np.flatnonzero(one.joints).tolist()
-        part = proof.parts[one.kind.name]
-        like, decided_by = list_alike(one.kind.name, joints, self.case, self.kinds)
-        return Selected(
-            effect=one.kind.name,
-            joints=name_joints(joints, machine),
-            probability=estimate_probability(one.nats),
-            parameters=numbers,
-            gap_closed=part["closed"],
-            same_as=like,
-            decided_by=decided_by,
-            identified=part["identified"],
-            edit=part["edit"],
-        )
-
-    def _build_outcome(
-        self,
-        selected: Sequence[Selected],
-        search: SimulatorSearch,
-        proof: SimulatorProof,
-        told: Sequence[Gate],
-        failed: str,
-    ) -> Outcome:
-        machine = self.case.machine
-        before, floor = proof.view(proof.before), proof.view_floor()
-        after = proof.view(proof.after) if proof.moves else None
-        verdict = "effects" if selected else "none"
-        if failed and not selected:
-            verdict = "unknown"
-        rivals = [one.summarise() for one in search.rivals]
-        evidence = {"rivals": describe_rivals(rivals, machine), "unit": "log likelihood"}
-        sanity = [remark.plain() for remark in self.remarks]
-        answer = Answer(
-            verdict=verdict,
-            selected=tuple(sorted(selected, key=lambda one: -one.probability)),
-            ranking=rank_effects(selected, rivals, verdict, machine),
-            where=locate_gap(before, floor, machine, find_stage(selected, self.kinds)),
-            gap=proof.measure_gap(bool(selected)),
-            rivals=proof.rivals,
-            gates=tuple(told),
-            next_experiment=propose_measurement(selected),
-            reason=_explain(verdict, selected, failed),
-            more={"sanity": sanity, "evidence": evidence},
-        )
-        return Outcome(answer, before, after, floor)
 
 
 def describe_doubts(case: GapCase, why: str) -> Outcome:

@@ -2,7 +2,6 @@
 
 An effect is put around the simulator in each form and size, and earns what it makes the errors of
 free runs likelier. The best one stays, all sizes are fitted again, and the search goes on beside it.
-At the end an effect that the others can replace is taken away.
 Axes: `C` candidates, `W` windows, `J` joints.
 """
 
@@ -15,23 +14,19 @@ import numpy as np
 
 from diagnosis.effect_library import EffectType, EffectValues, list_shared_effects
 from diagnosis.engine.decide import JOINT_NATS, JOINT_SHARE, LEAST_NATS, SECOND_SHARE
-from diagnosis.grown_effects import GrownEffect, NumberSlopes, list_candidates, list_trials
+from diagnosis.grown_effects import GrownEffect, NumberSlopes, list_candidates
 from diagnosis.simulator_runs import FreeRunLikelihood, SimulatorRuns
 
 STEP = 0.05
 """Finite difference, of the typical size."""
-ROUNDS = 5
-"""Steps of Levenberg and Marquardt at most, by which all numbers are fitted together."""
-LAST_ROUNDS = 30
-"""The same once all effects are known: those of a mass and its friction trade against each other."""
+ROUNDS = 30
+"""Steps of Levenberg and Marquardt at most, by which all numbers are fitted together: those of a mass
+and its friction trade against each other."""
 LEAST_GAIN = 0.1
 """Nats below which these steps end."""
-LEAST_SHARE = 0.02
-"""Least rise of the error without an effect, over all that the effects remove: one that does less only
-corrects the form of another."""
 MAX_EFFECTS = 6
-MAX_TURNS = 3
-"""Rounds of adding effects and of taking away those that others can replace."""
+NUM_FITTED = 3
+"""Best effects that are fitted before one is chosen: the sizes that are tried lie far apart."""
 MAX_WINDOWS = 32
 """Windows, evenly over the recordings, on which effects are proposed."""
 UNSEEN_SIDES = frozenset({"measurement", "kinematics"})
@@ -53,7 +48,6 @@ class SimulatorSearch:
         self, runs: SimulatorRuns, reference: SimulatorRuns | None, kinds: Sequence[EffectType]
     ) -> None:
         self.runs = runs
-        self.machine = runs.simulator.machine
         shared = list_shared_effects(kinds)
         self.kinds = [
             kind
@@ -72,30 +66,12 @@ class SimulatorSearch:
                 most = len(one.row)
                 some = np.unique(np.linspace(0, most - 1, min(most, MAX_WINDOWS)).astype(int))
                 self._views.append(WindowView(one.select(some), count / len(some)))
-        self._plain = self._measure_error(())
         self.rivals: list[GrownEffect] = []
         """All effects beside the simulator alone, the best first."""
 
     def run(self, tell: Progress) -> list[GrownEffect]:
         """Return the effects that the simulator lacks, the first found first."""
         found: list[GrownEffect] = []
-        for turn in range(MAX_TURNS):
-            grown = self._grow(found, lambda done, turn=turn: tell((turn + done) / MAX_TURNS))
-            kept = self._prune(grown)
-            is_settled = len(kept) == len(grown) or len(kept) <= len(found)
-            found = kept
-            if is_settled:
-                break
-            # Without what was taken away, others may show.
-        # A deviation that was taken beside wrong numbers explains their error, and holds them there.
-        self._whole.settle(())
-        found = self.improve(found, rounds=LAST_ROUNDS)
-        self._whole.settle(found)
-        return self.improve(found, rounds=LAST_ROUNDS)
-
-    def _grow(self, effects: Sequence[GrownEffect], tell: Progress) -> list[GrownEffect]:
-        """Return the effects with all that earn enough beside them, the best first."""
-        found = list(effects)
         while len(found) < MAX_EFFECTS:
             tell(len(found) / MAX_EFFECTS)
             names = {one.kind.name for one in found}
@@ -105,14 +81,16 @@ class SimulatorSearch:
             proposed.sort(key=lambda one: -one.nats)
             if not found:
                 self.rivals = proposed
-            if not proposed or proposed[0].nats < self._need(found):
+            needed = max([LEAST_NATS, *(SECOND_SHARE * one.nats for one in found)])
+            if not proposed or proposed[0].nats < needed:
                 break
-            found = self.fit([*found, proposed[0]])
-        return found
-
-    def _need(self, found: Sequence[GrownEffect]) -> float:
-        """Return what a further effect has to earn, nats."""
-        return max([LEAST_NATS, *(SECOND_SHARE * one.nats for one in found)])
+            fitted = [self.fit([*found, one]) for one in proposed[:NUM_FITTED]]
+            found = max(fitted, key=self._weigh)
+        # A deviation that was taken beside wrong numbers explains their error, and holds them there.
+        self._whole.settle(())
+        found = self.fit(found)
+        self._whole.settle(found)
+        return self.fit(found)
 
     def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
         """Return free runs with effects, `(W, K, J)`."""
@@ -129,13 +107,14 @@ class SimulatorSearch:
         for reference in self._views[1:]:
             # What a candidate earns where the simulator was fitted is no finding.
             gains = gains - np.maximum(reference.weigh_candidates(kind, candidates), 0.0)
+        costs = JOINT_NATS * _count_moved(kind, candidates)
         if kind.name in self.shared or not _is_per_joint(kind):
-            best = np.full(gains.shape[1], gains.sum(1).argmax())
+            best = np.full(gains.shape[1], (gains.sum(1) - costs).argmax())
             joints = np.ones(gains.shape[1], dtype=bool)
-            nats = float(gains[best[0]].sum()) - JOINT_NATS
+            nats = float(gains[best[0]].sum() - costs[best[0]])
         else:
-            best = gains.argmax(0)
-            nets = gains.max(0) - JOINT_NATS
+            best = (gains - costs[:, None]).argmax(0)
+            nets = (gains - costs[:, None]).max(0)
             joints = (nets > 0.0) & (nets >= JOINT_SHARE * nets.max())
             nats = float(nets[joints].sum())
         values = {}
@@ -143,37 +122,18 @@ class SimulatorSearch:
             values[name] = rows[best, np.arange(len(best))] if rows.shape[1] > 1 else rows[best[0]]
         return GrownEffect(kind, values, joints, nats).keep(joints)
 
+    def _weigh(self, effects: Sequence[GrownEffect]) -> float:
+        """Return the log likelihood with effects, less the price of their numbers, nats."""
+        nats = float(self._whole.weigh_numbers(effects, {}, None).sum())
+        return nats - JOINT_NATS * sum(one.count_numbers() for one in effects)
+
     def fit(
         self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
     ) -> list[GrownEffect]:
-        """Return the effects with all numbers fitted to the windows `used`, `(W,)` bool: in turn, then together."""
-        found = list(effects)
-        for place in range(len(found)):
-            for name in found[place].values:
-                found[place] = self._fit_number(found, place, name, used)
-        return self.improve(found, used)
-
-    def _fit_number(
-        self, effects: Sequence[GrownEffect], place: int, name: str, used: np.ndarray | None
-    ) -> GrownEffect:
-        """Return an effect with one of its numbers fitted, the others held."""
-        one = effects[place]
-        tried = list_trials(one, name)
-        gains = self._whole.weigh_numbers(effects, {(place, name): tried}, used)
-        if tried.shape[1] == 1 or one.kind.name in self.shared:
-            best = np.full(tried.shape[1], gains.sum(1).argmax())
-        else:
-            best = gains.argmax(0)
-        value = tried[best, np.arange(tried.shape[1])]
-        return replace(one, values={**one.values, name: value}).keep(one.joints)
-
-    def improve(
-        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None, rounds: int = ROUNDS
-    ) -> list[GrownEffect]:
-        """Return the effects with all numbers fitted together, from where they are."""
+        """Return the effects with all numbers fitted together to the windows `used`, `(W,)` bool."""
         found = list(effects)
         best = float(self._whole.weigh_numbers(found, {}, used).sum())
-        for _ in range(rounds if found else 0):
+        for _ in range(ROUNDS if found else 0):
             slopes = self._whole.linearise(found, used)
             trials = slopes.list_steps(found)
             gains = self._whole.weigh_numbers(found, trials, used).sum(1)
@@ -185,34 +145,6 @@ class SimulatorSearch:
                 one = found[place]
                 found[place] = replace(one, values={**one.values, name: rows[top]})
         return found
-
-    def _prune(self, effects: Sequence[GrownEffect]) -> list[GrownEffect]:
-        """Return the effects without those that the others can replace."""
-        found = list(effects)
-        while len(found) > 1:
-            whole, error = self._measure(found), self._measure_error(found)
-            rests = []
-            for one in found:
-                others = [other for other in found if other is not one]
-                rest = self.improve(others)
-                rise = (self._measure_error(rest) - error) / max(self._plain - error, 1e-12)
-                lost = whole - self._measure(rest)
-                is_needed = lost >= self._need(rest) and rise >= LEAST_SHARE
-                rests.append((is_needed, lost, others))
-            needed, _, rest = min(rests, key=lambda one: one[:2])
-            if needed:
-                break
-            found = self.fit(rest)
-        return found
-
-    def _measure_error(self, effects: Sequence[GrownEffect]) -> float:
-        """Return the root mean square error over the travel of all joints."""
-        off = self.simulate(effects) - self.runs.cut.measured
-        return float(np.sqrt(np.square(off / (self.machine.upper - self.machine.lower)).mean()))
-
-    def _measure(self, effects: Sequence[GrownEffect]) -> float:
-        """Return the log likelihood of all joints with effects, nats."""
-        return float(self._whole.weigh_numbers(effects, {}, None).sum())
 
 
 class WindowView:
@@ -233,30 +165,18 @@ class WindowView:
         """Let the deviation of the errors be that beside effects, and new candidates be put beside these."""
         self._effects = effects
         self.deviation = self._likelihood.weigh_motion(self.simulate(effects))
-        self._slopes = self.linearise(effects) if effects else None
 
     def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
         """Return free runs with effects, `(W, K, J)`."""
-        given = [(one.kind, one.repeat(1)) for one in effects]
-        return self.runs.simulator.simulate(given)[0]
+        return self._simulate_numbers(effects, {})[0]
 
     def weigh_candidates(self, kind: EffectType, candidates: EffectValues) -> np.ndarray:
-        """Return what candidates of an effect earn beside those that are there, nats, `(C, J)`.
-
-        The numbers of those that are there follow each candidate, to first order.
-        """
+        """Return what candidates of an effect earn beside those that are there, nats, `(C, J)`."""
         count = len(next(iter(candidates.values())))
         beside = [(one.kind, one.repeat(count)) for one in self._effects]
         paths = self.runs.simulator.simulate([*beside, (kind, candidates)], count)
-        if self._slopes is None:
-            known = self._likelihood.weigh(self.simulate(())[None], self.deviation)
-            return self._factor * (self._likelihood.weigh(paths, self.deviation) - known)
-        paths = np.concatenate([self.simulate(self._effects)[None], paths])
-        errors = self._likelihood.subtract_memory(paths, self.deviation)
-        errors = errors.reshape(len(errors), -1, errors.shape[-1])
-        left = self._slopes.follow(errors, self._effects)
-        found = -left.shape[1] * np.log(np.abs(left).mean(1) + self._likelihood.floor)
-        return self._factor * (found[1:] - found[0])
+        known = self._likelihood.weigh(self.simulate(self._effects)[None], self.deviation)
+        return self._factor * (self._likelihood.weigh(paths, self.deviation) - known)
 
     def linearise(
         self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
@@ -302,6 +222,12 @@ class WindowView:
         """Return the log likelihood with trials of some numbers, `(C, J)`."""
         paths = self._simulate_numbers(effects, trials)
         return self._likelihood.weigh(paths, self.deviation, used)
+
+
+def _count_moved(kind: EffectType, candidates: EffectValues) -> np.ndarray:
+    """Return how many of its numbers each candidate of an effect moves, `(C,)`: at least one is free."""
+    moved = [(candidates[n] != kind.numbers[n].none).any(1) for n in kind.fitted]
+    return np.maximum(np.sum(moved, 0), 1)
 
 
 def _is_per_joint(kind: EffectType) -> bool:

@@ -110,7 +110,7 @@ class Diagnose:
             else:
                 base, seed = self._find_base(given), self.session.stream("base")
                 work = SimulatorDiagnosis(
-                    given, base, self._kinds, self.thresholds, generator, seed
+                    given, self._kinds, self.thresholds, generator, base, seed
                 )
             return self._add_changes(work.run(tell), given)
 

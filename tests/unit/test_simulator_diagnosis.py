@@ -24,7 +24,7 @@ Diagnosis = Callable[..., Answer]
 def diagnose(machine: Machine) -> Diagnosis:
     axis = make_axis(machine)
     field = driven(axis, 3, 60.0, 3)
-    every = ("dead_time", "flow_gain", "lag", "backlash", "dead_band")
+    every = ("dead_time", "flow_gain", "asymmetry", "lag", "backlash", "dead_band")
 
     def run(names: Sequence[str] = every, turn: bool = False, **numbers: float) -> Answer:
         seen: list[Recording] = [replace(one, u=-one.u) if turn else one for one in field]
@@ -32,7 +32,7 @@ def diagnose(machine: Machine) -> Diagnosis:
         kinds = load_effects(axis, names, base)
         case = GapCase(axis, [], seen)
         draw = np.random.default_rng(0)
-        work = SimulatorDiagnosis(case, base, kinds, load_part("thresholds"), draw, 0)
+        work = SimulatorDiagnosis(case, kinds, load_part("thresholds"), draw, base, 0)
         return work.run(lambda doing, done: None).answer
 
     return run
