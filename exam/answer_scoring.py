@@ -14,7 +14,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
-from diagnosis.answer import ANSWER_FILE, Answer, parse_answer
+from diagnosis.answer import ANSWER_FILE, parse_answer
 from exam import run_cases, score
 from exam.case_distribution import CaseDistribution
 from exam.generate import WITHHELD_FOLDER
@@ -44,14 +44,6 @@ class GivenAnswer:
     note: Mapping[str, Any]
     content: Mapping[str, Any] | None
     left_out: tuple[str, ...] = ()
-
-    def parse(self, where: str) -> Answer | None:
-        """Return the answer; `where` names it in messages.
-
-        Raises:
-            RecordingError: it is no diagnosis.
-        """
-        return None if self.content is None else parse_answer(self.content, where)
 
     @property
     def seconds(self) -> float | None:
@@ -130,12 +122,12 @@ def build_table(
     scores, shared = [], mix.list_shared()
     for label in labels:
         case = label["case"]
-        if case in given:
-            answer, seconds = given[case].parse(f"answer to case {case}"), given[case].seconds
-            examination = examined.get(case)
-            scores.append(
-                score.score_answer(label, answer, mix.classes, shared, seconds, examination)
-            )
+        if case not in given:
+            continue
+        one, examination = given[case], examined.get(case)
+        answer = None if one.content is None else parse_answer(one.content, f"case {case}")
+        row = score.score_answer(label, answer, mix.classes, shared, one.seconds, examination)
+        scores.append(row)
     not_begun = len(labels) - len(scores)
     if not_begun:
         log.warning("%d of %d cases were not begun and are left out", not_begun, len(labels))

@@ -95,7 +95,6 @@ class PolicyContract:
         terms: Parts of the observation vector, in their order.
         commands: Columns of the log with the command in force, in the order of the output.
         training: Statistics of the training's observations; `None` where there are none.
-        data: All that stands in the file.
     """
 
     source: Path
@@ -104,7 +103,6 @@ class PolicyContract:
     terms: tuple[ObservationTerm, ...]
     commands: tuple[str, ...]
     training: Mapping[str, Any] | None
-    data: Mapping[str, Any]
 
     @property
     def size(self) -> int:
@@ -246,7 +244,6 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
             terms=tuple(map(_read_term, terms)),
             commands=tuple(commands),
             training=data.get("training_observations"),
-            data=data,
         )
     except FileNotFoundError:
         raise CheckpointError(
@@ -300,15 +297,22 @@ def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str,
 def _read_term(term: Mapping[str, Any]) -> ObservationTerm:
     """Return a term of a contract for any network."""
     columns, before = tuple(term["columns"]), term.get("before", "first")
+    samples, newest = int(term.get("samples", 1)), int(term.get("newest", 0))
+    std = np.broadcast_to(np.asarray(term.get("std", 1.0), float), (len(columns),))
     if before not in ("first", "zero"):
         raise ValueError(f"'before' of term {term['name']} is {before}, expected first or zero")
+    if samples < 1 or newest > 0 or not (std > 0.0).all():
+        raise ValueError(
+            f"term {term['name']}: expected samples of 1 or more, newest of 0 or less and std above 0, got {samples}, "
+            f"{newest} and {std.tolist()}"
+        )
     return ObservationTerm(
         name=str(term["name"]),
         columns=columns,
-        samples=int(term.get("samples", 1)),
-        newest=int(term.get("newest", 0)),
+        samples=samples,
+        newest=newest,
         mean=np.broadcast_to(np.asarray(term.get("mean", 0.0), float), (len(columns),)),
-        std=np.broadcast_to(np.asarray(term.get("std", 1.0), float), (len(columns),)),
+        std=std,
         clip=term.get("clip"),
         before=before,
     )

@@ -16,6 +16,7 @@ from brokk_rl.session import write_json
 from diagnosis.deployment.contract import LoadedPolicy
 from diagnosis.deployment.examination import (
     NUM_RANKED,
+    UNLISTED,
     DoctorVerdict,
     Finding,
     RunExamination,
@@ -56,7 +57,7 @@ class DoctorAnswer:
             "schema": SCHEMA,
             "verdict": self.verdict,
             "reason": self.reason,
-            "named": bool(self.findings) and all(one.is_named for one in self.findings),
+            "named": bool(self.findings) and all(one.kind != UNLISTED for one in self.findings),
             "logs": [_describe_run(run) for run in self.runs],
             "actuator": {
                 "horizon_s": self.motion.horizon_s,

@@ -66,11 +66,6 @@ class Finding:
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict)
     same_as: Sequence[Mapping[str, str]] = ()
 
-    @property
-    def is_named(self) -> bool:
-        """True if the mistake has a name."""
-        return self.kind != UNLISTED
-
 
 @dataclass(frozen=True)
 class RunExamination:

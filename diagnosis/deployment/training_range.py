@@ -65,11 +65,10 @@ class RangeEvidence:
 def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidence:
     """Compare what the task gave in a log with the range of training."""
     if contract.training is None:
-        is_own = "order" in contract.data["observation"]
-        advice = "export it again by mode=export" if is_own else "add training_observations"
-        return RangeEvidence(
-            (), f"{contract.source.name} lacks the range of the training's observations; {advice}"
-        )
+        advice = "export it again by mode=export, or add training_observations"
+        name = contract.source.name
+        text = f"{name} lacks the range of the training's observations; {advice}"
+        return RangeEvidence((), text)
     table: RangeTable = dict(contract.training["ranges"])
     margin_share = measure_margin(contract.training.get("count", EXPORTED_ROWS), len(table))
     found = []

@@ -107,7 +107,7 @@ def run_loop(
         made = np.concatenate(
             [np.ravel((parts[name] - mean[name]) / std[name]) for name, _ in TERMS]
         )
-        made = vector(made, k).astype(np.float32)
+        made = np.asarray(vector(made, k), np.float32)
         command = policy.network.answer(made[None])[0]
         sent = send(command, k)
         rows.append((measured, sent, target, command, made))
@@ -142,6 +142,7 @@ def turn_joint(values: np.ndarray, _: int) -> np.ndarray:
     return values * np.array([1, 1, -1, 1, 1])
 
 
+NEWEST_FIRST = np.r_[0:3, 18:23, 13:18, 8:13, 3:8, 23:43]
 FAULTS = {
     "sign": ({"see_q": turn_joint}, "sign", "q.q3"),
     "unit": ({"see_q": lambda q, _: np.rad2deg(q)}, "scale", "q"),
@@ -150,6 +151,8 @@ FAULTS = {
     "valves": ({"send": lambda u, _: u[[1, 0, 2, 3, 4]]}, "order", "command"),
     "slow": ({"send": lambda u, _: 0.6 * u}, "scale", "command"),
     "clip": ({"vector": lambda v, _: v.clip(-0.4, 0.4)}, "clip", "observation"),
+    "history": ({"vector": lambda v, _: v[NEWEST_FIRST]}, "order", "q"),
+    "raw": ({"vector": lambda v, _: [*v[:3], *(0.7 * v[3:23] + 0.3), *v[23:]]}, "scale", "q"),
 }
 
 
@@ -198,7 +201,7 @@ def test_a_mistake_without_a_name_gets_none(policy: LoadedPolicy, machine: Machi
     recording = run_loop(policy, machine, vector=lambda v, _: v + 0.2 * rng.standard_normal(len(v)))
     found = ask(policy, recording, machine)
     assert found.verdict == "code"
-    assert [one.is_named for one in found.findings] == [False]
+    assert [one.kind for one in found.findings] == ["unlisted"]
 
 
 def test_a_target_out_of_the_training_is_the_task(policy: LoadedPolicy, machine: Machine) -> None:
@@ -285,10 +288,6 @@ def drop_term(contract: dict[str, Any]) -> None:
     contract["observation"]["terms"].pop()
 
 
-def drop_joints(contract: dict[str, Any]) -> None:
-    del contract["joints"]
-
-
 def keep_three_joints(contract: dict[str, Any]) -> None:
     contract["joints"] = contract["joints"][:3]
 
@@ -301,8 +300,9 @@ def make_of_terms(contract: dict[str, Any]) -> None:
     ("change", "told"),
     [
         (drop_term, "23 numbers, the network takes 43"),
-        (drop_joints, "lacks 'joints'"),
+        (lambda contract: contract.pop("joints"), "lacks 'joints'"),
         (keep_three_joints, "gives 5 commands, the contract names 3"),
+        (lambda contract: contract["observation"]["terms"][1].update(std=0), "and std above 0"),
         (make_of_terms, r"terms of the task's own \(distance\)"),
     ],
 )
