@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.record import format_now
 from brokk_rl.spec import spec
 from study import study_folder as folders
 from study.design import PERIODS, Trial
@@ -221,7 +222,7 @@ class Conductor:
             # A reason is a short text; the page's own limit may be circumvented.
             self._stop(str(said.get("reason", ""))[:200])
         elif do == "go_on" and step.kind == "stopped":
-            self._note({"stopped": False, "went_on": folders.format_now()})
+            self._note({"stopped": False, "went_on": format_now()})
         elif do == "consent" and step.kind == "consent":
             self._take_consent(said)
         elif do == "end_practice" and attempt and not step.period and not self.running:
@@ -261,9 +262,8 @@ class Conductor:
         if self._who is None:
             return
         step = self._step = find_next_step(self._data, self._who)
-        log.info(
-            "%s: %s %s", self._who, step.kind, step.trial.name if step.trial else step.period or ""
-        )
+        what = step.trial.name if step.trial else step.period or ""
+        log.info("%s: %s %s", self._who, step.kind, what)
         if step.trial is not None:
             self._attempt = Attempt(
                 self._data, step.trial, self._machine, self._stage, self._times, self._facts, self._clock
@@ -277,7 +277,7 @@ class Conductor:
             "version": self._consent.version,
             # A language tag is short; longer text is no tag.
             "language": str(said.get("language", ""))[:5],
-            "at": folders.format_now(),
+            "at": format_now(),
         }
         refusal = {} if consent["agreed"] else {"stopped": True, "reason": "no consent"}
         self._note({"consent": consent, **refusal})
@@ -285,8 +285,8 @@ class Conductor:
     def _stop(self, reason: str) -> None:
         if self._attempt is not None:
             self._attempt.stop()
-        at = folders.format_now()
-        self._note({"stopped": True, "reason": reason or "no reason given", "stopped_at": at})
+        reason = reason or "no reason given"
+        self._note({"stopped": True, "reason": reason, "stopped_at": format_now()})
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None

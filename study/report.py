@@ -74,12 +74,11 @@ def write_report(folder: Path, found: Analysis) -> Path:
     """
     data, trials, means = found.data, found.trials, found.means
     effects = pd.DataFrame(map(asdict, found.effects.values()), index=list(found.effects))
+    effects["p_holm"] = pd.Series(found.holm, dtype=float)
     tables = {
         "trials": trials.drop(columns="tip_in_base_m"),
         "means": means,
-        "effects": effects.assign(p_holm=pd.Series(found.holm, dtype=float)).reset_index(
-            names="measure"
-        ),
+        "effects": effects.reset_index(names="measure"),
     }
     for name, table in tables.items():
         text = table.assign(simulated=data.is_simulated).to_csv(index=False)

@@ -17,12 +17,12 @@ import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from brokk_rl.errors import ConfigError, StorageError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.record import format_now
 from brokk_rl.session import write_json
 from study.design import PERIODS, Design, Trial
 
@@ -147,11 +147,6 @@ def update_record(path: Path, facts: dict[str, Any]) -> None:
     write_json(path, known | facts)
 
 
-def format_now() -> str:
-    """Return the present time as it stands in files."""
-    return datetime.now().astimezone().isoformat(timespec="microseconds")
-
-
 def erase(folder: Path, participant: str) -> list[Path]:
     """Delete every file about a participant, return their paths; the plan keeps an empty place that says so.
 
@@ -202,9 +197,7 @@ def _find_problem(data: StudyData, trial: dict[str, Any]) -> str:
     if not planned:
         return f"{key[0]}, period {key[1]}, trial {key[2]} is not in the plan; kept, but it does not count"
     if trial.get("condition") != planned[0]:
-        return (
-            f"done {trial.get('condition')}, but planned {planned[0]}; kept, but it does not count"
-        )
+        return f"done {trial.get('condition')}, but planned {planned[0]}; it does not count"
     if key in data.trials:
         return "done twice: the first counts, since the second had more practice; the other is kept"
     if trial.get("outcome") == "aborted":

@@ -95,7 +95,7 @@ class TwinGround:
                 "outcome": "inserted" if found["success"] else "time limit",
                 "recording": name,
                 "simulated": True,
-                "operator": name_spec(self._choose_operator(trial)),
+                "operator": name_spec(getattr(self, trial.condition)),
             }
             folders.write_trial(folder, trial.name, facts)
 
@@ -112,22 +112,19 @@ class TwinGround:
         # A session's seed is smaller than a stream's.
         own = replace(session, seed=session.stream(f"twin {trial.name}") % MOST_SEED)
         person = Person(number, session.stream("study operators"), own.generator("operator"))
-        operator = self._choose_operator(trial).build(machine, person)
+        operator = getattr(self, trial.condition).build(machine, person)
         desk = TwinDesk(self, machine, own, q, rim_m, is_guided)
         left = round(self.settle_s / machine.period_s)
         for _ in range(round(design.limit_s / machine.period_s)):
             q, shown = desk.seen()
             advice = shown if is_guided else np.full(machine.num_joints, np.nan)
-            desk.run_period(operator.step(q, rim_m, advice))
+            desk.run_period(operator(q, rim_m, advice))
             # The recording goes on for a while after the insertion, as that of a real trial does.
             tip_m = compute_tool_kinematics(machine, desk.seen()[0]).tip_in_base_m
             left -= find_insertion(tip_m[None], hole, design.success) is not None
             if left <= 0:
                 break
         return desk.end()
-
-    def _choose_operator(self, trial: Trial) -> Operator:
-        return self.guided if trial.condition == "guided" else self.unguided
 
 
 class TwinDesk:

@@ -80,7 +80,6 @@ class BoardCalibration:
         least_turn_rad: The poses should turn at least this far about two axes.
         max_poses: Of more frames, as many are used, evenly.
         work_m: Working distance, at which the uncertainty of a point is stated.
-        temperature_c: Of the day, for the record; `null` where it was not measured.
     """
 
     source: FrameSourceSpec
@@ -97,7 +96,6 @@ class BoardCalibration:
     least_turn_rad: float
     max_poses: Annotated[int, Ge(10)]
     work_m: Positive
-    temperature_c: float | None
 
     def calibrate(self, machine: Machine) -> dict[str, Any]:
         """Return the content of `calibration.yaml`.
@@ -140,7 +138,6 @@ class BoardCalibration:
         turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
         missing = self._check_coverage(machine, views, solution, q, float(turns[1]))
         more = {
-            "temperature_c": self.temperature_c,
             "T_link_board": solution.guess.link_from_board.round(9).tolist(),
             **evaluation.summarise_solution(views, solution, clock),
             "corners_px": round(float(np.median([one.pose.error_px for one in known])), 3),

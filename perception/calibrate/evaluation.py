@@ -10,13 +10,7 @@ from brokk_rl.machine import Machine
 from perception.calibrate import transforms
 from perception.calibrate.clock_offset import ClockEstimate
 from perception.calibrate.extrinsics import PoseResidual
-from perception.calibrate.hand_eye import (
-    MIN_VIEWS,
-    HandEyeSolution,
-    HandEyeViews,
-    predict_board_poses,
-    refine_solution,
-)
+from perception.calibrate.hand_eye import HandEyeSolution, HandEyeViews
 
 CLOCK_NAME = "clock"
 """Name of the clocks' offset among the systematic errors."""
@@ -66,34 +60,7 @@ def summarise_solution(
             "correlation": round(clock.correlation, 3),
             "trusted": clock.is_trusted,
         }
-    return {
-        "joint_zeros": errors,
-        "clock": clock_entry,
-        "arm_factor": round(solution.factor, 3),
-        "other_half": cross_validate_halves(views, solution),
-    }
-
-
-def cross_validate_halves(
-    views: HandEyeViews, solution: HandEyeSolution
-) -> dict[str, float] | None:
-    """Return the median residual of each half of the views at the solution of the other half."""
-    used = np.flatnonzero(solution.used)
-    halves = used[::2], used[1::2]
-    if min(len(half) for half in halves) < 2 * MIN_VIEWS:
-        return None
-    away = []
-    for half, other in (halves, halves[::-1]):
-        refined = refine_solution(views.part(half), solution)
-        rest = views.part(other)
-        board = predict_board_poses(rest, refined.guess)
-        motion = transforms.compute_motion(rest.camera_from_board, board[:, None])
-        away.append(motion[np.arange(len(rest)), np.abs(motion).sum(-1).argmin(1)])
-    sizes = np.concatenate(away)
-    return {
-        "median_m": round(float(np.median(np.linalg.norm(sizes[:, :3], axis=1))), 6),
-        "median_rad": round(float(np.median(np.linalg.norm(sizes[:, 3:], axis=1))), 6),
-    }
+    return {"joint_zeros": errors, "clock": clock_entry, "arm_factor": round(solution.factor, 3)}
 
 
 def measure_rotation_ranges(base_from_link: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -69,7 +69,7 @@ def load_extrinsics(given: CameraPlacement, where: str) -> CameraExtrinsics:
     if disparity is None:
         return CameraExtrinsics(place, (cov + cov.T) / 2)
     error_px = validation.check_disparity_error(disparity["error_px"], where)
-    std_px = validation.check_disparity_std(disparity["std_px"], where)
+    std_px = validation.check_number(disparity["std_px"], where, "disparity_std_px")
     return CameraExtrinsics(place, (cov + cov.T) / 2, error_px, std_px)
 
 

@@ -10,7 +10,7 @@ left out in the end. One factor on the arm's uncertainty is estimated by the med
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -68,18 +68,6 @@ class HandEyeViews:
 
     def __len__(self) -> int:
         return len(self.base_from_link)
-
-    def part(self, chosen: np.ndarray) -> HandEyeViews:
-        """Return the chosen views, by index."""
-        return replace(
-            self,
-            base_from_link=self.base_from_link[chosen],
-            camera_from_board=self.camera_from_board[chosen],
-            seen_cov=self.seen_cov[chosen],
-            slack=self.slack[chosen],
-            shared=self.shared[chosen],
-            names=tuple(self.names[int(k)] for k in chosen),
-        )
 
 
 @dataclass(frozen=True)
@@ -195,12 +183,6 @@ def solve_hand_eye(views: HandEyeViews) -> HandEyeSolution | None:
             break
         guess = _minimise(views, guess, factor, None)
     return _select_views(views, guess, factor)
-
-
-def refine_solution(views: HandEyeViews, solution: HandEyeSolution) -> HandEyeSolution:
-    """Return the solution of other views, begun at a solution and with its factor."""
-    guess = _minimise(views, solution.guess, solution.factor, None)
-    return _select_views(views, guess, solution.factor)
 
 
 def _select_views(views: HandEyeViews, guess: HandEyeGuess, factor: float) -> HandEyeSolution:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -103,16 +102,17 @@ def read_camera(path: Path) -> CameraModel:
         )
     where = str(path)
 
-    def check(name: str, judge: Callable[[Any, str], Any], usual: Any = None) -> Any:
-        return usual if told.get(name) is None else judge(told[name], where)
+    def check(name: str) -> float | None:
+        return None if told.get(name) is None else validation.check_number(told[name], where, name)
 
+    pose = told.get("T_base_cam")
     return CameraModel(
         validation.check_matrix(told["K"], where),
         validation.check_distortion(told.get("dist"), where),
-        check("baseline_m", validation.check_baseline),
-        check("T_base_cam", validation.check_pose),
-        disparity_std_px=check("disparity_std_px", validation.check_disparity_std),
-        gamma=check("gamma", validation.check_gamma, validation.USUAL_GAMMA),
+        check("baseline_m"),
+        None if pose is None else validation.check_pose(pose, where),
+        disparity_std_px=check("disparity_std_px"),
+        gamma=check("gamma") or validation.USUAL_GAMMA,
         size_px=validation.parse_size(told.get("size_px"), where),
     )
 

@@ -91,7 +91,7 @@ def read_pair_lens(
         shift_m = np.asarray(content["T"], float).ravel()
     for matrix, _ in cameras:
         validation.check_matrix_fits(matrix, size_px[1], size_px[0], str(path))
-    validation.check_baseline(float(np.linalg.norm(shift_m)), str(path))
+    validation.check_number(float(np.linalg.norm(shift_m)), str(path), "baseline_m")
     (one, bent), (other, other_bent) = cameras
     # alpha 0: only pixels that both cameras show.
     first, second, project, project_other, *_ = cv2.stereoRectify(

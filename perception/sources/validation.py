@@ -34,6 +34,14 @@ USUAL_GAMMA = 2.2
 _LARGEST_GAMMA = 4.0
 
 
+NUMBERS = {
+    "baseline_m": (1e-3, 3.0, " m; is it in mm, or negative?"),
+    "disparity_std_px": (0.0, _LARGEST_OFFSET_PX, " px"),
+    "gamma": (1.0, _LARGEST_GAMMA, f", and 1 is linear; most cameras have {USUAL_GAMMA:g}"),
+}
+"""Least and largest value of each number of a camera, and words about them."""
+
+
 def check_matrix(value: Any, where: str) -> np.ndarray:
     """Return a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
     found = _parse_numbers(value, (3, 3), f"{where}: K")
@@ -161,34 +169,12 @@ def check_upright(base_from_camera: np.ndarray, where: str) -> None:
         )
 
 
-def check_baseline(value: Any, where: str) -> float:
-    """Return a baseline in m, or raises a `FrameError` where it is none."""
-    found = float(_parse_numbers(value, (), f"{where}: baseline_m"))
-    if not 1e-3 <= found <= 3.0:
-        raise FrameError(
-            f"{where}: baseline_m is {found:g}, expected 0.001 to 3 m; is it in mm, or negative?"
-        )
-    return found
-
-
-def check_disparity_std(value: Any, where: str) -> float:
-    """Return the standard deviation of a disparity's offset, px, or raises a `FrameError`."""
-    found = float(_parse_numbers(value, (), f"{where}: disparity_std_px"))
-    if not 0.0 <= found <= _LARGEST_OFFSET_PX:
-        raise FrameError(
-            f"{where}: disparity_std_px is {found:g}, expected 0 to {_LARGEST_OFFSET_PX:g} px"
-        )
-    return found
-
-
-def check_gamma(value: Any, where: str) -> float:
-    """Return the exponent of a tone curve, or raises a `FrameError`."""
-    found = float(_parse_numbers(value, (), f"{where}: gamma"))
-    if not 1.0 <= found <= _LARGEST_GAMMA:
-        raise FrameError(
-            f"{where}: gamma is {found:g}, expected 1 (linear) to {_LARGEST_GAMMA:g}; most cameras "
-            f"have {USUAL_GAMMA:g}"
-        )
+def check_number(value: Any, where: str, name: str) -> float:
+    """Return a number of a camera (`NUMBERS`), or raises a `FrameError` where it is none."""
+    found = float(_parse_numbers(value, (), f"{where}: {name}"))
+    least, largest, words = NUMBERS[name]
+    if not least <= found <= largest:
+        raise FrameError(f"{where}: {name} is {found:g}, expected {least:g} to {largest:g}{words}")
     return found
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from actuators.person import HumanFollower
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from study.operators.person import Hands, Person, Range
+from study.operators.person import Hands, OperatorModel, Person, Range
 from study.operators.sight import Sight
 
 LONGER, SHORTER, LEAST, MOST = 1.25, 0.6, 0.05, 2.5
@@ -25,20 +25,10 @@ class AdviceFollower:
 
     hands: HumanFollower
 
-    def build(self, machine: Machine, person: Person) -> AdviceFollowerModel:
+    def build(self, machine: Machine, person: Person) -> OperatorModel:
         """See `study.operators.person.Operator`."""
-        return AdviceFollowerModel(Hands(self.hands, machine, person))
-
-
-class AdviceFollowerModel:
-    """A follower at work."""
-
-    def __init__(self, hands: Hands) -> None:
-        self._hands = hands
-
-    def step(self, q: np.ndarray, rim_in_base_m: np.ndarray, advice: np.ndarray) -> np.ndarray:
-        """See `study.operators.person.OperatorModel`."""
-        return self._hands.step(np.nan_to_num(advice))
+        hands = Hands(self.hands, machine, person)
+        return lambda q, rim_in_base_m, advice: hands.step(np.nan_to_num(advice))
 
 
 @spec
@@ -76,9 +66,9 @@ class Novice:
     wait_s: Range
     good_rad: float
 
-    def build(self, machine: Machine, person: Person) -> NoviceModel:
+    def build(self, machine: Machine, person: Person) -> OperatorModel:
         """See `study.operators.person.Operator`."""
-        return NoviceModel(self, machine, person)
+        return NoviceModel(self, machine, person).step
 
 
 class NoviceModel:
@@ -161,9 +151,9 @@ class Crossover:
     creep: float
     good_rad: float
 
-    def build(self, machine: Machine, person: Person) -> CrossoverModel:
+    def build(self, machine: Machine, person: Person) -> OperatorModel:
         """See `study.operators.person.Operator`."""
-        return CrossoverModel(self, machine, person)
+        return CrossoverModel(self, machine, person).step
 
 
 @spec

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -43,20 +44,14 @@ class Person:
         return low + (high - low) * place
 
 
-class OperatorModel(Protocol):
-    """A simulated operator at the levers of a machine; one control period a call."""
+OperatorModel = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""A simulated operator at the levers of a machine; one control period a call.
 
-    def step(self, q: np.ndarray, rim_in_base_m: np.ndarray, advice: np.ndarray) -> np.ndarray:
-        """Return the commands of the coming period, `(J,)` in [-1, 1].
-
-        Exclusive joints never move together with others.
-
-        Args:
-            q: Joint positions at its start, `(J,)`.
-            rim_in_base_m: Centre of the hole's rim, `(3,)`; the model adds its errors of vision.
-            advice: Commands that are advised, `(J,)`; NaN where none is shown.
-        """
-        ...
+It takes the joint positions at its start, `(J,)`, the centre of the hole's rim, `(3,)`, to which the
+model adds its errors of vision, and the commands that are advised, `(J,)`, NaN where none is shown.
+It returns the commands of the coming period, `(J,)` in [-1, 1]. Exclusive joints never move
+together with others.
+"""
 
 
 class Operator(Protocol):

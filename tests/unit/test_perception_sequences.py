@@ -15,9 +15,9 @@ from brokk_rl.contracts.vision import HolePose
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception.benchmark.session_score import match_found_holes
 from perception.calibrate.arm import compute_link_poses
 from perception.label.camera_pose import Charuco
+from perception.modes.score_camera import match_found_holes
 from perception.render.board_on_arm import BoardOnArm
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.stereo_camera import StereoRig

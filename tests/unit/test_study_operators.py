@@ -44,7 +44,7 @@ def worked(
     pipe = [np.zeros(5)] * round(MACHINE.dead_time_s / MACHINE.period_s)
     shown, qs, us = np.array([advice, 0.0, 0.0, 0.0, 0.0]), [], []
     for _ in range(round(seconds / MACHINE.period_s)):
-        u = model.step(q, RIMS_M[trial], shown)
+        u = model(q, RIMS_M[trial], shown)
         pipe = [*pipe[1:], u]
         opening = np.sign(pipe[0]) * np.maximum(np.abs(pipe[0]) - 0.08, 0) / 0.92
         q = q + opening * MACHINE.max_speed * MACHINE.period_s

@@ -1,1 +1,0 @@
-"""Benchmarks of finder and detectors against ground truth."""
