@@ -1,7 +1,8 @@
 """Segmentation by a network in onnxruntime.
 
 The network runs on the whole picture for the block, then on the block alone, where a hole has
-several times the pixels.
+several times the pixels. It runs once more where the block has grown, and on parts of the picture
+where the first run found no block.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from brokk_rl.contracts.vision import Masks
 from brokk_rl.errors import CheckpointError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, spec
-from perception.segment.window import Window, bound_block, center_window, cover_picture
+from perception.segment.window import Window, bound_block, center_window, cover_picture, tile_halves
 
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the networks that come with the package."""
@@ -31,6 +32,9 @@ SMALLEST_PIECE = 0.2
 show. Chosen by hand."""
 LEAST_BLOCK = 0.003
 """Least piece of a block, as a part of the picture; that of `depth_plane`, where it is `min_area`."""
+MAX_CLOSE_RUNS, STABLE = 2, 0.1
+"""Largest number of runs on the block alone; change of its box, as a part of its size, below which
+no other one follows. Chosen by hand."""
 
 Infer = Callable[[np.ndarray], np.ndarray]
 """From a picture `(3, h, w)` float32 in [0, 1] to the probabilities of block and hole, `(2, h,
@@ -137,10 +141,23 @@ class NetworkSegmenter:
         if self._margin is None:
             return _drop_specks(block, holes)
         box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
-        closer = window if box is None else center_window(box, self._size_px, self._margin)
-        if closer.width < window.width:
+        if box is None:
+            part = np.zeros_like(block)
+            for half in tile_halves(block.shape, self._size_px):
+                self._write_masks(frame, half, part, np.zeros_like(part))
+                np.maximum(block, part, out=block)
+            box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
+        for _ in range(MAX_CLOSE_RUNS):
+            closer = window if box is None else center_window(box, self._size_px, self._margin)
+            if box is None or closer.width >= window.width:
+                break
             holes[:] = 0.0
             self._write_masks(frame, closer, block, holes)
+            before, box = box, bound_block(block, THRESHOLD, SMALLEST_PIECE)
+            if box is not None and np.abs(np.subtract(box, before)).max() < STABLE * max(
+                before[2:]
+            ):
+                break
         return _drop_specks(block, holes)
 
     def _write_masks(

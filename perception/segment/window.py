@@ -74,6 +74,16 @@ def cover_picture(shape: tuple[int, ...], size_px: tuple[int, int]) -> Window:
     return center_window((0, 0, shape[1], shape[0]), size_px, 0.0)
 
 
+def tile_halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window]:
+    """Return six overlapping windows of half the size of a picture `(H, W)` that cover most of it."""
+    height, width = shape[:2]
+    corners = []
+    for down in (0.05, 0.45):
+        for across in (0.0, 0.25, 0.5):
+            corners.append((across * width, down * height))
+    return [center_window((*corner, 0.5 * width, 0.5 * height), size_px, 0.0) for corner in corners]
+
+
 def center_window(
     box: tuple[float, float, float, float], size_px: tuple[int, int], margin: float
 ) -> Window:

@@ -93,6 +93,37 @@ def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
     assert cuboid.overlap(twice.block > 0.5, true_block) > 0.95
 
 
+def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_where_more_of_it_is() -> (
+    None
+):
+    frame = Frame(
+        color=np.zeros((360, 640, 3), np.uint8), depth_m=np.ones((360, 640), np.float32), camera_matrix=np.eye(3),
+        base_from_camera=None, t_s=0.0,
+    )  # fmt: skip
+    frame.color[100:200, 300:450] = 128
+    shown = []
+
+    def infer(picture: np.ndarray) -> np.ndarray:
+        shown.append(picture)
+        bright = picture[0] > 0.3
+        if len(shown) <= 6:  # nothing in the whole, nor in five of its parts
+            bright[:] = False
+        if len(shown) == 7:  # in the last one what is there of it
+            bright &= np.arange(160) < 60
+        return np.stack([bright, 0.0 * bright]).astype(np.float32)
+
+    masks = NetworkSegmenter(infer, (160, 96), 0.15).segment(frame)
+    assert len(shown) == 9, (
+        "the whole, six parts, and two closer looks, since the first of them changed the box"
+    )
+    assert cuboid.overlap(masks.block > 0.5, frame.color[..., 0] > 0) > 0.9
+    shown.clear()
+    empty = NetworkSegmenter(
+        lambda picture: np.zeros((2, 96, 160), np.float32), (160, 96), 0.15
+    ).segment(frame)
+    assert not empty.block.any() and empty.hole_mask is not None and not empty.hole_mask.any()
+
+
 def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = UNet((4, 8, 8)).eval().requires_grad_(False)
