@@ -8,6 +8,7 @@ metadata `run`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -48,13 +49,10 @@ class CaptureLogReader:
             RecordingError: it cannot be read, was made on another machine, or holds no piece that
                 is long enough.
         """
-        (contents, q, flow), found = self._series(path, machine), []
-        # All joints share the pieces: a gap in one of them ends the piece for all.
-        for begin_s, end_s in record.split_at_gaps(
-            [t_s for t_s, _ in (*q.values(), *flow.values())], self.longest_gap_s
-        ):
+        signals, found = _read_signals(path, machine), []
+        for begin_s, end_s in signals.split(self.longest_gap_s):
             if end_s - begin_s >= max(self.shortest_s, 2 * machine.period_s):
-                found.append(self._piece(contents, q, flow, begin_s, end_s, path, machine))
+                found.append(signals.cut(begin_s, end_s))
         if not found:
             raise RecordingError(
                 f"{path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s in positions or "
@@ -68,39 +66,34 @@ class CaptureLogReader:
         Raises:
             RecordingError: it cannot be read, was made on another machine, or has a gap there.
         """
-        contents, q, flow = self._series(path, machine)
-        for first_s, last_s in record.split_at_gaps(
-            [t_s for t_s, _ in (*q.values(), *flow.values())], self.longest_gap_s
-        ):
+        signals = _read_signals(path, machine)
+        for first_s, last_s in signals.split(self.longest_gap_s):
             # The ends may be off by less than a gap, since messages do not fall on them.
             if first_s <= begin_s + self.longest_gap_s and last_s >= end_s - self.longest_gap_s:
-                return self._piece(
-                    contents, q, flow, max(first_s, begin_s), min(last_s, end_s), path, machine
-                )
+                return signals.cut(max(first_s, begin_s), min(last_s, end_s))
         raise RecordingError(
             f"{path}: a gap of more than {self.longest_gap_s:g} s in the {end_s - begin_s:.1f} s that are asked for"
         )
 
-    def _series(
-        self, path: Path, machine: Machine
-    ) -> tuple[CaptureContents, dict[str, Series], dict[str, Series]]:
-        """Return the capture, and positions and valve feedback by joint."""
-        contents = capture_reader.read_capture(path)
-        contents.check_machine(machine, path)
-        names = machine.joint_names
-        q = {name: _find_series(contents, f"Position_{name}", path) for name in names}
-        return contents, q, {name: _find_series(contents, f"Flow_{name}", path) for name in names}
 
-    def _piece(
-        self,
-        contents: CaptureContents,
-        q: dict[str, Series],
-        flow: dict[str, Series],
-        begin_s: float,
-        end_s: float,
-        path: Path,
-        machine: Machine,
-    ) -> Recording:
+@dataclass(frozen=True)
+class _Signals:
+    """Positions and valve feedback of a capture, by joint."""
+
+    contents: CaptureContents
+    q: dict[str, Series]
+    flow: dict[str, Series]
+    path: Path
+    machine: Machine
+
+    def split(self, longest_gap_s: float) -> list[tuple[float, float]]:
+        """Return begin and end of the pieces; a gap in one joint ends the piece for all."""
+        times = [t_s for t_s, _ in (*self.q.values(), *self.flow.values())]
+        return list(record.split_at_gaps(times, longest_gap_s))
+
+    def cut(self, begin_s: float, end_s: float) -> Recording:
+        """Return the recording of a piece."""
+        contents, machine = self.contents, self.machine
         begin_s = _align_with_advice(contents, begin_s, machine.period_s)
         # The small addition keeps a period that rounding would drop.
         grid_s = (
@@ -111,12 +104,12 @@ class CaptureLogReader:
         created = datetime.fromtimestamp((contents.wall_ns / 1e9) + (begin_s - first_s), UTC)
         columns_u, columns_q = [], []
         for name in machine.joint_names:
-            columns_u.append(_average_over_periods(flow[name], grid_s, machine.period_s))
-            columns_q.append(np.interp(grid_s, *q[name]))
+            columns_u.append(_average_over_periods(self.flow[name], grid_s, machine.period_s))
+            columns_q.append(np.interp(grid_s, *self.q[name]))
         metadata = {
-            "source": f"capture: {contents.facts.get('source', path.name)}",
+            "source": f"capture: {contents.facts.get('source', self.path.name)}",
             "fingerprint": record.format_fingerprint(machine),
-            "run": f"{path.resolve().parent.name}/{path.stem}",
+            "run": f"{self.path.resolve().parent.name}/{self.path.stem}",
             "created": created.isoformat(timespec="milliseconds"),
         }
         if contents.num_damaged:
@@ -135,6 +128,15 @@ class CaptureLogReader:
             metadata=metadata,
             path=None,
         )
+
+
+def _read_signals(path: Path, machine: Machine) -> _Signals:
+    contents = capture_reader.read_capture(path)
+    contents.check_machine(machine, path)
+    names = machine.joint_names
+    q = {name: _find_series(contents, f"Position_{name}", path) for name in names}
+    flow = {name: _find_series(contents, f"Flow_{name}", path) for name in names}
+    return _Signals(contents, q, flow, path, machine)
 
 
 def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
