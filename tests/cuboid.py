@@ -38,6 +38,18 @@ def looking(eye_m: tuple[float, float, float], at_m: tuple[float, float, float])
     return pose
 
 
+def sight(
+    pose: np.ndarray, size_px: tuple[int, int], focal_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the camera's matrix, and the rays of its pixels in the world, one metre of depth long each."""
+    width, height = size_px
+    matrix = np.diag([focal_px, focal_px, 1.0])
+    matrix[:2, 2] = (width - 1) / 2, (height - 1) / 2
+    pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))])
+    rays = np.moveaxis(pixels, 0, -1) @ np.linalg.inv(matrix).T
+    return matrix, rays @ pose[:3, :3].T
+
+
 def seen(
     pose: np.ndarray,
     size_px: tuple[int, int] = (320, 180),
@@ -47,23 +59,8 @@ def seen(
     seed: int = 0,
 ) -> View:
     """Renders one view; `occluder_m` is the centre of a ball of 8 cm that floats in front of the box."""
-    width, height = size_px
-    focal = 0.55 * width
-    camera_matrix = np.array(
-        [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
-    )
-    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack(
-        [
-            (columns - camera_matrix[0, 2]) / focal,
-            (rows - camera_matrix[1, 2]) / focal,
-            np.ones(columns.shape),
-        ],
-        -1,
-    )
-    rays = rays @ pose[:3, :3].T  # in the world; one unit of the ray is one metre of depth
+    camera_matrix, rays = sight(pose, size_px, 0.55 * size_px[0])
     eye = pose[:3, 3]
-    depth, what = np.full(columns.shape, np.inf), np.zeros(columns.shape, int)
     with np.errstate(divide="ignore", invalid="ignore"):
         ground = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)
         depth, what = np.where(ground < 30, ground, np.inf), np.where(ground < 30, 1, 0)

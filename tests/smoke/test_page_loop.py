@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from block import BLOCK_M, TARGETS, BlockCamera
+from block import TARGETS, take_frame
 from desk import free_port
 from PIL import Image
 from websockets.asyncio.client import connect
 
-FRAME = BlockCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 0.0)
+FRAME = take_frame((640, 360), 0, 0.0)
 TOKEN = "correct horse battery staple"
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from block import BLOCK_M, TARGETS, BlockCamera
+from block import TARGETS, take_frame
 from composed import option
 
 from brokk_rl.contracts.vision import CameraView, FrameDetections, HolePose
@@ -40,7 +40,7 @@ from deploy.runtime.target import (
 
 MACHINE = option("machine", "brokk170")
 OPTIONS = (option("page", "local"), MACHINE, option("guidance", "machine"))
-FRAME = BlockCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 12.0)
+FRAME = take_frame((640, 360), 0, 12.0)
 PIXELS = 640 * 360
 
 

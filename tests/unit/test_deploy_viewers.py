@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from block import BLOCK_M, TARGETS, BlockCamera
+from block import BLOCK_M, TARGETS, take_frame
 from composed import option
 from desk import DBC
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -58,7 +58,6 @@ HOLES = [
 def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of one second with every topic, and two pictures where viewers' messages are written."""
     folder, bus = tmp_path_factory.mktemp("capture"), BusDescription(DBC, machine)
-    camera = BlockCamera(160, 90, BLOCK_M, TARGETS)
     with CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 1.0)) as log:
 
         def say(topic: str, t_s: float, values: dict[str, Any]) -> None:
@@ -76,7 +75,7 @@ def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
         for topic, values in SAID.items():
             say(topic, BEGIN_S + 1.0, values)
         for number in range(2):
-            log.add_frame(camera.take_frame(number, BEGIN_S + 0.2 + 0.5 * number))
+            log.add_frame(take_frame((160, 90), number, BEGIN_S + 0.2 + 0.5 * number))
     return folder
 
 
@@ -146,7 +145,7 @@ def test_the_replay_shows_the_pictures_again(folder: Path, machine: Machine) -> 
     views = ("camera", "camera/calibration", "camera/points", "tf/camera")
     feed = ReplayFeed(replay, machine, read_capture(folder / MCAP, views), lambda: now[0])
     assert feed.read_frame(-1.0) is None, "nothing was taken yet"
-    taken = BlockCamera(160, 90, BLOCK_M, TARGETS).take_frame(1, 0.0)
+    taken = take_frame((160, 90), 1, 0.0)
     now[0] = 0.9
     again = feed.read_frame(-1.0)
     assert again is not None and again.t_s == 0.9 and feed.read_frame(0.9) is None
