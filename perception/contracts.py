@@ -1,6 +1,6 @@
-"""Contracts of the parts of the shipped finder: segmenters, ellipse detectors, pose estimators.
+"""Contracts of the parts of the shipped finder: segmenters, ellipse detectors.
 
-Each is an option of `conf/perception/<part>`: a spec whose `build()` returns the part. Pictures and
+A segmenter is an option of `conf/perception/segmenter`. Pictures and
 camera coordinates are those of `brokk_rl.contracts.vision`.
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
+from brokk_rl.contracts.vision import FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
 
 
@@ -38,34 +38,13 @@ class SegmenterSpec(Protocol):
         ...
 
 
-class PoseEstimator(Protocol):
-    """Turns an ellipse of a picture into a hole in space."""
-
-    def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Return the hole in camera coordinates, or why it is refused; `frame` has no distortion."""
-        ...
-
-
-class PoseEstimatorSpec(Protocol):
-    """A spec in `conf/perception/pose`."""
-
-    def build(self) -> PoseEstimator:
-        """Return an estimator."""
-        ...
-
-
 @runtime_checkable
-class RejectionExplainer(Protocol):
-    """Optional ability of a finder, for `explain.txt` of `mode=perceive`."""
+class SteeredFinder(Protocol):
+    """Optional abilities of a finder: words for `explain.txt`, and to look at known holes alone."""
 
     def explain(self, rejection: Rejection) -> str:
         """Return a sentence: the refused candidate, the reason, and a remedy."""
         ...
-
-
-@runtime_checkable
-class HoleFollower(Protocol):
-    """Optional ability of a finder: to look at known holes alone, in a fraction of the time."""
 
     @property
     def search_every(self) -> int:

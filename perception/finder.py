@@ -15,12 +15,12 @@ from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks,
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception import pair_check, rim_scale, search
-from perception.contracts import PoseEstimatorSpec, SegmenterSpec
+from perception.contracts import SegmenterSpec
 from perception.ellipse.detector import ContourArcs
 from perception.pair_check import PairCheck
 from perception.pair_depth import PairDepth
 from perception.pose import consistency
-from perception.pose.plane_conic import convert_to_gray
+from perception.pose.plane_conic import PlaneConic, convert_to_gray
 from perception.pose.rim import build_chart
 from perception.pose.wall_light import IN_DUST
 from perception.rim_scale import RimScale
@@ -132,7 +132,7 @@ class StagedPerception:
 
     segmenter: SegmenterSpec
     ellipse: ContourArcs
-    pose: PoseEstimatorSpec
+    pose: PlaneConic
     radius_m: Positive
     size_slack: NonNegative
     comfortable_px: float
@@ -221,11 +221,11 @@ class StagedFinder:
 
     @property
     def search_every(self) -> int:
-        """Frames of which one is to be searched as a whole; see `HoleFollower`."""
+        """Frames of which one is to be searched as a whole; see `SteeredFinder`."""
         return self.settings.search_every
 
     def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
-        """Return the holes that are still where they were; see `HoleFollower.follow`."""
+        """Return the holes that are still where they were; see `SteeredFinder.follow`."""
         s = self.settings
         ms: dict[str, float] = {}
         frame, fault = self._prepare(frame, ms)

@@ -76,6 +76,12 @@ def wire(kind: str) -> CanBus:
     )
 
 
+def build_twin(bus: CanBus, **changes: Any) -> Twin:
+    """Returns the twin of a gateway that plays its remote and holds the dead-man, with `changes`."""
+    usual = {"dbc": DBC, "remote": True, "deadman": True, "again_s": None, "fault_port": None}
+    return Twin(wire=bus, seconds=None, realtime=False, **usual | changes)
+
+
 class Stop(NamedTuple):
     """How a machine came to rest.
 
@@ -113,16 +119,7 @@ class Desk:
         # The observer's file is of the hydraulic plant, not of the nominal machine of this desk.
         limits = replace(limits, observer=None)
         self._setting = BusProcessConfig(self.wire, DBC, machine, limits, needs_page=commands)
-        twin = Twin(
-            wire=self.wire,
-            dbc=DBC,
-            remote=True,
-            deadman=True,
-            again_s=None,
-            fault_port=self.port,
-            seconds=None,
-            realtime=False,
-        )
+        twin = build_twin(self.wire, fault_port=self.port)
         session = Session(out=str(folder), seed=0, device="cpu")
         self._twin_arguments = (twin, machine, NominalMachine(), session, None)
         page = replace(option("page", "local"), port=0)
@@ -156,14 +153,7 @@ class Desk:
         """Arms or disarms."""
         # The commander keeps the switches fresh, as the supervisor does.
         now_s = time.monotonic()
-        controls = OperatorControls(
-            t_s=now_s,
-            armed=armed,
-            armed_t_s=now_s,
-            recording=False,
-            recording_t_s=0.0,
-            recording_failed=False,
-        )
+        controls = OperatorControls(now_s, armed, now_s, False, 0.0, recording_failed=False)
         self.memory.controls.write(controls)
 
     def press_stop(self) -> float:

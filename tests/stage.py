@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from composed import option
+from desk import build_twin
 
 from actuators.excite.player import NominalMachine
 from brokk_rl.errors import LinkError
@@ -35,7 +36,7 @@ from deploy.runtime.operator_state import LoopSnapshot
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import FaultPort
 from deploy.twin.remote import RadioRemote
-from deploy.twin.twin import RunningTwin, Twin
+from deploy.twin.twin import RunningTwin
 
 DBC = "deploy:dbc/example_gateway.dbc"
 NO_WIRE = CanBus(interface="virtual", channel="air", bitrate=None, port=None, hops=None)
@@ -273,16 +274,7 @@ class Stage:
         self.meddle: Callable[[], None] | None = None
         self.clock_jump_s, self._times = 0.0, 0
         with self._time():
-            self._twin_settings = Twin(
-                wire=NO_WIRE,
-                dbc=twin_dbc,
-                remote=True,
-                deadman=True,
-                again_s=again_s,
-                fault_port=None,
-                seconds=None,
-                realtime=False,
-            )
+            self._twin_settings = build_twin(NO_WIRE, dbc=twin_dbc, again_s=again_s)
             self._link = NominalMachine().build(
                 machine, 1, Session(out=str(folder), seed=0, device="cpu")
             )

@@ -32,7 +32,7 @@ from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, spec
-from perception.contracts import RejectionExplainer
+from perception.contracts import SteeredFinder
 from perception.overlay import OverlayDrawing
 from perception.tracking.steered_search import SteeredSearch
 
@@ -220,7 +220,7 @@ class Perceive:
 
 def _explain(finder: BoreholeFinder, rejection: Rejection) -> str:
     """Return a refusal in words: the finder's own if it has any."""
-    if isinstance(finder, RejectionExplainer):
+    if isinstance(finder, SteeredFinder):
         return finder.explain(rejection)
     value, limit = f"{rejection.value:.4g}", f"{rejection.limit:.4g}"
     return f"{rejection.stage}: {rejection.reason} is {value}, limit {limit}"

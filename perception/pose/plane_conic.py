@@ -164,7 +164,7 @@ class PlaneConicEstimator:
         self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
+        """Return the hole in camera coordinates, or why it is none; `frame` has no distortion."""
         s, row = self.settings, as_row(ellipse)
         gray, light, allowed = self._prepare(frame, masks)
         self._focal.begin(frame)

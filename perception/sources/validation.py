@@ -35,11 +35,11 @@ _LARGEST_GAMMA = 4.0
 
 
 NUMBERS = {
-    "baseline_m": (1e-3, 3.0, " m; is it in mm, or negative?"),
-    "disparity_std_px": (0.0, _LARGEST_OFFSET_PX, " px"),
-    "gamma": (1.0, _LARGEST_GAMMA, f", and 1 is linear; most cameras have {USUAL_GAMMA:g}"),
+    "baseline_m": (1e-3, 3.0, "0.001 to 3 m; is it in mm, or negative?"),
+    "disparity_std_px": (0.0, _LARGEST_OFFSET_PX, f"0 to {_LARGEST_OFFSET_PX:g} px"),
+    "gamma": (1.0, _LARGEST_GAMMA, f"1 (linear) to {_LARGEST_GAMMA:g}; most have {USUAL_GAMMA:g}"),
 }
-"""Least and largest value of each number of a camera, and words about them."""
+"""Least and largest value of each number of a camera, and both in words."""
 
 
 def check_matrix(value: Any, where: str) -> np.ndarray:
@@ -172,9 +172,9 @@ def check_upright(base_from_camera: np.ndarray, where: str) -> None:
 def check_number(value: Any, where: str, name: str) -> float:
     """Return a number of a camera (`NUMBERS`), or raises a `FrameError` where it is none."""
     found = float(_parse_numbers(value, (), f"{where}: {name}"))
-    least, largest, words = NUMBERS[name]
+    least, largest, expected = NUMBERS[name]
     if not least <= found <= largest:
-        raise FrameError(f"{where}: {name} is {found:g}, expected {least:g} to {largest:g}{words}")
+        raise FrameError(f"{where}: {name} is {found:g}, expected {expected}")
     return found
 
 

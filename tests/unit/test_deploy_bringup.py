@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,21 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
-from desk import DBC, free_port
+from desk import DBC, build_twin, free_port, wire
 
 from actuators.excite.player import NominalMachine
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.session import Session
 from deploy.bringup import JointResponse, _StateChecks, describe_joint, find_pushes
-from deploy.bus.can_bus import CanBus, CanFrame
+from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
-from deploy.runtime.process import ChildProcess
-from deploy.twin.faults import request_fault
 from deploy.twin.rehearsal import RehearsalBench, ScriptedPerson
 from deploy.twin.remote import RadioRemote
-from deploy.twin.twin import Twin
 
 T_S = np.arange(0, 40, 0.01)
 MACHINE = option("machine", "brokk170")
@@ -137,71 +130,6 @@ def test_a_dead_time_beyond_the_commands_of_the_history_fails_the_check(
     assert checks._check_joints().passed is passed
 
 
-def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -> None:
-    """Does what the checklist asks for: dead-man, emergency stop, then each joint both ways."""
-    remote, person = (
-        RadioRemote(BusDescription(DBC, machine), machine),
-        ScriptedPerson(machine, None),
-    )
-    begun_s, asked = time.monotonic(), False
-    with wire.open(remote.frame_ids) as bus:
-        for now_s in remote.iterate_cycles(stop.is_set, bus):
-            person.move(remote, now_s - begun_s)
-            if person.holds("e-stop", now_s - begun_s) and not asked:
-                with contextlib.suppress(TimeoutError):
-                    request_fault(port, {"fault": "estop", "seconds": 0.3})
-            asked = person.holds("e-stop", now_s - begun_s)
-
-
-@pytest.mark.slow
-def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
-    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
-) -> None:
-    bus_port, port = free_port(), free_port()
-    wire = CanBus(
-        interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port, hops=0
-    )
-    twin = Twin(
-        wire=wire,
-        dbc=DBC,
-        remote=False,
-        deadman=False,
-        again_s=None,
-        fault_port=port,
-        seconds=None,
-        realtime=False,
-    )
-    session, stop = Session(out=str(tmp_path / "twin"), seed=0, device="cpu"), threading.Event()
-    child = ChildProcess(
-        "twin", "deploy.twin.twin:run", (twin, machine, NominalMachine(), session), (), 60
-    )
-    time.sleep(2.0)
-    hands = threading.Thread(target=operator, args=(stop, wire, port, machine))
-    hands.start()
-    try:
-        done = brokk(
-            "mode=bringup", "bus=udp", "bus.channel=239.74.163.77", f"bus.port={bus_port}", "bringup.listen_s=1",
-            "bringup.shadow_s=3", "bringup.patience_s=60", "bringup.quiet=1", "bringup.rate=0.8",
-            "guard.observer=null",  # its file is of the hydraulic plant, not of the nominal machine
-            "session.out=report",
-        )  # fmt: skip
-    finally:
-        stop.set()
-        hands.join()
-        child.end(3.0)
-    assert done.code == 0
-    findings = {
-        one["check"]: one
-        for one in json.loads((tmp_path / "report/bringup.json").read_text())["findings"]
-    }
-    assert list(findings) == ["bus", "positions", "dead-man", "e-stop", "joints", "shadow"]
-    failed = {name: one["text"] for name, one in findings.items() if not one["passed"]}
-    assert not failed
-    assert findings["joints"]["values"]["q1"]["dead_time_s"] == pytest.approx(
-        machine.dead_time_s, abs=0.1
-    )
-
-
 def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
     """Its stamps would jump at the first message it hears, and look like those of late copies."""
     machine = option("machine", "brokk170")
@@ -255,10 +183,7 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
 
 
 def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:
-    twin = Twin(
-        wire=CanBus(interface="virtual", channel="x", bitrate=None, port=None, hops=None), dbc=DBC, remote=False, deadman=True,
-        again_s=None, fault_port=43210, seconds=None, realtime=False,
-    )  # fmt: skip
+    twin = build_twin(wire("udp"), remote=False, fault_port=43210)
     bench = RehearsalBench(twin=twin, plant=NominalMachine(), rest_s=1.0, fails=None)  # type: ignore[arg-type]
     assert [one.name for one in bench.companions(option("machine", "brokk170"), None)] == [
         "twin",
@@ -272,14 +197,21 @@ def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_rehearsal_that_fails_a_check_ends_with_an_error(
-    brokk: Callable[..., Any], tmp_path: Path
+@pytest.mark.parametrize("fails", [None, "e-stop"])
+def test_the_checklist_finds_a_sound_machine_and_a_check_that_fails(
+    brokk: Callable[..., Any], machine: Machine, tmp_path: Path, fails: str | None
 ) -> None:
     done = brokk(
         "mode=bringup", "bus=udp", "bus.channel=239.74.163.78", f"bus.port={free_port()}", "bench=operator",
-        f"bench.twin.fault_port={free_port()}", "bench.fails=e-stop", "bench.rest_s=3", "link=nominal", "bringup.listen_s=1",
-        "bringup.shadow_s=3", "bringup.patience_s=30", "bringup.quiet=1", "bringup.rate=0.5", "bringup.realtime=false",
-        "guard.observer=null",  # its file is of the hydraulic plant
+        f"bench.twin.fault_port={free_port()}", f"bench.fails={fails or 'null'}", "bench.rest_s=3", "link=nominal",
+        "bringup.listen_s=1", "bringup.shadow_s=3", "bringup.patience_s=60", "bringup.quiet=1", "bringup.rate=0.5",
+        "bringup.realtime=false", "guard.observer=null",  # its file is of the hydraulic plant
         "session.out=report",
     )  # fmt: skip
-    assert done.code != 0 and "1 of 6 checks failed: e-stop" in done.err
+    report = json.loads((tmp_path / "report/bringup.json").read_text())
+    findings = {one["check"]: one for one in report["findings"]}
+    assert list(findings) == ["bus", "positions", "dead-man", "e-stop", "joints", "shadow"]
+    failed = [name for name, one in findings.items() if not one["passed"]]
+    assert failed == ([fails] if fails else []) and bool(done.code) == bool(fails)
+    joint = findings["joints"]["values"]["q1"]
+    assert joint["dead_time_s"] == pytest.approx(machine.dead_time_s, abs=0.1)

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from composed import option
-from desk import DBC
+from desk import DBC, build_twin
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -23,7 +23,6 @@ from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
 from deploy.twin.bench import GamepadBench
 from deploy.twin.remote import GamepadRemote, run_gamepad
-from deploy.twin.twin import Twin
 
 REMOTE = GamepadRemote(device="", axes=(-1, 0, -4, 3), deadman=4, button_right=5)
 AXIS, BUTTON = 0x02, 0x01
@@ -93,10 +92,7 @@ def test_sticks_are_levers_shoulders_are_dead_man_and_button_and_unplugged_is_si
 def test_a_gamepad_that_is_not_there_is_refused_before_anything_starts(
     machine: Machine, tmp_path: Path
 ) -> None:
-    twin = Twin(
-        wire=option("bus", "udp"), dbc=DBC, remote=False, deadman=True, again_s=None,
-        fault_port=None, seconds=None, realtime=False,
-    )  # fmt: skip
+    twin = build_twin(option("bus", "udp"), remote=False)
     pad = replace(REMOTE, device=str(tmp_path / "js9"))
     bench = GamepadBench(twin=twin, plant=option("link", "nominal"), gamepad=pad)
     with pytest.raises(ConfigError, match=r"bench.gamepad.device=.*js9: No such file.*ls /dev/inp"):
