@@ -26,10 +26,10 @@ class Room:
 ROOMS = (
     Room(("brokk_rl", "tasks", "conf"), bound=13_753, budget=10_500),
     Room(("actuators", "diagnosis", "exam"), bound=21_842, budget=16_500),
-    Room(("perception",), bound=11_134, budget=9_500),
-    Room(("deploy",), bound=7_774, budget=7_500),
-    Room(("study",), bound=1_816, budget=1_800),
-    Room(("tests",), bound=31_915, budget=25_000),
+    Room(("perception",), bound=11_064, budget=9_500),
+    Room(("deploy",), bound=7_770, budget=7_500),
+    Room(("study",), bound=1_804, budget=1_800),
+    Room(("tests",), bound=31_776, budget=25_000),
     Room(("benchmarks",), bound=2_000, budget=2_000),
 )
 
