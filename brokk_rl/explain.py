@@ -131,14 +131,11 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
     )
     if not found:
         text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
-        if mixed := re.search(
-            r"override ([\w.]+)=.*Cannot merge (?:Dict|List)Config with (?:Dict|List)Config",
-            text,
-            re.DOTALL,
-        ):
+        if "Cannot merge" in text:
+            key = text.partition("override ")[2].partition("=")[0]
             return (
-                f"{mixed[1]} holds a list and you gave a table, or the reverse; Hydra puts neither in the place of the other. Take "
-                f"the old value away, '~{mixed[1]}' '+{mixed[1]}=…', or give the option as a file, <group>=@<path>."
+                f"{key} holds a list and you gave a table, or the reverse. Take the old value away, "
+                f"'~{key}' '+{key}=…', or give the option as a file, <group>=@<path>."
             )
         return text
     where, key = found[1], found[2].split("@")[0]
