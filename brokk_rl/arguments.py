@@ -187,9 +187,10 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     is_name = override.is_sweep_override() or isinstance(override.value(), (str, list))
     if key in groups and not is_name:
         return f"{key}='{value}'"  # so that Hydra looks for an option of that name
-    names = list_names(override) if key in groups else []
+    is_sweep = override.is_sweep_override()
+    names = list(override.sweep_string_iterator()) if is_sweep else list_names(override)
     for name in names:
-        if names.count(name) > 1:
+        if key in groups and names.count(name) > 1:
             raise ConfigError(f"{word}: '{name}' stands in it twice; leave one out")
     return word
 
@@ -203,12 +204,13 @@ def parse_words(words: Sequence[str]) -> list[Override]:
 def list_names(override: Override) -> list[str]:
     """Return the texts that an override gives: its value, the items of a list, or all of a sweep."""
     if override.is_sweep_override():
-        texts = ",".join(override.sweep_string_iterator())
-        return [text.strip("[]'\" ") for text in texts.split(",")]
+        names: list[str] = []
+        for text in override.sweep_string_iterator():
+            names += list_names(*parse_words([f"x={text}"]))
+        return names
     value = override.value()
-    return [
-        item for item in (value if isinstance(value, list) else [value]) if isinstance(item, str)
-    ]
+    values = value if isinstance(value, list) else [value]
+    return [item for item in values if isinstance(item, str)]
 
 
 def is_list_group(group: str) -> bool:
