@@ -183,6 +183,8 @@ def _explain_absence(cfg: DictConfig, key: str, value: str) -> str:
         near = []
     wanted = {name for name in names if near and near[0] in (name, _shorten(name))}
     lacks = f"'{parent or mode}' has no '{leaf}'"
+    if "policy" in groups and (value.endswith(".pt") or "policy" in key):
+        return f"{lacks}; a policy is given by policy={value}"
     if found := [f"{one}={value}" for one in keys if one.rpartition(".")[2] in wanted]:
         return f"{lacks}; did you mean {' or '.join(found[:3])}?"
     if value.endswith(ROBOT_FILES):

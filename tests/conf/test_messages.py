@@ -205,6 +205,7 @@ VALUES = {
     "mode=train policy=classical": "this mode takes a network",
     "mode=evaluate policy=runs/none": "policy=runs/none: expected a run folder",
     "mode=evaluate policy=trainned": "there is no policy=trainned; did you mean 'trained'",
+    "mode=evaluate policy.folder=runs/x": "a policy is given by policy=runs/x",
     "mode=evaluate task.action.kind=residual": "kind=residual was asked for, the policy has dir",
     "mode=evaluate task.depth_m=0.1": "task.depth_m=0.1 was asked for, the policy has 0.14",
     "mode=evaluate task=goal_pose": "for task=borehole_insertion, but task=goal_pose was asked for",
