@@ -14,18 +14,16 @@ from brokk_rl.sim.events import Event
 from brokk_rl.sim.model import check_simulated, compile_model, mask_normal_forces
 from brokk_rl.sim.properties import StoredWorld, list_fields
 
-WARNINGS = {
-    mujoco.mjtWarning.mjWARN_INERTIA: "inertia near zero",
-    mujoco.mjtWarning.mjWARN_CONTACTFULL: "the contact buffer is full",
-    mujoco.mjtWarning.mjWARN_CNSTRFULL: "the buffer of constraint rows is full",
-    mujoco.mjtWarning.mjWARN_BADQPOS: "bad position",
-    mujoco.mjtWarning.mjWARN_BADQVEL: "bad speed",
-    mujoco.mjtWarning.mjWARN_BADQACC: "bad acceleration",
-    mujoco.mjtWarning.mjWARN_BADCTRL: "bad command of a drive",
+ALARMS = {
+    1 << int(mujoco.mjtWarning.mjWARN_INERTIA): "inertia near zero",
+    1 << int(mujoco.mjtWarning.mjWARN_CONTACTFULL): "the contact buffer is full",
+    1 << int(mujoco.mjtWarning.mjWARN_CNSTRFULL): "the buffer of constraint rows is full",
+    1 << int(mujoco.mjtWarning.mjWARN_BADQPOS): "bad position",
+    1 << int(mujoco.mjtWarning.mjWARN_BADQVEL): "bad speed",
+    1 << int(mujoco.mjtWarning.mjWARN_BADQACC): "bad acceleration",
+    1 << int(mujoco.mjtWarning.mjWARN_BADCTRL): "bad command of a drive",
 }
-"""MuJoCo's warnings, in words."""
-ALARMS = {1 << int(kind): text for kind, text in WARNINGS.items()}
-"""The same by the bits of an alarm."""
+"""MuJoCo's warnings in words, by the bits of an alarm."""
 
 
 class NativeWorld(StoredWorld):
