@@ -13,7 +13,7 @@ from diagnosis.closure import Estimate
 NUM_DRAWS = 1000
 """Draws; the ends of an interval then vary by 2 % of its width. Chosen by hand."""
 BLOCK_WINDOWS = 4
-"""Windows in a row that are drawn together."""
+"""Windows in a row that are drawn together, and that belong to one half of the field."""
 MIN_BLOCKS = 4
 """Least number of blocks; with fewer windows blocks are shorter. Chosen by hand."""
 

@@ -43,14 +43,14 @@ class JointClosed:
     Attributes:
         before: Of the simulator as it was.
         after: With the selected effects.
-        floor: Of the unchanged machine under the field's motion; `None` where it is unknown.
+        floor: Of the unchanged machine under the field's motion.
         share: `1 - after / before`.
         closed: `(before - after) / (before - floor)`; `None` without a floor below `before`.
     """
 
     before: float
     after: float
-    floor: float | None
+    floor: float
     share: float
     closed: float | None
 
@@ -64,7 +64,7 @@ class Gap:
         after: With the selected effects.
         floor: Error that the unchanged machine would show under the field's own motion; without a
             reference that of an ARX on field recordings that it was not fitted to, or of the
-            repaired simulator; `None` where none is known.
+            repaired simulator.
         closed: `(before - after) / (before - floor)`; above 1 where `after` is below the floor, which
             is an estimate and no bound; `None` where no effect is named.
         unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
@@ -76,7 +76,7 @@ class Gap:
 
     before: float
     after: float
-    floor: float | None
+    floor: float
     closed: Estimate | None
     unit: str = "rad"
     floor_of: str = "reference"

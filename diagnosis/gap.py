@@ -50,19 +50,15 @@ def compute_shapley(
 
 
 def describe_joints(
-    machine: Machine, before: np.ndarray, after: np.ndarray, floor: np.ndarray | None
+    machine: Machine, before: np.ndarray, after: np.ndarray, floor: np.ndarray
 ) -> dict[str, JointClosed]:
     """Return errors `(J,)` before, after and at the floor, joint by joint."""
     found = {}
-    for j, name in enumerate(machine.joint_names):
-        least = None if floor is None else float(floor[j])
-        above = (
-            None
-            if least is None or before[j] < MIN_GAP_RATIO * least
-            else (before[j] - after[j]) / (before[j] - least)
-        )
-        share = float(1.0 - after[j] / max(before[j], 1e-12))
-        found[name] = JointClosed(
-            float(before[j]), float(after[j]), least, share, None if above is None else float(above)
-        )
+    rows = zip(before.tolist(), after.tolist(), floor.tolist(), strict=True)
+    for name, (error, left, least) in zip(machine.joint_names, rows, strict=True):
+        closed = None
+        if error > MIN_GAP_RATIO * least:
+            closed = (error - left) / (error - least)
+        share = 1.0 - left / max(error, 1e-12)
+        found[name] = JointClosed(error, left, least, share, closed)
     return found

@@ -18,7 +18,7 @@ from actuators.scales import choose_horizon_s
 from brokk_rl.commands import view_recordings
 from brokk_rl.record import Recording
 from diagnosis import sensors
-from diagnosis.bootstrap import draw_weights, summarise_draws
+from diagnosis.bootstrap import BLOCK_WINDOWS, draw_weights, summarise_draws
 from diagnosis.case import GapCase
 from diagnosis.closure import MIN_RESTORED, Estimate, Gap, Gate, RivalError
 from diagnosis.engine.decide import Decider, EffectFinding
@@ -31,8 +31,6 @@ from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
 from diagnosis.rivals import measure_rivals
 
-BLOCK_WINDOWS = 4
-"""Windows in a row that belong to one half of the field."""
 NOISE_FACTOR = 3.0
 """An error within so many deviations of the sensor's noise is none."""
 SURE_QUANTILE = 0.95

@@ -66,8 +66,6 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
 
 
 def _describe_floor(gap: Gap) -> str:
-    if gap.floor is None:
-        return "the floor is not known"
     whose = "" if gap.floor_of == "reference" else ", that of an ARX or of the repaired simulator"
     return f"the floor is {format_error(gap.floor, gap.unit)}{whose}"
 
