@@ -205,12 +205,7 @@ class ReferenceDiagnosis(Diagnosis):
         self, decision: Decision, detected: Sequence[DetectedEffect]
     ) -> list[NamedEffect]:
         kinds = {kind.name: kind for kind in self.kinds}
-        # Frames that come late shake all joints, which looks like noise of all sensors.
-        is_held = any(one.hold is not None for one in decision.named)
-        found = []
-        for one in detected:
-            if not (is_held and one.kind.name == "sensor_noise" and one.joints.all()):
-                found.append(NamedEffect(one.kind, None, one))
+        found = [NamedEffect(one.kind, None, one) for one in detected]
         for finding in decision.named if decision.verdict == "effects" else ():
             # The engine simulates a clock that is late as a dead time of all joints.
             is_clock = self.clock_late_s != 0.0 and finding.name == "dead_time"

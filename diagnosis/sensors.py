@@ -1,7 +1,8 @@
 """Noise of sensors, from the scatter of samples; free runs are too coarse.
 
-The scatter of second differences is measured at rest and in motion. White noise of variance `v` adds `6 v`
-to its square, so that every size has a likelihood, given the scatter of the parts of the reference.
+The scatter of second differences is measured under steady commands, where neither drive nor late frames add to it.
+White noise of variance `v` adds `6 v` to its square, so that every size has a likelihood, given the scatter of
+the parts of the reference.
 Axes: `T` time, `J` joints, `P` parts of the reference, `S` sizes.
 """
 
@@ -27,9 +28,8 @@ MIN_ADDED_SCATTER = 1.0
 """Least noise that is added, over that of the reference's own sensor: what adds less is not seen in
 motion. On 120 answers from practice plants of other making, faults that were there reached 6 or
 more, and those named without being there 0.6 at most."""
-REST_SPEED, MOVING_SPEED = 0.01, 0.08
-"""Mean speed over a second, of full speed, below which a joint rests and above which it moves;
-chosen by hand."""
+STEADY_COMMAND = 0.01
+"""Changes of a command over the last second, in all, below which it is steady; chosen by hand."""
 SCATTER_SIGMA = 0.08
 """Standard deviation of the logarithm of the scatter from day to day; chosen by hand: larger ones miss
 faint effects, smaller ones add false alarms."""
@@ -43,21 +43,18 @@ FLOAT_NOISE = 2e-6
 
 
 def measure_scatter(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:
-    """Return the logarithm of the scatter of each recording at rest and in motion, `(P, J, 2)`; NaN where too short."""
+    """Return the squared scatter of each recording under steady commands, `(P, J)`; NaN where there are too few."""
     second = max(2, round(1.0 / machine.period_s))
-    found = np.full((len(recordings), machine.num_joints, 2), np.nan)
+    found = np.full((len(recordings), machine.num_joints), np.nan)
     for number, recording in enumerate(recordings):
-        q = recording.q.astype(float)
-        speed = np.zeros_like(q)
-        speed[second // 2 : second // 2 + len(q) - second] = (q[second:] - q[:-second]) / second
-        speed = np.abs(speed[1:-1]) / (machine.max_speed * machine.period_s)
-        bend = np.abs(np.diff(q, 2, axis=0))
+        way = np.abs(np.diff(recording.u, axis=0)).cumsum(0)
+        bend = np.abs(np.diff(recording.q.astype(float), 2, axis=0))[second - 1 :]
+        steady = way[second:] - way[:-second] < STEADY_COMMAND
         for j in range(machine.num_joints):
-            states = (speed[:, j] < REST_SPEED, speed[:, j] > MOVING_SPEED)
-            for place, rows in enumerate(states):
-                if rows.sum() >= 3 * second:
-                    cut = np.minimum(bend[rows, j], 4 * np.sqrt(np.mean(bend[rows, j] ** 2)))
-                    found[number, j, place] = np.log(np.sqrt(np.mean(cut**2)) + FLOAT_NOISE)
+            own = bend[steady[:, j], j]
+            if len(own) >= 3 * second:
+                cut = np.minimum(own, 4 * np.sqrt(np.mean(own**2)))
+                found[number, j] = np.mean(cut**2) + FLOAT_NOISE**2
     return found
 
 
@@ -68,13 +65,16 @@ def find_sensor_noise(
     reference, machine = split_recordings(case.reference, case.machine), case.machine
     if len(reference) < 2:
         return None
-    seen = _compute_mean(measure_scatter(case.field, machine))
-    plain = measure_scatter(reference, machine)
+    squares = measure_scatter(reference, machine)
+    # A sensor between two of its steps scatters not at all: less than the usual is not told.
+    usual = _compute_mean(squares)
+    seen = _compute_mean(0.5 * np.log(measure_scatter(case.field, machine) + usual))
+    plain = 0.5 * np.log(squares + usual)
     (name,) = kind.fitted
     sizes = SIZES[:, None] * kind.size(name)
     noisy = []
     for added in WHITE_NOISE_FACTOR * sizes**2:
-        noisy.append(0.5 * np.log(np.exp(2.0 * plain) + added[:, None]))
+        noisy.append(0.5 * np.log(squares + usual + added))
     likelihood = np.stack([_compute_likelihood(seen, one, plain) for one in noisy])
     gain = np.minimum(likelihood.max(0) - _compute_likelihood(seen, plain, plain), MAX_GAIN)
     best = likelihood.argmax(0)
@@ -94,7 +94,7 @@ def find_sensor_noise(
         own = np.log(high / low) / (2.0 * SIGMAS)
         factor = np.exp(SIGMAS * np.hypot(own, get_form_error(kind.name)))
         parameters[machine.joint_names[j]] = Estimate(size, (size / factor, size * factor))
-    after = _compute_mean(np.stack(noisy)[best, :, joints].swapaxes(0, 1))
+    after = _compute_mean(np.stack(noisy)[best, :, joints].T)
     closed = _compute_closed_share(seen[mask], after[mask], _compute_mean(plain)[mask])
     earned = float(gain[mask].sum())
     return DetectedEffect(kind, mask, {name: parameters}, worth, earned, closed)
@@ -118,15 +118,14 @@ def _compute_closed_share(seen: np.ndarray, after: np.ndarray, before: np.ndarra
 
 
 def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Return the log likelihood of the field's scatter given that of the parts, `(J,)`.
+    """Return the log likelihood of the field's scatter given that of the parts, `(J,)`; NaN without steady commands.
 
-    Parts scatter at least as they do without noise, `plain` `(P, J, 2)`: a few of them may agree by
+    Parts scatter at least as they do without noise, `plain` `(P, J)`: a few of them may agree by
     chance.
     """
     variance = np.fmax(_compute_variance(drawn), _compute_variance(plain))
     variance = variance * (1.0 + 1.0 / len(drawn)) + SCATTER_SIGMA**2
-    off = np.square(seen - _compute_mean(drawn)) / variance
-    return -0.5 * np.nansum(off + np.where(np.isfinite(off), np.log(variance), 0.0), 1)
+    return -0.5 * (np.square(seen - _compute_mean(drawn)) / variance + np.log(variance))
 
 
 def _compute_mean(values: np.ndarray) -> np.ndarray:

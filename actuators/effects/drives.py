@@ -71,6 +71,22 @@ class Inertia(DriveEffect):
 
 
 @spec
+class Damping(DriveEffect):
+    """Another damping of a position servo: the derivative gain of its firmware, back EMF, viscous friction.
+
+    With less of it a joint overshoots its target; with more it comes later.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        factor: Damping over that of the simulator.
+    """
+
+    interfaces = frozenset({"position"})
+    drives = MappingProxyType({"factor": "damping"})
+    numbers: ClassVar = {"factor": EffectNumber("1", none=1.0, typical=0.6, bounds=(0.1, 5.0))}
+
+
+@spec
 class ForceOffset(DriveEffect):
     """A constant force against the positive direction: weight, or an amplifier that is off its zero.
 

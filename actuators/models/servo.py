@@ -101,8 +101,9 @@ class ServoModel(PlannableModel):
 
     Attributes:
         parameters: Numbers by name, `(N, J)`, `limit_rad` only where there is a limit.
-        drive_changes: Changes by effects, `(N, J)` by name: `shortage`, the error of 5 % of the travel
-            over another limit, 0 for none, and its `firmware_damping`. The lower limit counts.
+        drive_changes: Changes by effects, `(N, J)` by name: a factor on the `damping`; `shortage`, the
+            error of 5 % of the travel over another limit, 0 for none, and its `firmware_damping`. The
+            lower limit counts.
     """
 
     STATES = ("held", "speed")
@@ -122,9 +123,10 @@ class ServoModel(PlannableModel):
     def solve(self, drive: CommandParts) -> tuple[PartSolution, PartSolution]:
         """Return the motion over the two parts of a period."""
         value, limit = self.parameters, self.read_limit()
+        damping = value["damping"] * self.drive_changes.get("damping", 1.0)
         found = []
         for share in (drive.part, 1.0 - drive.part):
-            loop = value["response_s"], value["damping"], share * self.plant.period_s
+            loop = value["response_s"], damping, share * self.plant.period_s
             limited = None if limit is None else LimitedSolution.build(*loop, limit)
             found.append(PartSolution(LoopSolution.build(*loop), limited))
         first, second = found

@@ -27,6 +27,9 @@ at most 26, eight joints with coarse ones 145 and more."""
 LATTICE_LENGTH = 0.8
 """Concentration of the positions at rest from which they lie on a lattice: 0.9 to 1.0 on six joints of a real
 servo arm, whose logs were brought to one rate, which takes positions in motion off their lattice."""
+ALIKE = 2.2
+"""Factor between a step and another one, or a half of that, of about the same sensor: the scale of an encoder is
+off by some per cent."""
 STILL_STEPS = 4.0
 """A joint is at rest that moves by less than such a part of a step in two samples."""
 
@@ -49,7 +52,8 @@ def find_lattice(field: Side, reference: Side, joint: int) -> float:
     nats, step = find_step(field, joint)
     if nats < LATTICE_NATS or measure_rests(reference, joint, step) > LATTICE_LENGTH:
         return 0.0
-    usual = weigh_step(reference, joint, step)
+    # A sensor whose scale is off has steps of its own, nearly as fine as before.
+    usual, _ = _find_step_between(reference, joint, step / ALIKE, step * ALIKE)
     return step if nats > 2.0 * usual + LATTICE_NATS else 0.0
 
 
@@ -83,15 +87,6 @@ def _find_step_between(
     best = int(np.argmax(nats > PART_SHARE * nats.max()))
     best += int(np.argmax(nats[best : best + PADDING]))
     return float(nats[best]), float(steps[best])
-
-
-def weigh_step(side: Side, joint: int, step: float) -> float:
-    """Return the evidence that positions lie on a lattice of a step, units, in nats."""
-    q = _pick_positions(side, joint, step)
-    if len(q) < MIN_POSITIONS:
-        return 0.0
-    length = np.abs(np.exp(2j * np.pi * q / step).mean())
-    return float(_weigh_length(length, len(q)))
 
 
 def _pick_positions(side: Side, joint: int, step: float) -> np.ndarray:

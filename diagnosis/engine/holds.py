@@ -11,8 +11,9 @@ Axes: `T` samples, `K` delays, `M` models of the course.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -40,6 +41,8 @@ LATENT_UNITS_S = 0.004
 """Speed that no joint shows: its step is below the noise of the encoder."""
 TEMPERS = (1.0, 0.5)
 """Powers of the likelihood under which a course is sought; the samples depend on each other."""
+IMPOSSIBLE = -1e9
+"""Log chance of what cannot be."""
 NEIGHBOUR = 0.45
 """Chance that a jumping delay changes by one sample only, up and down each."""
 LEAST_NATS = 5.0
@@ -76,83 +79,28 @@ class HeldCourse:
 @wp.kernel(enable_backward=False)
 def find_courses(
     likelihood: wp.array2d[wp.float64],
-    is_first: wp.array[wp.int32],
-    is_loss: wp.array[wp.int32],
-    begins: wp.array[wp.float64],
-    lasts: wp.array[wp.float64],
-    temper: wp.array[wp.float64],
+    laws: wp.array3d[wp.float64],
     score: wp.array3d[wp.float64],
     back: wp.array3d[wp.int32],
     course: wp.array2d[wp.int32],
 ):
-    """Find the likeliest course of each model by Viterbi's algorithm, `(M, T)`."""
+    """Find the likeliest course under each law by Viterbi's algorithm, `(M, T)`."""
     m = wp.tid()
     samples = likelihood.shape[0]
     delays = likelihood.shape[1]
-    one = wp.float64(1.0)
-    stay_off = wp.log(one - begins[m])
-    begin = wp.log(begins[m])
-    last = wp.log(lasts[m])
-    end = wp.log(one - lasts[m])
-    jump = wp.log((one - lasts[m]) / wp.float64(delays))
-    near = wp.log((one - lasts[m]) * wp.float64(NEIGHBOUR))
-    for d in range(delays):
-        score[m, 0, d] = wp.float64(-1e9)
-    score[m, 0, 0] = wp.float64(0.0)
     for k in range(samples):
-        top = score[m, 0, 0]
-        place = wp.int32(0)
-        for d in range(1, delays):
-            if score[m, 0, d] > top:
-                top = score[m, 0, d]
-                place = d
         for d in range(delays):
-            best = wp.float64(-1e9)
-            source = place
-            if is_first[k] == 1:
-                if d == 0:
-                    best = top
-            elif is_loss[m] == 1:
-                if d == 0:
-                    best = score[m, 0, 0] + stay_off
-                    source = wp.int32(0)
-                    if top + end > best and place > 0:
-                        best = top + end
-                        source = place
-                    for other in range(1, delays):
-                        if score[m, 0, other] + end > best:
-                            best = score[m, 0, other] + end
-                            source = other
-                elif d == 1:
-                    best = score[m, 0, 0] + begin
-                    source = wp.int32(0)
-                else:
-                    best = score[m, 0, d - 1] + last
-                    source = d - 1
-            else:
-                best = top + jump
-                stay = last
-                if d == 0:
-                    stay = stay_off
-                if score[m, 0, d] + stay > best:
-                    best = score[m, 0, d] + stay
-                    source = d
-                if d > 0:
-                    rise = near
-                    if d == 1:
-                        rise = begin
-                    if score[m, 0, d - 1] + rise > best:
-                        best = score[m, 0, d - 1] + rise
-                        source = d - 1
-                # Warp evaluates both sides of `and`: the index stays within the row.
-                above = wp.min(d + 1, delays - 1)
-                if d < above and score[m, 0, above] + near > best:
-                    best = score[m, 0, above] + near
-                    source = above
-            score[m, 1, d] = best
+            best = score[m, 0, 0] + laws[m, 0, d]
+            source = wp.int32(0)
+            for before in range(1, delays):
+                tried = score[m, 0, before] + laws[m, before, d]
+                if tried > best:
+                    best = tried
+                    source = before
+            score[m, 1, d] = best + likelihood[k, d]
             back[m, k, d] = source
         for d in range(delays):
-            score[m, 0, d] = score[m, 1, d] + temper[m] * likelihood[k, d]
+            score[m, 0, d] = score[m, 1, d]
     state = wp.int32(0)
     for d in range(1, delays):
         if score[m, 0, d] > score[m, 0, state]:
@@ -163,46 +111,57 @@ def find_courses(
         state = back[m, k, state]
 
 
+def build_law(course: Course, num_delays: int) -> np.ndarray:
+    """Return the log chance that a delay (first axis) is followed by another one (second), `(K, K)`."""
+    stays = np.full(num_delays, course.lasts)
+    stays[0] = 1.0 - course.begins
+    steps = np.arange(num_delays)
+    if course.is_loss:
+        chance = np.zeros((num_delays, num_delays))
+        chance[steps[1:], 0] = 1.0 - course.lasts
+        chance[steps[1:-1], steps[2:]] = course.lasts
+        chance[0, :2] = (1.0 - course.begins, course.begins)
+    else:
+        is_near = np.abs(steps[:, None] - steps) == 1
+        chance = (1.0 - stays[:, None]) * np.where(is_near, NEIGHBOUR, 1.0 / num_delays)
+        np.fill_diagonal(chance, stays)
+    return np.where(chance > 0.0, np.log(np.maximum(chance, 1e-300)), IMPOSSIBLE)
+
+
 def _search_courses(
     side: Side, bases: Sequence[JointBaseline], numbers: Sequence[np.ndarray]
-) -> list[tuple[Course, np.ndarray, int]]:
-    """Return the likeliest course under each law and temper, in samples, and its number of delays."""
+) -> list[tuple[Course, np.ndarray, np.ndarray]]:
+    """Return the likeliest course under each law and temper, in samples, and its law."""
     found = []
     for parts in sorted({course.parts for course in side.model.courses}):
         courses = [course for course in side.model.courses if course.parts == parts]
         bank = _build_bank(side, bases, numbers, parts)
-        for course, states in _follow_courses(bank, courses, side):
+        laws = [build_law(course, bank.shape[1]) for course in courses]
+        for place, states in enumerate(follow_courses(bank, laws)):
             delays = states / parts
+            law = laws[place // len(TEMPERS)]
             for _ in range(0 if side.model.integrates else TARGET_ROUNDS):
                 bank = _build_target_bank(side, bases, numbers, parts, delays)
-                (_, states), *_ = _follow_courses(bank, [course], side)
-                delays = states / parts
-            found.append((course, delays, bank.shape[1]))
+                delays = follow_courses(bank, [law])[0] / parts
+            found.append((courses[place // len(TEMPERS)], delays, law))
     return found
 
 
-def _follow_courses(
-    bank: np.ndarray, courses: Sequence[Course], side: Side
-) -> list[tuple[Course, np.ndarray]]:
-    """Return the likeliest states of courses from log likelihoods `(T, K)`."""
-    models = [(course, temper) for course in courses for temper in TEMPERS]
+def follow_courses(bank: np.ndarray, laws: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the likeliest states under each law and temper from log likelihoods `(T, K)`, `(M, T)`."""
     num_samples, num_delays = bank.shape
-    is_first = np.zeros(num_samples, dtype=np.int32)
-    is_first[side.starts] = 1
+    # A law over a temper is the same as the likelihood to the power of it.
+    models = np.array([law / temper for law in laws for temper in TEMPERS])
     with wp.ScopedDevice(DEVICE):
         found = wp.zeros((len(models), num_samples), dtype=wp.int32)
         inputs = [
             wp.array(bank, dtype=wp.float64),
-            wp.array(is_first, dtype=wp.int32),
-            wp.array([int(course.is_loss) for course, _ in models], dtype=wp.int32),
-            wp.array([course.begins for course, _ in models], dtype=wp.float64),
-            wp.array([course.lasts for course, _ in models], dtype=wp.float64),
-            wp.array([temper for _, temper in models], dtype=wp.float64),
-            wp.empty((len(models), 2, num_delays), dtype=wp.float64),
+            wp.array(models, dtype=wp.float64),
+            wp.zeros((len(models), 2, num_delays), dtype=wp.float64),
             wp.empty((len(models), num_samples, num_delays), dtype=wp.int32),
         ]
         wp.launch(find_courses, dim=len(models), inputs=inputs, outputs=[found])
-    return [(course, row) for (course, _), row in zip(models, found.numpy(), strict=True)]
+    return found.numpy()
 
 
 def _build_bank(
@@ -235,6 +194,7 @@ def _build_bank(
         bank[: side.num_samples - late - 1] += mixed.T
     for begin in side.starts:
         bank[begin : begin + num_delays] = 0.0
+    bank[side.starts, 1:] = IMPOSSIBLE
     return bank
 
 
@@ -268,6 +228,7 @@ def _build_target_bank(
             bank[:, d] += (lost * missing - 0.5 * missing**2) / variance
     for begin in side.starts:
         bank[begin : begin + side.count(side.model.settling_s)] = 0.0
+    bank[side.starts, 1:] = IMPOSSIBLE
     return bank
 
 
@@ -327,23 +288,10 @@ def _weigh_samples(side: Side) -> np.ndarray:
     return squares / max(float(squares.sum()), 1e-12)
 
 
-def _price_course(delays: np.ndarray, course: Course, num_delays: int) -> np.ndarray:
+def _price_course(delays: np.ndarray, law: np.ndarray, parts: int) -> np.ndarray:
     """Return the log prior of each step of a course, against no delay at all, `(T,)`."""
-    states = np.rint(delays * course.parts)
-    now, then = states[:-1], states[1:]
-    is_off, is_same = now == 0, now == then
-    off = np.log(1.0 - course.begins)
-    begin, last = np.log(course.begins), np.log(course.lasts)
-    end = np.log(1.0 - course.lasts)
-    if course.is_loss:
-        on = np.where(then == now + 1, last, end)
-        price = np.where(is_off, np.where(is_same, off, begin), on)
-    else:
-        step = np.where(np.abs(now - then) == 1, NEIGHBOUR, 1.0 / num_delays)
-        stay = np.where(is_off, off, last)
-        leave = np.where(is_off, begin, end) + np.log(step)
-        price = np.where(is_same, stay, leave)
-    return np.append(price - off, 0.0)
+    states = np.rint(delays * parts).astype(int)
+    return np.append(law[states[:-1], states[1:]] - law[0, 0], 0.0)
 
 
 class HeldCommands:
@@ -355,13 +303,39 @@ class HeldCommands:
 
     def __init__(self, evidence: RowEvidence) -> None:
         self._evidence = evidence
-        self._on_reference: dict[Course, float] = {}
 
     def find(self, joints: Sequence[FieldJoint]) -> dict[str, HeldCourse]:
         """Return the best course of each effect beside the numbers of the joints, where one earns anything."""
-        side, evidence = joints[0].side, self._evidence
-        numbers = [joint.numbers for joint in joints]
+        side, reference = joints[0].side, self._evidence.reference
         rising = _find_rising(side, joints)
+        found: dict[str, HeldCourse] = {}
+        for course, gain, delays, gains in self._search(joints):
+            if gain < LEAST_NATS:
+                continue
+            price = self._prices.get(course, 0.0) * side.num_samples / reference.num_samples
+            best = found.get(course.effect)
+            if best is None or gain - price > best.gain - best.price:
+                starts, stops = float(gains[rising].sum()), float(gains[~rising].sum())
+                found[course.effect] = HeldCourse(
+                    course, delays, gain, price, starts, stops, _weigh_samples(side)
+                )
+        return found
+
+    @cached_property
+    def _prices(self) -> dict[Course, float]:
+        """What each course earns on the reference, nats."""
+        evidence = self._evidence
+        healthy = [base.numbers for base in evidence.bases]
+        found: dict[Course, float] = {}
+        for course, gain, *_ in self._search(evidence.view_field(healthy, evidence.reference)):
+            found[course] = max(gain, found.get(course, 0.0))
+        return found
+
+    def _search(
+        self, joints: Sequence[FieldJoint]
+    ) -> Iterator[tuple[Course, float, np.ndarray, np.ndarray]]:
+        """Yield courses with their gain in all, their delays and the gain at each sample."""
+        side = joints[0].side
 
         def judge(delays: np.ndarray) -> np.ndarray:
             held = hold_commands(side, delays)
@@ -373,55 +347,10 @@ class HeldCommands:
                 total[: len(gains)] += gains
             return total
 
-        found: dict[str, HeldCourse] = {}
-        for course, delays, num_delays in _search_courses(side, evidence.bases, numbers):
-            if not delays.any():
-                continue
-            gain, delays, gains = _drop_worthless(side, delays, course, num_delays, judge)
-            if gain < LEAST_NATS:
-                continue
-            price = max(self._price(course), 0.0) * side.num_samples
-            price /= evidence.reference.num_samples
-            best = found.get(course.effect)
-            if best is None or gain - price > best.gain - best.price:
-                starts, stops = float(gains[rising].sum()), float(gains[~rising].sum())
-                found[course.effect] = HeldCourse(
-                    course, delays, gain, price, starts, stops, _weigh_samples(side)
-                )
-        return found
-
-    def _price(self, course: Course) -> float:
-        """Return what a model of the course earns on the left-out parts of the reference, nats."""
-        if not self._on_reference:
-            self._search_reference()
-        return self._on_reference[course]
-
-    def _search_reference(self) -> None:
-        evidence, side = self._evidence, self._evidence.reference
-        bases, nuisances = evidence.bases, evidence.nuisances
-        self._on_reference = dict.fromkeys(side.model.courses, 0.0)
-        numbers = [base.numbers for base in bases]
-        healthy = [side.simulate(j, row)[0] for j, row in enumerate(numbers)]
-
-        def judge(delays: np.ndarray) -> np.ndarray:
-            held = hold_commands(side, delays)
-            total = np.zeros(side.num_samples)
-            for j, base in enumerate(bases):
-                path = held.simulate(j, base.numbers)[0]
-                added = base.measure(path).astype(float) - base.measure(healthy[j])
-                for k, part in enumerate(nuisances[j].parts):
-                    own = np.flatnonzero(base.part == k)
-                    before = base.left_out[own]
-                    left = before - added[own]
-                    first, second = part.clean(before), part.clean(left)
-                    root = np.sqrt(part.spread)
-                    total[own] += 0.5 * (before / root * first - left / root * second)
-            return total
-
-        for course, delays, num_delays in _search_courses(side, bases, numbers):
+        numbers = [joint.numbers for joint in joints]
+        for course, delays, law in _search_courses(side, self._evidence.bases, numbers):
             if delays.any():
-                gain = _drop_worthless(side, delays, course, num_delays, judge)[0]
-                self._on_reference[course] = max(self._on_reference[course], gain)
+                yield course, *_drop_worthless(side, delays, law, course.parts, judge)
 
 
 def _share_gain(
@@ -454,19 +383,19 @@ def _find_rising(side: Side, joints: Sequence[FieldJoint]) -> np.ndarray:
 def _drop_worthless(
     side: Side,
     delays: np.ndarray,
-    course: Course,
-    num_delays: int,
+    law: np.ndarray,
+    parts: int,
     judge: Callable[[np.ndarray], np.ndarray],
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return gain, course and gain of each sample without the episodes that do not earn their prior."""
 
     def add_up(tried: np.ndarray, gains: np.ndarray) -> float:
-        return float(gains.sum() + _price_course(tried, course, num_delays).sum())
+        return float(gains.sum() + _price_course(tried, law, parts).sum())
 
     gains = judge(delays)
     best = (add_up(delays, gains), delays, gains)
     for _ in range(3):
-        prior = _price_course(delays, course, num_delays)
+        prior = _price_course(delays, law, parts)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], delays > 0, [0]]).astype(int)))
         begin, end = edges[::2], edges[1::2]
         if not len(begin):

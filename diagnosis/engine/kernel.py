@@ -360,7 +360,7 @@ def simulate_servo(
     step_s = period_s / wp.float64(substeps)
     source = which[c]
     w = one / numbers[c, ServoPlace.RESPONSE_S]
-    damping = numbers[c, ServoPlace.DAMPING]
+    damping = numbers[c, ServoPlace.DAMPING_RATIO]
     inside = numbers[c, ServoPlace.FIRMWARE_DAMPING]
     brake_s = wp.float64(2.0) * inside * damping / w
     push = step_s * w * w

@@ -22,7 +22,7 @@ NUMBERS = (
     JointNumber("crosstalk"),
     JointNumber("crosstalk_joint"),
     JointNumber("response_s", 0.05, 0.04, 0.002, 0.001, 0.008, 0.6),
-    JointNumber("damping", 1.0, 0.4, 0.03, 0.02, 0.15, 5.0),
+    JointNumber("damping_ratio", 1.0, 0.4, 0.03, 0.02, 0.15, 5.0),
     JointNumber("sag", 0.0, 0.04, 0.001, 0.0015, -1.0, 1.0),
     *repeat_number(4, JointNumber("sag_pose", 0.0, 0.03, 0.001, 0.001, -0.6, 0.6)),
     JointNumber("dry", 0.004, 0.006, 0.0005, 0.0006, 0.0, 0.5),
@@ -55,6 +55,8 @@ def _list_effect_rows() -> list[Row]:
         rows.append(Row("lag", (("command_lag_s", "add", s),)))
         two_stages = (("command_lag_s", "add", 0.5 * s), ("pilot_lag_s", "add", 0.5 * s))
         rows.append(Row("lag", two_stages, (0, 1)))
+    for s in (-0.8, -0.6, -0.42, -0.28, -0.17, -0.1, 0.1, 0.17, 0.3, 0.5, 0.9, 1.6, 2.8):
+        rows.append(Row("damping", (("damping_ratio", "scale", s),)))
     for s in spread_sizes(0.06, 4.0, 18):
         rows.append(Row("rate_limit", (("slope_time_s", "least", s),)))
     for s in spread_sizes(0.003, 0.3, 16):
@@ -102,6 +104,7 @@ SERVO = JointModel(
             ("delay_s",),
             ("command_lag_s",),
             ("command_lag_s", "pilot_lag_s"),
+            ("damping_ratio",),
             ("slope_time_s",),
             ("dry",),
             ("hysteresis",),

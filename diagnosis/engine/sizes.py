@@ -177,6 +177,8 @@ def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
         return {"extend": values["band_out"], "retract": values["band_in"]}
     if effect == "flow_gain":
         return {"gain": 1.0 + values["speed_out"]}
+    if effect == "damping":
+        return {"factor": 1.0 + values["damping_ratio"]}
     if effect == "asymmetry":
         return {
             "extend_gain": 1.0 + values.get("speed_out", 0.0),

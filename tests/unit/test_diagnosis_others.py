@@ -52,6 +52,12 @@ def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine
     assert found is not None
     assert found.joints.tolist() == [False, True, False, False, False]
     assert found.parameters["sigma_rad"]["q2"].mean == pytest.approx(1.5e-3, rel=0.15)
+    # What shakes a joint while it moves is no noise of its sensor.
+    shaken = field.q.copy()
+    moves = np.abs(np.gradient(shaken[:, 2])) > 0.3 * np.abs(np.gradient(shaken[:, 2])).max()
+    shaken[moves, 2] += 2e-3 * np.random.default_rng(5).standard_normal(moves.sum())
+    shaking = GapCase(machine, reference, [dataclasses.replace(field, q=shaken)])
+    assert sensors.find_sensor_noise(shaking, kinds["sensor_noise"], 8.0, 12.0) is None
     sound = GapCase(machine, reference, [field])
     assert sensors.find_sensor_noise(sound, kinds["sensor_noise"], 8.0, 12.0) is None
 
@@ -152,3 +158,14 @@ def test_a_lattice_that_motion_blurs_in_the_reference_is_no_coarse_sensor(machin
     field = stack_side([coarse[1]], machine)
     assert find_lattice(field, stack_side([fine], machine), 2) > 0.0
     assert find_lattice(field, stack_side([blurred], machine), 2) == 0.0
+
+
+@pytest.mark.parametrize("scale", [0.97, 1.02])
+def test_an_encoder_whose_scale_is_off_is_no_coarser_than_before(
+    machine: Machine, scale: float
+) -> None:
+    before, after = (swept(machine, 300.0, seed) for seed in (0, 1))
+    reference = dataclasses.replace(before, q=np.round(before.q / 0.0015) * 0.0015)
+    field = dataclasses.replace(after, q=scale * np.round(after.q / 0.0015) * 0.0015)
+    sides = stack_side([field], machine), stack_side([reference], machine)
+    assert find_lattice(*sides, 2) == 0.0

@@ -60,6 +60,18 @@ def test_a_servo_follows_its_differential_equation(arm: Machine, damping: float)
     np.testing.assert_allclose(found, solved.y[0], atol=3e-3)  # of a step by 0.8 rad
 
 
+@pytest.mark.parametrize("factor", [0.4, 1.6])
+def test_another_damping_is_that_of_the_servo_it_acts_on(arm: Machine, factor: float) -> None:
+    loop = {"response_s": 0.06, "top_speed": 50.0}
+    servo = replace(option("actuator", "servo"), damping=0.8, **loop).build(arm, 1, CPU)
+    spec = replace(option("effect", "damping"), joints=["pitch"], factor=factor)
+    found = run_servo(spec.wrap(servo, arm, 1, CPU), arm, step_commands(arm))
+    for damping, joint in ((0.8, 0), (0.8 * factor, 1)):
+        own = replace(option("actuator", "servo"), damping=damping, **loop).build(arm, 1, CPU)
+        expected = run_servo(own, arm, step_commands(arm))
+        np.testing.assert_allclose(found[:, joint], expected[:, joint], atol=1e-6)
+
+
 def test_an_ideal_servo_is_at_its_target_after_a_period(arm: Machine) -> None:
     u = np.random.default_rng(0).uniform(-0.1, 0.1, (30, arm.num_joints)).cumsum(0).clip(-1, 1)
     found = run_servo(
@@ -106,8 +118,8 @@ def test_effects_of_valves_are_refused_by_servos_and_the_other_way_round(
 ) -> None:
     known = {kind.name for kind in load_effects(arm)}
     assert known == {
-        "backlash", "dead_time", "delay_jitter", "frame_loss", "lag", "quantisation", "rate_limit", "sag", "sensor_noise",
-        "torque_limit",
+        "backlash", "damping", "dead_time", "delay_jitter", "frame_loss", "lag", "quantisation", "rate_limit", "sag",
+        "sensor_noise", "torque_limit",
     }  # fmt: skip
     model = option("actuator", "servo").build(arm, 1, CPU)
     with pytest.raises(ConfigError, match="commanded by position, where it does not occur"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import Answer
 from diagnosis.case import GapCase
+from diagnosis.engine.holds import build_law, follow_courses
+from diagnosis.engine.joint_model import Course
 from diagnosis.engine.rows import Row
 from diagnosis.engine.servo import SERVO
 from diagnosis.engine.side import Side, stack_side
@@ -28,7 +31,9 @@ SUBSTEPS = 10
 """Steps of the plant in a control period."""
 
 
-def record_arm(arm: Machine, seed: int, lost: float, late_s: float) -> Recording:
+def record_arm(
+    arm: Machine, seed: int, lost: float, late_s: float, damping: float = ARM_DAMPING
+) -> Recording:
     """Returns a minute and a half of ramps to and fro, followed by a loop of second order.
 
     A frame is lost with the chance `lost`, else late by up to `late_s`; none overtakes another.
@@ -45,7 +50,7 @@ def record_arm(arm: Machine, seed: int, lost: float, late_s: float) -> Recording
     fine_s = arm.period_s / SUBSTEPS * np.arange(count * SUBSTEPS)
     sent = u[arrives][np.maximum(np.searchsorted(come_s, fine_s, "right") - 1, 0)]
     middle, half = (arm.upper + arm.lower) / 2, (arm.upper - arm.lower) / 2
-    loop = np.array([[0.0, 1.0], [-(ARM_RESPONSE_S**-2), -2.0 * ARM_DAMPING / ARM_RESPONSE_S]])
+    loop = np.array([[0.0, 1.0], [-(ARM_RESPONSE_S**-2), -2.0 * damping / ARM_RESPONSE_S]])
     drive = np.array([[0.0], [ARM_RESPONSE_S**-2]])
     continuous = (loop, drive, np.eye(2), 0.0 * drive)
     discrete: Any = cont2discrete(continuous, arm.period_s / SUBSTEPS)
@@ -113,7 +118,7 @@ def stand_still(machine: Machine, u: np.ndarray) -> Side:
 def simulate(machine: Machine, u: np.ndarray, **values: float) -> np.ndarray:
     """Return the path of the first joint under targets `(T,)`, half travels from the middle."""
     numbers = np.zeros(len(SERVO.numbers))
-    plain = {"response_s": RESPONSE_S, "damping": DAMPING, "firmware_damping": 0.5}
+    plain = {"response_s": RESPONSE_S, "damping_ratio": DAMPING, "firmware_damping": 0.5}
     for name, value in (plain | values).items():
         numbers[SERVO.place[name]] = value
     side = stand_still(machine, np.stack([u, np.zeros_like(u)], 1))
@@ -224,3 +229,35 @@ def test_late_servos_are_named_with_their_delay(
     for name in names:
         estimate = answer.selected[0].parameters["dead_time_s"][name]
         assert estimate.mean == pytest.approx(late * pair.period_s, rel=0.1)
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.5])
+def test_another_damping_is_named_alone_with_its_size(pair: Machine, factor: float) -> None:
+    arm = option("machine", "so101")
+    reference = [cut_joints(record_arm(arm, seed, 0.0, 0.0), pair) for seed in (1, 2, 3)]
+    field = []
+    for seed in (4, 5):
+        one = cut_joints(record_arm(arm, seed, 0.0, 0.0), pair)
+        changed = cut_joints(record_arm(arm, seed, 0.0, 0.0, factor * ARM_DAMPING), pair)
+        q = one.q.copy()
+        q[:, 1] = changed.q[:, 1]
+        field.append(replace(one, q=q))
+    answer = diagnose(GapCase(pair, reference, field))
+    assert [(one.effect, one.joints) for one in answer.selected] == [("damping", ("pitch",))]
+    estimate = answer.selected[0].parameters["factor"]["pitch"]
+    assert estimate.mean == pytest.approx(factor, rel=0.1)
+    assert estimate.ci95[0] < factor < estimate.ci95[1]
+
+
+@pytest.mark.parametrize("effect", ["frame_loss", "delay_jitter"])
+def test_the_found_course_is_the_likeliest_of_all(effect: str) -> None:
+    """Against all 4^6 courses: the log chance of each step and the likelihood of each state."""
+    law = build_law(Course(effect, 0.2, 0.6), 4)
+    for seed in range(5):
+        bank = 3.0 * np.random.default_rng(seed).standard_normal((6, 4))
+        best = (-np.inf, ())
+        for states in product(range(4), repeat=6):
+            total = law[states[:-1], states[1:]].sum() + bank[np.arange(6), states].sum()
+            total += law[:, states[0]].max()
+            best = max(best, (float(total), states))
+        assert tuple(follow_courses(bank, [law])[0]) == best[1]
