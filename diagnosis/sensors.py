@@ -43,7 +43,7 @@ FLOAT_NOISE = 2e-6
 
 
 def measure_scatter(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:
-    """Return the squared scatter of each recording under steady commands, `(P, J)`; NaN where there are too few."""
+    """Return the logarithm of the scatter of each recording under steady commands, `(P, J)`; NaN where there are too few."""
     second = max(2, round(1.0 / machine.period_s))
     found = np.full((len(recordings), machine.num_joints), np.nan)
     for number, recording in enumerate(recordings):
@@ -54,7 +54,7 @@ def measure_scatter(recordings: Sequence[Recording], machine: Machine) -> np.nda
             own = bend[steady[:, j], j]
             if len(own) >= 3 * second:
                 cut = np.minimum(own, 4 * np.sqrt(np.mean(own**2)))
-                found[number, j] = np.mean(cut**2) + FLOAT_NOISE**2
+                found[number, j] = np.log(np.sqrt(np.mean(cut**2)) + FLOAT_NOISE)
     return found
 
 
@@ -65,16 +65,13 @@ def find_sensor_noise(
     reference, machine = split_recordings(case.reference, case.machine), case.machine
     if len(reference) < 2:
         return None
-    squares = measure_scatter(reference, machine)
-    # A sensor between two of its steps scatters not at all: less than the usual is not told.
-    usual = _compute_mean(squares)
-    seen = _compute_mean(0.5 * np.log(measure_scatter(case.field, machine) + usual))
-    plain = 0.5 * np.log(squares + usual)
+    seen = _compute_mean(measure_scatter(case.field, machine))
+    plain = measure_scatter(reference, machine)
     (name,) = kind.fitted
     sizes = SIZES[:, None] * kind.size(name)
     noisy = []
     for added in WHITE_NOISE_FACTOR * sizes**2:
-        noisy.append(0.5 * np.log(squares + usual + added))
+        noisy.append(0.5 * np.log(np.exp(2.0 * plain) + added))
     likelihood = np.stack([_compute_likelihood(seen, one, plain) for one in noisy])
     gain = np.minimum(likelihood.max(0) - _compute_likelihood(seen, plain, plain), MAX_GAIN)
     best = likelihood.argmax(0)

@@ -153,7 +153,8 @@ class JointModel:
                 if how == "add":
                     values[place] += value
                 elif how == "scale":
-                    values[place] *= 1.0 + value
+                    number = self.numbers[place]
+                    values[place] = np.clip(values[place] * (1.0 + value), number.lower, number.upper)
                 elif how == "set":
                     values[place] = value
                 else:

@@ -57,7 +57,7 @@ FIXED = frozenset(
 )
 """Numbers that choose a form; no size of them is searched."""
 CEILINGS = {"stop_ratio": 0.97, "damping": 0.7, "thermal_s": 700.0, "firmware_damping": 1.0}
-FLOORS = {"thermal_s": 30.0, "damping_ratio": -0.9}
+FLOORS = {"thermal_s": 30.0}
 
 
 def _limit_shape(name: str, factor: float) -> float:

@@ -57,6 +57,9 @@ def _list_effect_rows() -> list[Row]:
         rows.append(Row("lag", two_stages, (0, 1)))
     for s in (-0.8, -0.6, -0.42, -0.28, -0.17, -0.1, 0.1, 0.17, 0.3, 0.5, 0.9, 1.6, 2.8):
         rows.append(Row("damping", (("damping_ratio", "scale", s),)))
+        # Friction in proportion to the speed acts beside a limit of the torque, not within it.
+        friction = ("firmware_damping", "scale", -s / (1.0 + s))
+        rows.append(Row("damping", (("damping_ratio", "scale", s), friction)))
     for s in spread_sizes(0.06, 4.0, 18):
         rows.append(Row("rate_limit", (("slope_time_s", "least", s),)))
     for s in spread_sizes(0.003, 0.3, 16):
