@@ -154,7 +154,9 @@ class JointModel:
                     values[place] += value
                 elif how == "scale":
                     number = self.numbers[place]
-                    values[place] = np.clip(values[place] * (1.0 + value), number.lower, number.upper)
+                    values[place] = np.clip(
+                        values[place] * (1.0 + value), number.lower, number.upper
+                    )
                 elif how == "set":
                     values[place] = value
                 else:
