@@ -160,12 +160,9 @@ def test_a_lattice_that_motion_blurs_in_the_reference_is_no_coarse_sensor(machin
     assert find_lattice(field, stack_side([blurred], machine), 2) == 0.0
 
 
-@pytest.mark.parametrize("scale", [0.97, 1.02])
-def test_an_encoder_whose_scale_is_off_is_no_coarser_than_before(
-    machine: Machine, scale: float
-) -> None:
+def test_an_encoder_whose_scale_is_off_is_no_coarser_than_before(machine: Machine) -> None:
     before, after = (swept(machine, 300.0, seed) for seed in (0, 1))
     reference = dataclasses.replace(before, q=np.round(before.q / 0.0015) * 0.0015)
-    field = dataclasses.replace(after, q=scale * np.round(after.q / 0.0015) * 0.0015)
+    field = dataclasses.replace(after, q=1.02 * np.round(after.q / 0.0015) * 0.0015)
     sides = stack_side([field], machine), stack_side([reference], machine)
     assert find_lattice(*sides, 2) == 0.0

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-import warp as wp
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
@@ -228,52 +227,24 @@ def test_share_and_persistence_of_losses_are_read_from_their_course(machine: Mac
         assert by_joint["q1"].ci95[1] <= 1.0
 
 
-@pytest.mark.parametrize("effect", ["frame_loss", "delay_jitter"])
-def test_courses_are_the_likeliest_of_all(effect: str) -> None:
-    generator = np.random.default_rng(3)
-    samples, delays = 6, 3
-    likelihood = generator.normal(0.0, 2.0, (samples, delays))
-    course = Course(effect, 0.1, 0.7)
-    found = wp.zeros((1, samples), dtype=wp.int32)
-    wp.launch(
-        holds.find_courses,
-        dim=1,
-        inputs=[
-            wp.array(likelihood, dtype=wp.float64),
-            wp.zeros(samples, dtype=wp.int32),
-            wp.array([int(course.is_loss)], dtype=wp.int32),
-            wp.array([course.begins], dtype=wp.float64),
-            wp.array([course.lasts], dtype=wp.float64),
-            wp.array([1.0], dtype=wp.float64),
-            wp.empty((1, 2, delays), dtype=wp.float64),
-            wp.empty((1, samples, delays), dtype=wp.int32),
-        ],
-        outputs=[found],
-    )
+LOSS = ((0.9, 0.1, 0.0), (0.3, 0.0, 0.7), (0.3, 0.0, 0.0))
+JITTER = ((0.9, 0.045, 0.1 / 3.0), (0.135, 0.7, 0.135), (0.1, 0.135, 0.7))
+"""Chance that a delay follows another: begins with 0.1 and lasts with 0.7; jumps to a neighbour with 0.45."""
 
-    def score(path: tuple[int, ...]) -> float:
-        total = likelihood[np.arange(samples), path].sum()
-        for before, after in zip((0, *path), path, strict=False):
-            total += step(before, after)
-        return total
 
-    def step(before: int, after: int) -> float:
-        off, on = np.log(0.9), np.log(0.7)
-        if effect == "frame_loss":
-            if before == 0:
-                return {0: off, 1: np.log(0.1)}.get(after, -np.inf)
-            return np.log(0.3) if after == 0 else (on if after == before + 1 else -np.inf)
-        ways = [np.log(0.3 / delays)]
-        if after == before:
-            ways.append(off if before == 0 else on)
-        if after == before + 1:
-            ways.append(np.log(0.1) if before == 0 else np.log(0.3 * holds.NEIGHBOUR))
-        if after == before - 1:
-            ways.append(np.log(0.3 * holds.NEIGHBOUR))
-        return max(ways)
+@pytest.mark.parametrize(("effect", "chance"), [("frame_loss", LOSS), ("delay_jitter", JITTER)])
+def test_courses_are_the_likeliest_of_all(effect: str, chance: tuple[tuple[float, ...]]) -> None:
+    law = holds.build_law(Course(effect, 0.1, 0.7), 3)
+    np.testing.assert_allclose(np.exp(law), chance)
+    for seed in range(4):
+        likelihood = np.random.default_rng(seed).normal(0.0, 2.0, (6, 3))
+        likelihood[0, 1:] = -1e9  # no command is late at the beginning
 
-    best = max(product(range(delays), repeat=samples), key=score)
-    assert score(tuple(found.numpy()[0].tolist())) == pytest.approx(score(best))
+        def score(path: tuple[int, ...], told: np.ndarray = likelihood) -> float:
+            return told[np.arange(6), path].sum() + law[path[:-1], path[1:]].sum()
+
+        best = max(product(range(3), repeat=6), key=score)
+        assert tuple(holds.follow_courses(likelihood, [law])[0]) == best
 
 
 def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,6 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import Answer
 from diagnosis.case import GapCase
-from diagnosis.engine.holds import build_law, follow_courses
-from diagnosis.engine.joint_model import Course
 from diagnosis.engine.rows import Row
 from diagnosis.engine.servo import SERVO
 from diagnosis.engine.side import Side, stack_side
@@ -98,6 +95,12 @@ def cut_joints(recording: Recording, machine: Machine) -> Recording:
         u=recording.u[:, :count],
         q=recording.q[:, :count],
     )
+
+
+def record_pair(pair: Machine, seeds: tuple[int, ...], **changes: float) -> list[Recording]:
+    """Return recordings of the first joints of the arm, sound ones without changes."""
+    arm, sound = option("machine", "so101"), {"lost": 0.0, "late_s": 0.0}
+    return [cut_joints(record_arm(arm, seed, **(sound | changes)), pair) for seed in seeds]
 
 
 def stand_still(machine: Machine, u: np.ndarray) -> Side:
@@ -204,10 +207,8 @@ def test_weight_pulls_a_joint_from_its_target() -> None:
 def test_late_and_lost_frames_of_servos_are_named(
     pair: Machine, lost: float, late_s: float, named: list[str]
 ) -> None:
-    arm = option("machine", "so101")
-    reference = [cut_joints(record_arm(arm, seed, 0.0, 0.0), pair) for seed in (1, 2, 3)]
-    field = [cut_joints(record_arm(arm, seed, lost, late_s), pair) for seed in (4, 5)]
-    answer = diagnose(GapCase(pair, reference, field))
+    field = record_pair(pair, (4, 5), lost=lost, late_s=late_s)
+    answer = diagnose(GapCase(pair, record_pair(pair, (1, 2, 3)), field))
     assert [one.effect for one in answer.selected][:1] == named
 
 
@@ -215,15 +216,12 @@ def test_late_and_lost_frames_of_servos_are_named(
 def test_late_servos_are_named_with_their_delay(
     pair: Machine, late: int, joints: list[int]
 ) -> None:
-    arm = option("machine", "so101")
-    reference = [cut_joints(record_arm(arm, seed, 0.0, 0.0), pair) for seed in (1, 2, 3)]
     field = []
-    for seed in (4, 5):
-        one = cut_joints(record_arm(arm, seed, 0.0, 0.0), pair)
+    for one in record_pair(pair, (4, 5)):
         q = one.q.copy()
         q[late:, joints] = one.q[:-late, joints]
         field.append(replace(one, q=q))
-    answer = diagnose(GapCase(pair, reference, field))
+    answer = diagnose(GapCase(pair, record_pair(pair, (1, 2, 3)), field))
     names = tuple(pair.joint_names[j] for j in joints)
     assert [(one.effect, one.joints) for one in answer.selected] == [("dead_time", names)]
     for name in names:
@@ -233,31 +231,12 @@ def test_late_servos_are_named_with_their_delay(
 
 @pytest.mark.parametrize("factor", [0.6, 1.5])
 def test_another_damping_is_named_alone_with_its_size(pair: Machine, factor: float) -> None:
-    arm = option("machine", "so101")
-    reference = [cut_joints(record_arm(arm, seed, 0.0, 0.0), pair) for seed in (1, 2, 3)]
     field = []
-    for seed in (4, 5):
-        one = cut_joints(record_arm(arm, seed, 0.0, 0.0), pair)
-        changed = cut_joints(record_arm(arm, seed, 0.0, 0.0, factor * ARM_DAMPING), pair)
-        q = one.q.copy()
-        q[:, 1] = changed.q[:, 1]
-        field.append(replace(one, q=q))
-    answer = diagnose(GapCase(pair, reference, field))
+    changed = record_pair(pair, (4, 5), damping=factor * ARM_DAMPING)
+    for one, other in zip(record_pair(pair, (4, 5)), changed, strict=True):
+        field.append(replace(one, q=np.stack([one.q[:, 0], other.q[:, 1]], 1)))
+    answer = diagnose(GapCase(pair, record_pair(pair, (1, 2, 3)), field))
     assert [(one.effect, one.joints) for one in answer.selected] == [("damping", ("pitch",))]
     estimate = answer.selected[0].parameters["factor"]["pitch"]
     assert estimate.mean == pytest.approx(factor, rel=0.1)
     assert estimate.ci95[0] < factor < estimate.ci95[1]
-
-
-@pytest.mark.parametrize("effect", ["frame_loss", "delay_jitter"])
-def test_the_found_course_is_the_likeliest_of_all(effect: str) -> None:
-    """Against all 4^6 courses: the log chance of each step and the likelihood of each state."""
-    law = build_law(Course(effect, 0.2, 0.6), 4)
-    for seed in range(5):
-        bank = 3.0 * np.random.default_rng(seed).standard_normal((6, 4))
-        best = (-np.inf, ())
-        for states in product(range(4), repeat=6):
-            total = law[states[:-1], states[1:]].sum() + bank[np.arange(6), states].sum()
-            total += law[:, states[0]].max()
-            best = max(best, (float(total), states))
-        assert tuple(follow_courses(bank, [law])[0]) == best[1]
