@@ -27,9 +27,8 @@ at most 26, eight joints with coarse ones 145 and more."""
 LATTICE_LENGTH = 0.8
 """Concentration of the positions at rest from which they lie on a lattice: 0.9 to 1.0 on six joints of a real
 servo arm, whose logs were brought to one rate, which takes positions in motion off their lattice."""
-ALIKE = 2.2
-"""Factor between a step and another one, or a half of that, of about the same sensor: the scale of an encoder is
-off by some per cent."""
+ALIKE = 1.1
+"""Factor within which two steps are of the same sensor: the scale of an encoder is off by some per cent."""
 STILL_STEPS = 4.0
 """A joint is at rest that moves by less than such a part of a step in two samples."""
 
@@ -52,8 +51,11 @@ def find_lattice(field: Side, reference: Side, joint: int) -> float:
     nats, step = find_step(field, joint)
     if nats < LATTICE_NATS or measure_rests(reference, joint, step) > LATTICE_LENGTH:
         return 0.0
-    # A sensor whose scale is off has steps of its own, nearly as fine as before.
-    usual, _ = _find_step_between(reference, joint, step / ALIKE, step * ALIKE)
+    # A sensor whose scale is off has nearly the steps of before; half of a step fits as well.
+    usual = 0.0
+    for before in (step, 2.0 * step):
+        found, _ = _find_step_between(reference, joint, before / ALIKE, before * ALIKE)
+        usual = max(usual, found)
     return step if nats > 2.0 * usual + LATTICE_NATS else 0.0
 
 
