@@ -144,6 +144,8 @@ def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) 
     Raises:
         KeyboardInterrupt: the person interrupted the program that answers; nothing is noted then.
     """
+    if (out / ANSWER_FILE).is_file():
+        return None  # by a helper process before another one was killed
     begun, error = time.monotonic(), None
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
         copy, place = Path(scratch) / "case", Path(scratch) / "answer"

@@ -175,8 +175,7 @@ class Exam:
         )
         recorder.write_all(questions, settings.workers)
         write_json(folder / FACTS_FILE, {**facts, "labels_sha256": found})
-        place = folder / CASES_FOLDER
-        log.info("%d cases in %s, labels sealed: sha256 %s", len(labels), place, found)
+        log.info("%d cases in %s, labels sealed: sha256 %s", len(labels), folder, found)
 
     def questions(self, salt: str) -> list[CaseDesign]:
         """Return the cases; those of a sealed exam depend on the secret salt too."""
@@ -192,8 +191,7 @@ class Exam:
     def _run(self) -> None:
         """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case, and `run.json`."""
         settings, facts, out = self.exam, self._read_facts(), self.session.folder
-        names = [f"{number:04d}" for number in range(facts["num_cases"])]
-        cases = [self._folder / CASES_FOLDER / name for name in names]
+        cases = [self._folder / CASES_FOLDER / f"{n:04d}" for n in range(facts["num_cases"])]
         files = [
             {str(path.relative_to(case)) for path in case.rglob("*.parquet")} for case in cases
         ]
