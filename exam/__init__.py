@@ -1,8 +1,8 @@
 """Blind exam of a diagnosis: sealed cases, answers without a way to the labels, metrics.
 
 case_distribution  kinds, effects, joints, sizes of cases
-generate           plans and recordings of reference and field
-dataset            cases on disk, labels, seal
+generate           plans and recordings of cases, on disk
+dataset            labels, and the sealed file of them
 run_cases          one process a case
 examiner           the repair of an answer, simulated on withheld recordings
 score              one answer against one label
