@@ -38,9 +38,8 @@ class Person:
         low, high = value if isinstance(value, tuple) else (value, value)
         if high < low:
             raise ConfigError(f"operator: {name} is [{low}, {high}], expected the lower end first")
-        place = np.random.default_rng(
-            (self._seed, self._number, zlib.crc32(name.encode()))
-        ).random()
+        key = (self._seed, self._number, zlib.crc32(name.encode()))
+        place = np.random.default_rng(key).random()
         return low + (high - low) * place
 
 
@@ -77,14 +76,11 @@ class Hands:
         drawn: dict[str, Any] = {}
         for field in fields(follower):
             value = getattr(follower, field.name)
-            if not isinstance(value, tuple):
-                continue
-            low, high = value
-            if field.name == "joints_at_once":
-                # The whole numbers are equally likely: each has an interval of its own.
-                drawn[field.name] = round(person.draw(field.name, (low - 0.499, high + 0.499)))
-            else:
-                drawn[field.name] = person.draw(field.name, (low, high))
+            if isinstance(value, tuple):
+                # Of whole numbers each has an interval of its own: they are equally likely.
+                half = 0.499 if field.name == "joints_at_once" else 0.0
+                number = person.draw(field.name, (value[0] - half, value[1] + half))
+                drawn[field.name] = round(number) if half else number
         self._torch = torch
         torch.manual_seed(int(person.chance.integers(2**31)))
         self._model = replace(follower, **drawn).build(machine, 1, torch.device("cpu"))
