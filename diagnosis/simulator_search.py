@@ -25,8 +25,8 @@ and its friction trade against each other."""
 LEAST_GAIN = 0.1
 """Nats below which these steps end."""
 MAX_EFFECTS = 6
-NUM_FITTED = 3
-"""Best effects that are fitted before one is chosen: the sizes that are tried lie far apart."""
+NUM_FITTED, FIRST_ROUNDS = 3, 5
+"""Best effects that are fitted, and by how many steps, before one is chosen: the sizes that are tried lie far apart."""
 MAX_WINDOWS = 32
 """Windows, evenly over the recordings, on which effects are proposed."""
 UNSEEN_SIDES = frozenset({"measurement", "kinematics"})
@@ -84,7 +84,8 @@ class SimulatorSearch:
             needed = max([LEAST_NATS, *(SECOND_SHARE * one.nats for one in found)])
             if not proposed or proposed[0].nats < needed:
                 break
-            fitted = [self.fit([*found, one]) for one in proposed[:NUM_FITTED]]
+            some = proposed[:NUM_FITTED]
+            fitted = [self.fit([*found, one], rounds=FIRST_ROUNDS) for one in some]
             found = max(fitted, key=self._weigh)
         # A deviation that was taken beside wrong numbers explains their error, and holds them there.
         self._whole.settle(())
@@ -128,12 +129,12 @@ class SimulatorSearch:
         return nats - JOINT_NATS * sum(one.count_numbers() for one in effects)
 
     def fit(
-        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
+        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None, rounds: int = ROUNDS
     ) -> list[GrownEffect]:
         """Return the effects with all numbers fitted together to the windows `used`, `(W,)` bool."""
         found = list(effects)
         best = float(self._whole.weigh_numbers(found, {}, used).sum())
-        for _ in range(ROUNDS if found else 0):
+        for _ in range(rounds if found else 0):
             slopes = self._whole.linearise(found, used)
             trials = slopes.list_steps(found)
             gains = self._whole.weigh_numbers(found, trials, used).sum(1)
