@@ -230,13 +230,15 @@ class ToolPoseProcess(EpisodeProcess):
         command, action = groups["guide"][:, : self.num_actions], self.task.action
         return torch.zeros_like(command) if action.kind == "residual" else command / action.scale
 
-    def example_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+    def example_action(self, groups: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the action of one who knows a clear path; see `TaskProcess.example_action`."""
         values = self.control.encoder.decode(groups["policy"])
         fixed_rad = torch.full_like(groups["policy"][:, 0], self.task.fixed_pitch_rad)
         action = self.task.action
-        u, base = self.control.follow_plan({PITCH: fixed_rad} | values, groups["plan"])
-        return (u - base if action.kind == "residual" else u) / action.scale
+        plan = groups["plan"]
+        u, base = self.control.follow_plan({PITCH: fixed_rad} | values, plan)
+        shown = u - base if action.kind == "residual" else u
+        return shown / action.scale, plan[:, -1] != PLAN_DONE
 
     def describe(self) -> dict[str, Any]:
         """Return the contract of the `policy` group; see `TaskProcess.describe`."""

@@ -175,10 +175,11 @@ class TaskProcess(ABC):
         """Return the classical controller's action, `(N, num_actions)`, for observation groups."""
         self.refuse("classical_action")
 
-    def example_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+    def example_action(self, groups: dict[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the action that a training may imitate, `(N, num_actions)`.
 
-        Unlike a policy it may use groups of what only a simulator knows.
+        Unlike a policy it may use groups of what only a simulator knows. The second tensor says
+        where it follows a path that is known to be clear, `(N,)` bool.
         """
         self.refuse("example_action")
 

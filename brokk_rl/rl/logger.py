@@ -322,9 +322,8 @@ class TrainingLogger:
             raise SimulationError(
                 f"{fault_rate:.2%} of the control steps of iteration {it} ended in a world that "
                 "diverged, became NaN or overflowed its contact buffers (limit "
-                f"{most:.2%}). Look at the drive's stiffness, the time step (sim.substeps) and the "
-                "sizes of the buffers (sim). The first ones are recorded in the folder faults of "
-                "the run."
+                f"{most:.2%}); the log names the first ones. Look at the drive's stiffness, the time "
+                "step (sim.substeps) and the sizes of the buffers (sim)."
             )
         spoiled = [name for name, value in losses.items() if not math.isfinite(value)]
         if spoiled:

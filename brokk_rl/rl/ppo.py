@@ -43,6 +43,10 @@ CLIP_MARGIN = 1e-6
 """Added to a norm that is divided by, as `torch.nn.utils.clip_grad_norm_` does."""
 
 
+ExampleAction = Callable[[Any], tuple[torch.Tensor, torch.Tensor]]
+"""Returns actions for observation groups, and where they follow a path."""
+
+
 class DevicePPO(PPO):
     """PPO for feed-forward networks with Gaussian actions.
 
@@ -66,22 +70,18 @@ class DevicePPO(PPO):
     _wanted: torch.Tensor
     """`desired_kl`, which may change from update to update."""
     _sums: torch.Tensor
-    _teacher: Callable[[Any], torch.Tensor] | None = None
-    _imitation: torch.Tensor
-    """Weight of the distance from the teacher."""
+    _teacher: ExampleAction | None = None
+    imitation: Sequence[float] = (0.0, 0.0)
+    """Weights of the mean squared distance between the actions of teacher and student, (along a
+    path, beside it)."""
 
-    def follow(self, teacher: Callable[[Any], torch.Tensor]) -> None:
-        """Follow a teacher, with weight 0 until `set_imitation`; call it before the first step.
+    def follow(self, teacher: ExampleAction) -> None:
+        """Follow a teacher as far as `imitation` says; call it before the first step.
 
         Args:
-            teacher: Returns actions for observation groups.
+            teacher: See `brokk_rl.contracts.task.TaskProcess.example_action`.
         """
         self._teacher = teacher
-        self._imitation = torch.zeros((), device=self.device)
-
-    def set_imitation(self, weight: float) -> None:
-        """Set the weight of the mean squared distance between the actions of both."""
-        self._imitation.fill_(weight)
 
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Draw actions; see `rsl_rl.algorithms.PPO.act`."""
@@ -258,7 +258,7 @@ class DevicePPO(PPO):
         observations: Any = storage.observations.flatten(0, 1)[order]
         samples = {}
         if self._teacher is not None:
-            samples["wanted"] = self._teacher(observations).clamp(-1.0, 1.0)
+            samples["wanted"], samples["imitation"] = self._imitate(self._teacher, observations)
         names = ("actions", "values", "returns", "advantages")
         stored = {name: getattr(storage, name) for name in names}
         stored["log_prob"] = storage.actions_log_prob
@@ -277,6 +277,18 @@ class DevicePPO(PPO):
             self._samples[name].copy_(value)
         for name, model in models.items():
             self._samples[name][:, : model.obs_dim].copy_(model.get_latent(observations))
+
+    def _imitate(self, teacher: ExampleAction, seen: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the teacher's actions, `(M, A)`, and the weights of the distances, `(M, 1)`.
+
+        A teacher without weight is not asked: it costs a twentieth of a CPU's time.
+        """
+        along, beside = self.imitation
+        if max(along, beside) == 0.0:
+            nothing = torch.zeros(len(seen), self.storage.actions.shape[-1], device=self.device)
+            return nothing, nothing[:, :1]
+        wanted, is_along = teacher(seen)
+        return wanted.clamp(-1.0, 1.0), torch.where(is_along, along, beside)[:, None]
 
     def _differentiate(self, first: int) -> None:
         """Differentiate the loss of the mini-batch that begins at row `first` of the samples."""
@@ -320,8 +332,8 @@ class DevicePPO(PPO):
             old = tuple(batch[f"{PARAMETER}{index}"] for index in range(len(new)))
             divergence = _measure_divergence(old, new)
         if self._teacher is not None:
-            distance = (actor.output_mean - batch["wanted"]).square().mean()
-            loss = loss + self._imitation * distance
+            distance = (actor.output_mean - batch["wanted"]).square()
+            loss = loss + (batch["imitation"] * distance).mean()
         return loss, torch.stack((value_loss, surrogate_loss, entropy, divergence)).detach()
 
     def _sum_up(self) -> None:

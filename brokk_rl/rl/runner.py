@@ -106,7 +106,7 @@ class TrainingRunner(OnPolicyRunner):
         if self.training.exploration and isinstance(distribution, CappedGaussian):
             distribution.set_cap(self.training.exploration.cap_at(share_spent))
         if teacher and isinstance(self.alg, DevicePPO):
-            self.alg.set_imitation(teacher.weight_at(share_spent))
+            self.alg.imitation = teacher.weights_at(share_spent)
 
     def _count_iterations(self) -> int:
         """Return the number of iterations until the next checkpoint or change of the schedules.

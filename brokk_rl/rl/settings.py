@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from annotated_types import Interval, MinLen
 
 from brokk_rl.errors import ConfigError
@@ -133,28 +134,29 @@ class Exploration:
 
     def cap_at(self, share_spent: float) -> float:
         """Return the cap when this share of the budget is spent."""
-        (first, last), (begin, end) = self.cap, self.over
-        done = float(share_spent >= end)
-        if end > begin:
-            done = min(1.0, max(0.0, (share_spent - begin) / (end - begin)))
-        return first * (last / first) ** done
+        return float(np.exp(np.interp(share_spent, self.over, np.log(self.cap))))
 
 
 @spec
 class Teacher:
-    """The task's example, which a training follows at its beginning.
+    """The task's example, which a training imitates.
+
+    Along its path it shows a detour, which rewards alone would make forgotten. Beside the path, at
+    the target, it shows one way of several, which may be left sooner.
 
     Attributes:
         weight: Weight of the mean squared distance between the actions of both at the beginning.
-        until: Share of the budget at which the weight has fallen to 0, linearly.
+        until: Shares of the budget at which the weight has fallen to 0, linearly: along the path,
+            and beside it.
     """
 
     weight: Positive
-    until: PositiveShare
+    until: tuple[PositiveShare, PositiveShare]
 
-    def weight_at(self, share_spent: float) -> float:
-        """Return the weight when this share of the budget is spent."""
-        return self.weight * max(0.0, 1.0 - share_spent / self.until)
+    def weights_at(self, share_spent: float) -> list[float]:
+        """Return the weights when this share of the budget is spent, [along the path, beside it]."""
+        ends = (self.weight, 0.0)
+        return [float(np.interp(share_spent, (0.0, until), ends)) for until in self.until]
 
 
 @spec
@@ -174,8 +176,7 @@ class NearStarts:
 
     def share_at(self, share_spent: float) -> float:
         """Return the part of the episodes when this share of the budget is spent."""
-        first, last = self.share
-        return first + (last - first) * min(1.0, share_spent)
+        return float(np.interp(share_spent, (0.0, 1.0), self.share))
 
 
 @spec
@@ -195,8 +196,7 @@ class TrainingConfig:
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.ppo:CappedGaussian`.
-        teacher: How to follow the classical controller at the beginning; `null` to learn from
-            rewards alone.
+        teacher: How to imitate the task's example; `null` to learn from rewards alone.
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
@@ -292,11 +292,8 @@ class TrainingConfig:
     def divergence(self, share_spent: float) -> float | None:
         """Return the `desired_kl` of updates when this share of the budget is spent."""
         desired = self.runner["algorithm"].get("desired_kl")
-        if desired is None or share_spent <= 1.0 - self.settling:
-            return desired
-        return desired * (
-            1.0 - SETTLED_PART * min(1.0, (share_spent - 1.0 + self.settling) / self.settling)
-        )
+        left = np.interp(share_spent, (1.0 - self.settling, 1.0), (1.0, 1.0 - SETTLED_PART))
+        return None if desired is None else desired * float(left)
 
     def describe_network(self) -> dict[str, Any]:
         """Return configuration and observation groups of the actor, as plain JSON data."""

@@ -145,7 +145,9 @@ def test_paired_episodes_of_the_task_end_alike(
     assert np.median(apart) < 0.1, apart
 
 
-@pytest.mark.parametrize("teacher", [None, Teacher(weight=1.0, until=0.5)], ids=["alone", "led"])
+@pytest.mark.parametrize(
+    "teacher", [None, Teacher(weight=1.0, until=(1.0, 0.5))], ids=["alone", "led"]
+)
 def test_a_training_stays_captured(
     machine: Machine, tmp_path: Path, teacher: Teacher | None
 ) -> None:

@@ -241,11 +241,10 @@ def test_without_a_compiler_it_says_what_to_do(
 
 
 def test_the_example_gets_there_where_the_controller_is_stuck(machine: Machine) -> None:
-    reached = []
-    for name in ("classical_action", "example_action"):
-        loop = make(machine, 64)
-        policy = SimpleNamespace(act=getattr(loop.task, name))
-        found = evaluate_policy(loop, policy, loop.starts, 0, 1)
+    loop, reached = make(machine, 64), []
+    task = loop.task
+    for act in (task.classical_action, lambda groups: task.example_action(groups)[0]):
+        found = evaluate_policy(loop, SimpleNamespace(act=act), loop.starts, 0, 1)
         reached.append(found.summary["success_reached"]["mean"])
     assert reached[0] < 0.95 <= reached[1]
 
