@@ -174,7 +174,7 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
         loaded = OmegaConf.create(text)
     except (OSError, yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
         reason = " ".join(str(error).split())
-        raise ConfigError(f"{where}: no valid YAML (seen from {Path.cwd()}): {reason}") from error
+        raise ConfigError(f"{where}: no plain YAML (seen from {Path.cwd()}): {reason}") from error
     node = OmegaConf.to_container(loaded, resolve=False) if isinstance(loaded, DictConfig) else None
     if not isinstance(node, dict) or not node:
         raise ConfigError(f"{where}: expected a mapping, as in a file of conf/{group}")

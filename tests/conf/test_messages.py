@@ -115,7 +115,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("effect=[lag,own/lag.yaml]",): ("effect=lag, and a file", "effect=@own/lag.yaml"),
     ("mode=compare", "compare.runs=other"): ("other/evaluation.json cannot be read",),
     ("session.out=other",): ("other already holds a run",),
-    ("machine=@bad.yaml",): ("machine=@bad.yaml: no valid YAML", "line 3"),
+    ("machine=@bad.yaml",): ("machine=@bad.yaml: no plain YAML", "line 3"),
     ("machine=@tabs.yaml",): ("line 2", "tab character"),
     ("machine=@foreign.yaml",): ("os.system' is no machine",),
     ("machine=@list.yaml",): ("expected a mapping",),
