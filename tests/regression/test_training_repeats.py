@@ -80,7 +80,7 @@ def test_a_resumed_run_settles_as_the_run_that_was_never_interrupted(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("brokk_rl.rl.runner.ITERATIONS_PER_ROUND", 2)
-    teacher = Teacher(weight=4.0, until=1.0)
+    teacher = Teacher(weight=4.0, until=(1.0, 0.5))
     training = runs.small(max_env_steps=8 * ITERATION, settling=0.8, teacher=teacher)
     whole = runs.train(machine, tmp_path / "run", replace(training, keep_checkpoints=9))
     again = runs.train(machine, tmp_path / "run", training, tmp_path / "run" / "model_5.pt")

@@ -146,7 +146,7 @@ def test_actuator_and_effects_are_chosen_as_everywhere(
             ("excitation=[holds,ramps]", "collect.run_minutes=0.2", "collect.file_minutes=0.2"),
             ("excitation=holds", "run_minutes"),
         ),
-        (("collect.guards.max_command=2",), ("max_command: expected", "above 0 up to 1")),
+        (("collect.guards.max_command=2",), ("max_command: expected", "equal to 1, got 2")),
         (("collect.flush_s=0",), ("flush_s: expected",)),
         (("actuator.gian=2",), ("'actuator' has no 'gian'",)),
     ],

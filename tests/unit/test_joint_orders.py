@@ -40,7 +40,7 @@ def make_policy() -> LoadedPolicy:
     ):
         terms.append(ObservationTerm(name, tuple(columns), 1, newest, mean, np.ones(12), None, "zero"))  # fmt: skip
     commands = tuple(f"u_{joint}" for joint in BY_KIND)
-    contract = PolicyContract(Path("a.json"), 50.0, tuple(BY_KIND), tuple(terms), commands, None, {"observation": {}})  # fmt: skip
+    contract = PolicyContract(Path("a.json"), 50.0, tuple(BY_KIND), tuple(terms), commands, None)  # fmt: skip
     return LoadedPolicy(contract, cast(Any, TanhNetwork(36)))
 
 

@@ -65,14 +65,13 @@ def test_depth_of_a_wrong_scale_is_named_by_its_factor(factor: float) -> None:
 
 @pytest.mark.parametrize(("score", "is_kept"), [(0.3, False), (0.9, True)])
 def test_a_rim_of_another_size_outweighs_holes_that_are_less_sure(
-    score: float, is_kept: bool
+    score: float, is_kept: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frame, masks, _ = drawn()
     hole = HolePose(CENTER, AXIS, 0.05, np.eye(3), np.eye(3), "camera", score, 0.0)
     estimator = SimpleNamespace(estimate=lambda *seen: hole)
-    settings = replace(
-        finder_with(masks).settings, pose=SimpleNamespace(build=lambda: estimator), size_slack=2.0
-    )
+    settings = replace(finder_with(masks).settings, size_slack=2.0)
+    monkeypatch.setattr(type(settings.pose), "build", lambda pose: estimator)
     doubled = replace(frame, depth_m=(2.0 * frame.depth_m).astype(np.float32))
     found = settings.build().find(doubled)
     assert bool(found.holes) == is_kept
