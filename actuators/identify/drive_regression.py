@@ -51,8 +51,8 @@ LEAST_SHARE = 0.1
 a weight over the travel takes 0.03, and its authors publish none; true terms take 0.3 and more."""
 FOLD_STEPS = 5
 """Evaluations of a fit without one part; it begins at the fit to all parts, which is near."""
-BOUNDS = dict.fromkeys(("offset_n", "pose_sin_n", "pose_cos_n"), (-np.inf, np.inf))
-BOUNDS |= dict.fromkeys(FITTED_LOADS, (0.0, 1.0)) | {"stribeck_m_s": (0.1, 10.0)}
+BOUNDS = dict.fromkeys(FITTED_LOADS, (0.0, 1.0)) | {"stribeck_m_s": (0.1, 10.0)}
+BOUNDS |= dict.fromkeys(("offset_n", "pose_sin_n", "pose_cos_n"), (-np.inf, np.inf))
 """Bounds of numbers over their sizes, that of `stribeck_m_s` is `STRIBECK_SPEED`; 0 and more for the others."""
 
 
