@@ -23,7 +23,7 @@ play: setup             ## install, and watch the shipped policy in a browser
 	$(BIN)/brokk mode=play
 
 test: setup             ## the tests that need no GPU, without the slow ones
-	@[ -n "$$CHROMIUM" ] || command -v chromium chromium-headless-shell >/dev/null || \
+	@[ -n "$$CHROMIUM" ] || { command -v chromium || command -v chromium-headless-shell; } >/dev/null || \
 	    echo "the tests in a browser are skipped: apt-get install chromium-headless-shell, or CHROMIUM=<path>"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -m "not gpu and not slow"
 

@@ -54,8 +54,8 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "64 simulated cranes, answered once. Six open cases of this make were seen before: they showed that the limit of a small pump was not fitted. By chance a person drives the field, in about half of the cases.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 64, "diagnosis", "valve",
+        "48 simulated cranes, answered once. Six open cases of this make were seen before. A person drives 27 of the fields.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 48, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",

@@ -99,7 +99,7 @@ MEASUREMENTS = (
     Measurement(
         name="short_training",
         title="`make train`",
-        conditions="Training from nothing for 290 s: the policy commands alone; its loss also imitates, less and less until the end, an example that knows a clear path of the joints. The baseline is the "
+        conditions="Training from nothing for 290 s: the policy commands alone; its loss also imitates, less and less, an example that knows a clear path. The baseline is the "
         "classical controller. The seeds ran one after the other on two cores that did little else.",
         commands=(
             "brokk -m mode=train preset=laptop session.seed=1,2,3,4 evaluation.video=false session.out={out}/seeds",
