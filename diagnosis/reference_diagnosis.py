@@ -70,7 +70,7 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What every diagnosis does, however it finds effects.
+    """Steps of a diagnosis that do not depend on how effects are found.
 
     Attributes:
         case: The recordings.

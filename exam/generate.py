@@ -115,7 +115,7 @@ class RecordingJob:
 
     @property
     def elapsed_s(self) -> float:
-        """How long the machine has run before; files follow one another through the day."""
+        """Time that the machine has run before, s; files follow one another through the day."""
         low_s, high_s = self.plan.elapsed_s
         share = (self.number + float(self.stream("elapsed").random())) / len(self.plan.programs)
         return low_s + share * (high_s - low_s)
@@ -193,8 +193,6 @@ class CaseRecorder:
         Raises:
             ConfigError: an excitation is unknown, or finds no room in a file.
         """
-        # a faulty machine may be slow on its ways to start poses; this process only records
-        logging.getLogger(PlanPlayer.__module__).setLevel(logging.ERROR)
         # all halves are planned before anything is recorded: a plan without room fails at once
         planned = []
         for half in self.halves:
@@ -266,7 +264,8 @@ class CaseRecorder:
             runs=tuple(plan.runs[0] for plan in plans), run_s=file_s, names=tuple(self.excitations)
         )
         guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
-        player = PlanPlayer(plan, machine, self.approach, guards)
+        # a faulty machine may be slow on its ways to start poses
+        player = PlanPlayer(plan, machine, self.approach, guards, level=logging.DEBUG)
         with link as opened:
             samples = list(drive(opened, player, machine, len(jobs), file_s))
         track = PlanTrack(samples)

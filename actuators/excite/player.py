@@ -107,15 +107,28 @@ INSIDE = np.array([False, False, True, True, True, False])
 class PlanPlayer:
     """The state machine, over all runs at once.
 
+    Args:
+        plan: Segments of each run.
+        machine: The machine.
+        approach: How start poses are taken up.
+        guards: Limits of all commands.
+        level: Level of the message that the way to a start pose was given up.
+
     Attributes:
         phase: `APPROACH`, `REST`, … of each run, `(N,)`.
         segment: Number of the segment of each run, `(N,)`.
     """
 
     def __init__(
-        self, plan: ExcitationPlan, machine: Machine, approach: Approach, guards: CommandGuards
+        self,
+        plan: ExcitationPlan,
+        machine: Machine,
+        approach: Approach,
+        guards: CommandGuards,
+        level: int = logging.WARNING,
     ) -> None:
         self._plan, self._machine, self._approach, self._guards = plan, machine, approach, guards
+        self._level = level
         self._tool_speed = None if guards.max_tool_speed_m_s is None else ToolSpeed(machine)
         count = len(plan.runs)
         self._rows = np.arange(count)
@@ -191,7 +204,7 @@ class PlanPlayer:
             joints = ", ".join(f"{names[j]} ({q[n, j]:.3f})" for j in np.flatnonzero(far[n]))
             name = self._plan.runs[n][self.segment[n]].name
             text = "run %d: way to the start of %s given up, out of place: %s; going on from there"
-            log.warning(text, n, name, joints)
+            log.log(self._level, text, n, name, joints)
         phase[arrived] += 1  # rest, or wait
         rest = round(self._approach.rest_s / self._machine.period_s)
         self._left[arrived] = rest

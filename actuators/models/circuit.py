@@ -43,13 +43,12 @@ from typing import Annotated, Literal
 import torch
 from annotated_types import Ge, Interval
 
-from actuators.models.hydraulic import OilModel, OverlapPerJoint
+from actuators.models.hydraulic import OilModel, OilNumbers
 from actuators.models.parameters import (
     NonNegativePerJoint,
     NumberBounds,
     PerJoint,
     PositivePerJoint,
-    SharePerJoint,
     open_valve,
 )
 from brokk_rl.history import History
@@ -73,38 +72,23 @@ trails by as much (1 mrad) when the arm speeds up at 1.5 rad/s². From twice tha
 
 
 @spec
-class HydraulicCircuit:
+class HydraulicCircuit(OilNumbers):
     """Valves, pump, cylinders on linkages, counterbalance valves and outriggers.
 
     Attributes:
         compensation: `pre` a pressure compensator before each valve; `post` behind it, so that a
             saturated pump slows all joints alike; `none` plain throttles behind a pump of constant
             flow, whose centre is open.
-        transport_s: Pure delay of radio, bus and pilot stage.
-        hysteresis: Width of the play between command and spool, of full command.
-        spool_hz: Natural frequency of the spool.
-        spool_damping: Damping ratio of the spool.
-        overlap_extend: Stroke up to which no oil flows in the positive direction, of full stroke.
-        overlap_retract: The same for the negative direction.
-        notch: Progressiveness of the flow curve: 0 linear, 1 quadratic.
-        speed_scale: Speed at full command, extending, in mid-travel, over the machine's `max_speed`.
         rod_area: Area of the rod side over that of the bore, 1 for a motor.
         linkage_lower_rad: Angle of the triangle between the sides at the joint's lower limit.
         linkage_upper_rad: The same at the upper limit; equal for a lever arm that stays.
         linkage_sides: Shorter over longer side of the triangle.
-        flow_share: Flow at full opening over the flow of the pump.
-        supply_ratio: Torque at relief pressure in mid-travel over the machine's `yield_force`.
-        mode_hz: First mode of the joint on closed valves in mid-travel.
         leak: Speed at which a joint sinks under relief pressure, of full speed.
         outlet: Pressure over the outlet edge at full speed.
         counterbalance_setting: Pressure at which a load alone opens the valve; 0: no such valve.
         counterbalance_ratio: Pilot ratio.
         counterbalance_range: Pressure over which it opens fully.
         counterbalance_s: Time constant of its poppet.
-        coulomb: Friction torque in motion.
-        breakaway: Friction torque at the onset of motion, at least `coulomb`.
-        stribeck_speed: Speed, of full speed, at which the excess has fallen to a third.
-        viscous: Friction torque proportional to speed, at full speed.
         margin: Supply above the highest load, and the drop that a compensator keeps; with
             `compensation: none` the drop at which a valve gives its nominal flow.
         standby: Pressure of the idle pump.
@@ -113,35 +97,19 @@ class HydraulicCircuit:
         power: Power limit over full flow at relief pressure.
         bypass_stroke: Stroke at which an open centre is closed, of full stroke.
         outrigger_nm_rad: Stiffness of the stand on its outriggers; 0: rigid.
-        substep_s: Own time step.
     """
 
     compensation: Literal["pre", "post", "none"]
-    transport_s: NonNegativePerJoint
-    hysteresis: SharePerJoint
-    spool_hz: PositivePerJoint
-    spool_damping: PositivePerJoint
-    overlap_extend: OverlapPerJoint
-    overlap_retract: OverlapPerJoint
-    notch: SharePerJoint
-    speed_scale: PositivePerJoint
     rod_area: RatioPerJoint
     linkage_lower_rad: LinkagePerJoint
     linkage_upper_rad: LinkagePerJoint
     linkage_sides: RatioPerJoint
-    flow_share: PositivePerJoint
-    supply_ratio: PositivePerJoint
-    mode_hz: PositivePerJoint
     leak: NonNegativePerJoint
     outlet: PositivePerJoint
     counterbalance_setting: NonNegativePerJoint
     counterbalance_ratio: NonNegativePerJoint
     counterbalance_range: PositivePerJoint
     counterbalance_s: PositivePerJoint
-    coulomb: NonNegativePerJoint
-    breakaway: NonNegativePerJoint
-    stribeck_speed: PositivePerJoint
-    viscous: NonNegativePerJoint
     margin: Positive
     standby: Positive
     pump_s: Positive

@@ -50,8 +50,8 @@ OverlapPerJoint = Annotated[PerJoint, NumberBounds("0 to 0.9", 0.0, 0.9)]
 
 
 @spec
-class Hydraulic:
-    """Valve spools, shared pump, oil compliance, friction, load, leak and oil temperature.
+class OilNumbers:
+    """Numbers of every hydraulic plant: valve spools, flow, inertia and friction.
 
     Attributes:
         transport_s: Pure delay of radio, bus and pilot stage. Spool and oil add to it until the
@@ -64,25 +64,15 @@ class Hydraulic:
         overlap_retract: The same for the negative direction.
         notch: Progressiveness `c` of the flow curve: 0 linear, 1 quadratic.
         speed_scale: Speed at full command without load, extending, over the machine's `max_speed`.
-        retract_ratio: Retracting speed over extending speed at equal flow: bore area over rod-side
-            area, 1 for a motor.
         flow_share: Flow at full opening over the flow of the pump.
         supply_ratio: Force at supply pressure over the machine's `yield_force`.
-        load_sensitivity: 0 ideal pressure compensator (speed free of load), 1 none.
-        mode_hz: First mode of the joint on its closed cylinder; with the machine's `stiffness` this
-            gives the inertia.
-        leak_hz: Rate at which a held force bleeds off through the closed valve.
+        mode_hz: First mode of the joint on its closed cylinder in mid-travel; with the machine's
+            `stiffness` this gives the inertia.
         coulomb: Friction force in motion over the supply force.
         breakaway: Friction force at the onset of motion over the supply force, at least `coulomb`.
         stribeck_speed: Speed, of full speed, at which break-away friction has fallen to a third of
             its excess.
         viscous: Friction force proportional to speed, at full speed, over the supply force.
-        oil_start_c: Oil temperature after a reset.
-        oil_ambient_c: Temperature to which resting oil cools.
-        oil_rise_c: Rise above that at full pump flow, after a long time.
-        oil_time_s: Time constant of warming and cooling.
-        oil_reference_c: Temperature at which speeds and spool frequencies hold.
-        thermal_gain: Relative change of speed and spool frequency per kelvin.
         substep_s: Own time step; the control period is divided into the nearest whole number of
             them.
     """
@@ -95,23 +85,42 @@ class Hydraulic:
     overlap_retract: OverlapPerJoint
     notch: SharePerJoint
     speed_scale: PositivePerJoint
-    retract_ratio: PositivePerJoint
     flow_share: PositivePerJoint
     supply_ratio: PositivePerJoint
-    load_sensitivity: SharePerJoint
     mode_hz: PositivePerJoint
-    leak_hz: NonNegativePerJoint
     coulomb: NonNegativePerJoint
     breakaway: NonNegativePerJoint
     stribeck_speed: PositivePerJoint
     viscous: NonNegativePerJoint
+    substep_s: Annotated[float, Interval(gt=0, le=0.01)]
+
+
+@spec
+class Hydraulic(OilNumbers):
+    """Valve spools, shared pump, oil compliance, friction, load, leak and oil temperature.
+
+    Attributes:
+        retract_ratio: Retracting speed over extending speed at equal flow: bore area over rod-side
+            area, 1 for a motor.
+        load_sensitivity: 0 ideal pressure compensator (speed free of load), 1 none.
+        leak_hz: Rate at which a held force bleeds off through the closed valve.
+        oil_start_c: Oil temperature after a reset.
+        oil_ambient_c: Temperature to which resting oil cools.
+        oil_rise_c: Rise above that at full pump flow, after a long time.
+        oil_time_s: Time constant of warming and cooling.
+        oil_reference_c: Temperature at which speeds and spool frequencies hold.
+        thermal_gain: Relative change of speed and spool frequency per kelvin.
+    """
+
+    retract_ratio: PositivePerJoint
+    load_sensitivity: SharePerJoint
+    leak_hz: NonNegativePerJoint
     oil_start_c: float
     oil_ambient_c: float
     oil_rise_c: float
     oil_time_s: Positive
     oil_reference_c: float
     thermal_gain: float
-    substep_s: Annotated[float, Interval(gt=0, le=0.01)]
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> HydraulicModel:
         """Return a model for `num_envs` environments on `device`.
@@ -126,7 +135,7 @@ class OilModel(ParametricModel):
     """Base of hydraulic plants: numbers, weight, stiffness, substeps.
 
     Args:
-        config: The spec, with `substep_s`.
+        config: The spec.
         machine: A machine with known masses.
         num_envs: Number of environments, `N`.
         device: Where the tensors live.
@@ -134,14 +143,16 @@ class OilModel(ParametricModel):
 
     DELAY = "transport_s"
 
-    def __init__(self, config: Any, machine: Machine, num_envs: int, device: torch.device) -> None:
+    def __init__(
+        self, config: OilNumbers, machine: Machine, num_envs: int, device: torch.device
+    ) -> None:
         check_interface(machine, "speed", "hydraulics set speeds")
         super().__init__(config, machine, num_envs, device)
         if (self.parameters["breakaway"] < self.parameters["coulomb"]).any():
             raise ConfigError(
                 "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)"
             )
-        self._config = config
+        self._config: Any = config  # of its own class
         self._num_substeps = max(1, round(machine.period_s / config.substep_s))
         self._dt_s = machine.period_s / self._num_substeps
         self._gravity = Gravity(machine, device)

@@ -323,7 +323,7 @@ class HeldCommands:
 
     @cached_property
     def _prices(self) -> dict[Course, float]:
-        """What each course earns on the reference, nats."""
+        """Gain of each course on the reference, nats."""
         evidence = self._evidence
         healthy = [base.numbers for base in evidence.bases]
         found: dict[Course, float] = {}

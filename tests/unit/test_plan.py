@@ -235,7 +235,6 @@ class Stuck(NominalLink):
 def test_an_approach_that_does_not_arrive_is_given_up_and_said(
     machine: Machine, approach: Approach, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("WARNING", logger="actuators.excite.player")  # an exam before it is silent
     start = machine.home + 0.8 * (np.arange(machine.num_joints) == 3)
     track = played([[constant({0: 0.3}, 1.0, start)]], machine, approach, link=Stuck(machine, 1))
     assert (track.u[track.stage[:, 0] == plan_report.PLAYING, 0, 0] == 0.3).all()
