@@ -31,7 +31,6 @@ from diagnosis.answer import Estimate, Stage
 log = logging.getLogger(__name__)
 
 SIDE_ORDER = {
-    "simulator": -1,
     "drive": -1,
     "joints": 0,
     "speed": 1,

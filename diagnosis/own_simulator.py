@@ -139,7 +139,7 @@ class OwnSimulatorModel:
 
     Attributes:
         plant: The plant.
-        changes: Parameters of effects on numbers of the plant, by quantity; see
+        drive_changes: Changes of numbers of the plant by effects, `(N, J)` by quantity; see
             `actuators.effects.simulator`.
     """
 
@@ -147,7 +147,7 @@ class OwnSimulatorModel:
         if device.type != "cpu":
             raise ConfigError("a simulator of your own runs on the CPU; set session.device=cpu")
         self.plant = plant
-        self.changes: dict[str, Callable[[], torch.Tensor]] = {}
+        self.drive_changes: dict[str, torch.Tensor] = {}
         self.delay_s = torch.zeros(num_envs, machine.num_joints)
         self._machine, self._period_s = machine, machine.period_s
         self._fresh = torch.ones(num_envs, dtype=torch.bool)
@@ -207,9 +207,7 @@ class OwnSimulatorModel:
         return _RolledRun(torch.as_tensor(path), begin)
 
     def _read_changes(self) -> dict[str, np.ndarray] | None:
-        found = {}
-        for name, read in self.changes.items():
-            found[name] = read().detach().double().numpy()
+        found = {name: value.double().numpy() for name, value in self.drive_changes.items()}
         return found or None
 
 

@@ -28,7 +28,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
-Side = Literal["simulator", "drive", "command", "speed", "joints", "measurement", "kinematics"]
+Side = Literal["drive", "command", "speed", "joints", "measurement", "kinematics"]
 MOTION: tuple[Side, ...] = ("speed", "joints")
 """Sides that change the increment which the inner model returns."""
 ANY_INTERFACE = frozenset({"speed", "position", "torque"})

@@ -6,39 +6,18 @@ They exist around `diagnosis.own_simulator` only. The way back is a change of th
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import torch
-
-from actuators.effects.effect import ANY_INTERFACE, EffectChain, EffectSpec
+from actuators.effects.drives import DriveEffect
+from actuators.effects.effect import ANY_INTERFACE
 from actuators.effects.ranges import EffectNumber
-from brokk_rl.contracts.actuator import ActuatorModel
-from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
 
-class _InsideEffect(EffectSpec):
+class _InsideEffect(DriveEffect):
     """An effect that writes one number of the plant."""
 
-    side = "simulator"
     interfaces = ANY_INTERFACE
-    quantity: ClassVar[str]
-
-    def wrap(
-        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
-    ) -> EffectChain:
-        """Return `model` whose plant has the number.
-
-        Around another model, which has no such number, the effect does nothing.
-        """
-        chain = super().wrap(model, machine, num_envs, device)
-        inner: Any = model
-        while hasattr(inner, "inner"):
-            inner = inner.inner
-        (number,) = self.numbers
-        if hasattr(inner, "changes"):
-            inner.changes[self.quantity] = lambda: chain.parameters[number]
-        return chain
 
 
 @spec
@@ -51,7 +30,7 @@ class JointFriction(_InsideEffect):
             (position), at full speed (velocity) or at full command (torque).
     """
 
-    quantity = "friction"
+    drives = MappingProxyType({"part": "friction"})
     # Chosen by hand: the drive stops 0.75 % of the travel from its target.
     numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.15, bounds=(0.0, 2.0))}
 
@@ -66,7 +45,7 @@ class JointDamping(_InsideEffect):
             than the robot.
     """
 
-    quantity = "damping"
+    drives = MappingProxyType({"part": "damping"})
     # Chosen by hand: at full speed the drive lags by 1 % of the travel more.
     numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.2, bounds=(-5.0, 5.0))}
 
@@ -80,7 +59,7 @@ class JointArmature(_InsideEffect):
         part: Added inertia over that of the joint in the file's own pose.
     """
 
-    quantity = "armature"
+    drives = MappingProxyType({"part": "armature"})
     # Chosen by hand: a rotor behind a gear of some hundreds doubles the inertia of a small arm.
     numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 20.0))}
 
@@ -94,7 +73,7 @@ class DriveGain(_InsideEffect):
         gain: Factor.
     """
 
-    quantity = "gain"
+    drives = MappingProxyType({"gain": "gain"})
     # Chosen by hand: a battery that sags takes a fifth of the voltage.
     numbers: ClassVar = {"gain": EffectNumber("1", none=1.0, typical=0.8, bounds=(0.1, 5.0))}
 
@@ -109,7 +88,7 @@ class DriveLimit(_InsideEffect):
             (velocity) or at full command (torque), over its largest torque; 0 for no limit.
     """
 
-    quantity = "limit"
+    drives = MappingProxyType({"shortage": "limit"})
     # As `torque_limit` around a servo; a drive at its full command is limited from 1 on.
     numbers: ClassVar = {"shortage": EffectNumber("1", none=0.0, typical=2.0, bounds=(0.0, 20.0))}
 
