@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brokk_rl.machine import Machine
@@ -83,3 +84,24 @@ def draw_motion_panels(
                 remove_frame(axis)
     add_legend(figure, figure.axes[0])
     return figure
+
+
+def draw_joint_track(
+    axis: Axes, times: np.ndarray, q: np.ndarray, u: np.ndarray, machine: Machine, joint: int
+) -> None:
+    """Draw command (full is half the height), position and stops of one joint, each `(T,)`."""
+    lower, upper, home = machine.lower[joint], machine.upper[joint], machine.home[joint]
+    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    # An exclusive joint never moves with others.
+    color = RED if machine.is_exclusive[joint] else GREY
+    label = "command (full: to the stops; red: never with others)"
+    axis.fill_between(
+        times, middle, middle + half * u, step="post", color=color, alpha=0.6, label=label
+    )
+    axis.plot(times, q, color="black", linewidth=1.1, label="position")
+    axis.axhline(lower, color=RED, linewidth=0.9, linestyle="--", label="stop")
+    axis.axhline(upper, color=RED, linewidth=0.9, linestyle="--")
+    axis.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
+    labels = [f"{lower:.2f}", f"home {home:.2f}", f"{upper:.2f}"]
+    axis.set_yticks([lower, home, upper], labels, fontsize=8)
+    axis.set_ylabel(f"{machine.joint_names[joint]}\n{machine.joints[joint].unit}")

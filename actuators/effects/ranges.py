@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal
@@ -147,7 +147,12 @@ class ParameterRanges:
             drawn[name] = (low, high, neutral, np.full(len(low), share), *keys)
         for effect, names in idle.items():
             if effect not in active:
-                raise ConfigError(_explain_idle(machine, names, where, numbers, effect))
+                known = "has known masses"
+                if not machine.has_bodies:
+                    known = "is known by its joints only (add joints[].body to its file)"
+                raise ConfigError(
+                    f"{where}.{', '.join(names)}: machine '{machine.name}' {known}, so that they do nothing; give the other numbers"
+                )
         self._draw = start_counter(num_envs, salt, device) if stochastic or drawn else None
         self.state = {} if self._draw is None else {"draw": self._draw}
         self._drawn: torch.Tensor | None = None
@@ -204,29 +209,6 @@ def _select_joints(joints: Joints, machine: Machine, where: str) -> np.ndarray:
                 f"{where}: '{name}' is no joint of machine '{machine.name}'; {list_choices(name, machine.joint_names)}"
             )
     return np.array([name in joints for name in machine.joint_names])
-
-
-def _explain_idle(
-    machine: Machine,
-    names: Sequence[str],
-    where: str,
-    numbers: Mapping[str, EffectNumber],
-    effect: str,
-) -> str:
-    """Return the message about numbers that the machine does not have, with those that it has."""
-    others = []
-    for name, number in numbers.items():
-        is_of_it = name.rpartition(".")[0] == effect
-        if is_of_it and number.masses is not None and number.is_on(machine):
-            others.append(name)
-    known, mend = "has known masses", ""
-    if not machine.has_bodies:
-        known = "is known by its joints only"
-        mend = ", or add joints[].body (axis, origin, mass, …) to its file"
-    return (
-        f"{where}.{', '.join(names)}: machine '{machine.name}' {known}, so that they do nothing; "
-        f"give {', '.join(others)}{mend}"
-    )
 
 
 def _resolve_range(

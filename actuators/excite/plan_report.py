@@ -10,9 +10,10 @@ from matplotlib.axes import Axes
 
 from actuators.excite.player import Sample
 from actuators.excite.schedule import ExcitationPlan
+from actuators.motion_panels import draw_joint_track
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, RED, draw_grid, make_figure, save_figure
+from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, draw_grid, make_figure, save_figure
 
 BEFORE, PLAYING, AWAY, AFTER = range(4)
 """On the way to the start of a segment and resting there; in its program; brought home meanwhile;
@@ -120,7 +121,7 @@ def draw_plan(
     axes = whole.subplots(rows + 1, 1, sharex=True, height_ratios=ratios)
     minutes = track.t_s / 60.0
     for j, axis in enumerate(axes[1 : machine.num_joints + 1]):
-        _draw_joint(axis, minutes, track.q[:, 0, j], track.u[:, 0, j], machine, j)
+        draw_joint_track(axis, minutes, track.q[:, 0, j], track.u[:, 0, j], machine, j)
     if has_tool:
         axes[-1].fill_between(minutes, tool_speed_m_s, color=GREY, linewidth=0)
         axes[-1].set_ylabel("tool\nm/s")
@@ -160,24 +161,3 @@ def _draw_segments(
     axes[0].set_yticks([])
     axes[0].set_ylim(0.0, 1.0)
     axes[0].spines[:].set_visible(False)
-
-
-def _draw_joint(
-    axis: Axes, minutes: np.ndarray, q: np.ndarray, u: np.ndarray, machine: Machine, joint: int
-) -> None:
-    """Draw command (full is half the height), position and stops of one joint."""
-    lower, upper, home = machine.lower[joint], machine.upper[joint], machine.home[joint]
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-    # An exclusive joint never moves with others.
-    color = RED if machine.is_exclusive[joint] else GREY
-    label = "command (full: to the stops; red: never with others)"
-    axis.fill_between(
-        minutes, middle, middle + half * u, step="post", color=color, alpha=0.6, label=label
-    )
-    axis.plot(minutes, q, color="black", linewidth=1.1, label="predicted position")
-    axis.axhline(lower, color=RED, linewidth=0.9, linestyle="--", label="stop")
-    axis.axhline(upper, color=RED, linewidth=0.9, linestyle="--")
-    axis.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
-    labels = [f"{lower:.2f}", f"home {home:.2f}", f"{upper:.2f}"]
-    axis.set_yticks([lower, home, upper], labels, fontsize=8)
-    axis.set_ylabel(f"{machine.joint_names[joint]}\n{machine.joints[joint].unit}")

@@ -88,8 +88,8 @@ def _judge_comparison(result: Mapping[str, Any], horizon: str) -> VerdictSentenc
     intervals = {joint: against[joint][horizon]["ci95"] or (-np.inf, np.inf) for joint in joints}
     better = [joint for joint, (_, high) in intervals.items() if high < 0]
     worse = [joint for joint, (low, _) in intervals.items() if low > 0]
-    text += f". Better beyond doubt on {_name_joints(better, joints)}"
-    text += f", worse on {_name_joints(worse, joints)}." if worse else "."
+    text += f". Better beyond doubt on {len(better)} of {len(joints)} joints"
+    text += f", worse on {', '.join(worse)}." if worse else "."
     if total["ci95"][1] < 0 and not worse:
         return VerdictSentence("good", text)
     is_bad = total["ci95"][0] > 0 or len(worse) > len(better)
@@ -149,14 +149,6 @@ def _list_test_doubts(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"Judged by {runs} runs: intervals from so few are coarse, most likely too narrow."
     for horizon, reason in result["missing"].items():
         yield f"No figure at {horizon} s: {reason}."
-
-
-def _name_joints(some: list[str], every: list[str]) -> str:
-    if not some:
-        return "no joint"
-    if len(some) == len(every):
-        return f"all {len(every)} joints"
-    return f"{len(some)} of {len(every)} joints ({', '.join(some)})"
 
 
 def build_results(

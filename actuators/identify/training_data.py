@@ -105,9 +105,6 @@ NEEDED_S = 15.0
 """Commanded time each way below which a fit is refused. Measured with `fit=mlp` on random levels of
 the hydraulic plant: with 10 s each way the error of a free run of 5 s is three times that of an
 ample fit, no better than a linear model; with 30 s 1.7 times."""
-AMPLE_S = 200.0
-"""Commanded time each way below which a warning stands: with 80 s that error is 1.15, with 200 s
-1.07 times an ample fit's."""
 SETTLED = 3
 """Histories without a command after which a joint is at rest: its dead time is over and what swung
 has died away."""
@@ -127,28 +124,22 @@ def measure_commanded_each_way_s(recordings: Sequence[Recording]) -> np.ndarray:
 
 
 def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
-    """Check that each joint is commanded long enough each way; warn where data are thin.
+    """Check that each joint is commanded long enough each way.
 
     Raises:
         RecordingError: a joint is hardly commanded, in figures.
     """
+    lacking = []
     found = measure_commanded_each_way_s(recordings)
-    for needed_s, is_fatal in ((NEEDED_S, True), (AMPLE_S, False)):
-        lacking = []
-        for name, (forth_s, back_s) in zip(machine.joint_names, found.T.tolist(), strict=True):
-            if min(forth_s, back_s) < needed_s:
-                lacking.append(
-                    f"{name} {forth_s / 60:.1f} min forth and {back_s / 60:.1f} min back"
-                )
-        if not lacking:
-            continue
-        text = f"{'; '.join(lacking)} commanded (|u| > {COMMANDED:g}) in the {len(recordings)} recordings to fit to"
-        advice = "Record more of these joints: small and large commands both ways over their whole travel (mode=collect)."
-        minutes = f"{needed_s / 60:.2g} min each way"
-        if is_fatal:
-            raise RecordingError(f"too little data: {text}, needed are {minutes}. {advice}")
-        log.warning("thin data: %s; errors hardly fall beyond %s. %s", text, minutes, advice)
-        return
+    for name, (forth_s, back_s) in zip(machine.joint_names, found.T.tolist(), strict=True):
+        if min(forth_s, back_s) < NEEDED_S:
+            lacking.append(f"{name} {forth_s / 60:.1f} min forth and {back_s / 60:.1f} min back")
+    if lacking:
+        raise RecordingError(
+            f"too little data: {'; '.join(lacking)} commanded (|u| > {COMMANDED:g}) in the {len(recordings)} recordings to fit to, "
+            f"needed are {NEEDED_S / 60:.2g} min each way. Record more of these joints: small and large commands both ways over "
+            "their whole travel (mode=collect)."
+        )
 
 
 def estimate_resting_noise(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:

@@ -10,7 +10,7 @@ import json
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 from scipy import io as matlab
 
-from actuators.recordings.log_tables import LogFile, LogRun, Table, Wanted
+from actuators.recordings.log_tables import HEAD_ROWS, LogFile, LogRun, Table, Wanted
 from actuators.recordings.message_numbers import read_number
 from actuators.recordings.name_evidence import TIME_UNITS
 from brokk_rl.errors import RecordingError
@@ -31,8 +31,6 @@ MOST_COLUMNS = 256
 """Widest matrix that is taken for joints; wider ones are pictures."""
 INDEX = "__index_level_"
 """Begin of the names under which pandas writes an index without a name."""
-HEAD_ROWS = 50
-"""Rows in the first of which a list is not empty, of which the number of items is told."""
 FORMATS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json"}
 """Formats of pyarrow by the ending of their files."""
 TABLE_ERRORS = (OSError, pa.ArrowException, ValueError)
@@ -55,59 +53,43 @@ class TableLog(LogFile):
         super().__init__(path)
         self._labels = labels or {}
 
-    def list_tables(self) -> dict[str, list[str]]:
-        """Return the columns of numbers, and those of fixed lists item by item."""
-        return {"": [*self._list_places()]}
-
-    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
+    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
         """Return the table of the file."""
-        return {"": Table(self.read_columns(wanted.get("", ()), max_rows))}
+        return {"": Table(self.read_columns(max_rows))}
 
-    def read_columns(self, names: Collection[str], max_rows: int | None) -> dict[str, np.ndarray]:
-        """Return the named columns, each `(T,)`; NaN for an empty cell, s for a time."""
-        places = {name: place for name, place in self._list_places().items() if name in names}
-        columns = sorted({field for field, *_ in places.values()})
+    def read_columns(self, max_rows: int | None) -> dict[str, np.ndarray]:
+        """Return the columns of numbers, and those of fixed lists item by item, each `(T,)`.
+
+        NaN stands for an empty cell; times are in s.
+        """
+        kind = FORMATS[self.path.suffix.lower()]
         found = {}
         try:
-            source = self._open()
-            if max_rows is None:
-                table = flatten_table(source.to_table(columns))
-            else:
-                table = flatten_table(source.head(max_rows, columns=columns))
-            for name, (_, inner, item, length) in places.items():
-                found[name] = _convert_column(table[inner], length)[:, item]
-        except TABLE_ERRORS as error:
-            raise RecordingError(f"{self.path}: damaged ({error})") from error
-        return found
-
-    def _open(self) -> ds.Dataset:
-        return ds.dataset(self.path, format=FORMATS[self.path.suffix.lower()])
-
-    def _list_places(self) -> dict[str, tuple[str, str, int, int]]:
-        """Return field, field within it, item and number of items of each name."""
-        try:
-            head = self._open().head(HEAD_ROWS)
+            source = ds.dataset(self.path, format=kind)
+            table = source.to_table() if max_rows is None else source.head(max_rows)
+            table = flatten_table(table)
+            for name, column in zip(table.column_names, table.columns, strict=True):
+                found |= self._split_column(name, column)
         except FileNotFoundError as error:
             raise RecordingError(f"{self.path}: no such log") from error
         except TABLE_ERRORS as error:
-            kind = FORMATS[self.path.suffix.lower()]
             raise RecordingError(f"{self.path}: cannot be read as {kind} ({error})") from error
-        places = {}
-        for field in head.column_names if head.num_rows else ():
-            part = flatten_table(head.select([field]))
-            for name, column in zip(part.column_names, part.columns, strict=True):
-                value = next(filter(None, column.to_pylist()), None)
-                is_text = isinstance(value, str) and read_number(value) is not None
-                if is_text or _is_number(column.type):
-                    is_index = name.startswith(INDEX) and pa.types.is_timestamp(column.type)
-                    places["timestamp" if is_index else name] = (field, name, 0, 1)
-                elif _is_list(column.type) and _is_number(column.type.value_type) and value:
-                    labels = self._labels.get(name, [])
-                    if len({*labels}) != len(value):
-                        labels = [str(item) for item in range(len(value))]
-                    for item, label in enumerate(labels):
-                        places[f"{name}[{label}]"] = (field, name, item, len(value))
-        return places
+        return found
+
+    def _split_column(self, name: str, column: pa.ChunkedArray) -> dict[str, np.ndarray]:
+        """Return the numbers of a column by name; none for text."""
+        value = next(filter(None, column[:HEAD_ROWS].to_pylist()), None)
+        is_text = isinstance(value, str) and read_number(value) is not None
+        if is_text or _is_number(column.type):
+            is_index = name.startswith(INDEX) and pa.types.is_timestamp(column.type)
+            return {"timestamp" if is_index else name: _convert_column(column, 1)[:, 0]}
+        if not (_is_list(column.type) and _is_number(column.type.value_type) and value):
+            return {}
+        labels = self._labels.get(name, [])
+        if len({*labels}) != len(value):
+            labels = [str(item) for item in range(len(value))]
+        items = _convert_column(column, len(value)).T
+        return {f"{name}[{label}]": item for label, item in zip(labels, items, strict=True)}
 
 
 class LeRobotLog(LogFile):
@@ -138,14 +120,10 @@ class LeRobotLog(LogFile):
                 f"{path}: no data/**/*.parquet; a LeRobotDataset keeps its rows there"
             )
 
-    def list_tables(self) -> dict[str, list[str]]:
-        """Return the columns of numbers, items of lists by the names that the dataset gives them."""
-        return self._files[0].list_tables()
-
-    def read_runs(self, wanted: Wanted, max_rows: int | None) -> Iterator[LogRun]:
+    def read_runs(self, wanted: Wanted | None, max_rows: int | None) -> Iterator[LogRun]:
         """Yield each episode as a run."""
         for file in self._files if max_rows is None else self._files[:1]:
-            columns = file.read_columns({*wanted.get("", ()), EPISODE}, max_rows)
+            columns = file.read_columns(max_rows)
             numbers = columns.get(EPISODE, np.empty(0))
             if not len(numbers):
                 raise RecordingError(f"{file.path}: column '{EPISODE}' is missing or has no rows")
@@ -178,15 +156,11 @@ class ArrayLog(LogFile):
                         columns[f"{name}[{item}]"] = column
             self._tables[table] = columns
 
-    def list_tables(self) -> dict[str, list[str]]:
+    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
         """Return the real vectors of the most frequent length, and columns of such matrices."""
-        return {table: [*columns] for table, columns in self._tables.items()}
-
-    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
-        """Return the tables of the file."""
         tables = {}
-        for table, names in wanted.items():
-            tables[table] = Table({name: self._tables[table][name][:max_rows] for name in names})
+        for table, columns in self._tables.items():
+            tables[table] = Table({name: values[:max_rows] for name, values in columns.items()})
         return tables
 
 

@@ -74,14 +74,6 @@ FINDINGS = {
         "rows are not equally spaced in time",
         "stamp rows where they are measured, not where they are written",
     ),
-    "clock jumps": FindingKind(
-        "warn", "single periods are much longer than the others", "record frame counters"
-    ),
-    "clock rate": FindingKind(
-        "note",
-        "the clock runs faster or slower than the stated rate",
-        "state the true rate, or discipline the clock",
-    ),
     "saturated sensor": FindingKind(
         "bad",
         "the sensor stays at one end of its range, away from the joint's stops: it cannot say more, or a stop is nearer than known",

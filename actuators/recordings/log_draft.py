@@ -188,7 +188,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         opened = open_log(path, None, given.dbc, given.damaged, given.channel)
         if isinstance(opened, TextLog):
             signs = (opened.layout.delimiter, opened.layout.decimal)
-        run = next(opened.read_runs(opened.list_tables(), SAMPLED_ROWS), None)
+        run = next(opened.read_runs(None, SAMPLED_ROWS), None)
         if run is None:
             raise RecordingError(f"{path}: no row")
         sample = read_columns(run, given)

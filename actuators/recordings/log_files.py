@@ -52,16 +52,12 @@ class CsvFolderLog(LogFile):
         super().__init__(path)
         self._logs = {Path(name).stem: TextLog(path / name) for name in _list_csv_files(path)}
 
-    def list_tables(self) -> dict[str, list[str]]:
-        """Return the columns of each file."""
-        return {table: log.list_tables()[""] for table, log in self._logs.items()}
-
-    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
-        """Return the rows of each file."""
+    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+        """Return the rows of each file that is needed."""
         tables = {}
         for table, log in self._logs.items():
-            if names := wanted.get(table):
-                tables[table] = log.read_tables({"": names}, max_rows)[""]
+            if wanted is None or table in wanted:
+                tables[table] = log.read_tables(None, max_rows)[""]
         return tables
 
 

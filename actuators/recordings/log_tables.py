@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import logging
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,7 +49,9 @@ class Table:
         """Return the value of a cell as its file has it, for a message; two quotes for an empty one."""
         if self.find_line is None:
             return f"{self.columns[column][row]:g}"
-        return self.find_line(row)[1][column] or "''"
+        cells = self.find_line(row)[1]
+        cell = cells.get(column) or cells.get(column.rpartition("[")[0], "")  # an item of a list
+        return f"'{cell}'"
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,9 @@ class LogRun:
 
 
 Wanted = Mapping[str, Collection[str]]
-"""Columns to read by table; other tables are left out."""
+"""Columns by table."""
+HEAD_ROWS = 50
+"""Rows from which the columns of a log are listed."""
 
 
 @functools.cache
@@ -78,7 +81,7 @@ def warn_once(text: str) -> None:
     log.warning("%s", text)
 
 
-class LogFile(ABC):
+class LogFile:
     """A log of which only the needed columns are read."""
 
     keep_whole = False
@@ -98,19 +101,20 @@ class LogFile(ABC):
             raise RecordingError(f"{self.path}: {text}; {advise('damaged')}") from error
         warn_once(f"{self.path}: {text}: left out")
 
-    @abstractmethod
     def list_tables(self) -> dict[str, list[str]]:
         """Return the columns of numbers of each table, from the beginning of the log.
 
         Raises:
             RecordingError: The log cannot be read.
         """
+        run = next(self.read_runs(None, HEAD_ROWS))
+        return {name: [*table.columns] for name, table in run.tables.items()}
 
-    def read_runs(self, wanted: Wanted, max_rows: int | None) -> Iterator[LogRun]:
-        """Yield each run with the wanted columns; a log is one run unless its reader says otherwise.
+    def read_runs(self, wanted: Wanted | None, max_rows: int | None) -> Iterator[LogRun]:
+        """Yield each run; a log is one run unless its reader says otherwise.
 
         Args:
-            wanted: Columns to read by table; other tables are left out.
+            wanted: Columns that are needed, by table; `None` for all. A reader may leave out the others.
             max_rows: Rows of each table after which reading may stop; `None` for all.
 
         Raises:
@@ -119,8 +123,8 @@ class LogFile(ABC):
         name = self.path.resolve().name if self.path.is_dir() else self.path.stem
         yield LogRun(name, str(self.path), self.read_tables(wanted, max_rows))
 
-    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
-        """Return the wanted columns of a log that is one run; see `read_runs`."""
+    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+        """Return the tables of a log that is one run; see `read_runs`."""
         raise NotImplementedError
 
 

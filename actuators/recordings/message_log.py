@@ -83,8 +83,9 @@ class MessageLog(LogFile):
                 break
         return {table: [self.clock, *found[table]] for table in sorted(found) if found[table]}
 
-    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
-        """Return the numbers of each topic; messages without any wanted number are left out."""
+    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+        """Return the needed numbers of each topic; messages without any of them are left out."""
+        wanted = self.list_tables() if wanted is None else wanted
         names = {table: [one for one in wanted[table] if one != self.clock] for table in wanted}
         rows = {table: array("d") for table in wanted}
         counts = dict.fromkeys(wanted, 0)

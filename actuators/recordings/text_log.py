@@ -22,7 +22,6 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from actuators.recordings.advice import advise
 from actuators.recordings.log_tables import LogFile, Table, Wanted
 from actuators.recordings.message_numbers import read_number
 from actuators.recordings.name_evidence import is_unit
@@ -99,36 +98,32 @@ class TextLog(LogFile):
         """
         super().__init__(path)
         self.layout = detect_layout(path, signs)
-        self._places: dict[str, tuple[int, int]] = {}
-        for at, name in enumerate(self.layout.names):
-            kind = self.layout.kinds[at]
-            if kind == "list":
-                length = len(split_list(self.layout.samples[0][at]))
-                self._places |= {f"{name}[{item}]": (at, item) for item in range(length)}
-            elif name and kind != "text":
-                self._places[name] = (at, 0)
 
-    def list_tables(self) -> dict[str, list[str]]:
-        """Return the columns whose cells are numbers, times, flags or lists."""
-        return {"": [*self._places]}
+    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+        """Return the rows of the file with all columns of numbers, times, flags and lists.
 
-    def read_tables(self, wanted: Wanted, max_rows: int | None) -> dict[str, Table]:
-        """Return the rows of the file; a last line that a crash cut off is left out with a warning.
+        NaN stands for a cell that is none of them. A last line that a crash cut off is left out with a warning.
 
         Raises:
-            RecordingError: A cell cannot be read, or the file is damaged; names line and column.
+            RecordingError: The file is damaged; names the line.
         """
-        places = {name: self._places[name] for name in wanted.get("", ())}
-        frame = self._read_cells(sorted({at for at, _ in places.values()}), max_rows)
-        numbers = {at: self._convert(cells, at) for at, cells in frame.items()}
-        columns = {name: numbers[at][:, item] for name, (at, item) in places.items()}
+        frame = self._read_cells(max_rows)
+        columns = {}
+        for at, cells in frame.items():
+            name, kind = self.layout.names[at], self.layout.kinds[at]
+            if kind != "list":
+                columns[name] = convert_cells(cells, kind, self.layout.decimal)
+                continue
+            items = convert_lists(cells, len(split_list(self.layout.samples[0][at])))
+            columns |= {f"{name}[{item}]": values for item, values in enumerate(items.T)}
         return {"": Table(columns, find_line=self.find_line)}
 
     def find_line(self, row: int) -> tuple[int, dict[str, str]]:
         """Return number, from 1, and cells by column of the line of a row of data."""
         number, cells, _ = next(itertools.islice(self._iterate_lines(), row, None))
-        cells += [""] * len(self.layout.names)  # a damaged line may have fewer
-        return number, {name: cells[at] for name, (at, _) in self._places.items()}
+        return number, dict(
+            zip(self.layout.names, cells, strict=False)
+        )  # a damaged line may have fewer
 
     def _iterate_lines(self) -> Iterator[tuple[int, list[str], bool]]:
         """Yield number, from 1, and cells of each line of data, and whether the line has its end."""
@@ -138,9 +133,10 @@ class TextLog(LogFile):
                     cells = split_line(line, self.layout.delimiter)
                     yield number, cells, line.endswith("\n")
 
-    def _read_cells(self, places: list[int], max_rows: int | None) -> dict[int, Any]:
-        """Return the cells of some columns; numbers are numbers already where all of them are."""
+    def _read_cells(self, max_rows: int | None) -> dict[int, Any]:
+        """Return the cells of all columns but text; numbers are numbers already where all of them are."""
         layout, width = self.layout, len(self.layout.samples[0])
+        places = [at for at, name in enumerate(layout.names) if name and layout.kinds[at] != "text"]
         read = functools.partial(
             pd.read_csv,
             self.path,
@@ -197,24 +193,9 @@ class TextLog(LogFile):
         log.warning("%s: the last line %s", self.path, text)
         return True
 
-    def _convert(self, cells: pd.Series, at: int) -> np.ndarray:
-        """Return the numbers of a column, `(T, K)`, with one for each item of a list; NaN for an empty cell."""
-        kind = self.layout.kinds[at]
-        length = sum(place == at for place, _ in self._places.values())
-        values = convert_cells(cells, kind, length, self.layout.decimal).reshape(len(cells), -1)
-        bad = np.isnan(values).any(1) & cells.notna().to_numpy()
-        if bad.any() and not self.keep_whole:
-            row = int(np.argmax(bad))
-            what = {"list": f"a list of {length} numbers", "time": "a time"}.get(kind, "a number")
-            raise RecordingError(
-                f"{self.path}: line {self.find_line(row)[0]} (row {row}), column '{self.layout.names[at]}': "
-                f"'{str(cells.iloc[row]).strip()}' is not {what}; {advise('damaged')}"
-            )
-        return values
 
-
-def convert_cells(cells: Any, kind: CellKind, length: int, decimal: str) -> np.ndarray:
-    """Return cells as numbers, `(T,)`, or `(T, K)` for lists; NaN for what is none."""
+def convert_cells(cells: Any, kind: CellKind, decimal: str) -> np.ndarray:
+    """Return cells as numbers, `(T,)`; NaN for what is none."""
     if kind == "number":
         if cells.dtype.kind in "fiu":
             return cells.to_numpy(dtype=float)
@@ -224,10 +205,13 @@ def convert_cells(cells: Any, kind: CellKind, length: int, decimal: str) -> np.n
     texts = cells.fillna("").str.strip()
     if kind == "flag":
         return texts.str.lower().map(FLAGS).to_numpy(dtype=float)
-    if kind == "time":
-        return convert_times(texts)
-    found = np.full((len(texts), length), np.nan)
-    for row, text in enumerate(texts):
+    return convert_times(texts)
+
+
+def convert_lists(cells: Any, length: int) -> np.ndarray:
+    """Return lists of numbers as `(T, K)`; NaN for another cell."""
+    found = np.full((len(cells), length), np.nan)
+    for row, text in enumerate(cells.fillna("").str.strip()):
         numbers = [read_number(part) for part in split_list(text)]
         if len(numbers) == length and None not in numbers:
             found[row] = numbers
@@ -284,7 +268,6 @@ def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayou
             f"the file begins with '{text}'"
         )
     _, delimiter, decimal, first, width, samples = max(candidates, key=lambda one: one[0])
-    _refuse_double_comma(path, head[:first], delimiter, width, samples)
     names = _find_names(path, head[:first], delimiter, width, samples)
     kept = tuple(tuple(row) for row in samples)
     return TextLayout(delimiter, decimal, encoding, first, _tell_apart(names), kept)
@@ -329,21 +312,6 @@ def _is_data(row: list[str], decimal: str) -> bool:
     return bool(values) and 2 * len(values) > len(filled) and len(row) > 1
 
 
-def _refuse_double_comma(
-    path: Path, above: list[str], delimiter: str, width: int, samples: list[list[str]]
-) -> None:
-    """Refuse rows in which a comma is the delimiter and the decimal sign."""
-    if delimiter != "," or not above:
-        return
-    num_names = len(split_line(above[-1], delimiter))
-    fractions = [cell for row in samples for cell in row[1::2]]
-    if num_names < width <= 2 * num_names and all(cell.isdigit() for cell in fractions):
-        raise RecordingError(
-            f"{path}: the comma is both delimiter and decimal sign: a header of {num_names} cells, rows of {width}; "
-            "export again with a decimal point, or with ; or tab between the cells"
-        )
-
-
 def _find_names(
     path: Path, above: list[str], delimiter: str, width: int, samples: list[list[str]]
 ) -> list[str]:
@@ -365,9 +333,13 @@ def _find_names(
         if len(cells) != width:
             is_near = line is filled[-1] and not is_comment and width <= 2 * len(cells) <= 4 * width
             if is_near and len(cells) > 1:
+                commas = (
+                    "; if the comma is both delimiter and decimal sign, export again with a decimal point, or with ; or tab "
+                    "between the cells"
+                )
                 raise RecordingError(
                     f"{path}: the header has {len(cells)} cells, the rows below it have {width}: '{line.strip()[:80]}'; "
-                    f"mend the header, or the delimiter '{delimiter}'"
+                    f"mend the header, or the delimiter '{delimiter}'{commas if delimiter == ',' else ''}"
                 )
             continue
         if not units and all(cell in MISSING or is_unit(cell) for cell in cells):

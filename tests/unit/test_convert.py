@@ -126,7 +126,7 @@ def put(at: int, cell: int, text: str) -> list[str]:
     [
         (put(7, 1, "off"), r"dig\.csv: line 9 \(row 7\), column 'Boom Cmd': 'off' is not a number"),
         (put(7, 6, ""), r"dig\.csv: line 9 \(row 7\), column 'Stick Ms': '' is not a number"),
-        (put(3, 8, "nan"), r"dig\.csv: line 5 \(row 3\), column 'Swing Ms': nan is not a number"),
+        (put(3, 8, "nan"), r"dig\.csv: line 5 \(row 3\), column 'Swing Ms': 'nan' is not a number"),
         (
             put(7, 0, "100.1"),
             r"dig\.csv: line 9 \(row 7\), column 'Time': time does not increase \(100\.318 s, then 100\.1 s\)",

@@ -69,20 +69,16 @@ def test_a_lock_without_a_common_condition_stays_unexplained(
     [
         (lambda t: t + 0.004 * np.random.default_rng(0).uniform(-0.5, 0.5, len(t)), None),
         (lambda t: t + 0.018 * (np.arange(len(t)) % 2) - 0.009, "irregular clock"),
-        (lambda t: t + 0.0095 * (t > 100.0) + 0.0095 * (t > 150.0), "clock jumps"),
-        (lambda t: t * 1.004, "clock rate"),
+        (lambda t: t + 0.0095 * (t > 100.0) + 0.0095 * (t > 150.0), None),
+        (lambda t: t * 1.004, None),
     ],
 )
-def test_what_is_wrong_with_a_clock_is_told_apart(
+def test_only_rows_that_are_not_equally_spaced_are_a_fault_of_the_clock(
     machine: Machine, thresholds: InspectionThresholds, change, name: str | None
 ) -> None:
     sound = recording(machine)
     found = named(examine_recordings([replace(sound, t_s=change(sound.t_s))], machine, thresholds))
     assert {key for key in found if "clock" in key} == ({name} if name else set())
-    if name == "clock jumps":
-        assert found[name].count == 2 and found[name].from_s == pytest.approx(100.0, abs=0.1)
-    if name == "clock rate":
-        assert found[name].amount.startswith("+4000 ppm")
 
 
 def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -100,14 +99,3 @@ def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> N
         match=r"too little data: q3 0\.0 min forth and 0\.\d min back commanded .* needed are 0\.25 min",
     ):
         training_data.check_enough([dataclasses.replace(part, u=u)], machine)
-
-
-def test_thin_data_is_warned_of(machine: Machine, caplog: pytest.LogCaptureFixture) -> None:
-    runs = [recording(machine, seed, minutes=4.0) for seed in range(5)]
-    with caplog.at_level(logging.WARNING):
-        training_data.check_enough(runs[:1], machine)
-    assert "thin data: q1 1." in caplog.text
-    caplog.clear()
-    with caplog.at_level(logging.WARNING):
-        training_data.check_enough(runs, machine)
-    assert not caplog.text

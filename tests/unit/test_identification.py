@@ -167,7 +167,7 @@ def test_the_report_of_a_good_model_says_so(
     }  # fmt: skip
     assert (
         result["verdict"][0]["tone"] == "good"
-        and "Better beyond doubt on all 5 joints" in result["verdict"][0]["text"]
+        and "Better beyond doubt on 5 of 5 joints" in result["verdict"][0]["text"]
     )
     assert any("inside the history of 0.65 s" in sentence["text"] for sentence in result["verdict"])
     assert "Judged by 2 runs" in result["verdict"][-1]["text"]
