@@ -24,7 +24,7 @@ class DeadBand(EffectSpec):
     """
 
     side = "command"
-    pointwise = True
+    recent = 1
     numbers: ClassVar = {
         "extend": EffectNumber(
             "1", none=0.0, typical=0.06, bounds=(0.0, 0.85)
@@ -48,7 +48,7 @@ class Saturation(EffectSpec):
     """
 
     side = "command"
-    pointwise = True
+    recent = 1
     interfaces = frozenset({"speed", "torque"})
     numbers: ClassVar = {"level": EffectNumber("1", none=1.0, typical=0.75, bounds=(0.05, 1.0))}
 

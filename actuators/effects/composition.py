@@ -7,7 +7,6 @@ import zlib
 import torch
 
 from actuators.effects.effect import MOTION, EffectChain, EffectSpec
-from actuators.effects.timing import DelayJitter
 from actuators.models.parameters import OTHER, PerJoint
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.errors import ConfigError, list_choices
@@ -31,8 +30,8 @@ class Library:
 
     Attributes:
         share: Part of the environments that have an effect; or by effect, `other` for the rest.
-        effects: Effects by name, on actuation and sensing. An added dead time comes before the
-            other effects on commands, jitter last.
+        effects: Effects by name, on actuation and sensing. An added dead time is nearest to the machine,
+            wherever it stands.
     """
 
     share: float | dict[str, float]
@@ -48,17 +47,10 @@ class Library:
                 raise ConfigError(
                     f"effect.library.share: '{name}' is no effect of it; {list_choices(name, known)}"
                 )
-        on_commands = [name for name, effect in self.effects.items() if effect.side == "command"]
         for name, effect in self.effects.items():
             if effect.side not in LIBRARY_SIDES:
                 mend = f"put it beside the library, effect=[library,{name}]"
                 raise ConfigError(f"{where}.{name}: acts on {effect.side}; {mend}")
-            if effect.delays and name != on_commands[0]:
-                place = f"before {on_commands[0]}: nearest to the machine"
-                raise ConfigError(f"{where}: '{name}' must come {place}")
-            if isinstance(effect, DelayJitter) and name != on_commands[-1]:
-                place = f"behind {on_commands[-1]}: it delays what is sent"
-                raise ConfigError(f"{where}: '{name}' must come {place}")
 
     def check_machine(self, machine: Machine) -> None:
         """Refuse numbers that a machine cannot have; effects that do not occur on it are left out."""

@@ -51,10 +51,9 @@ class EffectSpec:
         smooth: Whether small changes of its numbers change the motion a little.
         delays: Whether it shifts all commands that the inner model sees, not only the newest; its
             number is then the shift, s.
-        pointwise: Whether each command that it returns depends on the same command only, so that
-            all commands of a run can be given to it at once.
         recent: Number of newest commands that it looks at, where it changes the newest only and
-            asks for no positions but in `begin`; `None`: any. See `EffectChain.plan_run`.
+            asks for no positions but in `begin`; `None`: any. With 1 each command that it returns depends
+            on the same command only. See `EffectChain.plan_run`.
         layer: Place among the effects of its side, from the machine outwards; a command passes the
             largest first.
         placed: Whether its `begin` asks for the positions of the joints.
@@ -76,7 +75,6 @@ class EffectSpec:
     stochastic: ClassVar[bool] = False
     smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
-    pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
     layer: ClassVar[int] = 0
     placed: ClassVar[bool] = False
@@ -324,7 +322,7 @@ class EffectChain:
         """True if all commands of a run can be given to its effects, and to the model inside, beforehand."""
         if not hasattr(self.inner, "plan_run") or not getattr(self.inner, "is_plannable", True):
             return False
-        told = all(e.pointwise or e.delays or e.recent for e in self.commands.values())
+        told = all(e.delays or e.recent for e in self.commands.values())
         told &= all(len(effect.numbers) == 1 for effect in self._delays.values())
         # One counter a step: several effects that draw would draw in another order.
         return told and self._num_recent is None and (not self._salts or len(self.effects) == 1)

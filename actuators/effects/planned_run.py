@@ -42,7 +42,7 @@ def change_run_commands(
 ) -> torch.Tensor:
     """Return the commands of a run `(T, N, J)` after one effect; `q`: the positions before it."""
     effect, still, rows = chain.commands[name], torch.zeros_like(u[0]), u.transpose(0, 1)
-    if effect.pointwise or effect.delays:
+    if effect.recent == 1 or effect.delays:
         now = chain.describe(name, History(q=rows, u=rows), still, None)
         if effect.delays:  # in a step no command is known before it is given
             earliest_s = -chain.inner.delay_s

@@ -107,7 +107,7 @@ class Sag(EffectSpec):
 
     side = "command"
     layer = 2  # of the target: play holds the joint about the target less the sag
-    pointwise = True
+    recent = 1
     interfaces = frozenset({"position"})
     numbers: ClassVar = {
         # The weight of a stretched-out arm is about half of the yield force.

@@ -65,17 +65,11 @@ class ToolSpeed:
                 "collect.guards.max_tool_speed_m_s: needs torch, which is not installed; give null, or a max_command"
             ) from error
         self._kinematics, self._tensor = Kinematics(machine), torch.as_tensor
-        self._period_s = machine.period_s
 
     def of(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """Return the tool speed in m/s, `(N,)`, at `q` and joint speeds `speed`, each `(N, J)`."""
         tip = self._kinematics.jacobian(self._tensor(q.astype(np.float32))).tip.numpy()
         return np.linalg.norm((tip @ speed[..., None])[..., 0], axis=-1)
-
-    def along(self, q: np.ndarray) -> np.ndarray:
-        """Return the tool speed in m/s, `(T,)`, along a path `q`, `(T, J)`."""
-        tip_m = self._kinematics.pose(self._tensor(q.astype(np.float32))).tip_in_base_m.numpy()
-        return np.linalg.norm(np.gradient(tip_m, axis=0), axis=-1) / self._period_s
 
 
 def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
@@ -84,7 +78,7 @@ def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
     `None` where geometry or torch are missing.
     """
     try:
-        return ToolSpeed(machine).along(q)
+        return ToolSpeed(machine).of(q, np.gradient(q, machine.period_s, axis=0))
     except ConfigError:
         return None
 

@@ -180,8 +180,6 @@ def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
         ({"share": 1.5}, "expected 0 to 1, got 1.5"),
         ({"share": {"backslash": 0.1, "other": 0.2}}, "did you mean 'backlash'"),
         ({"effects": ["link_length"]}, "acts on kinematics; put it beside the library"),
-        ({"effects": ["dead_band", "dead_time"]}, "'dead_time' must come before dead_band"),
-        ({"effects": ["delay_jitter", "dead_band"]}, "'delay_jitter' must come behind dead_band"),
     ],
 )
 def test_what_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -> None:

@@ -201,7 +201,7 @@ def test_a_model_that_stands_still_is_no_good_news(
     result = run(identify(machine, tmp_path / "out", recordings, Fit(Hold())))
     assert (
         result["verdict"][0]["tone"] == "bad"
-        and "worse on all 5 joints" in result["verdict"][0]["text"]
+        and "worse on q1, q2, q3, q4, q5" in result["verdict"][0]["text"]
     )
     result["data"]["excitation"]["q3"] |= {
         "commanded_s": 30.0,
