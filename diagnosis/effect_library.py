@@ -30,14 +30,7 @@ from diagnosis.answer import Estimate, Stage
 
 log = logging.getLogger(__name__)
 
-SIDE_ORDER = {
-    "drive": -1,
-    "joints": 0,
-    "speed": 1,
-    "command": 2,
-    "measurement": 4,
-    "kinematics": 5,
-}
+SIDE_ORDER = {"drive": -1, "joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
 """From the machine outwards; delays of a command lie outside of what the valve makes of it."""
 
 
