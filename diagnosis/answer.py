@@ -14,18 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import TypeAdapter, ValidationError
+
 from brokk_rl.errors import RecordingError
 from brokk_rl.session import write_json
-from diagnosis.closure import (
-    Estimate,
-    Gap,
-    Gate,
-    RivalError,
-    read_estimate,
-    read_gap,
-    read_rivals,
-    serialize_estimate,
-)
+from diagnosis.closure import ErrorInUnit, Estimate, Gap, Gate, RivalError
 from diagnosis.free_runs import WindowedRuns
 
 SCHEMA = 1
@@ -75,12 +68,13 @@ class Ranked:
 
 
 @dataclass(frozen=True)
-class JointGap:
-    """Error of one joint over free runs (rad or m), its floor, and its share of the gap."""
+class JointGap(ErrorInUnit):
+    """Error of one joint over free runs, its floor, both in `unit` (rad or m), and its share of the gap."""
 
     rmse: float
     floor: float
     share: float
+    unit: str = "rad"
 
 
 @dataclass(frozen=True)
@@ -97,7 +91,7 @@ class Where:
     """Where the gap lies.
 
     Attributes:
-        joints: By joint, with its unit.
+        joints: By joint.
         regimes: The largest shares first.
         stage: On which part of the way from command to estimate; `None` where nothing is to be
             said.
@@ -106,7 +100,6 @@ class Where:
     joints: Mapping[str, JointGap]
     regimes: tuple[RegimeGap, ...]
     stage: Stage | None
-    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -141,7 +134,7 @@ class Answer:
     ranking: tuple[Ranked, ...]
     where: Where
     gap: Gap | None
-    next_experiment: NextExperiment | None
+    next_experiment: NextExperiment | None = None
     rivals: Mapping[str, RivalError] = field(default_factory=dict)
     gates: tuple[Gate, ...] = ()
     reason: str = ""
@@ -149,34 +142,9 @@ class Answer:
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of `diagnosis.json`."""
-        where = {
-            "joints": {
-                name: {
-                    f"rmse_{self.where.units.get(name, 'rad')}": gap.rmse,
-                    f"floor_{self.where.units.get(name, 'rad')}": gap.floor,
-                    "share": gap.share,
-                }
-                for name, gap in self.where.joints.items()
-            },
-            "regimes": [dataclasses.asdict(regime) for regime in self.where.regimes],
-            "stage": self.where.stage,
-        }
-        gap, key = self.gap and self.gap.to_json(), self.gap.key if self.gap else "rmse_rad"
-        return {
-            "schema": SCHEMA,
-            "verdict": self.verdict,
-            "reason": self.reason,
-            "selected": [_serialize_selected(one) for one in self.selected],
-            "ranking": [_serialize_tuples(dataclasses.asdict(one)) for one in self.ranking],
-            "where": where,
-            "gap": gap,
-            "rivals": {name: one.to_json(key) for name, one in self.rivals.items()},
-            "gates": [dataclasses.asdict(one) for one in self.gates],
-            "next_experiment": None
-            if self.next_experiment is None
-            else _serialize_tuples(dataclasses.asdict(self.next_experiment)),
-            **self.more,
-        }
+        found = TypeAdapter(Answer).dump_python(self, mode="json")
+        more = found.pop("more")
+        return {"schema": SCHEMA, **found, **more}
 
     def write(self, path: Path) -> None:
         """Write `diagnosis.json` in one step.
@@ -209,83 +177,13 @@ def parse_answer(found: Any, where: str) -> Answer:
     try:
         if found["schema"] != SCHEMA:
             raise RecordingError(f"{where}: schema {found['schema']}, expected {SCHEMA}")
-        return _build_answer(found)
-    except (KeyError, TypeError) as error:
+        known = {"schema", *(one.name for one in dataclasses.fields(Answer))}
+        more = {key: value for key, value in found.items() if key not in known}
+        return TypeAdapter(Answer).validate_python({**found, "more": more})
+    except (AttributeError, KeyError, TypeError, ValidationError) as error:
         raise RecordingError(
-            f"{where}: no diagnosis: {error!r} is missing or of another kind"
+            f"{where}: no diagnosis: something is missing or of another kind ({error})"
         ) from error
-
-
-def _build_answer(found: dict[str, Any]) -> Answer:
-    joints, units = {}, {}
-    for name, gap in found["where"]["joints"].items():
-        units[name] = "m" if "rmse_m" in gap else "rad"
-        joints[name] = JointGap(
-            gap[f"rmse_{units[name]}"], gap[f"floor_{units[name]}"], gap["share"]
-        )
-    where = Where(
-        joints,
-        tuple(RegimeGap(**one) for one in found["where"]["regimes"]),
-        found["where"]["stage"],
-        units,
-    )
-    gap = read_gap(found["gap"]) if found["gap"] else None
-    following = found.get("next_experiment")
-    known = {"schema", *(one.name for one in dataclasses.fields(Answer))}
-    return Answer(
-        verdict=found["verdict"],
-        selected=tuple(_read_selected(one) for one in found["selected"]),
-        ranking=tuple(
-            Ranked(one["effect"], tuple(one["joints"]), one["probability"])
-            for one in found["ranking"]
-        ),
-        where=where,
-        gap=gap,
-        rivals=read_rivals(found.get("rivals", {})),
-        gates=tuple(Gate(**one) for one in found.get("gates", ())),
-        next_experiment=following
-        and NextExperiment(
-            following["excitation"], tuple(following["separates"]), following.get("why", "")
-        ),
-        reason=found.get("reason", ""),
-        more={key: value for key, value in found.items() if key not in known},
-    )
-
-
-def _serialize_selected(one: Selected) -> dict[str, Any]:
-    return _serialize_tuples(dataclasses.asdict(one)) | {
-        "parameters": {
-            name: {joint: serialize_estimate(value) for joint, value in values.items()}
-            for name, values in one.parameters.items()
-        },
-        "gap_closed": serialize_estimate(one.gap_closed),
-    }
-
-
-def _read_selected(one: dict[str, Any]) -> Selected:
-    read = {
-        "joints": tuple(one["joints"]),
-        "parameters": _read_parameters(one["parameters"]),
-        "gap_closed": read_estimate(one["gap_closed"]),
-        "same_as": tuple(one["same_as"]),
-    }
-    return Selected(**one | read)
-
-
-def _read_parameters(given: Mapping[str, Any]) -> dict[str, dict[str, Estimate]]:
-    found: dict[str, dict[str, Estimate]] = {}
-    for name, values in given.items():
-        found[name] = {}
-        for joint, value in values.items():
-            if (estimate := read_estimate(value)) is not None:
-                found[name][joint] = estimate
-    return found
-
-
-def _serialize_tuples(fields: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: list(value) if isinstance(value, tuple) else value for key, value in fields.items()
-    }
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,16 @@
-"""Numbers of a gap: errors before, after and at the floor, shares with intervals, rivals and gates."""
+"""Numbers of a gap: errors before, after and at the floor, shares with intervals, rivals and gates.
+
+`diagnosis.json` holds them field by field; pydantic writes and reads it. Names of errors end there with
+their unit.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
+
+from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 
 RELATIVE_ROUNDING = 1e-9
 """Width of an interval, over the number, below which it is rounding of double precision."""
@@ -34,6 +39,17 @@ class Estimate:
     def has_interval(self) -> bool:
         """True if the interval was computed, and its width is more than rounding."""
         return self.ci95[1] - self.ci95[0] > RELATIVE_ROUNDING * abs(self.mean)
+
+    @model_serializer
+    def _write(self) -> dict[str, Any]:
+        """Return it as `diagnosis.json` holds it: without an interval where none could be computed."""
+        found = {"mean": self.mean, "ci95": list(self.ci95) if self.has_interval else None}
+        return found | ({"at_bound": True} if self.at_bound else {})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, told: Any) -> Any:
+        return {**told, "ci95": told["ci95"] or [told["mean"], told["mean"]]}
 
 
 @dataclass(frozen=True)
@@ -83,53 +99,22 @@ class Gap:
     joints: Mapping[str, JointClosed] = field(default_factory=dict)
     reduced: Estimate | None = None
 
-    @property
-    def key(self) -> str:
-        """Name of the errors in `diagnosis.json`."""
-        return f"rmse_{self.unit}"
+    @model_serializer(mode="wrap")
+    def _write(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found = write(self)
+        key = f"rmse_{found.pop('unit')}"
+        for name in ("before", "after", "floor"):
+            found[name] = {key: found[name]}
+        return found
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the field `gap` of `diagnosis.json`."""
-        errors = {name: {self.key: getattr(self, name)} for name in ("before", "after", "floor")}
-        return {
-            **errors,
-            "closed": serialize_estimate(self.closed),
-            "reduced": serialize_estimate(self.reduced),
-            "floor_of": self.floor_of,
-            "joints": {name: dataclasses.asdict(one) for name, one in self.joints.items()},
-        }
-
-
-def read_gap(given: Mapping[str, Any]) -> Gap:
-    """Return the gap of a `diagnosis.json`; earlier ones have no `reduced`."""
-    key = next(iter(given["before"]))
-    before, after, floor = (given[name][key] for name in ("before", "after", "floor"))
-    return Gap(
-        before,
-        after,
-        floor,
-        read_estimate(given["closed"]),
-        key.removeprefix("rmse_"),
-        given.get("floor_of", "reference"),
-        {name: JointClosed(**one) for name, one in given.get("joints", {}).items()},
-        read_estimate(given.get("reduced")),
-    )
-
-
-def serialize_estimate(value: Estimate | None) -> dict[str, Any] | None:
-    """Return a number as plain JSON data; `ci95` is null where no interval could be computed."""
-    if value is None:
-        return None
-    found = {"mean": value.mean, "ci95": list(value.ci95) if value.has_interval else None}
-    return found | ({"at_bound": True} if value.at_bound else {})
-
-
-def read_estimate(value: Mapping[str, Any] | None) -> Estimate | None:
-    """Return the number of `serialize_estimate`."""
-    if value is None:
-        return None
-    low, high = value["ci95"] or (value["mean"], value["mean"])
-    return Estimate(value["mean"], (low, high), bool(value.get("at_bound")))
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, told: Any) -> Any:
+        found = dict(told)
+        for name in ("before", "after", "floor"):
+            ((key, found[name]),) = told[name].items()
+            found["unit"] = key.removeprefix("rmse_")
+        return found
 
 
 @dataclass(frozen=True)
@@ -151,24 +136,34 @@ class Gate:
     text: str
 
 
+class ErrorInUnit:
+    """Base of errors that `diagnosis.json` names with their unit, such as `rmse_rad`."""
+
+    @model_serializer(mode="wrap")
+    def _write(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        told, found = write(self), {}
+        for name, value in told.items():
+            if name != "unit":
+                found[f"{name}_{told['unit']}" if name in ("rmse", "floor") else name] = value
+        return found
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, told: Any) -> Any:
+        found = {}
+        for key, value in told.items():
+            name, _, unit = key.partition("_")
+            found[name] = value
+            if unit:
+                found["unit"] = unit
+        return found
+
+
 @dataclass(frozen=True)
-class RivalError:
+class RivalError(ErrorInUnit):
     """Error of a rival on the windows of the gap, all joints together and by joint; `None`: not to be had."""
 
     rmse: float | None
     joints: Mapping[str, float]
     reason: str = ""
-
-    def to_json(self, key: str) -> dict[str, Any]:
-        """Return plain JSON data; `key`: name of the error of all joints."""
-        found: dict[str, Any] = {key: self.rmse, "joints": dict(self.joints)}
-        return found | ({"reason": self.reason} if self.reason else {})
-
-
-def read_rivals(given: Mapping[str, Any]) -> dict[str, RivalError]:
-    """Return the rivals of a `diagnosis.json`."""
-    found = {}
-    for name, one in given.items():
-        rmse = next((value for key, value in one.items() if key.startswith("rmse_")), None)
-        found[name] = RivalError(rmse, one.get("joints", {}), one.get("reason", ""))
-    return found
+    unit: str = "rad"

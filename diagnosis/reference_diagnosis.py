@@ -5,9 +5,10 @@ Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -54,23 +55,29 @@ NATS_OF_SURE = 15.0
 
 
 @dataclass(frozen=True)
-class NamedEffect:
-    """A named effect, however it was found.
+class SearchResult:
+    """What a search for effects in the motion found.
 
     Attributes:
-        kind: The effect of the registry.
-        finding: What the engine found; `None` where it was found directly.
-        detected: What tool points or samples showed; `None` otherwise.
+        verdict: Its verdict, before the gates.
+        proof: Free runs with and without the named effects.
+        prove_nothing: Makes the proof without any effect.
+        rivals: All effects with what they earn, the best first.
+        otherwise: The reason where nothing is named.
+        evidence: Further evidence, plain JSON data.
     """
 
-    kind: EffectType
-    finding: EffectFinding | None
-    detected: DetectedEffect | None
+    verdict: Verdict
+    proof: RepairProof
+    prove_nothing: Callable[[], RepairProof]
+    rivals: Sequence[EffectFinding]
+    otherwise: str
+    evidence: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """Steps of a diagnosis that do not depend on how effects are found.
+class Diagnosis(ABC):
+    """A diagnosis: what tool points and samples show directly, the search in the motion, its proof, the gates.
 
     Attributes:
         case: The recordings.
@@ -84,53 +91,48 @@ class Diagnosis:
     thresholds: InspectionThresholds
     generator: np.random.Generator
 
-    @cached_property
-    def remarks(self) -> list[RecordingRemark]:
-        """Findings about the field's recordings."""
-        return examine_recordings(self.case.field, self.case.machine, self.thresholds)
+    @abstractmethod
+    def search(self, told: Sequence[Gate], tell: ProgressCallback) -> SearchResult:
+        """Return what explains the motion; `told` are the gates of the recordings."""
 
-    def judge_recordings(self) -> list[Gate]:
-        """Return the gates of the recordings."""
-        case = self.case
-        known = examine_recordings(case.reference, case.machine, self.thresholds)
-        return gates.judge_recordings(self.remarks, known, case.field, case.reference, case.machine)
+    @abstractmethod
+    def size(self, one: EffectFinding, proof: RepairProof) -> tuple[str, SizesByName]:
+        """Return the name of an effect in the registry, and its sizes."""
 
-    def describe_simulated(
-        self, kind: str, one: EffectFinding, numbers: SizesByName, proof: RepairProof
-    ) -> Selected:
-        """Return the answer about an effect `kind` of the registry that was simulated."""
-        part = proof.parts.get(one.effect)
-        like, decided_by = list_alike(kind, one.joints, self.case, self.kinds)
-        return Selected(
-            effect=kind,
-            joints=name_joints(one.joints, self.case.machine),
-            probability=estimate_probability(one.nats),
-            parameters=numbers,
-            gap_closed=None if part is None else part["closed"],
-            same_as=like,
-            decided_by=decided_by,
-            identified=None if part is None else part["identified"],
-            edit=None if part is None else part["edit"],
-        )
-
-    def build_outcome(
-        self,
-        verdict: Verdict,
-        selected: Sequence[Selected],
-        rivals: Sequence[EffectFinding],
-        proof: RepairProof,
-        told: Sequence[Gate],
-        reason: str,
-        evidence: Mapping[str, Any],
-    ) -> Outcome:
-        """Return the outcome of effects that are `selected`, with what else was weighed."""
+    def run(self, tell: ProgressCallback) -> Outcome:
+        """Return the outcome; `tell` receives the name and the progress of each step."""
         machine = self.case.machine
+        tell("recordings", 0.02)
+        remarks = examine_recordings(self.case.field, machine, self.thresholds)
+        told = self._judge_recordings(remarks)
+        found = self.search(told, tell)
+        tell("sizes and proof", 0.9)
+        proof, verdict, detected = found.proof, found.verdict, self.detected
+        named = {j for one in proof.findings for j in one.joints}
+        told = accept_named_joints(told, name_joints(sorted(named), machine))
+        if failed := gates.list_failures(told):
+            proof, detected = found.prove_nothing(), []
+        elif proof.findings or verdict == "none":
+            judged = proof.judge()
+            told += judged
+            if failed := gates.list_failures(judged):
+                proof = found.prove_nothing()
+        ranked = [(one.gain, describe_detected(one, machine)) for one in detected]
+        ranked += [(one.nats, self._describe(one, proof)) for one in proof.findings]
+        selected = [one for _, one in sorted(ranked, key=lambda pair: -pair[0])]
+        reason = f"cannot tell, because {failed}" if failed else found.otherwise
+        if selected:
+            verdict = "effects"
+            if not failed:
+                reason = "; ".join(f"{one.effect} on {', '.join(one.joints)}" for one in selected)
+        elif failed or verdict != "none":
+            verdict = "unknown"
         before, floor = proof.view(proof.before), proof.view_floor()
-        weighed = {"rivals": describe_rivals(rivals, machine), "unit": "log likelihood"}
+        weighed = {"rivals": describe_rivals(found.rivals, machine), "unit": "log likelihood"}
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
-            ranking=rank_effects(selected, rivals, verdict, machine),
+            ranking=rank_effects(selected, found.rivals, verdict, machine),
             where=locate_gap(before, floor, machine, find_stage(selected, self.kinds)),
             gap=proof.measure_gap(bool(selected)),
             rivals=proof.rivals,
@@ -138,51 +140,15 @@ class Diagnosis:
             next_experiment=propose_measurement(selected),
             reason=reason,
             more={
-                "sanity": [remark.plain() for remark in self.remarks],
-                "evidence": {**weighed, **evidence},
+                "sanity": [remark.plain() for remark in remarks],
+                "evidence": {**weighed, **found.evidence},
             },
         )
         return Outcome(answer, before, proof.view(proof.after) if selected else None, floor)
 
-
-class ReferenceDiagnosis(Diagnosis):
-    """A diagnosis of a machine of which earlier recordings are known."""
-
-    def run(self, tell: ProgressCallback) -> Outcome:
-        """Return the outcome; `tell` receives the name and the progress of each step."""
-        case, machine = self.case, self.case.machine
-        tell("recordings", 0.05)
-        told = self.judge_recordings()
-        tell("sensors and tool points", 0.1)
-        detected = self._detect()
-        tell("fitting the reference", 0.2)
-        reference = stack_side(case.reference, machine)
-        field = stack_side(correct_positions(case.field, detected, machine), machine)
-        decider = Decider(reference, field, self._measure_noise(detected), self.clock_late_s)
-        tell("simulating every effect", 0.45)
-        decision = decider.decide()
-        named_joints = {machine.joint_names[j] for one in decision.named for j in one.joints}
-        told = accept_named_joints(told, sorted(named_joints))
-        if failed := gates.list_failures(told):
-            decision = replace(decision, verdict="unknown", named=())
-        tell("sizes and proof", 0.8)
-        named = [] if failed else self._list_named(decision, detected)
-        findings = [one.finding for one in named if one.finding is not None]
-        proof = EngineProof(case, decider, findings, self.generator)
-        judged = proof.judge() if findings or decision.verdict == "none" else []
-        if not failed and (failed := gates.list_failures(judged)):
-            decision = replace(decision, verdict="unknown", named=())
-            named = [one for one in named if one.finding is None]
-            proof = EngineProof(case, decider, [], self.generator)
-        selected = [self._describe(one, proof) for one in sorted(named, key=_get_nats)]
-        verdict = "effects" if selected else decision.verdict
-        reason = _explain(verdict, selected, decision, failed)
-        told = (*told, *judged)
-        evidence = _describe_evidence(decision)
-        return self.build_outcome(verdict, selected, decision.rivals, proof, told, reason, evidence)
-
-    def _detect(self) -> list[DetectedEffect]:
-        """Return the effects that tool points and the scatter of samples show."""
+    @cached_property
+    def detected(self) -> list[DetectedEffect]:
+        """Effects that tool points and the scatter of samples show."""
         found = geometry.find_geometry_errors(self.case, self.kinds, DIRECT_NATS, NAME_NATS)
         for kind in self.kinds:
             # Steps of a coarse sensor are found by the engine itself.
@@ -191,28 +157,83 @@ class ReferenceDiagnosis(Diagnosis):
                 found += [] if noise is None else [noise]
         return found
 
-    def _measure_noise(self, detected: Sequence[DetectedEffect]) -> np.ndarray:
+    def _judge_recordings(self, remarks: Sequence[RecordingRemark]) -> list[Gate]:
+        case = self.case
+        known = examine_recordings(case.reference, case.machine, self.thresholds)
+        return gates.judge_recordings(remarks, known, case.field, case.reference, case.machine)
+
+    def _describe(self, one: EffectFinding, proof: RepairProof) -> Selected:
+        """Return the answer about an effect in the motion."""
+        name, numbers = self.size(one, proof)
+        part = proof.parts[one.effect]
+        like, decided_by = list_alike(name, one.joints, self.case, self.kinds)
+        return Selected(
+            effect=name,
+            joints=name_joints(one.joints, self.case.machine),
+            probability=estimate_probability(one.nats),
+            parameters=numbers,
+            gap_closed=part["closed"],
+            same_as=like,
+            decided_by=decided_by,
+            identified=part["identified"],
+            edit=part["edit"],
+        )
+
+
+class ReferenceDiagnosis(Diagnosis):
+    """A diagnosis of a machine of which earlier recordings are known."""
+
+    def search(self, told: Sequence[Gate], tell: ProgressCallback) -> SearchResult:
+        """Return what the engine decides."""
+        case, machine, detected = self.case, self.case.machine, self.detected
+        tell("fitting the reference", 0.2)
+        reference = stack_side(case.reference, machine)
+        field = stack_side(correct_positions(case.field, detected, machine), machine)
+        decider = Decider(reference, field, self._measure_noise(), self.clock_late_s)
+        tell("simulating every effect", 0.45)
+        decision = decider.decide()
+        tell("sizes and proof", 0.8)
+        known = {kind.name for kind in self.kinds} - {one.kind.name for one in detected}
+        findings = []
+        for one in decision.named if decision.verdict == "effects" else ():
+            if self._name(one) in known:
+                findings.append(one)
+        prove = partial(EngineProof, case, decider, generator=self.generator)
+        return SearchResult(
+            verdict=decision.verdict,
+            proof=prove(findings=findings),
+            prove_nothing=partial(prove, findings=()),
+            rivals=decision.rivals,
+            otherwise=_explain(decision),
+            evidence=_describe_evidence(decision),
+        )
+
+    def size(self, one: EffectFinding, proof: RepairProof) -> tuple[str, SizesByName]:
+        """Return the name of an effect in the registry, and its sizes."""
+        assert isinstance(proof, EngineProof), "the search made it"
+        name, machine = self._name(one), self.case.machine
+        if name == "clock_offset":
+            return name, {"offset_s": dict.fromkeys(machine.joint_names, self._clock)}
+        if name == "quantisation":
+            joints = name_joints(one.joints, machine)
+            return name, {"step_rad": {joint: proof.steps[joint] for joint in joints}}
+        (kind,) = [kind for kind in self.kinds if kind.name == name]
+        return name, describe_numbers(kind, proof.sizes[one.effect], one.hold, machine)
+
+    def _name(self, one: EffectFinding) -> str:
+        # The engine simulates a clock that is late as a dead time of all joints.
+        is_clock = self.clock_late_s != 0.0 and one.name == "dead_time"
+        return "clock_offset" if is_clock else one.name
+
+    def _measure_noise(self) -> np.ndarray:
         """Return the noise that noisy sensors add, units, `(J,)`."""
         machine = self.case.machine
         found = np.zeros(machine.num_joints)
-        for one in detected:
+        for one in self.detected:
             if one.kind.name == "sensor_noise":
                 for name, sigma in one.parameters["sigma_rad"].items():
                     found[machine.joint_names.index(name)] = sigma.mean
         return found / measure_units(machine)
-
-    def _list_named(
-        self, decision: Decision, detected: Sequence[DetectedEffect]
-    ) -> list[NamedEffect]:
-        kinds = {kind.name: kind for kind in self.kinds}
-        found = [NamedEffect(one.kind, None, one) for one in detected]
-        for finding in decision.named if decision.verdict == "effects" else ():
-            # The engine simulates a clock that is late as a dead time of all joints.
-            is_clock = self.clock_late_s != 0.0 and finding.name == "dead_time"
-            name = "clock_offset" if is_clock else finding.name
-            if name in kinds and name not in [one.kind.name for one in found]:
-                found.append(NamedEffect(kinds[name], finding, None))
-        return found
 
     @cached_property
     def clock_late_s(self) -> float:
@@ -224,22 +245,11 @@ class ReferenceDiagnosis(Diagnosis):
         late_s = now - (then or 0.0)
         return late_s if abs(late_s) > CLOCK_SHIFT_S else 0.0
 
-    def _describe(self, one: NamedEffect, proof: EngineProof) -> Selected:
-        machine = self.case.machine
-        if one.detected is not None:
-            return describe_detected(one.detected, machine)
-        finding = one.finding
-        assert finding is not None, "an effect was found one way or the other"
-        if one.kind.name == "clock_offset":
-            offset = describe_clock(self.clock_late_s)
-            parameters = {"offset_s": dict.fromkeys(machine.joint_names, offset)}
-        elif one.kind.name == "quantisation":
-            coarse = name_joints(finding.joints, machine)
-            parameters = {"step_rad": {name: proof.steps[name] for name in coarse}}
-        else:
-            rows = proof.sizes[finding.effect]
-            parameters = describe_numbers(one.kind, rows, finding.hold, machine)
-        return self.describe_simulated(one.kind.name, finding, parameters, proof)
+    @property
+    def _clock(self) -> Estimate:
+        late_s = self.clock_late_s
+        half = SIGMAS * float(np.hypot(CLOCK_ERROR_S, CLOCK_ERROR * late_s))
+        return Estimate(late_s, (late_s - half, late_s + half))
 
 
 def describe_detected(one: DetectedEffect, machine: Machine) -> Selected:
@@ -256,12 +266,6 @@ def describe_detected(one: DetectedEffect, machine: Machine) -> Selected:
         gap_closed=None,
         edit={"own_statistic_explained": one.closed},
     )
-
-
-def describe_clock(late_s: float) -> Estimate:
-    """Return the time by which encoders lag behind the tool tracker with its 95 % interval."""
-    half = SIGMAS * float(np.hypot(CLOCK_ERROR_S, CLOCK_ERROR * late_s))
-    return Estimate(late_s, (late_s - half, late_s + half))
 
 
 def list_alike(
@@ -297,14 +301,6 @@ def accept_named_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate
         passed = gate.passed or (gate.name in ACCEPTED_FINDINGS and is_named)
         found.append(replace(gate, passed=passed))
     return found
-
-
-def _get_nats(one: NamedEffect) -> float:
-    """Return the key that puts the effect that earns most first."""
-    if one.finding is not None:
-        return -one.finding.nats
-    assert one.detected is not None, "an effect was found one way or the other"
-    return -one.detected.gain
 
 
 def estimate_probability(nats: float) -> float:
@@ -414,12 +410,9 @@ def propose_measurement(selected: Sequence[Selected]) -> NextExperiment | None:
     return None
 
 
-def _explain(verdict: str, selected: Sequence[Selected], decision: Decision, failed: str) -> str:
-    if failed:
-        return f"cannot tell, because {failed}"
-    if verdict == "effects":
-        return "; ".join(f"{one.effect} on {', '.join(one.joints)}" for one in selected)
-    if verdict == "none":
+def _explain(decision: Decision) -> str:
+    """Return why nothing is named."""
+    if decision.verdict == "none":
         return "no effect earns more on the field recordings than it would by chance"
     group, nats = decision.generic
     return (

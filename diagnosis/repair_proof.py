@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -29,7 +30,7 @@ from diagnosis.engine.side import Side, choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
-from diagnosis.rivals import measure_rivals
+from diagnosis.rivals import TOO_FEW, measure_rivals
 
 NOISE_FACTOR = 3.0
 """An error within so many deviations of the sensor's noise is none."""
@@ -46,9 +47,9 @@ class RepairProof(ABC):
 
     Args:
         case: The recordings.
-        effects: Joints of each named effect that acts on the motion.
+        findings: The named effects that act on the motion.
         num_windows: `W`.
-        generator: Draws the bootstraps.
+        generator: Draws the bootstraps, the same ones for each proof of a diagnosis.
     """
 
     floor_of = "reference"
@@ -56,16 +57,17 @@ class RepairProof(ABC):
     def __init__(
         self,
         case: GapCase,
-        effects: Mapping[str, Sequence[int]],
+        findings: Sequence[EffectFinding],
         num_windows: int,
         generator: np.random.Generator,
     ) -> None:
         self.machine = case.machine
+        self.findings = findings
         self.half = np.arange(num_windows) // BLOCK_WINDOWS % 2
         """Half of each window, `(W,)`; its sizes are those that were fitted to the other one."""
-        self.weights = draw_weights(num_windows, generator)
+        self.weights = draw_weights(num_windows, deepcopy(generator))
         self._case = case
-        self._effects = effects
+        self._effects = [one.effect for one in findings]
         self._runs: dict[frozenset[str], np.ndarray] = {}
 
     @property
@@ -92,13 +94,15 @@ class RepairProof(ABC):
         """Return left-out runs beside the recordings of the reference; `None` without any."""
 
     @abstractmethod
-    def _simulate(self, effects: frozenset[str]) -> np.ndarray:
-        """Return free runs with some of the named effects, `(W, K, J)`."""
+    def _simulate(self, effects: frozenset[str], half: int) -> np.ndarray:
+        """Return free runs with some of the named effects, `(W, K, J)`, with the sizes for a half."""
 
     def run(self, effects: frozenset[str]) -> np.ndarray:
         """Return free runs with some of the named effects, each window with sizes of the other half."""
         if effects not in self._runs:
-            self._runs[effects] = self._simulate(effects)
+            is_first = self.half[:, None, None] == 0
+            runs = [self._simulate(effects, half) for half in (0, 1)]
+            self._runs[effects] = np.where(is_first, *runs)
         return self._runs[effects]
 
     @property
@@ -150,10 +154,9 @@ class RepairProof(ABC):
     @cached_property
     def parts(self) -> dict[str, dict[str, Any]]:
         """Part of each effect: its Shapley value, what its removal restores, and how much of the error is then new."""
-        names = list(self._effects)
-        every = frozenset(names)
+        every = frozenset(self._effects)
         before, after = self.measure_errors(self.before), self.measure_errors(self.after)
-        values = compute_shapley(names, lambda some: -self.measure_errors(self.run(some)))
+        values = compute_shapley(self._effects, lambda some: -self.measure_errors(self.run(some)))
         found = {}
         for name, fewer in values.items():
             reduced = summarise_draws(fewer / np.maximum(before, 1e-12))
@@ -163,12 +166,8 @@ class RepairProof(ABC):
             restored, identified = judge_edit(reduced, rise)
             edit = {"restored": restored, "reduced": reduced.mean, "rise_without": rise.mean}
             closed = summarise_draws(self._share(fewer))
-            found[name] = {
-                "closed": closed,
-                "identified": identified,
-                "edit": edit,
-                "needed": needed,
-            }
+            told = {"closed": closed, "identified": identified, "edit": edit}
+            found[name] = {**told, "needed": needed}
         return found
 
     @cached_property
@@ -178,18 +177,19 @@ class RepairProof(ABC):
         horizon_s = choose_horizon_s(self.machine)
         cut = open_loop.cut_windows(recordings, self.machine, horizon_s, horizon_s)
         found = {}
-        for name, one in measure_rivals(cut).items():
-            if one.squares is None:
-                found[name] = RivalError(None, {}, one.reason)
+        unit = choose_unit(self.machine)
+        for name, squares in measure_rivals(cut).items():
+            if squares is None:
+                found[name] = RivalError(None, {}, TOO_FEW, unit)
                 continue
-            squares = one.squares.mean(0)
-            joints = dict(zip(self.machine.joint_names, np.sqrt(squares).tolist(), strict=True))
-            found[name] = RivalError(float(combine_joints(squares, self.machine)), joints)
+            mean = squares.mean(0)
+            joints = dict(zip(self.machine.joint_names, np.sqrt(mean).tolist(), strict=True))
+            found[name] = RivalError(float(combine_joints(mean, self.machine)), joints, unit=unit)
         return found
 
     def judge(self) -> list[Gate]:
         """Return whether the repaired simulator beats standing still on every named joint, without names on all."""
-        named = {j for joints in self._effects.values() for j in joints}
+        named = {j for one in self.findings for j in one.joints}
         joints = sorted(named or range(self.machine.num_joints))
         noise = sensors.estimate_sensor_noise(self._case.reference or self._case.field)
         after = np.sqrt(self.measure_squares(self.after)[0])
@@ -239,10 +239,8 @@ class EngineProof(RepairProof):
         evidence = decider.evidence
         horizon_s = choose_horizon_s(case.machine)
         self.windows = list_windows(evidence.field, horizon_s)
-        joints = {one.effect: one.joints for one in findings}
-        super().__init__(case, joints, len(self.windows.first), generator)
+        super().__init__(case, findings, len(self.windows.first), generator)
         self._decider = decider
-        self._findings = findings
         self._field = evidence.field
         self._healthy = [base.numbers for base in evidence.bases]
         self.floor = Floor(evidence.reference, evidence.bases, horizon_s)
@@ -259,7 +257,7 @@ class EngineProof(RepairProof):
     @property
     def moves(self) -> bool:
         """True if a named effect acts on the free runs; one that shows by itself need not."""
-        return any(one.rows or one.hold for one in self._findings)
+        return any(one.rows or one.hold for one in self.findings)
 
     @property
     def steps(self) -> dict[str, Estimate]:
@@ -273,7 +271,7 @@ class EngineProof(RepairProof):
     def judge(self) -> list[Gate]:
         """Return the gates of all repairs, and one that fails for each simulated effect without a number in the library."""
         found = super().judge()
-        for one in self._findings:
+        for one in self.findings:
             # What shows by itself, such as a coarse sensor, was not simulated and has no number.
             if one.rows and not self.sizes[one.effect]:
                 joints = ", ".join(self.machine.joint_names[j] for j in one.joints)
@@ -291,7 +289,7 @@ class EngineProof(RepairProof):
         """Return the rows of each named effect, one fitted beside the others, to the samples `used`."""
         numbers, side = list(self._healthy), self._field
         found: dict[str, dict[int, Row]] = {}
-        for finding in self._findings:
+        for finding in self.findings:
             found[finding.effect] = {}
             if finding.hold is not None:
                 side = hold_commands(side, finding.hold.delays)
@@ -311,25 +309,21 @@ class EngineProof(RepairProof):
             found[j] = self._field.model.change(found[j], [row])[0]
         return found
 
-    def _simulate(self, effects: frozenset[str]) -> np.ndarray:
+    def _simulate(self, effects: frozenset[str], half: int) -> np.ndarray:
         side = self._field
-        for finding in self._findings:
+        for finding in self.findings:
             if finding.effect in effects and finding.hold is not None:
                 side = hold_commands(side, finding.hold.delays)
-        runs = []
-        for sizes in self._halves:
-            numbers = list(self._healthy)
-            for name in effects:
-                numbers = self._apply(numbers, sizes[name])
-            runs.append(run_free(side, self.windows, numbers))
-        chosen = self.half[:, None, None] == 0
-        return np.where(chosen, runs[0], runs[1])
+        numbers = list(self._healthy)
+        for name in effects:
+            numbers = self._apply(numbers, self._halves[half][name])
+        return run_free(side, self.windows, numbers)
 
     @cached_property
     def floor_squares(self) -> np.ndarray:
         """Mean squares at the floor in each draw, `(1 + B, J)`."""
         numbers, side = list(self._healthy), self._field
-        for finding in self._findings:
+        for finding in self.findings:
             numbers = self._apply(numbers, self._rows[finding.effect])
             if finding.hold is not None:
                 side = hold_commands(side, finding.hold.delays)

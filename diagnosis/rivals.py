@@ -31,29 +31,13 @@ MAX_SPEED_RATIO = 1.2
 TOO_FEW = "too few windows to leave some out"
 
 
-@dataclass(frozen=True, eq=False)
-class Rival:
-    """Mean square errors of a rival, `(W, J)`; `None` where it could not be had, with the reason."""
-
-    squares: np.ndarray | None
-    reason: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class ArxRuns:
-    """Cross-validated free runs of the ARX, `(W, K, J)`, and the fold of each window, `(W,)`."""
-
-    paths: np.ndarray
-    fold: np.ndarray
-
-
-def measure_rivals(cut: FreeRunWindows) -> dict[str, Rival]:
-    """Return the rivals `hold` and `arx` on the windows of a cut."""
+def measure_rivals(cut: FreeRunWindows) -> dict[str, np.ndarray | None]:
+    """Return mean square errors `(W, J)` of `hold` and `arx` on windows; `None` where they are `TOO_FEW`."""
     start = cut.q[:, cut.num_before - 1]
-    found = {"hold": Rival(np.square(start[:, None] - cut.measured).mean(1))}
-    if len(cut.q) < 2:
-        return found | {"arx": Rival(None, TOO_FEW)}
-    return found | {"arx": Rival(np.square(run_arx(cut).paths - cut.measured).mean(1))}
+    arx = None
+    if len(cut.q) > 1:
+        arx = np.square(run_arx(cut) - cut.measured).mean(1)
+    return {"hold": np.square(start[:, None] - cut.measured).mean(1), "arx": arx}
 
 
 def assign_folds(num_windows: int) -> np.ndarray:
@@ -62,10 +46,10 @@ def assign_folds(num_windows: int) -> np.ndarray:
     return np.arange(num_windows) // size % min(FOLDS, num_windows)
 
 
-def run_arx(cut: FreeRunWindows) -> ArxRuns:
-    """Return free runs of a ridge regression of steps on commands, their hinges and earlier steps.
+def run_arx(cut: FreeRunWindows) -> np.ndarray:
+    """Return free runs `(W, K, J)` of a ridge regression of steps on commands, their hinges and earlier steps.
 
-    The pull of a fold is the one that predicts the other folds best.
+    Each fold is predicted by a fit to the others. The pull of a fold is the one that predicts the other folds best.
     """
     fold = assign_folds(len(cut.q))
     folds = np.unique(fold)
@@ -82,7 +66,7 @@ def run_arx(cut: FreeRunWindows) -> ArxRuns:
             found[fold == out] = trials[best][fold == out]
         return found
 
-    return ArxRuns(np.stack(map_parallel(run, range(cut.q.shape[2])), -1), fold)
+    return np.stack(map_parallel(run, range(cut.q.shape[2])), -1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,11 @@ import numpy as np
 from actuators.models.linear import Hold
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.machine import Machine
-from diagnosis import gates, geometry, sensors
-from diagnosis.answer import Answer, Outcome, Ranked, Selected, Verdict, Where
+from diagnosis import sensors
+from diagnosis.answer import Answer, Outcome, Ranked, Where
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
-from diagnosis.effect_library import DetectedEffect
+from diagnosis.engine.decide import EffectFinding
 from diagnosis.engine.sizes import SIGMAS
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import combine_joints
@@ -27,13 +27,10 @@ from diagnosis.gates import MAX_RIVAL_RATIO
 from diagnosis.grown_effects import GrownEffect
 from diagnosis.reference_diagnosis import (
     ACCEPTED_FINDINGS,
-    DIRECT_NATS,
-    NAME_NATS,
     Diagnosis,
     ProgressCallback,
-    accept_named_joints,
-    describe_detected,
-    name_joints,
+    SearchResult,
+    SizesByName,
 )
 from diagnosis.repair_proof import NOISE_FACTOR, RepairProof
 from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
@@ -69,9 +66,9 @@ class SimulatorProof(RepairProof):
         generator: np.random.Generator,
     ) -> None:
         self._search = search
-        joints = {one.kind.name: np.flatnonzero(one.joints).tolist() for one in effects}
-        super().__init__(case, joints, len(search.runs.row), generator)
-        self._reference = reference
+        findings = [one.summarise() for one in effects]
+        super().__init__(case, findings, len(search.runs.row), generator)
+        self.effects, self._reference = effects, reference
         if reference is None:
             self.floor_of = "field"
         self._fitted = [search.fit(effects, self.half != half) for half in (0, 1)]
@@ -81,13 +78,15 @@ class SimulatorProof(RepairProof):
         """Measured positions, `(W, K, J)`, rad or m."""
         return self._search.runs.cut.measured
 
-    def _simulate(self, effects: frozenset[str]) -> np.ndarray:
-        runs = []
-        for fitted in self._fitted:
-            some = [one for one in fitted if one.kind.name in effects]
-            runs.append(self._search.simulate(some))
-        chosen = self.half[:, None, None] == 0
-        return np.where(chosen, runs[0], runs[1])
+    def _simulate(self, effects: frozenset[str], half: int) -> np.ndarray:
+        some = [one for one in self._fitted[half] if one.kind.name in effects]
+        return self._search.simulate(some)
+
+    @cached_property
+    def sizes(self) -> dict[str, SizesByName]:
+        """Sizes of each effect."""
+        numbers = estimate_numbers(self._search, self.effects, self.machine)
+        return {one.kind.name: own for one, own in zip(self.effects, numbers, strict=True)}
 
     @cached_property
     def floor_squares(self) -> np.ndarray:
@@ -142,68 +141,49 @@ class SimulatorDiagnosis(Diagnosis):
     base: Actuator
     seed: int
 
-    def run(self, tell: ProgressCallback) -> Outcome:
-        """Return the outcome; `tell` receives the name and the progress of each step."""
-        case, machine = self.case, self.case.machine
-        tell("recordings", 0.02)
-        told = self.judge_recordings()
+    def search(self, told: Sequence[Gate], tell: ProgressCallback) -> SearchResult:
+        """Return what the simulator lacks."""
+        case = self.case
         runs = self._cut(case.field)
         reference = self._cut(case.reference) if case.reference else None
         search = SimulatorSearch(runs, reference, self.kinds)
-        found: list[GrownEffect] = []
+        effects: list[GrownEffect] = []
         # A search takes minutes, and most findings end in "cannot tell" whatever it names.
         if all(gate.passed or gate.name in ACCEPTED_FINDINGS for gate in told):
-            found = search.run(lambda done: tell("simulating every effect", 0.05 + 0.75 * done))
-        named = {j for one in found for j in one.summarise().joints}
-        told = accept_named_joints(told, name_joints(sorted(named), machine))
-        if failed := gates.list_failures(told):
-            found = []
-        on_tool: Sequence[DetectedEffect] = ()
-        if not failed:
-            on_tool = geometry.find_geometry_errors(case, self.kinds, DIRECT_NATS, NAME_NATS)
-        tell("sizes and proof", 0.85)
-        proof, found = self._prove(search, found, reference)
-        judged = [] if failed else proof.judge()
-        if not failed and (failed := gates.list_failures(judged)):
-            found = []
-            proof = SimulatorProof(case, search, found, reference, self.generator)
-        sizes = estimate_numbers(search, found, machine) if found else []
-        selected = [describe_detected(one, machine) for one in on_tool]
-        for one, numbers in zip(found, sizes, strict=True):
-            finding = one.summarise()
-            selected.append(self.describe_simulated(finding.name, finding, numbers, proof))
-        selected.sort(key=lambda one: -one.probability)
-        verdict: Verdict = "effects" if selected else "none"
-        if failed and not selected:
-            verdict = "unknown"
-        rivals = [one.summarise() for one in search.rivals]
-        reason = _explain(verdict, selected, failed)
-        return self.build_outcome(verdict, selected, rivals, proof, (*told, *judged), reason, {})
+            effects = search.run(lambda done: tell("simulating every effect", 0.05 + 0.75 * done))
+
+        def prove(effects: Sequence[GrownEffect] = ()) -> SimulatorProof:
+            return SimulatorProof(case, search, effects, reference, self.generator)
+
+        proof = prove(effects)
+        while (weak := _find_weakest(proof)) is not None:
+            proof = prove(search.fit([one for one in proof.effects if one is not weak]))
+        return SearchResult(
+            verdict="effects" if proof.effects else "none",
+            proof=proof,
+            prove_nothing=prove,
+            rivals=[one.summarise() for one in search.rivals],
+            otherwise="no effect makes the errors of the simulator likelier than chance would",
+            evidence={},
+        )
+
+    def size(self, one: EffectFinding, proof: RepairProof) -> tuple[str, SizesByName]:
+        """Return the name of an effect in the registry, and its sizes."""
+        assert isinstance(proof, SimulatorProof), "the search made it"
+        return one.name, proof.sizes[one.effect]
 
     def _cut(self, recordings: Sequence[Any]) -> SimulatorRuns:
         return cut_simulator_runs(self.base, recordings, self.case.machine, self.seed)
 
-    def _prove(
-        self,
-        search: SimulatorSearch,
-        effects: Sequence[GrownEffect],
-        reference: SimulatorRuns | None,
-    ) -> tuple[SimulatorProof, list[GrownEffect]]:
-        """Return the proof and the effects without which the error on the other half surely rises."""
-        found = list(effects)
-        while True:
-            proof = SimulatorProof(self.case, search, found, reference, self.generator)
-            if not found:
-                return proof, found
-            needs = [proof.parts[one.kind.name]["needed"] for one in found]
-            weak = []
-            for place, need in enumerate(needs):
-                if need.mean < LEAST_NEED or need.ci95[0] <= 0.0:
-                    weak.append((need.mean, place))
-            if not weak:
-                return proof, found
-            _, worst = min(weak)
-            found = search.fit([one for place, one in enumerate(found) if place != worst])
+
+def _find_weakest(proof: SimulatorProof) -> GrownEffect | None:
+    """Return the effect whose removal raises the error on the other half least, of those that do not for sure."""
+    weak = []
+    for place, one in enumerate(proof.effects):
+        need = proof.parts[one.kind.name]["needed"]
+        if need.mean < LEAST_NEED or need.ci95[0] <= 0.0:
+            weak.append((need.mean, place))
+    return proof.effects[min(weak)[1]] if weak else None
 
 
 def describe_doubts(case: GapCase, why: str) -> Outcome:
@@ -224,14 +204,6 @@ def describe_doubts(case: GapCase, why: str) -> Outcome:
         reason=f"cannot tell, because {why}",
     )
     return Outcome(answer, runs.view(runs.simulator.plain_runs), None, None)
-
-
-def _explain(verdict: str, selected: Sequence[Selected], failed: str) -> str:
-    if verdict == "effects":
-        return "; ".join(f"{one.effect} on {', '.join(one.joints)}" for one in selected)
-    if verdict == "unknown":
-        return f"cannot tell, because {failed}"
-    return "no effect makes the errors of the simulator likelier than chance would"
 
 
 def estimate_numbers(

@@ -85,18 +85,17 @@ def locate_gap(
     beyond = _take_first_positive(excess - chance, excess, whole)
     share = _normalise(beyond / travel**2)
     joints, regimes = {}, []
-    for j, name in enumerate(machine.joint_names):
+    for j, joint in enumerate(machine.joints):
         rmse, least = np.sqrt(whole[j] / time[j]), np.sqrt(base[j])
-        joints[name] = JointGap(float(rmse), float(least), float(share[j]))
+        joints[joint.name] = JointGap(float(rmse), float(least), float(share[j]), joint.unit)
         if excess[j] <= SURE_ERRORS * chance[j]:
             continue
         parts = share[j] * _normalise(_take_first_positive(square[j] - expected[j], square[j]))
         for regime, part in zip(REGIMES, parts.tolist(), strict=True):
             if part > 0.0:
-                regimes.append(RegimeGap(name, regime, part))
+                regimes.append(RegimeGap(joint.name, regime, part))
     regimes.sort(key=lambda one: -one.share)
-    units = {joint.name: joint.unit for joint in machine.joints}
-    return Where(joints, tuple(regimes), stage, units)
+    return Where(joints, tuple(regimes), stage)
 
 
 def trace_to_origin(error: np.ndarray, label: np.ndarray, num_categories: int) -> np.ndarray:

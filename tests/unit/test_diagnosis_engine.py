@@ -41,10 +41,7 @@ def said() -> Answer:
         same_as=("lag",), decided_by="a dial gauge",
     )  # fmt: skip
     where = Where(
-        {"q3": JointGap(0.03, 0.002, 1.0)},
-        (RegimeGap("q3", "after a reversal", 0.8),),
-        "actuation",
-        {"q3": "rad"},
+        {"q3": JointGap(0.03, 0.002, 1.0)}, (RegimeGap("q3", "after a reversal", 0.8),), "actuation"
     )
     return Answer(
         verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),), where=where,
