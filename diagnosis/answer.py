@@ -78,27 +78,16 @@ class JointGap(ErrorInUnit):
 
 
 @dataclass(frozen=True)
-class RegimeGap:
-    """Share of the gap that a joint has in a regime."""
-
-    joint: str
-    regime: str
-    share: float
-
-
-@dataclass(frozen=True)
 class Where:
     """Where the gap lies.
 
     Attributes:
         joints: By joint.
-        regimes: The largest shares first.
         stage: On which part of the way from command to estimate; `None` where nothing is to be
             said.
     """
 
     joints: Mapping[str, JointGap]
-    regimes: tuple[RegimeGap, ...]
     stage: Stage | None
 
 

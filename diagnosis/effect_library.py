@@ -1,8 +1,7 @@
-"""The registered effects as a diagnosis sees them, and free runs of a simulator with effects around it.
+"""The registered effects as a diagnosis sees them.
 
 A diagnosis knows effects by their contract only, so that effects of third parties take part.
-Axes: `C` candidates, `W` windows, `K` steps, `J` joints, `L` samples before the free run, `H` of
-them history.
+Axes: `C` candidates, `J` joints.
 """
 
 from __future__ import annotations
@@ -19,19 +18,21 @@ import torch
 import yaml
 
 from actuators.models.linear import Hold
-from actuators.open_loop import FreeRunWindows, run_freely
 from brokk_rl import registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
-from brokk_rl.errors import BrokkError, ConfigError, group_by_reason, list_choices
+from brokk_rl.errors import ConfigError, group_by_reason, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.parallel import map_parallel
 from diagnosis.answer import Estimate, Stage
 
 log = logging.getLogger(__name__)
 
 SIDE_ORDER = {"drive": -1, "joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
 """From the machine outwards; delays of a command lie outside of what the valve makes of it."""
+
+
+EffectValues = Mapping[str, np.ndarray]
+"""Numbers of an effect by name, each `(C, J)`, or `(C, 1)` for one that joints do not have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,97 +260,3 @@ def estimate_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float,
             curve = np.where(near, np.maximum(curve, a * fine**2 + b * fine + c), curve)
     inside = np.exp(fine[curve > curve.max() - 1.92])
     return float(np.exp(fine[int(np.argmax(curve))])), float(inside.min()), float(inside.max())
-
-
-BATCH_ROWS = 1536
-"""Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
-
-EffectValues = Mapping[str, np.ndarray]
-"""Numbers of an effect by name, each `(C, J)`, or `(C, 1)` for one that joints do not have."""
-
-
-@dataclass(frozen=True)
-class EffectSimulator:
-    """Free runs of one base through one cut, as a function of effects.
-
-    Attributes:
-        base: The simulator.
-        machine: The machine.
-        cut: FreeRunWindows.
-        running_s: Time since the machine was started at the beginning of each window, `(W,)`.
-        seed: Of the random numbers that stochastic effects draw.
-    """
-
-    base: Actuator
-    machine: Machine
-    cut: FreeRunWindows
-    running_s: np.ndarray
-    seed: int
-
-    def simulate(
-        self, effects: Sequence[tuple[EffectType, EffectValues]], count: int = 1
-    ) -> np.ndarray:
-        """Return measured positions of free runs, `(C, W, K, J)`.
-
-        Args:
-            effects: Effects with the numbers of each candidate.
-            count: Number of candidates, `C`.
-
-        Raises:
-            BrokkError: the model ran into NaN.
-        """
-        effects = sorted(effects, key=lambda one: one[0].order)
-        found = np.empty((count, *self.cut.measured.shape), dtype=np.float32)
-        at_once = max(1, BATCH_ROWS // len(self.cut.q))
-        batches = [
-            np.arange(start, min(start + at_once, count)) for start in range(0, count, at_once)
-        ]
-        runs = map_parallel(lambda batch: self._run(effects, batch), batches)
-        for batch, paths in zip(batches, runs, strict=True):
-            found[batch] = paths
-        if not np.isfinite(found).all():
-            names = ", ".join(kind.name for kind, _ in effects) or "no effect"
-            raise BrokkError(
-                f"the simulator ran into NaN in a free run with {names}; look at its fit"
-            )
-        return found
-
-    def _run(
-        self, effects: Sequence[tuple[EffectType, EffectValues]], candidates: np.ndarray
-    ) -> np.ndarray:
-        """Return the free runs of some candidates, `(C, W, K, J)`."""
-        cut, windows, device = self.cut, len(self.cut.q), torch.device("cpu")
-        size, before = cut.num_history, cut.num_before
-        count, rows = len(candidates) * windows, np.repeat(candidates, windows)
-        u = self._commands.repeat(1, len(candidates), 1)
-        with torch.random.fork_rng(devices=[]):
-            # Rows of other batches draw other numbers. `torch.manual_seed` would also prepare the
-            # seeds of GPUs that nothing here uses, which takes longer than a step.
-            torch.default_generator.manual_seed(self.seed + int(candidates[0]))
-            model: Any = self.base.build(self.machine, count, device)
-            for kind, values in effects:
-                model = kind.wrap(model, self.machine, count, device)
-                for name, value in values.items():
-                    model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))
-                if kind.running:
-                    begun_s = (
-                        np.tile(self.running_s, len(candidates))
-                        - (before - size) * self.machine.period_s
-                    )
-                    model.parameters[kind.running].copy_(
-                        torch.as_tensor(begun_s, dtype=torch.float32)[:, None]
-                    )
-        known = torch.as_tensor(np.tile(cut.q[:, :before], (len(candidates), 1, 1)))
-        seen = run_freely(model, u, known.transpose(0, 1), size).numpy()
-        return seen.swapaxes(0, 1).reshape(len(candidates), windows, *seen.shape[::2])
-
-    @cached_property
-    def plain_runs(self) -> np.ndarray:
-        """Free runs without any effect, `(W, K, J)`."""
-        return self.simulate([])[0]
-
-    @cached_property
-    def _commands(self) -> torch.Tensor:
-        """Recorded commands of the windows, `(T, W, J)`: time comes first, so that a step reads one piece of memory."""
-        u = torch.as_tensor(self.cut.u, dtype=torch.float32)
-        return u.transpose(0, 1).contiguous()

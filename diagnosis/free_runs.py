@@ -1,7 +1,6 @@
 """Free runs of a simulator beside the recordings from which they were cut.
 
-Regime labels are made on whole recordings and then cut like the free runs, so that they know the
-time before a window. Axes: `W` windows, `K` steps, `J` joints, `T` rows of a recording.
+Axes: `W` windows, `K` steps, `J` joints.
 """
 
 from __future__ import annotations
@@ -32,24 +31,14 @@ class WindowedRuns:
     row: np.ndarray
     simulated: np.ndarray
 
-    @property
-    def num_windows(self) -> int:
-        """Number of windows, `W`."""
-        return len(self.row)
-
-    def cut(self, values: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the part of each recording's values, `(T, …)`, that lies in each window, `(W, K, …)`; NaN after the end."""
-        steps = self.simulated.shape[1]
-        found = np.full((self.num_windows, steps, *values[0].shape[1:]), np.nan)
-        for window, (source, row) in enumerate(zip(self.source, self.row, strict=True)):
-            part = values[source][row : row + steps]
-            found[window, : len(part)] = part
-        return found
-
     @cached_property
     def measured(self) -> np.ndarray:
         """Measured positions, `(W, K, J)`, NaN after the end of the recording."""
-        return self.cut([recording.q for recording in self.recordings])
+        found = np.full(self.simulated.shape, np.nan)
+        for window, (source, row) in enumerate(zip(self.source, self.row, strict=True)):
+            part = self.recordings[source].q[row : row + found.shape[1]]
+            found[window, : len(part)] = part
+        return found
 
     @cached_property
     def error(self) -> np.ndarray:

@@ -123,74 +123,61 @@ class NumberSlopes:
     errors: np.ndarray
     changes: np.ndarray
 
-    def _list_unknowns(self, effects: Sequence[GrownEffect]) -> list[list[tuple[int, int]]]:
-        """Return the numbers that act on each joint, each with the place of its unknown."""
-        found: list[list[tuple[int, int]]] = [[] for _ in range(self.errors.shape[1])]
-        count = 0
+    def _list_unknowns(self, effects: Sequence[GrownEffect]) -> list[tuple[int, np.ndarray]]:
+        """Return the unknowns: place of the number, and the joints that have it together."""
+        found = []
         for number, (place, _) in enumerate(self.spots):
-            is_single = len(self.steps[number]) == 1
-            for j in np.flatnonzero(effects[place].joints).tolist():
-                found[j].append((number, count))
-                count += not is_single
-            count += is_single
+            joints = np.flatnonzero(effects[place].joints)
+            together = [joints] if len(self.steps[number]) == 1 else joints[:, None]
+            found += [(number, some) for some in together]
         return found
 
     def _form_normal(
-        self, effects: Sequence[GrownEffect]
-    ) -> tuple[np.ndarray, np.ndarray, list[list[tuple[int, int]]]]:
-        """Return normal matrix and gradient of all unknowns, in steps, and the unknowns of each joint.
+        self, unknowns: Sequence[tuple[int, np.ndarray]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return normal matrix and gradient of all unknowns, in steps.
 
         Errors count by the inverse of their size, as those of a Laplace distribution do.
         """
-        unknowns = self._list_unknowns(effects)
-        size = 1 + max([place for row in unknowns for _, place in row], default=-1)
-        normal, gradient = np.zeros((size, size)), np.zeros(size)
-        for j, row in enumerate(unknowns):
-            if not row:
-                continue
-            numbers = [number for number, _ in row]
-            places = [place for _, place in row]
-            left = self.errors[:, j]
-            scale = max(float(np.abs(left).mean()), 1e-12)
-            weight = 1.0 / (scale * np.maximum(np.abs(left), scale))
-            columns = self.changes[numbers, :, j]
-            normal[np.ix_(places, places)] += (columns * weight) @ columns.T
-            gradient[places] -= (columns * weight) @ left
-        return normal, gradient, unknowns
+        columns = np.zeros((len(unknowns), *self.errors.shape))
+        for place, (number, joints) in enumerate(unknowns):
+            columns[place][:, joints] = self.changes[number][:, joints]
+        size = np.abs(self.errors)
+        scale = np.maximum(size.mean(0), 1e-12)
+        weighted = columns / (scale * np.maximum(size, scale))
+        normal = np.einsum("aej,bej->ab", weighted, columns)
+        return normal, -np.einsum("aej,ej->a", weighted, self.errors)
 
     def list_steps(self, effects: Sequence[GrownEffect]) -> dict[tuple[int, str], np.ndarray]:
         """Return the numbers after a step with each of `DAMPINGS`, `(C, J)` or `(C, 1)` each."""
-        normal, gradient, unknowns = self._form_normal(effects)
+        unknowns = self._list_unknowns(effects)
+        normal, gradient = self._form_normal(unknowns)
         moves = []
         for damping in DAMPINGS:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
             moves.append(np.linalg.solve(damped, gradient))
         found = {}
-        for number, (place, name) in enumerate(self.spots):
-            kind = effects[place].kind
-            rows = np.repeat(effects[place].values[name][None], len(moves), 0)
-            for j, row in enumerate(unknowns):
-                where = dict(row).get(number)
-                if where is not None:
-                    own = j if rows.shape[1] > 1 else 0
-                    change = np.array([move[where] for move in moves]) * self.steps[number][own]
-                    rows[:, own] = effects[place].values[name][own] + change
-            found[place, name] = kind.clipped(name, rows)
-        return found
+        for place, name in self.spots:
+            found[place, name] = np.repeat(effects[place].values[name][None], len(moves), 0)
+        for move, (number, joints) in zip(np.transpose(moves), unknowns, strict=True):
+            own = self._choose_columns(number, joints)
+            found[self.spots[number]][:, own] += move[:, None] * self.steps[number][own]
+        return {spot: effects[spot[0]].kind.clipped(spot[1], rows) for spot, rows in found.items()}
 
     def estimate_deviations(
         self, effects: Sequence[GrownEffect]
     ) -> dict[tuple[int, str], np.ndarray]:
         """Return the standard error of each number, `(J,)` or `(1,)`, all fitted together."""
-        normal, _, unknowns = self._form_normal(effects)
+        unknowns = self._list_unknowns(effects)
+        normal, _ = self._form_normal(unknowns)
         variance = np.diag(np.linalg.pinv(normal + 1e-9 * np.eye(len(normal))))
-        found = {}
-        for number, spot in enumerate(self.spots):
-            deviation = np.zeros_like(self.steps[number])
-            for j, row in enumerate(unknowns):
-                where = dict(row).get(number)
-                if where is not None:
-                    own = j if len(deviation) > 1 else 0
-                    deviation[own] = np.sqrt(variance[where]) * abs(self.steps[number][own])
-            found[spot] = deviation
+        found = {
+            spot: np.zeros_like(step) for spot, step in zip(self.spots, self.steps, strict=True)
+        }
+        for own_variance, (number, joints) in zip(variance, unknowns, strict=True):
+            own = self._choose_columns(number, joints)
+            found[self.spots[number]][own] = np.sqrt(own_variance) * np.abs(self.steps[number][own])
         return found
+
+    def _choose_columns(self, number: int, joints: np.ndarray) -> np.ndarray:
+        return joints if len(self.steps[number]) > 1 else np.zeros(1, int)

@@ -21,10 +21,9 @@ from scipy.ndimage import minimum_filter1d
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.case import PAUSE_S
-from diagnosis.regimes import shift_by_dead_time
 
 PART_S = 30.0
-"""Length of the parts of recordings that are measured by themselves, s, as in `diagnosis.where`."""
+"""Length of the parts of recordings that are measured by themselves, s."""
 MIN_RECORDINGS = 3
 """So many recordings stay whole."""
 SPAN_S = 0.12
@@ -224,6 +223,14 @@ class _EffortLaw:
     def subtract(self, recording: Recording) -> np.ndarray:
         """Return the effort beyond that of the same motion on the reference, `(T,)`."""
         return recording.extra[self.name] - self._describe(recording) @ self._law
+
+
+def shift_by_dead_time(u: np.ndarray, dead_time_s: float, period_s: float) -> np.ndarray:
+    """Return the command that moved each joint before each row, `(T, J)`."""
+    found = np.zeros(u.shape)
+    back = round(dead_time_s / period_s) + 1  # row k - 1 is in force until row k is measured
+    found[back:] = u[: max(0, len(u) - back)]
+    return found
 
 
 def _measure_part(

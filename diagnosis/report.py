@@ -163,9 +163,7 @@ def _describe_place(answer: Answer) -> str:
     if not answer.where.joints:
         return ""
     joint, gap = max(answer.where.joints.items(), key=lambda pair: pair[1].share)
-    regime = next((one for one in answer.where.regimes if one.joint == joint), None)
-    text = f"; {100 * gap.share:.0f} % of it lies in {joint}"
-    return text + (f", most of that ({100 * regime.share:.0f} %) {regime.regime}" if regime else "")
+    return f"; {100 * gap.share:.0f} % of it lies in {joint}"
 
 
 def _format_share(value: Estimate, of: str = "") -> str:

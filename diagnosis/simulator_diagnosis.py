@@ -33,7 +33,7 @@ from diagnosis.reference_diagnosis import (
     SizesByName,
 )
 from diagnosis.repair_proof import NOISE_FACTOR, RepairProof
-from diagnosis.simulator_runs import SimulatorRuns, cut_simulator_runs
+from diagnosis.simulator_runs import EffectSimulator, cut_simulator_runs
 from diagnosis.simulator_search import SimulatorSearch
 
 FORM_ERROR = 0.1
@@ -62,7 +62,7 @@ class SimulatorProof(RepairProof):
         case: GapCase,
         search: SimulatorSearch,
         effects: Sequence[GrownEffect],
-        reference: SimulatorRuns | None,
+        reference: EffectSimulator | None,
         generator: np.random.Generator,
     ) -> None:
         self._search = search
@@ -126,7 +126,7 @@ class SimulatorProof(RepairProof):
         """Return free runs beside the recordings of the reference; `None` without any."""
         if self._reference is None:
             return None
-        return self._reference.view(self._reference.simulator.plain_runs)
+        return self._reference.view(self._reference.plain_runs)
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class SimulatorDiagnosis(Diagnosis):
         assert isinstance(proof, SimulatorProof), "the search made it"
         return one.name, proof.sizes[one.effect]
 
-    def _cut(self, recordings: Sequence[Any]) -> SimulatorRuns:
+    def _cut(self, recordings: Sequence[Any]) -> EffectSimulator:
         return cut_simulator_runs(self.base, recordings, self.case.machine, self.seed)
 
 
@@ -197,13 +197,13 @@ def describe_doubts(case: GapCase, why: str) -> Outcome:
         verdict="unknown",
         selected=(),
         ranking=(Ranked("unknown", (), 1.0),),
-        where=Where({}, (), None),
+        where=Where({}, None),
         gap=None,
         gates=(Gate("enough_data", False, None, None, why),),
         next_experiment=None,
         reason=f"cannot tell, because {why}",
     )
-    return Outcome(answer, runs.view(runs.simulator.plain_runs), None, None)
+    return Outcome(answer, runs.view(runs.plain_runs), None, None)
 
 
 def estimate_numbers(

@@ -7,20 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import torch
 from scipy.optimize import nnls
 
 from actuators import open_loop
-from actuators.open_loop import FreeRunWindows
+from actuators.open_loop import FreeRunWindows, run_freely
 from actuators.scales import choose_horizon_s, scale_time
 from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
 from diagnosis.case import estimate_running_s
-from diagnosis.effect_library import EffectSimulator
+from diagnosis.effect_library import EffectType, EffectValues
 from diagnosis.free_runs import WindowedRuns
 
 INTERVAL_S = 0.25
@@ -29,59 +33,144 @@ MEMORIES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.96)
 """Shares of an error in the next one that are tried."""
 LEAST_DEVIATION = 1e-6
 """Smallest deviation of an error, over the travel: rounding of single precision."""
+BATCH_ROWS = 1536
+"""Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
 
 
 @dataclass(frozen=True)
-class SimulatorRuns:
-    """A simulator and all whole windows of recordings.
+class EffectSimulator:
+    """Free runs of one simulator through windows of recordings, as a function of effects.
 
     Attributes:
+        base: The simulator.
+        machine: The machine.
         recordings: The recordings, their commands as speeds.
-        simulator: Makes the free runs.
         source: Number of the recording of each window, `(W,)`.
         row: Row of the first simulated position of each window, `(W,)`.
+        cut: The windows.
+        running_s: Time since the machine was started at the beginning of each window, `(W,)`.
+        seed: Of the random numbers that stochastic effects draw.
     """
 
+    base: Actuator
+    machine: Machine
     recordings: Sequence[Recording]
-    simulator: EffectSimulator
     source: np.ndarray
     row: np.ndarray
-
-    @property
-    def cut(self) -> FreeRunWindows:
-        """The windows."""
-        return self.simulator.cut
+    cut: FreeRunWindows
+    running_s: np.ndarray
+    seed: int
 
     def view(self, paths: np.ndarray) -> WindowedRuns:
         """Return free runs `(W, K, J)` beside their recordings."""
         return WindowedRuns(self.recordings, self.source, self.row, paths.astype(float))
 
-    def select(self, windows: np.ndarray) -> SimulatorRuns:
+    def select(self, windows: np.ndarray) -> EffectSimulator:
         """Return the same with some of the windows."""
         cut = self.cut
         some = replace(cut, u=cut.u[windows], q=cut.q[windows], run=cut.run[windows])
-        running_s = self.simulator.running_s[windows]
-        simulator = replace(self.simulator, cut=some, running_s=running_s)
-        return SimulatorRuns(self.recordings, simulator, self.source[windows], self.row[windows])
+        own = {name: getattr(self, name)[windows] for name in ("source", "row", "running_s")}
+        return replace(self, cut=some, **own)
+
+    def simulate(
+        self, effects: Sequence[tuple[EffectType, EffectValues]], count: int = 1
+    ) -> np.ndarray:
+        """Return measured positions of free runs, `(C, W, K, J)`.
+
+        Args:
+            effects: Effects with the numbers of each candidate.
+            count: Number of candidates, `C`.
+
+        Raises:
+            BrokkError: the model ran into NaN.
+        """
+        effects = sorted(effects, key=lambda one: one[0].order)
+        found = np.empty((count, *self.cut.measured.shape), dtype=np.float32)
+        at_once = max(1, BATCH_ROWS // len(self.cut.q))
+        batches = [
+            np.arange(start, min(start + at_once, count)) for start in range(0, count, at_once)
+        ]
+        runs = map_parallel(lambda batch: self._run(effects, batch), batches)
+        for batch, paths in zip(batches, runs, strict=True):
+            found[batch] = paths
+        if not np.isfinite(found).all():
+            names = ", ".join(kind.name for kind, _ in effects) or "no effect"
+            raise BrokkError(
+                f"the simulator ran into NaN in a free run with {names}; look at its fit"
+            )
+        return found
+
+    def _run(
+        self, effects: Sequence[tuple[EffectType, EffectValues]], candidates: np.ndarray
+    ) -> np.ndarray:
+        """Return the free runs of some candidates, `(C, W, K, J)`."""
+        cut, windows, device = self.cut, len(self.cut.q), torch.device("cpu")
+        size, before = cut.num_history, cut.num_before
+        count, rows = len(candidates) * windows, np.repeat(candidates, windows)
+        u = self._commands.repeat(1, len(candidates), 1)
+        with torch.random.fork_rng(devices=[]):
+            # Rows of other batches draw other numbers. `torch.manual_seed` would also prepare the
+            # seeds of GPUs that nothing here uses, which takes longer than a step.
+            torch.default_generator.manual_seed(self.seed + int(candidates[0]))
+            model: Any = self.base.build(self.machine, count, device)
+            for kind, values in effects:
+                model = kind.wrap(model, self.machine, count, device)
+                for name, value in values.items():
+                    model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))
+                if kind.running:
+                    early_s = (before - size) * self.machine.period_s
+                    begun_s = np.tile(self.running_s, len(candidates)) - early_s
+                    model.parameters[kind.running].copy_(torch.as_tensor(begun_s)[:, None])
+        known = torch.as_tensor(np.tile(cut.q[:, :before], (len(candidates), 1, 1)))
+        seen = run_freely(model, u, known.transpose(0, 1), size).numpy()
+        return seen.swapaxes(0, 1).reshape(len(candidates), windows, *seen.shape[::2])
+
+    @cached_property
+    def plain_runs(self) -> np.ndarray:
+        """Free runs without any effect, `(W, K, J)`."""
+        return self.simulate([])[0]
+
+    @cached_property
+    def _commands(self) -> torch.Tensor:
+        """Recorded commands of the windows, `(T, W, J)`: time comes first, so that a step reads one piece of memory."""
+        u = torch.as_tensor(self.cut.u, dtype=torch.float32)
+        return u.transpose(0, 1).contiguous()
 
 
 def cut_simulator_runs(
-    actuator: Actuator, recordings: Sequence[Recording], machine: Machine, seed: int
-) -> SimulatorRuns:
+    actuator: Actuator,
+    recordings: Sequence[Recording],
+    machine: Machine,
+    seed: int,
+    horizon_s: float | None = None,
+    stride_s: float | None = None,
+    begun_s: Sequence[float] | None = None,
+) -> EffectSimulator:
     """Return `actuator` held against all whole windows of recordings.
+
+    Args:
+        actuator: The simulator.
+        recordings: The recordings; those that are too short are left out.
+        machine: The machine.
+        seed: Of the random numbers that stochastic effects draw.
+        horizon_s: Length of the windows; `None`: that of `actuators.scales`.
+        stride_s: Distance between two of them; `None`: their length.
+        begun_s: How long the machine had been running at the beginning of each recording; `None`: as far as
+            their dates tell.
 
     Raises:
         RecordingError: no recording is long enough.
     """
-    before, horizon_s = open_loop.count_samples_before(machine), choose_horizon_s(machine)
-    steps = round(horizon_s / machine.period_s)
+    horizon_s = horizon_s or choose_horizon_s(machine)
+    before, steps = open_loop.count_samples_before(machine), round(horizon_s / machine.period_s)
+    stride = round((stride_s or horizon_s) / machine.period_s)
     cuts, source, row, running_s = [], [], [], []
-    begun_s = estimate_running_s(recordings)
+    begun_s = begun_s or estimate_running_s(recordings)
     for number, recording in enumerate(recordings):
         if recording.num_samples < before + steps:
             continue
-        cut = open_loop.cut_windows([recording], machine, horizon_s, horizon_s)
-        rows = before + steps * np.arange(len(cut.q))
+        cut = open_loop.cut_windows([recording], machine, horizon_s, stride * machine.period_s)
+        rows = before + stride * np.arange(len(cut.q))
         cuts.append(replace(cut, run=np.full(len(cut.q), f"{number}")))
         source += [number] * len(rows)
         row += rows.tolist()
@@ -90,10 +179,10 @@ def cut_simulator_runs(
         raise RecordingError(
             f"too little data: no recording is long enough for a free run of {horizon_s:g} s"
         )
+    places = (np.array(source), np.array(row))
     windows = open_loop.join_windows(cuts)
-    simulator = EffectSimulator(actuator, machine, windows, np.array(running_s), seed)
     viewed = view_recordings(recordings, machine)
-    return SimulatorRuns(viewed, simulator, np.array(source), np.array(row))
+    return EffectSimulator(actuator, machine, viewed, *places, windows, np.array(running_s), seed)
 
 
 class FreeRunLikelihood:

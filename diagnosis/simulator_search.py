@@ -15,7 +15,7 @@ import numpy as np
 from diagnosis.effect_library import EffectType, EffectValues, list_shared_effects
 from diagnosis.engine.decide import JOINT_NATS, JOINT_SHARE, LEAST_NATS, SECOND_SHARE
 from diagnosis.grown_effects import GrownEffect, NumberSlopes, list_candidates
-from diagnosis.simulator_runs import FreeRunLikelihood, SimulatorRuns
+from diagnosis.simulator_runs import EffectSimulator, FreeRunLikelihood
 
 STEP = 0.05
 """Finite difference, of the typical size."""
@@ -45,7 +45,7 @@ class SimulatorSearch:
     """
 
     def __init__(
-        self, runs: SimulatorRuns, reference: SimulatorRuns | None, kinds: Sequence[EffectType]
+        self, runs: EffectSimulator, reference: EffectSimulator | None, kinds: Sequence[EffectType]
     ) -> None:
         self.runs = runs
         shared = list_shared_effects(kinds)
@@ -156,10 +156,10 @@ class WindowView:
         factor: Windows of the field for each of them.
     """
 
-    def __init__(self, runs: SimulatorRuns, factor: float) -> None:
+    def __init__(self, runs: EffectSimulator, factor: float) -> None:
         self.runs = runs
         self._factor = factor
-        self._likelihood = FreeRunLikelihood(runs.cut, runs.simulator.machine)
+        self._likelihood = FreeRunLikelihood(runs.cut, runs.machine)
         self.settle(())
 
     def settle(self, effects: Sequence[GrownEffect]) -> None:
@@ -175,7 +175,7 @@ class WindowView:
         """Return what candidates of an effect earn beside those that are there, nats, `(C, J)`."""
         count = len(next(iter(candidates.values())))
         beside = [(one.kind, one.repeat(count)) for one in self._effects]
-        paths = self.runs.simulator.simulate([*beside, (kind, candidates)], count)
+        paths = self.runs.simulate([*beside, (kind, candidates)], count)
         known = self._likelihood.weigh(self.simulate(self._effects)[None], self.deviation)
         return self._factor * (self._likelihood.weigh(paths, self.deviation) - known)
 
@@ -212,7 +212,7 @@ class WindowView:
             for name in values:
                 values[name] = trials.get((place, name), values[name])
             given.append((one.kind, values))
-        return self.runs.simulator.simulate(given, count)
+        return self.runs.simulate(given, count)
 
     def weigh_numbers(
         self,

@@ -35,7 +35,7 @@ class ConstantAnswer:
             verdict=verdict,
             selected=selected,
             ranking=(Ranked(self.effect or "none", joints, self.probability),),
-            where=Where({}, (), None),
+            where=Where({}, None),
             gap=None,
             next_experiment=None,
         )

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 import yaml
 
-from actuators import open_loop
 from actuators.contracts import ActuatorFit, FitTask
 from brokk_rl import record
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
@@ -28,8 +27,8 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, read_answer
 from diagnosis.case import estimate_running_s
-from diagnosis.effect_library import EffectSimulator
 from diagnosis.effects_file import EFFECTS_FILE
+from diagnosis.simulator_runs import EffectSimulator, cut_simulator_runs
 from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER
 
 HORIZON_S = 5.0
@@ -127,13 +126,9 @@ class ExaminerSimulator:
         self, recordings: Sequence[Recording], running_s: Sequence[float]
     ) -> EffectSimulator:
         """Return free runs through windows of recordings; `running_s`: when each of them begins."""
-        cuts, times = [], []
-        for recording, begun_s in zip(recordings, running_s, strict=True):
-            cut = open_loop.cut_windows([recording], self._machine, HORIZON_S, STRIDE_S)
-            cuts.append(cut)
-            times.append(begun_s + STRIDE_S * np.arange(len(cut.q)))
-        windows, begun = open_loop.join_windows(cuts), np.concatenate(times)
-        return EffectSimulator(self._actuator, self._machine, windows, begun, seed=0)
+        return cut_simulator_runs(
+            self._actuator, recordings, self._machine, 0, HORIZON_S, STRIDE_S, running_s
+        )
 
     def _squares(self, runs: EffectSimulator, effects: Mapping[str, Any]) -> np.ndarray:
         """Return the mean square error of each window over all joints, `(W,)`.

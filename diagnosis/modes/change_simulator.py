@@ -121,7 +121,7 @@ class ChangeSimulator:
 
     def _replay(self, simulator: Actuator, recordings: Sequence[Recording]) -> dict[str, float]:
         """Return the error of free runs on the recordings by joint, rad or m."""
-        runs = cut_simulator_runs(simulator, recordings, self.machine, 0).simulator
+        runs = cut_simulator_runs(simulator, recordings, self.machine, 0)
         error = runs.cut.measured - runs.plain_runs
         rmse = np.sqrt(np.square(error).mean((0, 1)))
         return dict(zip(self.machine.joint_names, rmse.tolist(), strict=True))

@@ -54,7 +54,7 @@ def name_effects() -> Answer:
 
 
 NOTHING = Answer(
-    verdict="none", selected=(), ranking=(), where=Where({}, (), None), gap=None, next_experiment=None
+    verdict="none", selected=(), ranking=(), where=Where({}, None), gap=None, next_experiment=None
 )  # fmt: skip
 
 
@@ -124,7 +124,7 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
     def simulate(path: Path, effects: list[Any]) -> np.ndarray:
         simulator = api._load_simulator(path)
         runs = cut_simulator_runs(simulator, [recording], machine, 0)
-        return runs.simulator.simulate(effects)[0]
+        return runs.simulate(effects)[0]
 
     plain = simulate(source, [])
     names = list(dict(CHANGES))

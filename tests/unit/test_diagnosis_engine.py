@@ -19,7 +19,6 @@ from diagnosis.answer import (
     JointGap,
     NextExperiment,
     Ranked,
-    RegimeGap,
     Selected,
     Where,
 )
@@ -40,9 +39,7 @@ def said() -> Answer:
         parameters={"gap_rad": {"q3": Estimate(0.031, (0.028, 0.034))}}, gap_closed=Estimate(0.91, (0.86, 0.95)),
         same_as=("lag",), decided_by="a dial gauge",
     )  # fmt: skip
-    where = Where(
-        {"q3": JointGap(0.03, 0.002, 1.0)}, (RegimeGap("q3", "after a reversal", 0.8),), "actuation"
-    )
+    where = Where({"q3": JointGap(0.03, 0.002, 1.0)}, "actuation")
     return Answer(
         verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),), where=where,
         gap=Gap(0.03, 0.004, 0.002, Estimate(0.93, (0.88, 0.96))),

@@ -55,7 +55,7 @@ def answered(
         verdict=verdict or ("effects" if selected else "none"),  # pyright: ignore[reportArgumentType]
         selected=selected,
         ranking=tuple(ranking),
-        where=Where({}, (), None),
+        where=Where({}, None),
         gap=Gap(0.03, 0.01, 0.008, Estimate(0.9, (0.8, 0.95))),
         next_experiment=None,
     )

@@ -50,7 +50,7 @@ def say(closed: float | None) -> Answer:
         verdict="effects",
         selected=(),
         ranking=(),
-        where=Where({}, (), None),
+        where=Where({}, None),
         gap=Gap(0.03, 0.01, 0.008, estimate),
         next_experiment=None,
     )

@@ -9,7 +9,7 @@ import pytest
 
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
-from diagnosis.measured_changes import MeasuredChange, measure_changes
+from diagnosis.measured_changes import MeasuredChange, measure_changes, shift_by_dead_time
 
 PERIOD_S = 0.05
 OUT = "speed at full command, moving out"
@@ -72,3 +72,8 @@ def test_a_change_within_what_the_machine_repeats_is_none(two_joints: Machine) -
         one = record(two_joints, day, slower_out=0.05 * day)
         reference.append(replace(one, metadata={"created": f"2026-03-0{day + 1}T09:00:00"}))
     assert not compare(two_joints, reference, slower_out=0.1)[quantity].is_beyond
+
+
+def test_the_command_in_force_is_that_of_a_dead_time_before() -> None:
+    u = np.arange(20.0)[:, None] / 20.0
+    assert shift_by_dead_time(u, 0.5, PERIOD_S)[:, 0].tolist() == [0.0] * 11 + u[:9, 0].tolist()

@@ -65,7 +65,7 @@ def measure_errors(
 ) -> np.ndarray:
     """Returns the RMS error of free runs with effects, `(J,)` rad."""
     kinds = {kind.name: kind for kind in effect_library.load_effects(machine, None, simulator)}
-    runs = cut_simulator_runs(simulator, [recording], machine, 0).simulator
+    runs = cut_simulator_runs(simulator, [recording], machine, 0)
     chosen = [(kinds[name], values) for name, values in effects.items()]
     error = runs.cut.measured - runs.simulate(chosen)[0]
     return np.sqrt(np.square(error).mean((0, 1)))
