@@ -245,18 +245,3 @@ class DetectedEffect:
             found[name] = np.broadcast_to(off, len(self.joints)).astype(float)
             found[name][self.joints] = [one.mean for one in estimates.values()]
         return found
-
-
-def estimate_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float, float, float]:
-    """Return the most likely size and the ends of its 95 % interval from log likelihoods at rising `sizes`."""
-    fine = np.interp(np.linspace(0, len(sizes) - 1, 401), np.arange(len(sizes)), np.log(sizes))
-    curve = np.interp(fine, np.log(sizes), likelihood)
-    best = int(np.argmax(likelihood))
-    if 0 < best < len(sizes) - 1:  # a parabola through the best three
-        part = slice(best - 1, best + 2)
-        a, b, c = np.polyfit(np.log(sizes[part]), likelihood[part], 2)
-        near = (fine >= np.log(sizes[best - 1])) & (fine <= np.log(sizes[best + 1]))
-        if a < 0:
-            curve = np.where(near, np.maximum(curve, a * fine**2 + b * fine + c), curve)
-    inside = np.exp(fine[curve > curve.max() - 1.92])
-    return float(np.exp(fine[int(np.argmax(curve))])), float(inside.min()), float(inside.max())

@@ -34,9 +34,10 @@ class WindowedRuns:
     @cached_property
     def measured(self) -> np.ndarray:
         """Measured positions, `(W, K, J)`, NaN after the end of the recording."""
-        found = np.full(self.simulated.shape, np.nan)
+        found = np.full_like(self.simulated, np.nan)
+        steps = self.simulated.shape[1]
         for window, (source, row) in enumerate(zip(self.source, self.row, strict=True)):
-            part = self.recordings[source].q[row : row + found.shape[1]]
+            part = self.recordings[source].q[row : row + steps]
             found[window, : len(part)] = part
         return found
 

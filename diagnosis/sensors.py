@@ -1,9 +1,9 @@
 """Noise of sensors, from the scatter of samples; free runs are too coarse.
 
 The scatter of second differences is measured under steady commands, where neither drive nor late frames add to it.
-White noise of variance `v` adds `6 v` to its square, so that every size has a likelihood, given the scatter of
-the parts of the reference.
-Axes: `T` time, `J` joints, `P` parts of the reference, `S` sizes.
+White noise of variance `v` adds `6 v` to its square, which gives its size. What it earns is the likelihood of the
+field's scatter given that of the parts of the reference.
+Axes: `T` time, `J` joints, `P` parts of the reference.
 """
 
 from __future__ import annotations
@@ -16,14 +16,11 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
-from diagnosis.effect_library import DetectedEffect, EffectType, estimate_interval
+from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.side import stack_side
 from diagnosis.engine.sizes import SIGMAS, get_form_error
 
-SIZES = np.geomspace(0.05, 40.0, 40)
-"""Sizes that are tried, of typical; steps of 19 %, up to what a broken sensor shows. Steps chosen by
-hand."""
 MIN_ADDED_SCATTER = 1.0
 """Least noise that is added, over that of the reference's own sensor: what adds less is not seen in
 motion. On 120 answers from practice plants of other making, faults that were there reached 6 or
@@ -67,17 +64,16 @@ def find_sensor_noise(
         return None
     seen = _compute_mean(measure_scatter(case.field, machine))
     plain = measure_scatter(reference, machine)
-    (name,) = kind.fitted
-    sizes = SIZES[:, None] * kind.size(name)
-    noisy = []
-    for added in WHITE_NOISE_FACTOR * sizes**2:
-        noisy.append(0.5 * np.log(np.exp(2.0 * plain) + added))
-    likelihood = np.stack([_compute_likelihood(seen, one, plain) for one in noisy])
-    gain = np.minimum(likelihood.max(0) - _compute_likelihood(seen, plain, plain), MAX_GAIN)
-    best = likelihood.argmax(0)
-    joints = np.arange(machine.num_joints)
-    mask = gain > price
-    mask &= sizes[best, joints] >= MIN_ADDED_SCATTER * estimate_sensor_noise(reference)
+    base = _compute_mean(plain)
+    # Where there are too few steady commands nothing is known to be added.
+    added = np.nan_to_num(np.maximum(np.exp(2.0 * seen) - np.exp(2.0 * base), 0.0))
+    sizes = np.sqrt(added / WHITE_NOISE_FACTOR)
+    noisy = 0.5 * np.log(np.exp(2.0 * plain) + added)
+    variance = _compute_variance(noisy, plain)
+    gain = _compute_likelihood(seen, noisy, variance)
+    gain = gain - _compute_likelihood(seen, plain, _compute_variance(plain, plain))
+    gain = np.minimum(gain, MAX_GAIN)
+    mask = (gain > price) & (sizes >= MIN_ADDED_SCATTER * estimate_sensor_noise(reference))
     sides = stack_side(case.field, machine), stack_side(case.reference, machine)
     for j in np.flatnonzero(mask).tolist():
         # The steps of a coarse sensor scatter as well.
@@ -87,14 +83,16 @@ def find_sensor_noise(
         return None
     parameters = {}
     for j in np.flatnonzero(mask).tolist():
-        size, low, high = estimate_interval(sizes[:, j], likelihood[:, j])
-        own = np.log(high / low) / (2.0 * SIGMAS)
+        # The scatter grows by this share of a growth of the noise.
+        share = added[j] / (np.exp(2.0 * base[j]) + added[j])
+        own = np.sqrt(variance[j]) / share
         factor = np.exp(SIGMAS * np.hypot(own, get_form_error(kind.name)))
+        size = float(sizes[j])
         parameters[machine.joint_names[j]] = Estimate(size, (size / factor, size * factor))
-    after = _compute_mean(np.stack(noisy)[best, :, joints].T)
-    closed = _compute_closed_share(seen[mask], after[mask], _compute_mean(plain)[mask])
+    (name,) = kind.fitted
     earned = float(gain[mask].sum())
-    return DetectedEffect(kind, mask, {name: parameters}, worth, earned, closed)
+    # The size is the one that explains all of the scatter.
+    return DetectedEffect(kind, mask, {name: parameters}, worth, earned, closed=1.0)
 
 
 def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
@@ -108,33 +106,24 @@ def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
     return np.median(np.abs(np.concatenate(third)), 0) / 0.6745 / np.sqrt(20.0)
 
 
-def _compute_closed_share(seen: np.ndarray, after: np.ndarray, before: np.ndarray) -> float:
-    """Return the share of the squared difference of the scatter that the noise explains."""
-    left, whole = np.nansum(np.square(seen - after)), np.nansum(np.square(seen - before))
-    return float(np.clip(1.0 - left / whole, 0.0, 1.0))
+def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return the log likelihood of the field's scatter given that of the parts, `(J,)`; NaN without steady commands."""
+    return -0.5 * (np.square(seen - _compute_mean(drawn)) / variance + np.log(variance))
 
 
-def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
-    """Return the log likelihood of the field's scatter given that of the parts, `(J,)`; NaN without steady commands.
+def _compute_variance(drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
+    """Return the variance of the field's scatter given that of the parts, `(J,)`.
 
     Parts scatter at least as they do without noise, `plain` `(P, J)`: a few of them may agree by
     chance.
     """
-    variance = np.fmax(_compute_variance(drawn), _compute_variance(plain))
-    variance = variance * (1.0 + 1.0 / len(drawn)) + SCATTER_SIGMA**2
-    return -0.5 * (np.square(seen - _compute_mean(drawn)) / variance + np.log(variance))
+    found = []
+    for values in (drawn, plain):
+        # NaN where fewer than two parts have steady commands
+        found.append(np.ma.masked_invalid(values).var(0, ddof=1).filled(np.nan))
+    return np.fmax(*found) * (1.0 + 1.0 / len(drawn)) + SCATTER_SIGMA**2
 
 
 def _compute_mean(values: np.ndarray) -> np.ndarray:
     """Return the mean over parts `(P, …)` that have a value; NaN where none has."""
-    told = np.isfinite(values)
-    count = told.sum(0)
-    return np.where(count > 0, np.where(told, values, 0.0).sum(0) / np.maximum(count, 1), np.nan)
-
-
-def _compute_variance(values: np.ndarray) -> np.ndarray:
-    """Return the variance over parts `(P, …)` that have a value; NaN where fewer than two have."""
-    told = np.isfinite(values)
-    count = told.sum(0)
-    squares = np.square(np.where(told, values - _compute_mean(values), 0.0)).sum(0)
-    return np.where(count > 1, squares / np.maximum(count - 1, 1), np.nan)
+    return np.ma.masked_invalid(values).mean(0).filled(np.nan)

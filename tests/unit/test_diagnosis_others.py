@@ -13,7 +13,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library, geometry, sensors
 from diagnosis.case import GapCase
-from diagnosis.effect_library import DetectedEffect, estimate_interval
+from diagnosis.effect_library import DetectedEffect
 from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.side import stack_side
 
@@ -138,12 +138,6 @@ def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine:
 def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) -> None:
     one = swept(machine, 20.0, 9)
     assert not find(machine, one, one)
-
-
-def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:
-    sizes = np.geomspace(0.5, 2.0, 25)
-    mean, low, high = estimate_interval(sizes, -0.5 * np.square((sizes - 1.0) / 0.1))
-    assert (mean, low, high) == pytest.approx((1.0, 0.804, 1.196), abs=0.02)
 
 
 def test_a_lattice_that_motion_blurs_in_the_reference_is_no_coarse_sensor(machine: Machine) -> None:
