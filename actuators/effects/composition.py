@@ -7,7 +7,7 @@ import zlib
 import torch
 
 from actuators.effects.effect import MOTION, EffectChain, EffectSpec
-from actuators.models.parameters import OTHER, PerJoint
+from actuators.models.parameters import OTHER, SharePerJoint
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.history import History
@@ -34,13 +34,10 @@ class Library:
             wherever it stands.
     """
 
-    share: float | dict[str, float]
+    share: SharePerJoint
     effects: dict[str, EffectSpec]
 
     def check(self) -> None:
-        for name, share in self._get_shares().items():
-            if not 0 <= share <= 1:
-                raise ConfigError(f"effect.library.share: expected 0 to 1, got {share} for {name}")
         known, where = (*self.effects, OTHER), "effect.library.effects"
         for name in self.share if isinstance(self.share, dict) else ():
             if name not in known:
@@ -59,7 +56,7 @@ class Library:
                 effect.check_machine(machine, "effect.library.effects")
 
     def _get_shares(self) -> dict[str, float]:
-        share: PerJoint = self.share
+        share = self.share
         if not isinstance(share, dict):
             return dict.fromkeys(self.effects, share)
         return {name: share.get(name, share.get(OTHER, 1.0)) for name in self.effects}

@@ -6,9 +6,11 @@ import numpy as np
 from annotated_types import Interval
 
 from actuators.excite.poses import PoseProgram
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import Count, Positive, spec
+from brokk_rl.spec import Count, Ordered, Positive, PositiveRange, spec
+
+CommandRange = Annotated[tuple[float, Annotated[float, Interval(gt=0, le=1)]], Ordered()]
+"""Smallest and largest command."""
 
 
 @spec
@@ -32,22 +34,14 @@ class Work(PoseProgram):
     share: float
     pose_s: Positive
     joints_at_once: Count
-    stroke_s: tuple[Positive, Positive]
-    level: tuple[float, Annotated[float, Interval(gt=0, le=1)]]
+    stroke_s: PositiveRange
+    level: CommandRange
     ramp_s: Positive
     corrections: int
-    correction_s: tuple[Positive, Positive]
-    correction_level: tuple[float, Annotated[float, Interval(gt=0, le=1)]]
-    pause_s: tuple[Positive, Positive]
+    correction_s: PositiveRange
+    correction_level: CommandRange
+    pause_s: PositiveRange
     stop_margin: float
-
-    def check(self) -> None:
-        for name in ("stroke_s", "level", "correction_s", "correction_level", "pause_s"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ConfigError(
-                    f"{name}: expected [low, high] with low <= high, got [{low}, {high}]"
-                )
 
     def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands of so many control periods, `(T, J)`."""

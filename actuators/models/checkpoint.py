@@ -83,13 +83,9 @@ def read_checkpoint(
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {})["brokk"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise CheckpointError(
-            f"{path}: corrupt or truncated ({error}); copy it again or make a new one with `brokk mode=identify`"
-        ) from error
-    except (KeyError, ValueError) as error:
-        raise CheckpointError(
-            f"{path}: a safetensors file, but not an actuator of ours (no 'brokk' header)"
+            f"{path}: corrupt, truncated, or no actuator of ours ({error}); copy it again, or make one with `brokk mode=identify`"
         ) from error
     if header.get("schema") != SCHEMA or header.get("kind") != kind:
         raise CheckpointError(

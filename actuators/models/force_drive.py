@@ -22,7 +22,6 @@ from actuators.models.parameters import (
     NonNegativePerJoint,
     PerJoint,
     PositivePerJoint,
-    check_interface,
     select_commands_in_force,
 )
 from brokk_rl.errors import ConfigError
@@ -100,11 +99,11 @@ class ForceDriveModel(ParametricModel):
     """
 
     STATES = ("speed",)
+    INTERFACE = ("torque", "a force drive takes torques")
 
     def __init__(
         self, config: ForceDrive, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        check_interface(machine, "torque", "a force drive takes torques")
         absent = {"stribeck_m_s": STRIBECK_SPEED * machine.max_speed}
         super().__init__(config, machine, num_envs, device, absent)
         self.drive_changes: dict[str, torch.Tensor] = {}
@@ -114,7 +113,6 @@ class ForceDriveModel(ParametricModel):
         powers = torch.stack([times_s**power for power in range(3)], 1)
         # Slope at the newest sample of the parabola through the last positions.
         self._slope = torch.linalg.pinv(powers)[1].to(device, torch.float32)
-        self.reset(self._fresh.clone())
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""

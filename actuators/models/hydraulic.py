@@ -36,7 +36,6 @@ from actuators.models.parameters import (
     PerJoint,
     PositivePerJoint,
     SharePerJoint,
-    check_interface,
     open_valve,
     select_commands_in_force,
 )
@@ -142,11 +141,11 @@ class OilModel(ParametricModel):
     """
 
     DELAY = "transport_s"
+    INTERFACE = ("speed", "hydraulics set speeds")
 
     def __init__(
         self, config: OilNumbers, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        check_interface(machine, "speed", "hydraulics set speeds")
         super().__init__(config, machine, num_envs, device)
         if (self.parameters["breakaway"] < self.parameters["coulomb"]).any():
             raise ConfigError(

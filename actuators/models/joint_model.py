@@ -14,7 +14,12 @@ import numpy as np
 import torch
 
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import check_dead_time, read_parameters, split_run_commands
+from actuators.models.parameters import (
+    check_dead_time,
+    check_interface,
+    read_parameters,
+    split_run_commands,
+)
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
@@ -45,11 +50,13 @@ class ParametricModel:
         absent: Values `(J,)` of fields that are `None`.
 
     Raises:
-        ConfigError: a joint is missing or unknown, or the history does not hold the dead time.
+        ConfigError: a joint is missing or unknown, the history does not hold the dead time, or the machine is
+            commanded by another quantity.
 
     Attributes:
         STATES: Names of the state of each joint, `(N, J)`.
         DELAY: Name of the number that is the dead time.
+        INTERFACE: Quantity that its commands set, and what it is, for messages; see `check_interface`.
         parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
             candidates side by side.
         plant: Constants of the machine.
@@ -57,6 +64,7 @@ class ParametricModel:
 
     STATES: ClassVar[tuple[str, ...]]
     DELAY: ClassVar[str] = "dead_time_s"
+    INTERFACE: ClassVar[tuple[str, str]]
 
     def __init__(
         self,
@@ -66,6 +74,7 @@ class ParametricModel:
         device: torch.device,
         absent: Mapping[str, np.ndarray] = MappingProxyType({}),
     ) -> None:
+        check_interface(machine, *self.INTERFACE)
         self.parameters: dict[str, torch.Tensor] = {}
         nominal = read_parameters(config, machine, absent)
         check_dead_time(float(nominal[self.DELAY].max()), machine, f"actuator.{self.DELAY}")

@@ -103,13 +103,7 @@ class FirstOrderLagModel(PlannableModel):
     """Exact solution of `time_constant * v' + v = v_full * open_valve(u(t - dead_time))`."""
 
     STATES = ("speed",)
-
-    def __init__(
-        self, config: FirstOrderLag, machine: Machine, num_envs: int, device: torch.device
-    ) -> None:
-        check_interface(machine, "speed", "a lagging drive follows speeds")
-        super().__init__(config, machine, num_envs, device)
-        self.reset(self._fresh.clone())
+    INTERFACE = ("speed", "a lagging drive follows speeds")
 
     def ask(self, commands: torch.Tensor) -> torch.Tensor:
         """Return the speeds that commands ask for."""

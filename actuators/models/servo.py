@@ -25,12 +25,7 @@ from typing import ClassVar, NamedTuple
 import torch
 
 from actuators.models.joint_model import CommandParts, JointMemory, PlannableModel
-from actuators.models.parameters import (
-    NonNegativePerJoint,
-    PerJoint,
-    PositivePerJoint,
-    check_interface,
-)
+from actuators.models.parameters import NonNegativePerJoint, PerJoint, PositivePerJoint
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -107,14 +102,13 @@ class ServoModel(PlannableModel):
     """
 
     STATES = ("held", "speed")
+    INTERFACE = ("position", "a servo follows positions")
 
     def __init__(
         self, config: Servo, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        check_interface(machine, "position", "a servo follows positions")
         super().__init__(config, machine, num_envs, device)
         self.drive_changes: dict[str, torch.Tensor] = {}
-        self.reset(self._fresh.clone())
 
     def ask(self, commands: torch.Tensor) -> torch.Tensor:
         """Return the targets of commands, rad or m."""

@@ -25,7 +25,7 @@ import torch
 from actuators.models.joint_model import CommandParts, JointMemory, PlannableModel
 from actuators.models.joint_weight import build_joint_weight
 from actuators.models.machine_tensors import MachineTensors
-from actuators.models.parameters import NonNegativePerJoint, check_interface
+from actuators.models.parameters import NonNegativePerJoint
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -153,11 +153,11 @@ class ValveModel(PlannableModel):
     """
 
     STATES = ("pilot", "spool", "step")
+    INTERFACE = ("speed", "a valve sets speeds")
 
     def __init__(
         self, config: ValveActuator, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        check_interface(machine, "speed", "a valve sets speeds")
         super().__init__(config, machine, num_envs, device)
 
         def tensor(values: np.ndarray) -> torch.Tensor:

@@ -30,6 +30,14 @@ log = logging.getLogger(__name__)
 PAGE_FILE = "inspection.html"
 TEMPLATE = Path(__file__).with_name("inspection.html.jinja")
 JOINTS = ["joint", "measured", "limits", "commanded", "at limit", "noise", "step", "dead time"]
+OVERALL = {
+    "lowest": np.min,
+    "highest": np.max,
+    "fastest": np.max,
+    "noise": np.median,
+    "step": np.median,
+}
+"""Figure over all recordings of those that are no means."""
 FILES = ["file", "minutes", "rate", "jitter", "breaches", "findings"]
 
 
@@ -216,14 +224,9 @@ def _combine(key: str, values: np.ndarray, seconds: np.ndarray) -> float | None:
     there = np.isfinite(values)
     if not there.any():
         return None
-    values = values[there]
-    if key in ("noise", "step"):
-        return float(np.median(values))
-    if key == "lowest":
-        return float(values.min())
-    if key in ("highest", "fastest"):
-        return float(values.max())
-    return float(np.average(values, weights=seconds[there]))
+    if key in OVERALL:
+        return float(OVERALL[key](values[there]))
+    return float(np.average(values[there], weights=seconds[there]))
 
 
 def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:

@@ -199,13 +199,12 @@ class _ClockJudge:
         if self._is_named and is_later(-values).all():
             return f"'{self._text}' only decreases: the newest row comes first; sort the rows, oldest first"
         if fault is not None:
-            is_known = self._given.is_skipping or np.isfinite(values).all()
-            if later.mean() < (0.02 if self._is_named else 0.9) or not is_known:
+            if later.mean() < (0.02 if self._is_named else 0.9):
                 return None
             if not self._words.isdisjoint(("dt", "delta", "diff", "period")):
                 rate_hz = float(f"{1.0 / max(float(np.mean(values)), 1e-9):.3g}")
                 return f"'{self._text}' holds the time since the row before; {advise('rate', rate_hz=rate_hz)}"
-            if not (self._given.is_skipping and fault.is_damage):
+            if not fault.is_damage:  # damage is refused, or skipped, where the whole log is read
                 place = self._table.locate(int(fault.rows[0]))
                 return f"'{self._text}': {fault.text}, first in {place}; {fault.advice}"
         weighed = self._weigh_unit(values[later])

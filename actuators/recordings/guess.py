@@ -108,11 +108,6 @@ class GivenColumns:
     channel: int | str | None = None
     damaged: Damaged = "refuse"
 
-    @property
-    def is_skipping(self) -> bool:
-        """True where damaged parts are left out."""
-        return self.damaged == "skip"
-
     def find_unit(self, joint: str) -> str | None:
         """Return the unit of a joint's positions, where it is given."""
         given = self.position_unit

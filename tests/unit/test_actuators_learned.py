@@ -140,7 +140,7 @@ def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
 def test_a_truncated_checkpoint_is_refused(tmp_path: Path, machine: Machine, keep: int) -> None:
     path = written(tmp_path / "a.safetensors", machine)
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(CheckpointError, match=r"a\.safetensors: corrupt or truncated"):
+    with pytest.raises(CheckpointError, match=r"a\.safetensors: corrupt, truncated, or no"):
         load_networks(str(path), machine)
 
 

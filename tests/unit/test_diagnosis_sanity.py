@@ -69,8 +69,6 @@ def test_a_lock_without_a_common_condition_stays_unexplained(
     [
         (lambda t: t + 0.004 * np.random.default_rng(0).uniform(-0.5, 0.5, len(t)), None),
         (lambda t: t + 0.018 * (np.arange(len(t)) % 2) - 0.009, "irregular clock"),
-        (lambda t: t + 0.0095 * (t > 100.0) + 0.0095 * (t > 150.0), None),
-        (lambda t: t * 1.004, None),
     ],
 )
 def test_only_rows_that_are_not_equally_spaced_are_a_fault_of_the_clock(

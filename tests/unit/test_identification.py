@@ -199,10 +199,8 @@ def test_a_model_that_stands_still_is_no_good_news(
     machine: Machine, recordings: Path, tmp_path: Path
 ) -> None:
     result = run(identify(machine, tmp_path / "out", recordings, Fit(Hold())))
-    assert (
-        result["verdict"][0]["tone"] == "bad"
-        and "worse on q1, q2, q3, q4, q5" in result["verdict"][0]["text"]
-    )
+    verdict = result["verdict"][0]
+    assert verdict["tone"] == "bad" and "worse on q1, q2, q3, q4, q5" in verdict["text"]
     result["data"]["excitation"]["q3"] |= {
         "commanded_s": 30.0,
         "largest_command": [-0.9, 0.2],
