@@ -171,9 +171,8 @@ def test_the_bench_adds_up_what_two_processes_reach(tmp_path: Path) -> None:
     assert together(tmp_path, *BENCH, "session.out=run").returncode == 0
     found = read(tmp_path / "run" / "benchmark.json")
     rates = [rank["train_env_steps_per_s"] for rank in found["per_rank"]]
-    assert found["ranks"] == len(rates) == 2 and found["train_env_steps_per_s"] == pytest.approx(
-        sum(rates)
-    )
+    assert found["ranks"] == len(rates) == 2
+    assert found["train_env_steps_per_s"] == pytest.approx(sum(rates))
 
 
 def test_a_local_sweep_run_again_does_only_what_is_missing(tmp_path: Path) -> None:

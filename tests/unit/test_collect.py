@@ -73,10 +73,8 @@ def test_every_run_is_cut_into_files_that_know_each_other(
     assert len(set(runs)) == 2 and runs[:3] == [runs[0]] * 3
     first, second, *_ = files.values()
     assert second.metadata["created"] == record.add_seconds(first.metadata["created"], 12.0)
-    assert (
-        first.metadata["source"] == "simulator: Lag, excitation: sine"
-        and first.metadata["seed"] == "0"
-    )
+    assert first.metadata["source"] == "simulator: Lag, excitation: sine"
+    assert first.metadata["seed"] == "0"
     assert json.loads(first.metadata["fingerprint"]) == machine.fingerprint()
     assert first.t_s[0] == second.t_s[0] == 0.0
 

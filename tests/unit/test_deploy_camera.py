@@ -90,9 +90,8 @@ def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: LoopMemo
     perception_process._publish_frame(exchange.frame, FRAME, PIXELS, 5.0)
     assert exchange.frame.peek("t_s") == 5.0 and exchange.frame.number == 1
     whole = read_frame(exchange.frame.read())
-    assert np.array_equal(whole.color, FRAME.color) and np.array_equal(
-        whole.depth_m, FRAME.depth_m, equal_nan=True
-    )
+    assert np.array_equal(whole.color, FRAME.color)
+    assert np.array_equal(whole.depth_m, FRAME.depth_m, equal_nan=True)
     perception_process._publish_frame(exchange.frame, FRAME, PIXELS // 4, 6.0)
     small = read_frame(exchange.frame.read())
     assert small.color.shape == (180, 320, 3) and exchange.frame.number == 2
@@ -205,9 +204,8 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
         ("1", False),
         ("2", True),
     ], "perception knows it by now"
-    assert feed.submit(OperatorRequest("target", "1")) and not feed.submit(
-        OperatorRequest("target", "9")
-    )
+    assert feed.submit(OperatorRequest("target", "1"))
+    assert not feed.submit(OperatorRequest("target", "9"))
     wanted.refresh()
     assert aimed(exchange) == [2.95, -0.4, 0.75]
 
@@ -314,7 +312,5 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(
         np.frombuffer(CompressedImage.FromString(views[0][1]).data, np.uint8), cv2.IMREAD_COLOR
     )
     assert picture is not None and np.abs(picture[..., ::-1].astype(int) - FRAME.color).mean() < 6
-    assert (
-        PictureSampler(exchange.frame, 0.0).due() is None
-        and PictureSampler(None, 2.0).due() is None
-    )
+    assert PictureSampler(exchange.frame, 0.0).due() is None
+    assert PictureSampler(None, 2.0).due() is None

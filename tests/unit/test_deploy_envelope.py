@@ -157,9 +157,8 @@ def test_shapes_enclose_what_mujoco_draws_and_little_more() -> None:
     poses = draw_poses(25, seed=1)
     found = measure_clearance(envelope, poses)
     expected = np.array([find_distance_m(model, q, arm, other) for q in poses])
-    assert (found <= expected + 2e-5)[expected > 0.0].all() and (found <= 2e-5)[
-        expected <= 0.0
-    ].all()
+    assert (found <= expected + 2e-5)[expected > 0.0].all()
+    assert (found <= 2e-5)[expected <= 0.0].all()
     # The widest link has its cylinders 0.2 m beside its axis.
     clear = expected > 0.02
     assert clear.sum() >= 8 and (expected[clear] - found[clear]).max() < 0.25

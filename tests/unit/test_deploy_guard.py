@@ -128,12 +128,10 @@ def test_arming_alone_moves_nothing_and_neither_does_a_dead_man_held_from_the_st
     hand = Hand()
     hand.decide(WELL)
     decision = hand.decide(WELL, (0.5, 0.0, 0.0))
-    assert (
-        decision.state is GuardState.LATCHED
-        and decision.sends
-        and decision.u == STILL
-        and decision.trip is GuardTrip.NOT_ARMED
-    )
+    assert decision.state is GuardState.LATCHED
+    assert decision.sends
+    assert decision.u == STILL
+    assert decision.trip is GuardTrip.NOT_ARMED
 
 
 def test_the_way_to_the_valves_is_release_then_press() -> None:
@@ -156,11 +154,9 @@ def test_a_released_dead_man_is_zero_in_the_same_cycle_and_may_be_pressed_again(
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.0))
     decision = hand.decide(RELEASED, (0.1, 0.0, 0.0))
-    assert (
-        decision.state is GuardState.READY
-        and decision.u == STILL
-        and decision.trip is GuardTrip.DEADMAN
-    )
+    assert decision.state is GuardState.READY
+    assert decision.u == STILL
+    assert decision.trip is GuardTrip.DEADMAN
     assert hand.decide(u=(0.1, 0.0, 0.0)).state is GuardState.ACTIVE
     assert hand.decide(u=(0.05, 0.0, 0.0)).u == (0.05, 0.0, 0.0)
 
@@ -213,12 +209,10 @@ def test_anything_wrong_is_zero_in_the_same_cycle_and_latches_until_release_and_
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.1))
     decision = hand.decide(u=(0.1, 0.0, 0.1), **change)
-    assert (
-        decision.state is GuardState.LATCHED
-        and decision.u == STILL
-        and decision.trip is trip
-        and decision.cause is trip
-    )
+    assert decision.state is GuardState.LATCHED
+    assert decision.u == STILL
+    assert decision.trip is trip
+    assert decision.cause is trip
     again = hand.decide(u=(0.1, 0.0, 0.1))
     assert again.state is GuardState.LATCHED and again.u == STILL and again.trip is trip
     assert hand.decide(RELEASED).state is GuardState.READY
@@ -291,11 +285,9 @@ def test_disarming_is_silence_at_once() -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.0))
     decision = hand.decide(u=(0.1, 0.0, 0.0), armed=False)
-    assert (
-        decision.state is GuardState.SILENT
-        and decision.u == STILL
-        and decision.cause is GuardTrip.NONE
-    )
+    assert decision.state is GuardState.SILENT
+    assert decision.u == STILL
+    assert decision.cause is GuardTrip.NONE
     assert hand.decide().state is GuardState.LATCHED
 
 
@@ -551,18 +543,14 @@ def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any
             assert not (value > 0 and at >= upper) and not (value < 0 and at <= lower)
         if any(moved):
             assert decision.state is GuardState.ACTIVE and state is GuardState.ACTIVE
-            assert (
-                cycle["armed"]
-                and cycle["deadman"]
-                and not cycle["estop"]
-                and cycle["lever"] == 0
-                and pressed
-            )
-            assert (
-                cycle["u"] is not None
-                and all(map(math.isfinite, cycle["u"]))
-                and cycle["age_s"] <= LIMITS.request_s
-            )
+            assert cycle["armed"]
+            assert cycle["deadman"]
+            assert not cycle["estop"]
+            assert cycle["lever"] == 0
+            assert pressed
+            assert cycle["u"] is not None
+            assert all(map(math.isfinite, cycle["u"]))
+            assert cycle["age_s"] <= LIMITS.request_s
             assert dt <= LIMITS.gap_s and cycle["joints_age_s"] <= LIMITS.joints_s
         if decision.state is GuardState.ACTIVE and state is not GuardState.ACTIVE:
             assert state is GuardState.READY and cycle["deadman"] and not any(moved)
@@ -647,11 +635,9 @@ def test_a_gateway_that_does_not_follow_is_noticed() -> None:
     for _ in range(3):
         hand.decide(u=(0.05, 0.0, 0.0), dt=0.1, followed=False)
     decision = hand.decide(u=(0.05, 0.0, 0.0), dt=0.01, followed=False)
-    assert (
-        decision.state is GuardState.LATCHED
-        and decision.u == STILL
-        and decision.cause is GuardTrip.IGNORED
-    )
+    assert decision.state is GuardState.LATCHED
+    assert decision.u == STILL
+    assert decision.cause is GuardTrip.IGNORED
 
 
 def test_a_gateway_has_all_of_the_time_that_it_is_given_to_follow() -> None:
@@ -678,16 +664,12 @@ def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:
     hand.now_s = 0.0
     hand.decide(RELEASED, dt=0.25)
     hand.decide(RELEASED, dt=0.25)
-    assert (
-        hand.decide(WELL, dt=0.25).state is GuardState.ACTIVE
-        and hand.decide(WELL, dt=0.25).trip is GuardTrip.NONE
-    )
+    assert hand.decide(WELL, dt=0.25).state is GuardState.ACTIVE
+    assert hand.decide(WELL, dt=0.25).trip is GuardTrip.NONE
     watch = PlausibilityFilter(limits, BODY)
-    assert (
-        watch.accept(0, 0.0, 0.0)
-        and watch.accept(0, 0.25, 0.5)
-        and not watch.accept(0, 0.25, 0.7501)
-    )
+    assert watch.accept(0, 0.0, 0.0)
+    assert watch.accept(0, 0.25, 0.5)
+    assert not watch.accept(0, 0.25, 0.7501)
 
 
 def test_positions_are_plausible_until_as_many_jumps_as_it_takes() -> None:

@@ -368,10 +368,8 @@ def test_own_commands_that_come_back_are_known(loop: Loop) -> None:
     for _ in range(10):
         for frame in loop.cycle():
             assert loop.logic.take(frame, loop.now_s) == (None, False)
-    assert (
-        loop.state is GuardState.ACTIVE
-        and loop.logic.receiver.build_guard_input(loop.now_s, True, 0.0).alone
-    )
+    assert loop.state is GuardState.ACTIVE
+    assert loop.logic.receiver.build_guard_input(loop.now_s, True, 0.0).alone
 
 
 def test_a_way_that_is_too_long_or_unknown_is_no_way(loop: Loop) -> None:

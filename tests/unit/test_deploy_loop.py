@@ -89,11 +89,9 @@ def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.M
         assert pace.begin() == skipped
         assert pace.next_s == pytest.approx(next_s)
     report = pace.report()
-    assert (
-        report["cycles"] == 3
-        and report["missed"] == 2
-        and report["late_max_s"] == pytest.approx(0.12)
-    )
+    assert report["cycles"] == 3
+    assert report["missed"] == 2
+    assert report["late_max_s"] == pytest.approx(0.12)
 
 
 def test_levers_are_those_of_the_paper(machine: Machine) -> None:
@@ -414,11 +412,9 @@ def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_pa
     path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7]}')
     os.utime(path, ns=(time.time_ns() - 5 * 10**9,) * 2)
     first = target.news([], None)
-    assert (
-        first is not None
-        and first.center_in_base_m.tolist() == [2.5, 0.1, 0.7]
-        and first.t_s is not None
-    )
+    assert first is not None
+    assert first.center_in_base_m.tolist() == [2.5, 0.1, 0.7]
+    assert first.t_s is not None
     assert time.monotonic() - first.t_s == pytest.approx(5.0, abs=0.5)
     assert target.news([], None) is None
     path.write_text('{"center_in_base_m": [2.5, 0.1, 0.7], "std_m": NaN}')

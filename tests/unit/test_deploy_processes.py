@@ -93,9 +93,7 @@ def test_a_process_that_dies_or_hangs_stops_the_machine(
 def test_what_is_shown_says_who_has_the_valves(desk: Desk) -> None:
     desk.set_moving()
     state = desk.memory.state.read()
-    assert (
-        state is not None
-        and state.guard is GuardState.ACTIVE
-        and desk.memory.read_snapshot().commands
-    )
+    assert state is not None
+    assert state.guard is GuardState.ACTIVE
+    assert desk.memory.read_snapshot().commands
     assert [round(abs(u), 3) for u in state.sent] == [round(abs(u), 3) for u in COMMAND]

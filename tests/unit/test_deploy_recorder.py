@@ -92,15 +92,12 @@ def test_a_capture_becomes_the_recording_of_what_happened(machine: Machine, tmp_
     assert again.q[:, 0] == pytest.approx(0.1 * again.t_s, abs=1e-3)
     step = int(np.flatnonzero(again.u[:, 0] > 0)[0])
     # Part of that period.
-    assert again.t_s[step] == pytest.approx(1.0) and again.u[step, 0] == pytest.approx(
-        0.2, abs=0.11
-    )
+    assert again.t_s[step] == pytest.approx(1.0)
+    assert again.u[step, 0] == pytest.approx(0.2, abs=0.11)
     assert (again.u[step + 1 :, 0] == pytest.approx(0.5)) and not again.u[:, 1].any()
     assert again.extra["oil_c"] == pytest.approx(35.0) and np.isnan(again.extra["advice_q1"][5])
-    assert (
-        again.extra["advice_q1"][20] == pytest.approx(0.1)
-        and again.metadata["source"] == "capture: test"
-    )
+    assert again.extra["advice_q1"][20] == pytest.approx(0.1)
+    assert again.metadata["source"] == "capture: test"
 
 
 def test_rows_lie_on_the_decisions_and_hold_what_the_policy_saw(

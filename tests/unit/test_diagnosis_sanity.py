@@ -31,12 +31,10 @@ def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
     found = named(
         examine_recordings([recording(machine, np.abs(sound.u[:, 3]) > 0)], machine, thresholds)
     )["interlock"]
-    assert (
-        found.joint == "q3"
-        and found.severity == "bad"
-        and found.recording == "planted"
-        and found.count >= 5
-    )
+    assert found.joint == "q3"
+    assert found.severity == "bad"
+    assert found.recording == "planted"
+    assert found.count >= 5
     assert "q3 ignores its command when q4 is commanded" in found.amount
 
 
@@ -124,8 +122,6 @@ def test_the_gravest_comes_first_and_all_of_it_is_plain(
         (r.severity for r in remarks), key=["bad", "warn", "note"].index
     )
     for remark in remarks:
-        assert (
-            remark.plain()["name"] in REMARKS
-            and remark.plain()["advice"]
-            and remark.to_s >= remark.from_s
-        )
+        assert remark.plain()["name"] in REMARKS
+        assert remark.plain()["advice"]
+        assert remark.to_s >= remark.from_s

@@ -135,10 +135,8 @@ def test_tremor_is_in_proportion_to_the_deflection_and_has_no_mean(machine: Mach
     again = model.step(proposed)
     assert found.std(0).tolist() == pytest.approx([0.02, 0.0, 0.04, 0.0, 0.06], rel=0.05)
     assert found.mean(0).tolist() == pytest.approx([0.2, 0.0, 0.4, 0.0, 0.6], abs=0.005)
-    assert (
-        not torch.equal(found, again)
-        and torch.corrcoef(torch.stack((found[:, 0], again[:, 0])))[0, 1].abs() < 0.1
-    )
+    assert not torch.equal(found, again)
+    assert torch.corrcoef(torch.stack((found[:, 0], again[:, 0])))[0, 1].abs() < 0.1
     assert torch.corrcoef(found[:, [0, 2, 4]].T).fill_diagonal_(0).abs().max() < 0.1, (
         "each hand trembles by itself"
     )
@@ -165,10 +163,8 @@ def test_a_lever_once_taken_is_kept_for_a_while_as_long_as_it_is_asked_for(
     proposed = torch.zeros(8, 5)
     proposed[:, 0], proposed[1:, 2] = 0.4, 0.8
     moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
-    assert (
-        moved[:, 0].tolist() == [True] * 4 + [False] * 4
-        and moved[:, 2].tolist() == [False] * 4 + [True] * 4
-    )
+    assert moved[:, 0].tolist() == [True] * 4 + [False] * 4
+    assert moved[:, 2].tolist() == [False] * 4 + [True] * 4
     proposed[2, 0] = 0.0
     moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
     assert moved[:, 0].tolist() == [True] * 2 + [False] * 6, "what is no longer asked for is let go"
@@ -227,11 +223,9 @@ def test_each_part_is_off_at_its_neutral_value_whatever_the_others_are(
 def test_each_episode_has_another_person_within_the_ranges(machine: Machine) -> None:
     model = option("follower", "person").build(machine, 2000, CPU)
     delay_s = model.state["drawn.delay_s"].clone()
-    assert (
-        0.2 <= delay_s.min() < 0.21
-        and 0.39 < delay_s.max() <= 0.4
-        and float(delay_s.mean()) == pytest.approx(0.3, abs=0.01)
-    )
+    assert 0.2 <= delay_s.min() < 0.21
+    assert 0.39 < delay_s.max() <= 0.4
+    assert float(delay_s.mean()) == pytest.approx(0.3, abs=0.01)
     model.reset(torch.arange(2000) < 1000)
     assert (model.state["drawn.delay_s"][:1000] != delay_s[:1000]).float().mean() > 0.99
     assert torch.equal(model.state["drawn.delay_s"][1000:], delay_s[1000:])
@@ -304,9 +298,8 @@ def test_histories_and_recordings_hold_what_was_given_and_not_what_was_proposed(
         )
         loop.step(action)
     torch.testing.assert_close(loop.history.u[:, -4:], 0.5 * torch.stack(proposed[:4], 1))
-    assert torch.equal(loop.end_u, loop.history.u[:, -1]) and torch.equal(
-        loop.truth.u, loop.history.u
-    )
+    assert torch.equal(loop.end_u, loop.history.u[:, -1])
+    assert torch.equal(loop.truth.u, loop.history.u)
     assert torch.equal(loop.task.state["u"], proposed[-1]), (
         "the reward is about what the policy asks of the person"
     )
@@ -350,10 +343,8 @@ def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_p
             session,
             {"first": ClassicalPolicy(task=None), "second": ClassicalPolicy(task=None)},
         )
-        assert (
-            results["policies"]["first"] == results["policies"]["second"]
-            and results["follower"] == "person"
-        )
+        assert results["policies"]["first"] == results["policies"]["second"]
+        assert results["follower"] == "person"
     assert (tmp_path / "one" / "evaluation.json").read_text() == (
         tmp_path / "other" / "evaluation.json"
     ).read_text()

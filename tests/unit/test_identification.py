@@ -165,10 +165,8 @@ def test_the_report_of_a_good_model_says_so(
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {
         "identification.json", "identification.html", "prediction.png",
     }  # fmt: skip
-    assert (
-        result["verdict"][0]["tone"] == "good"
-        and "Better beyond doubt on 5 of 5 joints" in result["verdict"][0]["text"]
-    )
+    assert result["verdict"][0]["tone"] == "good"
+    assert "Better beyond doubt on 5 of 5 joints" in result["verdict"][0]["text"]
     assert any("inside the history of 0.65 s" in sentence["text"] for sentence in result["verdict"])
     assert "Judged by 2 runs" in result["verdict"][-1]["text"]
     text = (tmp_path / "out" / "identification.html").read_text()
@@ -186,10 +184,8 @@ def test_short_recordings_leave_out_the_horizons_that_do_not_fit(
         # 5 s less 1.65 s: no window of 5 s.
         record.write_recording(Recording(**{**vars(whole), **part}), cut / path.name)
     result = run(identify(machine, tmp_path / "out", cut, Fit()))
-    assert (
-        result["joints"]["q1"]["plant"]["5"] is None
-        and result["joints"]["q1"]["plant"]["2"] is not None
-    )
+    assert result["joints"]["q1"]["plant"]["5"] is None
+    assert result["joints"]["q1"]["plant"]["2"] is not None
     assert result["missing"].keys() == {"5", "10"} and "leaves 3.4 s" in result["missing"]["10"]
     assert any("after 2 s" in sentence["text"] for sentence in result["verdict"])
 

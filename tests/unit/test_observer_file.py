@@ -126,9 +126,8 @@ def test_thresholds_of_a_simulator_or_of_another_machine_count_for_nothing_on_a_
         if commands:
             with pytest.raises(ConfigError, match=reason) as caught:
                 read_observer_content(limits, MACHINE, interface, commands)
-            assert "mode=observe" in str(caught.value) and "guard.observer=null" in str(
-                caught.value
-            )
+            assert "mode=observe" in str(caught.value)
+            assert "guard.observer=null" in str(caught.value)
         else:
             assert build_observer(limits, MACHINE, interface, commands) is None
             assert reason in caplog.text and "mode=observe" in caplog.text

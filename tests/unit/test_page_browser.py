@@ -428,11 +428,9 @@ def test_everything_is_done_by_keys_and_by_gloves(
         box = button.bounding_box()
         # 15 mm by CSS.
         assert min(box["width"], box["height"]) >= 15 / 25.4 * 96, button.inner_text()
-        assert (
-            box["x"] >= 0
-            and box["x"] + box["width"] <= SIZE["width"]
-            and box["y"] + box["height"] <= SIZE["height"]
-        )
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= SIZE["width"]
+        assert box["y"] + box["height"] <= SIZE["height"]
     reached = set()
     for _ in range(13):
         page.keyboard.press("Tab")
@@ -510,9 +508,8 @@ def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
     page.locator("#picture").click(position={"x": 0.25 * box["width"], "y": 0.6 * box["height"]})
     eventually(lambda: bool(feed.requests))
     wish = feed.requests[-1]
-    assert wish.kind == "point" and [
-        float(part) for part in wish.value.split(",")
-    ] == pytest.approx([0.25, 0.6], abs=0.01)
+    assert wish.kind == "point"
+    assert [float(part) for part in wish.value.split(",")] == pytest.approx([0.25, 0.6], abs=0.01)
 
 
 AREAS = ("#view", "#insertion", "aside", "#levers")

@@ -216,11 +216,9 @@ def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
     Path("same.yaml").write_text(yaml.safe_dump(same))
     command = ("mode=calibrate", f"calibration.source.folder={footage}", "session.out=run")
     done = brokk(*command, "calibration.joints=same.yaml")
-    assert (
-        done.code == 2
-        and "do not determine where the camera is" in done.err
-        and "q1 stays within" in done.err
-    )
+    assert done.code == 2
+    assert "do not determine where the camera is" in done.err
+    assert "q1 stays within" in done.err
     assert not Path("run/calibration.yaml").exists()
     Path("few").mkdir()
     for name in ("camera.yaml", "000.color.png"):
@@ -334,9 +332,8 @@ def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
         "mode=calibrate", f"calibration.source.folder={footage}", "calibration.joints=wrong.yaml",
         "session.out=run",
     )  # fmt: skip
-    assert (
-        done.code == 2 and "not to be trusted: q3: its positions are to be multiplied" in done.err
-    )
+    assert done.code == 2
+    assert "not to be trusted: q3: its positions are to be multiplied" in done.err
     content = yaml.safe_load(Path("run/calibration.yaml").read_text())
     assert content["verdict"]["status"] == "not to be trusted"
     with pytest.raises(FrameError, match="not to be trusted: q3"):

@@ -74,11 +74,9 @@ def test_frames_come_back_as_they_were_written(frames: Path) -> None:
     np.testing.assert_array_equal(first.camera_matrix, MATRIX)
     np.testing.assert_array_equal(first.base_from_camera, POSE)
     assert first.distortion is None and first.right is None and first.baseline_m == 0.12
-    assert (
-        np.isnan(first.depth_m[:10]).all()
-        and (first.depth_m[10:] == 2.0).all()
-        and (second.depth_m[10:] == 3.0).all()
-    )
+    assert np.isnan(first.depth_m[:10]).all()
+    assert (first.depth_m[10:] == 2.0).all()
+    assert (second.depth_m[10:] == 3.0).all()
     blue_first = cv2.imread(str(frames / "00000.color.png"))
     assert blue_first is not None
     np.testing.assert_array_equal(first.color, blue_first[..., ::-1])
@@ -521,11 +519,9 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
         with pytest.raises(FrameError, match="no new frame"):
             source.read_latest()
     assert stopped == [True]
-    assert (
-        frame is not None
-        and np.isnan(frame.depth_m[0]).all()
-        and frame.depth_m[1, 0] == pytest.approx(1.5)
-    )
+    assert frame is not None
+    assert np.isnan(frame.depth_m[0]).all()
+    assert frame.depth_m[1, 0] == pytest.approx(1.5)
     assert ("color", 1280, 720, "rgb8", 15) in streams
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(FrameError, match="not installed"):

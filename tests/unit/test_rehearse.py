@@ -81,11 +81,9 @@ def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
         "on_machine",
     ]
     training = played.commands["policy"]
-    assert (
-        training[0] == "mode=train"
-        and f"rl=@{folder}/given/rl.yaml" in training
-        and "session.device=cpu" in training
-    )
+    assert training[0] == "mode=train"
+    assert f"rl=@{folder}/given/rl.yaml" in training
+    assert "session.device=cpu" in training
     assert yaml.safe_load((folder / "given/rl.yaml").read_text())["budget"]["max_seconds"] == 7
     assert yaml.safe_load((folder / "given/sim.yaml").read_text())["native"]["num_worlds"] == 3
     blind = [

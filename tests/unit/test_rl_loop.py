@@ -47,21 +47,17 @@ def test_only_finished_environments_begin_anew(machine: Machine) -> None:
     )
     before = snapshot(loop)
     _, _, done, extras = loop.step(torch.zeros(8, 5))
-    assert (
-        done.tolist() == [True, True, *[False] * 6]
-        and extras["time_outs"].tolist() == done.tolist()
-    )
+    assert done.tolist() == [True, True, *[False] * 6]
+    assert extras["time_outs"].tolist() == done.tolist()
     after = snapshot(loop)
     assert (after["task.steps"][:2] == 0).all() and (after["task.steps"][2:] == 4).all()
     assert (after["episode.length"][:2] == 0).all() and (after["episode.length"][2:] == 4).all()
     targets = "task.start.target_m"
-    assert (after[targets][:2] != before[targets][:2]).any() and torch.equal(
-        after[targets][2:], before[targets][2:]
-    )
+    assert (after[targets][:2] != before[targets][:2]).any()
+    assert torch.equal(after[targets][2:], before[targets][2:])
     assert (after["history.u"][:2] == 0).all() and (after["history.q"][:2].diff(dim=1) == 0).all()
-    assert torch.equal(after["history.q"][:2, -1], after["world.q"][:2]) and torch.equal(
-        after["world.q"][:2], after["task.start.q"][:2]
-    )
+    assert torch.equal(after["history.q"][:2, -1], after["world.q"][:2])
+    assert torch.equal(after["world.q"][:2], after["task.start.q"][:2])
     assert torch.equal(after["history.q"][2:, :-1], before["history.q"][2:, 1:])
 
 
@@ -80,9 +76,8 @@ def test_asking_twice_gives_the_same_observation(machine: Machine) -> None:
     loop.step(torch.randn(8, 5))
     state, random = snapshot(loop), torch.get_rng_state()
     assert (loop.get_observations() == loop.get_observations()).all()
-    assert torch.equal(random, torch.get_rng_state()) and all(
-        torch.equal(value, state[name]) for name, value in snapshot(loop).items()
-    )
+    assert torch.equal(random, torch.get_rng_state())
+    assert all(torch.equal(value, state[name]) for name, value in snapshot(loop).items())
 
 
 def test_what_was_handed_out_does_not_change_later(machine: Machine) -> None:

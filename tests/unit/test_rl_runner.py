@@ -306,9 +306,8 @@ def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(
     runner.run()
     rows = runs.progress(tmp_path)
     assert [float(row["fault_rate"]) for row in rows] == [1 / ITERATION, 0.0, 0.0]
-    assert float(rows[0]["episode/end/fault"]) == 1.0 and all(
-        value != "nan" for row in rows for value in row.values()
-    )
+    assert float(rows[0]["episode/end/fault"]) == 1.0
+    assert all(value != "nan" for row in rows for value in row.values())
     assert all(value.isfinite().all() for value in runs.weights(runner).values())
 
 

@@ -96,10 +96,8 @@ def test_a_sitting_is_walked_through_by_touch(
     arm.now_s += 5.0
     until(page, "() => window.sitting().phase === 'running'")
     # the operator's page is seen then, and its levers follow the condition
-    assert (
-        page.locator("#left").is_visible()
-        and page.locator("#study").get_attribute("class") == "bar"
-    )
+    assert page.locator("#left").is_visible()
+    assert page.locator("#study").get_attribute("class") == "bar"
     assert not page.locator("#record").is_visible() and page.locator("#stop").is_visible()
     until(page, f"() => document.body.classList.contains('lost') || {str(condition == 'guided').lower()} === "
                 "(document.querySelector('#advice').textContent !== 'Guidance is off')")  # fmt: skip
@@ -139,10 +137,8 @@ def test_the_whole_questionnaire_by_key_in_german(
     page.keyboard.press("Enter")
     until(page, "() => window.sitting().kind === 'trial'")
     found = answers(tmp_path)
-    assert (
-        list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70]
-        and tlx.compute_scores(found)[0]["raw"] == 57.5
-    )
+    assert list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70]
+    assert tlx.compute_scores(found)[0]["raw"] == 57.5
 
 
 def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
