@@ -170,7 +170,7 @@ DESCRIPTIONS = {
 
 
 @pytest.mark.parametrize("kind", DESCRIPTIONS)
-@pytest.mark.parametrize("side", ["dbc", "twin_dbc"])
+@pytest.mark.parametrize("side", ["dbc", pytest.param("twin_dbc", marks=pytest.mark.slow)])
 def test_ends_of_other_descriptions_never_get_ready(
     machine: Machine, tmp_path: Path, kind: str, side: str, record_property: Note
 ) -> None:
@@ -301,7 +301,7 @@ def test_inside_a_box_the_slew_turns_outward_alone(
         assert turned_rad < -0.2
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("side", [1.0, pytest.param(-1.0, marks=pytest.mark.slow)])
 def test_a_joint_with_a_long_dead_time_rests_before_its_stop(
     machine: Machine, tmp_path: Path, side: float, record_property: Note
 ) -> None:
