@@ -31,26 +31,6 @@ def draw_pattern(condition: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(np.rint(gray), 0, 255).astype(np.uint8), np.array(rows)
 
 
-def draw_occluded(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns discs of which a bar covers a third, and their rows `(n, 5)`."""
-    generator = np.random.default_rng(seed)
-    large = np.full((384 * FINE, 512 * FINE), 190, np.float32)
-    rows = []
-    for x in range(60, 480, 95):
-        for y in range(60, 350, 90):
-            a = generator.uniform(18, 32)
-            rows.append((x, y, a, a * generator.uniform(0.7, 1.0), generator.uniform(0, np.pi)))
-            fill(large, rows[-1], 45.0)
-            left = FINE * round(x + 0.25 * a)
-            cv2.rectangle(large, (left, FINE * (y - 42)), (left + 200, FINE * (y + 42)), 120.0, -1)
-    gray = cv2.GaussianBlur(
-        cv2.resize(large, (512, 384), interpolation=cv2.INTER_AREA), (0, 0), 0.7
-    )
-    return np.clip(gray + generator.normal(0, 1, gray.shape), 0, 255).astype(np.uint8), np.array(
-        rows
-    )
-
-
 def draw_negative(kind: str) -> np.ndarray:
     """Returns a grey picture without an ellipse, `(384, 512)`."""
     generator = np.random.default_rng(3)

@@ -192,14 +192,3 @@ def test_resolved_runs_again_in_a_new_folder(
     assert first == again
     assert brokk("--config-dir", "run", "--config-name", "resolved").code == 0
     assert [path.name.split("_", 2)[2] for path in (tmp_path / "runs").iterdir()] == ["parts"]
-
-
-def test_a_folder_that_holds_a_run_is_refused(
-    mine: Path, brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    assert brokk("mode=show", "session.out=run").code == 0
-    before = (tmp_path / "run" / "session.json").read_text()
-    done = brokk("mode=show", "session.out=run")
-    assert done.code == 2
-    assert "already holds a run" in done.err
-    assert (tmp_path / "run" / "session.json").read_text() == before

@@ -98,14 +98,6 @@ def test_the_source_distribution_installs_and_lists_the_same(
     assert str(tmp_path) in run_in(other, "python", "-c", "import conf; print(conf)").stdout
 
 
-def test_nothing_comes_from_the_checkout(home: Path) -> None:
-    program = (
-        "import brokk_rl, conf, tasks; print(brokk_rl.__file__, conf.__file__, tasks.__path__)"
-    )
-    told = run_in(home, "python", "-c", program).stdout
-    assert told.count(str(home / "env")) == 3 and str(ROOT) not in told
-
-
 def test_it_evaluates_the_policy_that_ships(home: Path) -> None:
     done = run_in(
         home, "brokk", "mode=evaluate", "evaluation.episodes=16", "evaluation.video=false",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import motion
@@ -17,7 +16,6 @@ from actuators.models.lag import FirstOrderLag
 from actuators.models.parameters import open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from brokk_rl.kinematics import GRAVITY_M_S2, Gravity
 from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")
@@ -141,41 +139,6 @@ def test_a_dead_time_beyond_the_history_is_refused(machine: Machine, dead_time_s
         lag(dead_time_s=dead_time_s).build(machine, 1, CPU)
 
 
-def test_gravity_of_a_hanging_arm_is_the_sum_of_moments(machine: Machine) -> None:
-    # arm stretched out level: every centre of mass lies ahead of q5 by com_x, and so on back to q2
-    q = torch.zeros(1, 5)
-    load = Gravity(machine, CPU).load(q)[0]
-    q5 = 225 * 0.42
-    q4 = 110 * 0.45 + 225 * (1.00 + 0.42)
-    q3 = 150 * 0.60 + 110 * (1.25 + 0.45) + 225 * (2.25 + 0.42)
-    q2 = 230 * 0.72 + 150 * (1.5 + 0.60) + 110 * (2.75 + 0.45) + 225 * (3.75 + 0.42)
-    np.testing.assert_allclose(load, GRAVITY_M_S2 * np.array([0.0, q2, q3, q4, q5]), rtol=1e-4)
-
-
-def test_gravity_is_the_slope_of_potential_energy(machine: Machine) -> None:
-    q = torch.tensor([[0.3, -0.7, 0.9, 0.5, -0.4]], dtype=torch.float64)
-    load = Gravity(machine, CPU).load(q.float())[0]
-    slope = [
-        (_energy(machine, q + step) - _energy(machine, q - step)) / 2e-4
-        for step in 1e-4 * torch.eye(5, dtype=torch.float64)
-    ]
-    np.testing.assert_allclose(load, -np.array(slope), atol=2.0)
-
-
-def _energy(machine: Machine, q: torch.Tensor) -> float:
-    """Potential energy, with the arm's pitch summed by hand (q2 to q5 turn about y, positive down)."""
-    pitch, height, energy = 0.0, 0.62 + 0.28, 0.0
-    lengths = [body.origin_m[0].value for body in machine.bodies[2:]] + [0.0]
-    for body, length, angle in zip(machine.bodies[1:], lengths, q[0, 1:].tolist(), strict=True):
-        pitch += angle
-        x, _, z = body.com_m
-        energy += (
-            body.mass_kg.value * GRAVITY_M_S2 * (height - x * math.sin(pitch) + z * math.cos(pitch))
-        )
-        height -= length * math.sin(pitch)
-    return energy
-
-
 def test_the_plant_starts_to_move_near_the_machines_dead_time(machine: Machine) -> None:
     for name in machine.joint_names:
         path = roll(option("actuator", "hydraulic"), machine, held(machine, 20, **{name: 1.0}))
@@ -208,12 +171,6 @@ def test_twice_the_pumps_flow_halves_the_speeds(machine: Machine) -> None:
     both = roll(plant, machine, held(machine, 40, q3=1.0, q4=1.0))
     assert speed(both, machine, "q3") == pytest.approx(0.5 * speed(alone, machine, "q3"), rel=0.01)
     assert speed(both, machine, "q4") == pytest.approx(0.5 * 0.34, rel=0.01)
-
-
-def test_enough_flow_leaves_joints_alone(machine: Machine) -> None:
-    plant = plain_plant(flow_share=0.5)
-    both = roll(plant, machine, held(machine, 40, q3=1.0, q4=1.0))
-    assert speed(both, machine, "q3") == pytest.approx(0.26, rel=0.01)
 
 
 def test_a_command_inside_the_overlap_moves_nothing(machine: Machine) -> None:

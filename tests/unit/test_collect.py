@@ -138,15 +138,12 @@ def test_actuator_and_effects_are_chosen_as_everywhere(
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("link=simulatd",), ("there is no link=simulatd", "did you mean 'simulated'?")),
         (("excitation=[levels,hold]",), ("there is no excitation=hold",)),
         (
             ("excitation=[holds,ramps]", "collect.run_minutes=0.2", "collect.file_minutes=0.2"),
             ("excitation=holds", "run_minutes"),
         ),
         (("collect.guards.max_command=2",), ("max_command: expected", "equal to 1, got 2")),
-        (("collect.flush_s=0",), ("flush_s: expected",)),
-        (("actuator.gian=2",), ("'actuator' has no 'gian'",)),
     ],
     ids=str,
 )

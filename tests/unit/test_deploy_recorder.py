@@ -288,16 +288,6 @@ def test_a_capture_of_another_machine_or_of_nothing_is_refused(
         READER.read(tmp_path / "none.mcap", machine)
 
 
-def test_a_capture_that_was_cut_off_is_converted(
-    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
-) -> None:
-    write(tmp_path / "run", machine, seconds=6.5)
-    content = (tmp_path / "run" / MCAP).read_bytes()
-    (tmp_path / "run" / MCAP).write_bytes(content[:-200])
-    done = brokk("mode=convert", "import=capture", "convert.input=run/*.mcap", "session.out=made")
-    assert done.code == 0 and len(record.read_recordings("made/recordings/*.parquet", machine)) == 1
-
-
 def test_messages_of_numbers_are_kept_by_column_and_others_as_they_are() -> None:
     said = [
         (0.1, {"q": 1.5, "sent": True}),

@@ -35,18 +35,6 @@ def library(share: float | dict[str, float], *specs: Any) -> Library:
     return Library(share=share, effects={spec.name(): spec for spec in specs})
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in EFFECTS if name not in ("frame_loss", "delay_jitter", "sensor_noise")]
-)
-def test_an_effect_does_in_the_library_what_it_does_alone(name: str, machine: Machine) -> None:
-    build, u, spec = option("actuator", "lag").build, draw_commands(machine, 60, 3, 1), fixed(name)
-    alone = spec.wrap(build(machine, 3, CPU), machine, 3, CPU)
-    together = library(1.0, spec).wrap(build(machine, 3, CPU), machine, 3, CPU)
-    assert torch.equal(roll(together, machine, u), roll(alone, machine, u))
-    assert torch.equal(together.measure(u[7]), alone.measure(u[7]))
-    assert torch.equal(together.truth(u[7]), alone.truth(u[7]))
-
-
 def test_all_together_are_one_around_the_other(machine: Machine) -> None:
     chance = ("frame_loss", "delay_jitter", "sensor_noise")
     build, u, specs = (
@@ -65,8 +53,7 @@ def test_all_together_are_one_around_the_other(machine: Machine) -> None:
     assert together.sides == {"command", "speed", "joints", "measurement"}
 
 
-@pytest.mark.parametrize("actuator", ["mlp", "lag"])
-def test_where_no_effect_is_there_nothing_changes(actuator: str, machine: Machine) -> None:
+def test_where_no_effect_is_there_nothing_changes(machine: Machine) -> None:
     build, u = option("actuator", "mlp").build, draw_commands(machine, 60, 3, 1)
     model = replace(option("effect", "library"), share=0.0).wrap(
         build(machine, 3, CPU), machine, 3, CPU

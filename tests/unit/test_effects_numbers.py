@@ -16,8 +16,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actuators.effects.composition import ActuatorWithEffects
-from actuators.effects.kinematics import rotate_points
-from brokk_rl.checks import check_actuator
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -379,15 +377,6 @@ def test_candidates_run_side_by_side(machine: Machine) -> None:
     np.testing.assert_allclose(path[1, :, 0], [0.01, 0.02, 0.04], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "effects", [{}, {"encoder_bias": {}, "sensor_noise": {}, "quantisation": {}, "backlash": {}}]
-)
-def test_an_actuator_with_its_effects_is_an_actuator(
-    machine: Machine, effects: dict[str, Any]
-) -> None:
-    check_actuator(affected("lag", **effects), machine)
-
-
 def test_a_longer_link_moves_the_tool_along_it(machine: Machine) -> None:
     q = torch.zeros(1, 5)  # stretched out level: every link behind q2 points ahead
     tip_m = Kinematics(machine).pose(q).tip_in_base_m
@@ -398,21 +387,6 @@ def test_a_longer_link_moves_the_tool_along_it(machine: Machine) -> None:
     q[0, 3] = math.pi / 2  # the third arm and the tool hang down
     np.testing.assert_allclose(model.tool(tip_m, q) - tip_m, [[0.01, 0, 0.015]], atol=1e-6)
     np.testing.assert_allclose(model.misplacement(q), [[0.01, 0, 0.015]], atol=1e-6)
-
-
-def test_a_longer_link_is_what_longer_origins_are(machine: Machine) -> None:
-    joints = list(machine.joints)
-    x, y, z = machine.bodies[3].origin_m
-    joints[3] = replace(
-        joints[3],
-        body=replace(machine.bodies[3], origin_m=(replace(x, value=x.value + 0.03), y, z)),
-    )
-    q = torch.rand(4, 5, generator=torch.Generator().manual_seed(2)) - 0.5
-    tip_m = Kinematics(machine).pose(q).tip_in_base_m
-    expected = Kinematics(replace(machine, joints=tuple(joints))).pose(q).tip_in_base_m
-    # From q3 to q4.
-    model = wrapped("link_length", machine, num=4, extra_m={"q3": 0.03, "other": 0})
-    torch.testing.assert_close(model.tool(tip_m, q), expected, rtol=0, atol=2e-6)
 
 
 def test_tilt_turns_the_tool_with_the_base(machine: Machine) -> None:
@@ -439,10 +413,3 @@ def test_extrinsics_turn_and_displace_what_the_camera_sees(machine: Machine) -> 
     )
     tip_m = Kinematics(machine).pose(torch.zeros(1, 5)).tip_in_base_m
     torch.testing.assert_close(model.misplacement(torch.zeros(1, 5)), model.target(tip_m) - tip_m)
-
-
-@given(angles=st.tuples(*[st.floats(-0.3, 0.3)] * 3), point=st.tuples(*[st.floats(-5, 5)] * 3))
-@few
-def test_turning_keeps_lengths(angles: tuple[float, ...], point: tuple[float, ...]) -> None:
-    got = rotate_points(torch.tensor([point]), *(torch.tensor([[angle]]) for angle in angles))
-    assert got.norm().item() == pytest.approx(math.dist(point, (0, 0, 0)), abs=1e-4)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,13 +19,9 @@ from actuators.person import HumanFollower
 from brokk_rl.build import describe_spec
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.policy_choice import CLASSICAL, _insert_behaviour
 from brokk_rl.policy_folder import find_policy
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.policy import ClassicalPolicy
-from brokk_rl.rl.settings import Evaluation
-from brokk_rl.session import Session
 
 CPU = torch.device("cpu")
 NEUTRAL: dict[str, Any] = {
@@ -327,27 +322,6 @@ def test_a_loop_behind_a_person_goes_on_exactly_when_restored(machine: Machine) 
         other.step(action)
     first = state_of(loop)
     assert all(torch.equal(value, first[name]) for name, value in state_of(other).items())
-
-
-def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_path: Path) -> None:
-    task = replace(option("task", "borehole_insertion"), episode_s=6.0)
-    plant = runs.plant(machine, task, follower=option("follower", "person"))
-    how = Evaluation(episodes=16, seed=3, num_recorded=1, video=False)
-    for name in ("one", "other"):
-        session = Session(out=str(tmp_path / name), seed=0, device="cpu")
-        session.folder.mkdir()
-        torch.manual_seed(len(name))
-        results = evaluate_policies(
-            plant,
-            how,
-            session,
-            {"first": ClassicalPolicy(task=None), "second": ClassicalPolicy(task=None)},
-        )
-        assert results["policies"]["first"] == results["policies"]["second"]
-        assert results["follower"] == "person"
-    assert (tmp_path / "one" / "evaluation.json").read_text() == (
-        tmp_path / "other" / "evaluation.json"
-    ).read_text()
 
 
 def test_the_controller_beside_a_policy_without_advice_keeps_its_own(

@@ -157,14 +157,6 @@ def test_valve_commands_get_neutral_full_and_sign_from_the_logs(sign: int) -> No
     assert {key: command[key] for key in expected} == pytest.approx(expected)
 
 
-def test_commands_that_go_one_way_only_are_said() -> None:
-    t_s, levels, q = make_valve([0.0, 0.0, 0.6, 1.0], back=0.4)  # it falls back by its weight
-    write_table(Path("a.csv"), {"t": t_s, "u": 200 * levels, "q": q})
-    done, recordings = import_log("log.input=a.csv")
-    assert "commands go one way only" in done.out and recordings
-    assert draft_file(MAP_TEMPLATE)["joints"]["joint"]["command"]["full_minus"] is None
-
-
 def test_joints_that_are_never_commanded_are_left_out_and_said() -> None:
     targets = make_targets()
     still = np.full(len(targets), 0.5)
@@ -286,17 +278,6 @@ def test_files_of_one_run_in_a_folder_keep_their_clocks_and_a_given_offset() -> 
     _, recordings = import_log("log.input=logs", offset)
     found = recordings[0]["q_hip_rad"]
     np.testing.assert_allclose(found, delay(targets)[: len(found), 0], atol=1e-5)
-
-
-def test_a_slide_in_millimetres_stands_beside_hinges_in_radians() -> None:
-    targets = make_targets()
-    columns = {"t_ms": 1000.0 * np.arange(len(targets)) / RATE_HZ}
-    for j, (name, scale) in enumerate((("hip", 1.0), ("lift_mm", 100.0))):
-        columns[f"cmd_{name}"] = scale * targets[:, j]
-        columns[f"meas_{name}"] = scale * delay(targets)[:, j]
-    write_table(Path("a.csv"), columns)
-    drafted = draft_file(MACHINE_TEMPLATE)
-    assert {one["name"]: one["kind"] for one in drafted["joints"]} == {"hip": "hinge", "lift": "slide"}  # fmt: skip
 
 
 def test_speeds_in_rad_per_second_count_alike_both_ways() -> None:

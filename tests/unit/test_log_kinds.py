@@ -146,23 +146,6 @@ def test_every_layout_of_text_gives_both_joints(name: str, lines: list[str], enc
 
 
 @pytest.mark.parametrize(
-    ("names", "factor"),
-    [
-        (("t [s]", "hip target [turns]", "hip pos [turns]", "knee target [turns]", "knee pos [turns]"), 1 / math.tau),
-        (("Time[ms]", "AxisSetPosHip[gon]", "AxisActPosHip[gon]", "AxisSetPosKnee[gon]", "AxisActPosKnee[gon]"), 200 / math.pi),
-    ],
-)  # fmt: skip
-def test_units_behind_names_are_read(names: tuple[str, ...], factor: float) -> None:
-    rows = make_rows()
-    rows[:, 1:] *= factor
-    rows[:, 0] *= 1000.0 if "ms" in names[0] else 1.0
-    write_text("a.csv", rows, names)
-    done, recordings = import_log("log.input=a.csv")
-    assert "No guess is unsure" in done.out
-    check_joints(recordings, atol=5e-3)
-
-
-@pytest.mark.parametrize(
     ("unit", "factor", "text"),
     [
         ("furlong", 1.0, "its unit 'furlong' is not known"),
@@ -617,20 +600,6 @@ def test_arm_and_wheels_on_one_topic_keep_their_own_rates() -> None:
     check_joints(recordings)
 
 
-def test_two_arms_on_topics_of_their_own_keep_all_joints() -> None:
-    messages = []
-    for row in make_rows():
-        for side, first in (("left", 1), ("right", 3)):
-            content = {"name": ["hip"], "target": [row[first]]}
-            messages.append((row[0], f"/{side}/joint_commands", content))
-            content = {"name": ["hip"], "position": [row[first + 1]]}
-            messages.append((row[0], f"/{side}/joint_states", content))
-    write_messages("a.mcap", messages)
-    done, recordings = import_log("log.input=a.mcap")
-    assert "No guess is unsure" in done.out
-    assert {"q_left_hip_rad", "q_right_hip_rad"} <= recordings[0].keys()
-
-
 @pytest.mark.parametrize("is_stamped", [True, False])
 def test_two_programs_on_one_topic_are_never_sure_and_a_stamp_of_zero_is_no_clock(
     is_stamped: bool,
@@ -659,27 +628,6 @@ def test_the_next_log_of_a_kind_fits_into_the_draft() -> None:
     reader, machine = (extensions.load_option(one, f"@{one}.yaml") for one in ("import", "machine"))
     (recording,) = reader.read(Path("b.csv"), machine)
     assert recording.num_samples == len(rows)
-
-
-def test_a_joint_that_hangs_is_remarked_by_convert_and_inspect(brokk: Callable[..., Done]) -> None:
-    rows = make_rows(1500)
-    rows[300:700, 4] = 1.5  # it hangs, while its target goes on
-    write_text("a.csv", rows)
-    pairs = ", ".join(f'{one}: ["{one}_target_rad", "{one}_pos_rad"]' for one in ("knee", "hip"))
-    given = f"log.joints={{{pairs}}}"
-    brokk("mode=import", "log.input=a.csv", "log.name=leg", "session.out=draft", given)
-    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml")
-    done = brokk("mode=convert", "convert.input=a.csv", *options, "session.out=read")
-    assert done.code == 0, done.err
-    (line,) = [line for line in done.out.splitlines() if "does not obey" in line]
-    assert "knee" in line and "6.0" in line and "13." in line
-    assert "jumps" in done.out
-    inspected = ("inspect.recordings=read/recordings/*", "session.out=seen")
-    done = brokk("mode=inspect", options[0], *inspected)
-    assert done.code == 0, done.err
-    found = json.loads(Path("seen/inspection.json").read_text())["recordings"][0]["findings"]
-    assert {one["kind"] for one in found if one["joint"] == "knee"} >= {"does not obey", "jumps"}
-    assert not [one for one in found if one["joint"] == "hip"]
 
 
 @pytest.mark.parametrize("command", ["position", "velocity", "torque"])

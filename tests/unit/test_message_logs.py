@@ -15,7 +15,6 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from log_import import write_messages
 from mcap.writer import Writer
 
-from actuators.recordings.column_map import AlignedTime, Column
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 
@@ -160,28 +159,6 @@ def test_messages_of_every_encoding_give_the_same_recording(
     (recording,) = reader.read(tmp_path / name, carriage)
     # stamps are seconds since 1970, rounded to 0.2 µs; the position steps by 0.12 m within 10 ms
     check(recording, 1e-5 if reader.time.column == "header.stamp" else 1e-6)
-
-
-def test_the_sensor_clock_of_a_topic_replaces_a_late_recorder(
-    tmp_path: Path, carriage: Machine
-) -> None:
-    generator, path = random.Random(0), tmp_path / "late.mcap"
-    messages = []
-    for t_s, u, q in zip(*make_signals().values(), strict=True):
-        header = {"stamp": t_s + 5.0}  # seconds since the sensor was switched on
-        for topic, value in (("/command", u), ("/state", q)):
-            late_s = t_s + 0.001 + 0.002 * generator.random()
-            messages.append((late_s, topic, {"header": header, "value": value}))
-    write_messages(path, messages)
-    late = make_topic_map("value", "value").read(path, carriage)[0]
-    time = AlignedTime(
-        column="header.stamp", scale=1.0, anchor=Column(column="log_time", scale=1.0, offset=0.0)
-    )
-    aligned = replace(make_topic_map("value", "value"), time=time).read(path, carriage)[0]
-    q = make_signals()["q"].astype(np.float32)
-    steady = slice(2, 25)  # the position steps back at row 32
-    errors = [np.abs(r.q[steady, 0] - np.interp(r.t_s[steady], r.t_s, q[: len(r.t_s)])).max() for r in (late, aligned)]  # fmt: skip
-    assert errors[1] < 0.1 * errors[0]
 
 
 def test_a_damaged_sqlite_bag_is_refused_by_its_name(tmp_path: Path, carriage: Machine) -> None:

@@ -25,7 +25,6 @@ from brokk_rl.policy_folder import (
     TaskDescription,
     describe_policy,
     describe_task,
-    find_policy,
     list_differences,
     read_checkpoint,
     write_policy,
@@ -182,19 +181,6 @@ def test_resuming_in_another_task_is_refused_by_name(shallow: Path, machine: Mac
     runner = runs.make(machine, shallow, training)
     with pytest.raises(CheckpointError, match=r"task\.depth_m is 0\.1 there, 0\.14 here.*resolved"):
         runner.load(str(shallow / "model_2.pt"))
-
-
-def test_weights_of_another_policy_are_noticed(
-    shallow: Path, machine: Machine, tmp_path: Path
-) -> None:
-    for name in ("policy.json", "golden.json", "policy.onnx"):
-        shutil.copy(SHIPPED / name, tmp_path / name)
-    shutil.copy(shallow / "policy.safetensors", tmp_path / "policy.safetensors")
-    with pytest.raises(CheckpointError, match=r"policy\.safetensors and policy\.json are of diff"):
-        find_policy(str(tmp_path)).read()
-    shutil.copy(shallow / "policy.onnx", tmp_path / "policy.onnx")
-    with pytest.raises(CheckpointError, match=r"policy\.json and policy\.onnx do not belong"):
-        PolicyBundle(str(tmp_path), machine)
 
 
 def test_a_pitch_is_given_exactly_where_the_policy_asks_for_one(machine: Machine) -> None:

@@ -8,7 +8,7 @@ import torch
 
 from perception.train import evaluation
 from perception.train.augmentation import Augmentation
-from perception.train.samples import Crop, Samples, TrainingViews, cut_windows
+from perception.train.samples import Crop, Samples, TrainingViews
 
 
 def test_each_picture_is_changed_its_own_way_and_the_mask_is_not() -> None:
@@ -28,19 +28,6 @@ def test_each_picture_is_changed_its_own_way_and_the_mask_is_not() -> None:
     assert one.shape == (2, 3, 48, 80) and one.min() >= 0.0 and one.max() <= 1.0
     assert torch.equal(one, same) and torch.equal(mask[0], mask[1])
     assert not torch.equal(one[0], one[1]) and not torch.equal(one, other)
-
-
-def test_a_crop_keeps_picture_and_mask_together() -> None:
-    crop = Crop(width=(0.5, 1.1), shift=0.2, roll_rad=0.3, mirror=0.5)
-    bright = torch.zeros(12, 2, 144, 240, dtype=torch.uint8)
-    bright[:, 0, 50:90, 80:150] = 255
-    bright[:, 1] = 255 - bright[:, 0]
-    windows = crop.windows(torch.ones(12), (144, 240))
-    seen = cut_windows(bright, windows, (80, 48))
-    assert seen.shape == (12, 2, 48, 80)
-    inside = cut_windows(torch.full_like(bright, 255), windows, (80, 48))[:, 0]
-    torch.testing.assert_close(seen[:, 0] + seen[:, 1], inside)
-    assert len({round(float(one.sum()), 1) for one in seen[:, 0]}) == 12
 
 
 @pytest.mark.parametrize("closer", [0.0, 1.0])

@@ -15,11 +15,9 @@ import yaml
 from composed import option
 from scipy.spatial.transform import Rotation
 
-from brokk_rl import record
 from brokk_rl.errors import FrameError
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from perception import dataset
 from perception.calibrate import arm, clock_offset, hand_eye, transforms, verdict
 from perception.calibrate.extrinsics import compute_point_std_m, load_extrinsics
@@ -228,44 +226,6 @@ def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
     Path("degrees.yaml").write_text(yaml.safe_dump({"000": [0.0, -43.0, 34.0, 28.0, 28.0]}))
     done = brokk(*command, "calibration.joints=degrees.yaml")
     assert done.code == 2 and "are these degrees?" in done.err
-
-
-@pytest.mark.slow
-def test_a_board_filmed_while_the_arm_moves_is_enough(
-    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
-) -> None:
-    poses = board.posed(machine, 12, 1)
-    t_s, knots = np.arange(0.0, 14.0, 0.05), np.arange(12.0)
-    # Of each second, 0.6 s on the way to the next pose.
-    eased = np.floor(t_s) + np.clip((t_s % 1.0 - 0.2) / 0.6, 0.0, 1.0)
-    q = np.stack([np.interp(eased, knots, column) for column in poses.q.T], 1)
-    recording = Recording(
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=("rad",) * 5,
-        rate_hz=20.0,
-        t_s=t_s,
-        u=np.zeros_like(q),
-        q=q,
-    )
-    record.write_recording(recording, tmp_path / "run.parquet")
-    frame_s, late_s, chance = np.arange(0.5, 11.5, 0.4), 0.12, np.random.default_rng(0)
-    dataset.write_camera(tmp_path, board.MATRIX, (1280, 720), None, None)
-    there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)
-    links = arm.compute_link_poses(machine, there).base_from_link
-    for number, link in enumerate(links):
-        seen = transforms.invert(board.CAMERA) @ link @ poses.link_from_board
-        dataset.write_picture(tmp_path / f"{number:03d}.color.png", board.picture(seen, chance))
-    # the folder's first frame is at 0 s, the recording's clock says 0.5 + 0.12 s then
-    done = brokk(
-        "mode=calibrate", f"calibration.source.folder={tmp_path}", "calibration.source.rate_hz=2.5",
-        f"calibration.joints={tmp_path / 'run.parquet'}", "session.out=run",
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    told = yaml.safe_load(Path("run/calibration.yaml").read_text())
-    assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(0.62, abs=0.01)
-    mm, degrees = off(np.array(told["T_base_cam"]))
-    assert mm < 4.0 and degrees < 0.1
 
 
 def judged(machine: Machine, poses: board.Posed, q: np.ndarray, seed: int) -> verdict.Verdict:

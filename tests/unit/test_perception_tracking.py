@@ -46,21 +46,6 @@ def test_holes_keep_their_names_are_averaged_by_variance_and_forgotten() -> None
     assert [one.name for one in tracker.update([detect((2.9, -0.4, 0.75))], 12.5)] == [1, 3]
 
 
-def test_averaging_takes_noise_away_as_far_as_the_memory_reaches() -> None:
-    tracker, generator = replace(FUSION, memory=1000).build(), np.random.default_rng(0)
-    for number in range(50):
-        center = np.array([2, 0, 0.4]) + generator.normal(0, 0.002, 3)
-        (hole,) = tracker.update([detect(tuple(center), 0.002)], 0.1 * number)
-    assert np.linalg.norm(hole.pose.center_m - [2, 0, 0.4]) < 0.0015
-    assert hole.std_m == pytest.approx(0.002 / np.sqrt(50))
-    assert np.diag(hole.pose.cov_m2) == pytest.approx(0.002**2 / 50)
-    tracker = FUSION.build()
-    for number in range(50):
-        (hole,) = tracker.update([detect((2, 0, 0.4), 0.002)], 0.1 * number)
-    assert hole.std_m == pytest.approx(0.002 / np.sqrt(FUSION.memory + 1))
-    assert np.diag(hole.pose.cov_m2) == pytest.approx(0.002**2 / (FUSION.memory + 1))
-
-
 def test_a_direction_that_is_measured_badly_stays_the_worst() -> None:
     cov = np.diag([0.001, 0.001, 0.004]) ** 2
     tracker = FUSION.build()

@@ -78,25 +78,6 @@ def test_a_small_network_learns_the_block_in_seconds(trained: Path) -> None:
     assert {path.name for path in trained.iterdir()} >= {"segmenter.onnx", "segmenter.safetensors"}
 
 
-def test_a_training_begins_with_the_network_it_is_given(
-    brokk: Callable[..., Any], frames: Path, trained: Path
-) -> None:
-    command = (
-        "mode=train_perception", f"training.frames={frames}", *SMALL, "training.rate=1e-9", "training.updates=1",
-        "training.hold_out=4", f"training.start={trained / 'segmenter.safetensors'}",
-    )  # fmt: skip
-    done = brokk(*command, "session.out=again")
-    assert done.code == 0, done.err
-    before, after = (
-        json.loads(Path(folder, "training.json").read_text()) for folder in (trained, "again")
-    )
-    begun = after["curve"][0]
-    assert (begun["update"], begun["loss"]) == (0, None), "what it began with is judged too"
-    assert begun["block"] == pytest.approx(before["conditions"]["all"]["block"], abs=1e-3)
-    refused = brokk(*command, "training.widths=[6,12]", "session.out=no")
-    assert refused.code == 2 and "widths [6, 12, 16]" in refused.err
-
-
 def test_a_stopped_training_leaves_the_best_network_to_go_on_with(
     brokk: Callable[..., Any], frames: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -286,31 +286,6 @@ def test_a_weight_that_the_last_update_spoils_is_named_and_not_written(
     assert not list_checkpoints(tmp_path)
 
 
-def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(
-    machine: Machine, tmp_path: Path
-) -> None:
-    runner = runs.make(
-        machine, tmp_path, runs.small(max_env_steps=3 * ITERATION, max_fault_rate=0.1)
-    )
-    step, calls = runner.env.world.step, [0]
-
-    def diverges_once(increment: torch.Tensor) -> None:
-        step(increment)
-        calls[0] += 1
-        if calls[0] == 2:
-            runner.env.world.q[3] = torch.nan
-            runner.env.world.contact_force_n[3] = torch.nan
-            runner.env.world.faults[3] = True
-
-    runner.env.world.step = diverges_once  # type: ignore[method-assign]
-    runner.run()
-    rows = runs.progress(tmp_path)
-    assert [float(row["fault_rate"]) for row in rows] == [1 / ITERATION, 0.0, 0.0]
-    assert float(rows[0]["episode/end/fault"]) == 1.0
-    assert all(value != "nan" for row in rows for value in row.values())
-    assert all(value.isfinite().all() for value in runs.weights(runner).values())
-
-
 def test_the_divergence_of_updates_falls_to_a_tenth_while_the_policy_settles() -> None:
     training = runs.small(max_env_steps=100, settling=0.5)
     assert [training.divergence(share) for share in (0.0, 0.5, 0.75, 1.0, 1.2)] == pytest.approx(

@@ -16,18 +16,6 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.rl.logger import TensorBoardTracking, WandbTracking, _find_sweep
 
 
-def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
-    tracker = TensorBoardTracking().open(tmp_path, {}, 0)
-    for step in range(3):
-        tracker.log({"episode/success_strict": 0.1 * step, "loss/value": 2.0}, step)
-    tracker.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
-    scalars = events.Scalars("episode/success_strict")
-    found = [(event.step, round(event.value, 3)) for event in scalars]
-    assert found == [(0, 0.0), (1, 0.1), (2, 0.2)]
-    assert len(events.Scalars("loss/value")) == 3
-
-
 def test_a_run_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
     for process, (first, last) in enumerate([(0, 8), (5, 10)]):
         tracker = TensorBoardTracking().open(tmp_path, {}, first)

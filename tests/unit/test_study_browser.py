@@ -141,41 +141,6 @@ def test_the_whole_questionnaire_by_key_in_german(
     assert tlx.compute_scores(found)[0]["raw"] == 57.5
 
 
-def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
-    tmp_path: Path, asked: Conductor, opened: Callable[..., Any]
-) -> None:
-    with open_study(asked) as port:
-        page = opened(port)
-        at(page, 0)
-        page.keyboard.press("End")
-        until(page, "() => window.sitting().ratings.mental === 100")
-        page.keyboard.press("Enter")
-        at(page, 1)
-        page.context.close()  # no goodbye
-        page = opened(port)
-        at(page, 1)
-        page.keyboard.press("Home")
-        until(page, "() => window.sitting().ratings.physical === 0")
-    again = conductor(tmp_path, Arm())  # another process would know no more than this
-    again.choose("P01")
-    with open_study(again, port):
-        until(page, "() => window.sitting().at === 2")  # the page comes back by itself
-        page.locator("#study .language").click()
-        until(
-            page,
-            "() => document.querySelector('#study h1').textContent === 'Zeitliche Anforderung'",
-        )
-        for screen in range(2, 6):
-            at(page, screen)
-            page.locator("#study .answers button").last.click()  # left open
-        at(page, 6)
-        assert page.locator("#study h1").inner_text() == "4 Fragen sind offen"
-        page.locator("#study .answers button").last.click()
-        until(page, "() => window.sitting().kind === 'trial'")
-    found = answers(tmp_path)
-    assert found["ratings"] == {"mental": 100, "physical": 0} and found["finished"]
-
-
 def test_nobody_leads_a_sitting_without_the_key(port: int, lead: Conductor, browser: Any) -> None:
     page = browser.new_context().new_page()
     page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))

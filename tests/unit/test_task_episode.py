@@ -344,22 +344,6 @@ def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine:
     assert end.reward.item() < -5.0, "5 (1 + closeness) is lost"
 
 
-def test_the_time_limit_is_a_time_out_and_no_failure(machine: Machine) -> None:
-    stage = Stage(machine, episode_s=0.2)
-    ends = [stage.step() for _ in range(4)]
-    assert [bool(end.timed_out) for end in ends] == [False, False, False, True]
-    assert not any(bool(end.terminated) for end in ends)
-    assert stage.process.reasons[int(ends[3].reason)] == "time_limit"
-
-
-def test_an_episode_that_fails_in_its_last_step_is_no_time_out(machine: Machine) -> None:
-    stage = Stage(machine, episode_s=0.05)
-    stage.history.q[0, -1, 0] = float(machine.upper[0])
-    end = stage.step()
-    assert stage.process.reasons[int(end.reason)] == "joint_limit"
-    assert end.terminated.item() and not end.timed_out.item()
-
-
 def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine: Machine) -> None:
     stage = Stage(machine, episode_s=1.0)
     stage.process.state["steps"].fill_(18.0)  # what rsl-rl does through episode_length_buf
@@ -599,25 +583,3 @@ def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
     }
     for part, value in expected.items():
         torch.testing.assert_close(seen[part], value, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", TASKS)
-@pytest.mark.parametrize("kind", ["direct", "residual"])
-def test_the_deployed_policy_commands_what_the_task_does(
-    name: str, kind: str, machine: Machine
-) -> None:
-    """From the observation vector alone, with another pitch in each episode of goal_pose."""
-    stage = Stage(
-        machine, name, num_envs=64, action=replace(option("task", name).action, kind=kind)
-    )
-    torch.manual_seed(0)
-    stage.history.u.uniform_(-1, 1)
-    groups = stage.process.observe(stage.history)
-    weights = torch.randn(groups["policy"].shape[1] + groups["guide"].shape[1], 5) * 0.05
-
-    class Linear(torch.nn.Module):
-        def forward(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-            return torch.cat((groups["policy"], groups["guide"]), 1) @ weights
-
-    deployed = stage.process.deployable(Linear())(groups["policy"])
-    torch.testing.assert_close(deployed, stage.process.command(Linear()(groups)), rtol=0, atol=1e-3)
