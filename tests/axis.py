@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import torch
+from motion import make_recording, rest
 
 from actuators.models.lag import FirstOrderLag
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -37,13 +37,8 @@ def driven(
     """Returns recordings of a plant under levels and rests, its speed wandering by a percent or two."""
     random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
     model = plant.build(machine, count, CPU)
-    shape = (count, machine.num_history, machine.num_joints)
-    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-    history.reset(
-        torch.ones(count, dtype=torch.bool),
-        torch.as_tensor(machine.home, dtype=torch.float32).expand(count, -1),
-    )
-    level, left, wander = np.zeros(shape[::2]), np.zeros(shape[::2]), np.zeros(shape[::2])
+    history = rest(machine, num=count)
+    level, left, wander = np.zeros((3, count, machine.num_joints))
     commands, positions, margin = [], [], 0.2 * (machine.upper - machine.lower)
     for _ in range(steps):
         q = history.q[:, -1].numpy()
@@ -60,10 +55,4 @@ def driven(
         moved = model.step(history) - before
         history.push_q(before + moved * torch.as_tensor(1.0 + wander, dtype=torch.float32))
     u, q = (np.stack(rows, 1).astype(np.float32) for rows in (commands, positions))
-    return [
-        Recording(
-            machine=machine.name, joints=machine.joint_names, units=("rad",) * machine.num_joints, rate_hz=20.0,
-            t_s=np.arange(steps) * 0.05, u=u[n], q=q[n], metadata={"run": f"{seed}.{n}"},
-        )
-        for n in range(count)
-    ]  # fmt: skip
+    return [make_recording(machine, u[n], q[n], f"{seed}.{n}") for n in range(count)]

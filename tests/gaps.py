@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from motion import make_recording
 
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -28,7 +29,4 @@ def recording(
     moved[DELAY:] = obeyed[:-DELAY] * machine.max_speed * PERIOD_S
     noise = NOISE * np.random.default_rng(0).standard_normal((steps, 5))
     q = machine.home + np.cumsum(moved, 0) + noise
-    return Recording(
-        machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(steps) * PERIOD_S,
-        u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": "planted"},
-    )  # fmt: skip
+    return make_recording(machine, u, q, "planted")

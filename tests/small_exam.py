@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from motion import roll
 
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
 SMALL = (
@@ -20,13 +20,5 @@ SMALL = (
 
 def run_model(model: Any, machine: Machine, u: np.ndarray) -> np.ndarray:
     """Returns positions before each command `(T, J)`, from home on."""
-    shape = (1, machine.num_history, machine.num_joints)
-    history = History(torch.zeros(shape), torch.zeros(shape))
-    home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
-    history.reset(torch.ones(1, dtype=torch.bool), home)
-    q = []
-    for command in torch.as_tensor(u, dtype=torch.float32):
-        q.append(history.q[0, -1].numpy().copy())
-        history.push_u(command[None])
-        history.push_q(model.step(history))
-    return np.array(q)
+    commands = torch.as_tensor(u, dtype=torch.float32)[:, None]
+    return roll(model, machine, commands)[:-1, 0].numpy()

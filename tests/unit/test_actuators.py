@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from motion import rest
 
 from actuators.models.hydraulic import Hydraulic
 from actuators.models.lag import FirstOrderLag
@@ -25,14 +26,6 @@ ALL = ("ideal", "lag", "hydraulic", "mlp")
 def roll(actuator: Any, machine: Machine, u: torch.Tensor, q: Any = None) -> torch.Tensor:
     """Returns the positions `(T + 1, N, J)` under the commands `u` `(T, N, J)`, from rest at `q` or at home."""
     return motion.roll(actuator.build(machine, u.shape[1], CPU), machine, u, q)
-
-
-def rest(machine: Machine, q: torch.Tensor) -> History:
-    """Returns the history of a machine at rest at `q` `(N, J)`."""
-    shape = (q.shape[0], machine.num_history, machine.num_joints)
-    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-    history.reset(torch.ones(q.shape[0], dtype=torch.bool), q)
-    return history
 
 
 def held(machine: Machine, steps: int, **level: float) -> torch.Tensor:
@@ -199,7 +192,7 @@ def test_a_machine_at_rest_creeps_no_more_than_its_leak(machine: Machine) -> Non
 def test_oil_warms_with_work_and_speeds_the_machine_up(machine: Machine) -> None:
     plant = hydraulic(oil_time_s=2.0, oil_start_c=20.0, thermal_gain=0.002)
     model = plant.build(machine, 1, CPU)
-    history = rest(machine, torch.as_tensor(machine.home, dtype=torch.float32)[None])
+    history = rest(machine)
     history.u[:] = held(machine, 13, q1=1.0)[:, 0]
     early = float((model.step(history) - history.q[:, -1])[0, 0])
     steps = [float((model.step(history) - history.q[:, -1])[0, 0]) for _ in range(200)]
@@ -229,7 +222,7 @@ def test_a_run_repeats_and_environments_do_not_touch(name: str, machine: Machine
 @pytest.mark.parametrize("name", ALL)
 def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine) -> None:
     model = option("actuator", name).build(machine, 3, CPU)
-    history = rest(machine, torch.as_tensor(machine.home, dtype=torch.float32).expand(3, 5))
+    history = rest(machine, num=3)
     fresh = {key: value.clone() for key, value in model.state.items()}
     for _ in range(20):
         history.push_u(torch.ones(3, 5))

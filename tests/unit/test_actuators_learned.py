@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from composed import option
+from motion import rest
 from safetensors.torch import load_file, save_file
 from torch import nn
 
@@ -104,8 +105,7 @@ def test_the_shipped_machine_at_rest_stays_at_rest(machine: Machine) -> None:
     # Half of the smallest dead band of the plant; close to it the fit is a few mrad worse.
     for level in (0.0, 0.03, -0.03):
         model = actuator.build(machine, num_envs, CPU)
-        history = History(q=torch.zeros(num_envs, 13, 5), u=torch.zeros(num_envs, 13, 5))
-        history.reset(torch.ones(num_envs, dtype=torch.bool), q)
+        history = rest(machine, q, num_envs)
         for _ in range(200):  # 10 s
             history.push_u(torch.full((num_envs, 5), level))
             history.push_q(model.step(history))
@@ -116,8 +116,7 @@ def test_the_shipped_model_reaches_a_target_and_stays(machine: Machine) -> None:
     model = option("actuator", "mlp").build(machine, 1, CPU)
     home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
     target = home + torch.tensor([[0.5, 0.0, 0.4, -0.4, 0.5]])
-    history = History(q=torch.zeros(1, 13, 5), u=torch.zeros(1, 13, 5))
-    history.reset(torch.ones(1, dtype=torch.bool), home)
+    history = rest(machine)
     error = []
     for _ in range(600):
         gap = target - history.q[:, -1]

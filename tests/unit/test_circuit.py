@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from motion import rest, roll
 from scipy.integrate import solve_ivp
 
 from actuators.models.circuit import (
@@ -20,7 +21,6 @@ from actuators.models.circuit import (
     compute_cylinder_length,
 )
 from brokk_rl.errors import ConfigError
-from brokk_rl.history import History
 from brokk_rl.kinematics import GRAVITY_M_S2, Gravity
 from brokk_rl.machine import Machine
 
@@ -53,9 +53,7 @@ class Run:
     ) -> None:
         self.model = CircuitModel(config, machine, 1, CPU)
         at = torch.tensor(machine.home if q is None else q, dtype=torch.float32)[None]
-        shape = (1, machine.num_history, machine.num_joints)
-        history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-        history.reset(torch.ones(1, dtype=torch.bool), at)
+        history = rest(machine, at)
         u = torch.zeros(1, machine.num_joints)
         for name, level in levels.items():
             u[0, machine.joint_names.index(name)] = level
@@ -164,11 +162,7 @@ def solve_one_joint(
         ]
 
     start = CircuitModel(config, machine, 1, CPU)
-    shape = (1, machine.num_history, machine.num_joints)
-    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-    history.reset(
-        torch.ones(1, dtype=torch.bool), torch.tensor(machine.home, dtype=torch.float32)[None]
-    )
+    history = rest(machine)
     lever, _ = start._follow_linkage(history.q[:, -1])
     force = start.parameters["supply_ratio"] * start._yield_force
     begun = start._begin(history, torch.zeros(1, machine.num_joints), lever, force)
@@ -322,16 +316,9 @@ def test_effects_around_a_circuit_are_not_taken_for_contact(machine: Machine) ->
     effect = dataclasses.replace(option("effect", "flow_gain"), gain=0.8)
     inner = circuit().build(machine, 1, CPU)
     model = effect.wrap(inner, machine, 1, CPU)
-    shape = (1, machine.num_history, machine.num_joints)
-    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
-    history.reset(
-        torch.ones(1, dtype=torch.bool), torch.tensor(machine.home, dtype=torch.float32)[None]
-    )
-    for _ in range(30):
-        u = torch.zeros(1, machine.num_joints)
-        u[0, Q3] = -0.7
-        history.push_u(u)
-        history.push_q(model.step(history))
+    u = torch.zeros(30, 1, machine.num_joints)
+    u[..., Q3] = -0.7
+    roll(model, machine, u)
     assert float(inner.state["pressed"].abs().max()) < 1e-5
 
 

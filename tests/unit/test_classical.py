@@ -9,8 +9,8 @@ import pytest
 import torch
 from composed import option
 from kinematic import KinematicWorld
+from motion import rest
 
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from tasks.control import ClassicalController, _solve_4
 
@@ -185,9 +185,7 @@ def test_it_gets_there_from_many_starts_through_dead_time_and_lag(
     start = process.starts(num, 11)
     everywhere = torch.ones(num, dtype=torch.bool)
     world.reset(everywhere, start["q"], start["scene"])
-    q, u = torch.zeros(2, num, machine.num_history, 5)
-    history = History(q=q, u=u)
-    history.reset(everywhere, start["q"])
+    history = rest(machine, start["q"], num)
     model.reset(everywhere)
     process.reset(everywhere, start)
     running, done = everywhere.clone(), ~everywhere

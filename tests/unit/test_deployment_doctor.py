@@ -13,6 +13,7 @@ import onnx
 import pytest
 from arm import make_machine
 from composed import option
+from motion import make_recording
 from onnx import TensorProto, helper, numpy_helper
 
 from brokk_rl.errors import CheckpointError
@@ -120,16 +121,8 @@ def run_loop(
         extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
     if detail == "observation":
         extra |= {f"obs_{j}": obs[:, j] for j in range(obs.shape[1])}
-    return Recording(
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=("rad",) * 5,
-        rate_hz=20.0,
-        t_s=np.arange(NUM_ROWS) * 0.05,
-        u=u.astype(np.float32),
-        q=q_log.astype(np.float32),
-        extra={name: values.astype(np.float32) for name, values in extra.items()},
-    )
+    told = {name: values.astype(np.float32) for name, values in extra.items()}
+    return make_recording(machine, u, q_log, extra=told)
 
 
 def ask(policy: LoadedPolicy, recording: Recording, machine: Machine) -> DoctorAnswer:

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from motion import make_recording
 
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -35,10 +36,7 @@ def swept(machine: Machine, seconds: float, seed: int, noise: float = 3e-4) -> R
             u[t, j], q[t, j] = 0.5 * level, at
             at += 0.5 * level * speed * machine.period_s
     q += noise * random.standard_normal(q.shape)
-    return Recording(
-        machine=machine.name, joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(count) * 0.05,
-        u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": f"{seed}"},
-    )  # fmt: skip
+    return make_recording(machine, u, q, f"{seed}")
 
 
 def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine) -> None:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from motion import make_recording
 
 from actuators.recordings.recording_checks import RecordingRemark
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from diagnosis import plots, report
 from diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Outcome, Selected, Where
 from diagnosis.effect_library import load_effects
@@ -29,12 +29,7 @@ def runs(machine: Machine, count: int, seed: int, factor: float) -> WindowedRuns
     for number in range(count):
         u = np.repeat(rng.choice([-0.6, 0.0, 0.6], (30, 5)) * [1, 0, 1, 1, 1], 40, 0)
         q = machine.home + 0.1 * np.cumsum(np.roll(u, 11, 0) * machine.max_speed * 0.05, 0)
-        recordings.append(
-            Recording(
-                machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(1200) * 0.05,
-                u=u.astype(np.float32), q=q, metadata={"run": f"<run> {seed}-{number}"},
-            )
-        )  # fmt: skip
+        recordings.append(make_recording(machine, u, q, f"<run> {seed}-{number}"))
         row += range(40, 1140, 100)
         source += [number] * 11
     found = WindowedRuns(recordings, np.array(source), np.array(row), np.zeros((len(row), 100, 5)))

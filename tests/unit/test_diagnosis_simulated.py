@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from motion import make_recording
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
@@ -75,15 +76,7 @@ def move(u: np.ndarray, delay_s: float, gain: float, seed: int) -> np.ndarray:
 def record(machine: Machine, u: np.ndarray, q: np.ndarray) -> Recording:
     """Return commands and positions as a recording."""
     middle = 0.5 * (machine.lower + machine.upper)
-    return Recording(
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=("rad", "rad"),
-        rate_hz=RATE_HZ,
-        t_s=np.arange(len(u)) / RATE_HZ,
-        u=u.astype(np.float32),
-        q=(middle + 0.5 * (q - q.mean(0))).astype(np.float32),
-    )
+    return make_recording(machine, u, middle + 0.5 * (q - q.mean(0)))
 
 
 def make_case(machine: Machine, delay_s: np.ndarray, gain: np.ndarray) -> GapCase:

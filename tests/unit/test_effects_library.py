@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 from composed import option
-from motion import draw_commands, roll
+from motion import draw_commands, make_recording, roll
 
 from actuators.effects.composition import Library
 from actuators.identify import dead_time
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
 EFFECTS = """
@@ -147,14 +146,9 @@ def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
             torch.arange(5) == 0
         )
         q = roll(model, machine, u)[:-1]
-        t_s = machine.period_s * np.arange(len(u))
         recordings = [
-            Recording(
-                machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=t_s, u=u[:, k].numpy(),
-                q=q[:, k].numpy(), metadata={"run": str(k)},
-            )
-            for k in range(4)
-        ]  # fmt: skip
+            make_recording(machine, u[:, k].numpy(), q[:, k].numpy(), str(k)) for k in range(4)
+        ]
         delay = dead_time.estimate_dead_times(recordings, machine, np.random.default_rng(0))["q1"]
         assert delay is not None
         found.append(delay.value_s)

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from motion import make_recording
 from small_exam import run_model
 
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import make_motion, write_recording
+from brokk_rl.record import write_recording
 from diagnosis.answer import Answer, Estimate, Gap, Where
 from exam.examiner import ExaminerSimulator, compute_closed, read_effects
 from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER
@@ -26,8 +27,7 @@ def record_lag(machine: Machine, gain: float, seed: int, seconds: float, path: P
     u = np.repeat(levels, 20, 0).astype(np.float32)
     lag = replace(option("actuator", "lag"), gain=gain)
     q = run_model(lag.build(machine, 1, torch.device("cpu")), machine, u)
-    t_s = machine.period_s * np.arange(len(u))
-    write_recording(make_motion(machine, f"{seed}", t_s, u, q), path)
+    write_recording(make_recording(machine, u, q, f"{seed}"), path)
 
 
 @pytest.fixture(scope="module")

@@ -77,13 +77,6 @@ def test_the_delay_is_exact_to_the_fraction_of_a_period(machine: Machine) -> Non
     )
 
 
-def test_the_hand_lags_exactly_as_a_first_order_system_does(machine: Machine) -> None:
-    """The mean of 1 - exp(-t / lag) over the period from a to b is 1 - lag (exp(-a / lag) - exp(-b / lag)) / (b - a)."""
-    times = [0.05 * k for k in range(8)]
-    mean = [1 - 0.15 * (math.exp(-t / 0.15) - math.exp(-(t + 0.05) / 0.15)) / 0.05 for t in times]
-    assert q1(machine, [1.0] * 8, lag_s=0.15) == pytest.approx(mean, abs=1e-6)
-
-
 def test_delay_and_lag_together_are_those_of_continuous_time(machine: Machine) -> None:
     """Against a simulation of hand and display in steps of 0.1 ms."""
     generator = torch.Generator().manual_seed(3)
@@ -305,23 +298,6 @@ def test_histories_and_recordings_hold_what_was_given_and_not_what_was_proposed(
         travel,
         msg="the valves' travel is that of what was given",
     )
-
-
-def test_a_loop_behind_a_person_goes_on_exactly_when_restored(machine: Machine) -> None:
-    loop = loop_with(machine, option("follower", "person"))
-    actions = 2 * torch.randn(40, 8, 5)
-    for action in actions[:20]:
-        loop.step(action)
-    state, random = loop.state_dict(), torch.get_rng_state()
-    for action in actions[20:]:
-        loop.step(action)
-    other = loop_with(machine, option("follower", "person"))
-    other.load_state_dict(state)
-    torch.set_rng_state(random)
-    for action in actions[20:]:
-        other.step(action)
-    first = state_of(loop)
-    assert all(torch.equal(value, first[name]) for name, value in state_of(other).items())
 
 
 def test_the_controller_beside_a_policy_without_advice_keeps_its_own(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from axis import PLANT, driven, make_axis
+from motion import make_recording
 
 from actuators import open_loop
 from actuators.contracts import FitTask
@@ -19,7 +20,6 @@ from actuators.identify import dead_time
 from actuators.models.linear import ArxFit, Hold
 from brokk_rl import record
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 
 CPU = torch.device("cpu")
 
@@ -46,15 +46,7 @@ def test_a_linear_machine_is_learned_by_the_linear_model(machine: Machine, tmp_p
     q[:, 1] = -0.7
     for k in range(12, 399):
         q[k + 1] = q[k] + 0.002 * u[k - 11] + 0.3 * (q[k] - q[k - 1])
-    run = Recording(
-        machine="brokk170",
-        joints=machine.joint_names,
-        units=("rad",) * 5,
-        rate_hz=20.0,
-        t_s=np.arange(400) * 0.05,
-        u=u,
-        q=q,
-    )
+    run = make_recording(machine, u, q)
     actuator = ArxFit(name="arx", ridge=1e-8).fit(FitTask(machine, [run], [run], tmp_path))
     cut = open_loop.cut_windows([run], machine, 5.0, 1.0)
     error, still = (

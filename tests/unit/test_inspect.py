@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from composed import option
+from motion import make_recording
 
 from actuators.identify.request import Identification
 from actuators.modes.inspect import InspectionRequest
@@ -43,10 +44,8 @@ def sound(machine: Machine, seconds: float = 60.0) -> Recording:
         + np.cumsum(moved, 0)
         + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
     )
-    return Recording(
-        machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(steps) * PERIOD_S,
-        u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": "sound", "created": "2026-11-20T10:00:00.000+00:00"},
-    )  # fmt: skip
+    told = {"run": "sound", "created": "2026-11-20T10:00:00.000+00:00"}
+    return make_recording(machine, u, q, metadata=told)
 
 
 def found(
@@ -163,10 +162,7 @@ def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_
     # a hundredth of full speed for ten seconds, then a hold
     u[:500, 2], q[:, 2] = 0.01, q[:, 2] + 0.01 * arm.max_speed[2] * np.minimum(t_s, 10.0)
     q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
-    follows = Recording(
-        machine="so101", joints=arm.joint_names, units=("rad",) * 5, rate_hz=50.0, t_s=t_s,
-        u=u.astype(np.float32), q=q.astype(np.float32),
-    )  # fmt: skip
+    follows = make_recording(arm, u, q)
     assert found(follows, arm, thresholds) == []
     q[700:, 2] -= 0.05 * np.minimum(np.arange(300) / 20, 1.0)  # the arm is pushed away
     (finding,) = found(replace(follows, q=q.astype(np.float32)), arm, thresholds)
@@ -190,10 +186,7 @@ def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
     q = targets.copy()
     targets[:, 2], q[:, 2] = arm.home[2] + travel * wave, arm.home[2] + travel * (late - 0.15)
     q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
-    log = Recording(
-        machine="so101", joints=arm.joint_names, units=("rad",) * 5, rate_hz=1.0 / period_s, t_s=t_s,
-        u=np.zeros_like(q, dtype=np.float32), q=q.astype(np.float32),
-    )  # fmt: skip
+    log = make_recording(arm, np.zeros_like(q), q, rate_hz=1.0 / period_s, t_s=t_s)
     findings = inspect_recording(log, arm, thresholds, targets).findings
     named = [one for one in findings if one.kind == "does not obey"]
     assert bool(named) == is_found

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from motion import make_recording
 
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording, make_motion
+from brokk_rl.record import Recording
 from diagnosis.measured_changes import MeasuredChange, measure_changes, shift_by_dead_time
 
 PERIOD_S = 0.05
@@ -31,10 +32,10 @@ def record(machine: Machine, seed: int, slower_out: float = 0.0, heavier: float 
     speed = level * gain * machine.max_speed
     q = np.cumsum(speed, 0) * PERIOD_S + 2e-4 * rng.standard_normal(speed.shape)
     torque = (1.0 + heavier) * (20.0 * np.sign(speed[:, 0]) + 5.0 * speed[:, 0]) + 50.0
-    told = make_motion(machine, f"{seed}", np.arange(len(q)) * PERIOD_S, level, q)
     noisy = torque + rng.standard_normal(len(q))
     name = f"torque_{machine.joint_names[0]}_nm"
-    return replace(told, extra={name: noisy.astype(np.float32)})
+    extra = {name: noisy.astype(np.float32)}
+    return make_recording(machine, level, q, f"{seed}", extra=extra)
 
 
 def compare(

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
+from motion import make_recording
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.record import Recording, make_motion, write_recording
+from brokk_rl.record import Recording, write_recording
 from deploy.guard_setup import build_observer, is_from_machine, read_observer_content
 from deploy.observer_file import FILE, ThresholdSettings, count_alarms, find_thresholds
 
@@ -42,8 +43,7 @@ def record(jump_rad: float, source: str = "machine: socketcan can0, excitation: 
     steps = acting * SPEED * period_s
     q = np.array(MACHINE.home) + np.concatenate([np.zeros((1, 5)), steps.cumsum(0)[:-1]])
     q[600:, 1] += jump_rad
-    motion = make_motion(MACHINE, "one", np.arange(length) * period_s, u, q)
-    return replace(motion, metadata={"run": "one", "source": source})
+    return make_recording(MACHINE, u, q, metadata={"run": "one", "source": source})
 
 
 def test_slack_is_the_largest_difference_in_the_recordings_times_the_margin() -> None:

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
+from motion import make_recording, roll
 
 from actuators import open_loop
 from actuators.identify.scores import FreeRunScores
 from actuators.models.lag import FirstOrderLag
 from brokk_rl.errors import BrokkError, RecordingError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -27,29 +27,12 @@ def levels(machine: Machine, lengths: Sequence[int], seed: int = 0) -> list[Reco
     """Recordings of `PLANT` under random levels, held for a second, one recording a length."""
     generator, found = np.random.default_rng(seed), []
     for number, length in enumerate(lengths):
-        u = np.repeat(generator.uniform(-0.6, 0.6, (length // 20 + 1, 5)), 20, 0)[:length].astype(
-            np.float32
-        )
-        model = PLANT.build(machine, 1, CPU)
-        history = History(q=torch.zeros(1, 13, 5), u=torch.zeros(1, 13, 5))
-        q = torch.as_tensor(0.5 * (machine.lower + machine.upper), dtype=torch.float32)[None]
-        history.reset(torch.ones(1, dtype=torch.bool), q)
-        path = []
-        for row in u:
-            path.append(q.numpy()[0])
-            history.push_u(torch.as_tensor(row)[None])
-            q = model.step(history)
-            history.push_q(q)
-        found.append(recording(u, np.stack(path), f"run {number}"))
+        u = np.repeat(generator.uniform(-0.6, 0.6, (length // 20 + 1, 5)), 20, 0)[:length]
+        commands = torch.as_tensor(u, dtype=torch.float32)[:, None]
+        middle = 0.5 * (machine.lower + machine.upper)
+        path = roll(PLANT.build(machine, 1, CPU), machine, commands, middle)
+        found.append(make_recording(machine, u, path[:-1, 0].numpy(), f"run {number}"))
     return found
-
-
-def recording(u: np.ndarray, q: np.ndarray, run: str) -> Recording:
-    joints = tuple(f"q{j + 1}" for j in range(u.shape[1]))
-    return Recording(
-        machine="brokk170", joints=joints, units=("rad",) * len(joints), rate_hz=20.0, t_s=np.arange(len(u)) * 0.05,
-        u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": run},
-    )  # fmt: skip
 
 
 def scores(
@@ -112,7 +95,8 @@ def test_errors_are_those_at_the_end_of_each_horizon(machine: Machine) -> None:
 
 def test_intervals_come_from_runs_not_from_windows(machine: Machine) -> None:
     """Of nine runs one is bad throughout: as many windows as one likes in each do not make the interval narrower."""
-    runs = [recording(np.zeros((200, 5)), np.zeros((200, 5)), f"run {n}") for n in range(9)]
+    still = np.zeros((200, 5))
+    runs = [make_recording(machine, still, still, f"run {n}") for n in range(9)]
     widths = []
     for stride_s in (2.0, 0.2):
         cut = open_loop.cut_windows(runs, machine, 1.0, stride_s)
@@ -127,7 +111,8 @@ def test_intervals_come_from_runs_not_from_windows(machine: Machine) -> None:
 def test_a_small_difference_that_every_run_shows_is_certain_although_intervals_overlap(
     machine: Machine,
 ) -> None:
-    runs = [recording(np.zeros((200, 5)), np.zeros((200, 5)), f"run {n}") for n in range(9)]
+    still = np.zeros((200, 5))
+    runs = [make_recording(machine, still, still, f"run {n}") for n in range(9)]
     cut = open_loop.cut_windows(runs, machine, 1.0, 1.0)
     size = np.array([0.1 * (1 + int(name[-1])) for name in cut.run])[:, None, None] * np.ones(
         (1, 20, 5)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
+from motion import make_recording
 from scipy.signal import cont2discrete, lsim
 
 from brokk_rl import extensions
@@ -58,15 +59,7 @@ def record_arm(
             q.append(state[0].copy())
         state = a @ state + b * (middle + half * command)
     noise = 3e-4 * random.standard_normal((count, 5))
-    return Recording(
-        machine=arm.name,
-        joints=arm.joint_names,
-        units=tuple(joint.unit for joint in arm.joints),
-        rate_hz=1.0 / arm.period_s,
-        t_s=arm.period_s * np.arange(count),
-        u=u.astype(np.float32),
-        q=(np.array(q) + noise).astype(np.float32),
-    )
+    return make_recording(arm, u, np.array(q) + noise)
 
 
 @pytest.fixture(scope="module")
@@ -106,16 +99,8 @@ def record_pair(pair: Machine, seeds: tuple[int, ...], **changes: float) -> list
 def stand_still(machine: Machine, u: np.ndarray) -> Side:
     """Return a side whose joints stand in the middle of their travel under targets `(T, J)`."""
     middle = 0.5 * (machine.upper + machine.lower)
-    recording = Recording(
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=tuple(joint.unit for joint in machine.joints),
-        rate_hz=1.0 / machine.period_s,
-        t_s=machine.period_s * np.arange(len(u)),
-        u=u.astype(np.float32),
-        q=np.repeat(middle[None], len(u), 0).astype(np.float32),
-    )
-    return stack_side([recording], machine)
+    still = make_recording(machine, u, np.repeat(middle[None], len(u), 0))
+    return stack_side([still], machine)
 
 
 def simulate(machine: Machine, u: np.ndarray, **values: float) -> np.ndarray:

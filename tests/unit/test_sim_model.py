@@ -10,13 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
-from brokk_rl.machine import Dimension
 from brokk_rl.sim.model import ASSETS, compile_model
 from brokk_rl.sim.scene import ScenePlacement, build_collision_geoms, make_nominal_scenes
-
-
-def _dimension(value: float) -> Dimension:
-    return Dimension(value=value, source="test", confidence="high")
 
 
 def test_numbers_of_the_machine_stand_in_the_model(machine):
@@ -33,23 +28,6 @@ def test_numbers_of_the_machine_stand_in_the_model(machine):
         model.actuator_forcerange[:, 1], [body.yield_force.value for body in machine.bodies]
     )
     assert [model.actuator(i).name for i in range(model.nu)] == list(machine.joint_names)
-
-
-def test_a_longer_boom_is_drawn_longer(machine):
-    joints = list(machine.joints)
-    longer = dataclasses.replace(
-        joints[2].body, origin_m=(_dimension(3.0), _dimension(0.0), _dimension(0.0))
-    )
-    joints[2] = dataclasses.replace(joints[2], body=longer)
-    longer = dataclasses.replace(machine, joints=tuple(joints))
-    plain, drawn = (
-        compile_model(machine, 0.01, visual=True),
-        compile_model(longer, 0.01, visual=True),
-    )
-    boom = next(i for i in range(plain.ngeom) if plain.geom_bodyid[i] == plain.body("q2_link").id)
-    assert drawn.geom_size[boom, 0] == pytest.approx(2 * plain.geom_size[boom, 0], rel=1e-2)
-    assert drawn.geom_pos[boom, 0] == pytest.approx(2 * plain.geom_pos[boom, 0])
-    assert drawn.geom_size[boom, 1] == pytest.approx(plain.geom_size[boom, 1], rel=1e-2)
 
 
 def test_pictures_do_not_change_the_physics(machine):
