@@ -11,6 +11,8 @@ from urllib.parse import unquote
 
 import pytest
 
+pytestmark = pytest.mark.slow  # `make docs` builds the site as strictly
+
 ROOT = Path(__file__).resolve().parents[2]
 FETCHED = re.compile(r'<(?:script|link|img|iframe|source)\b[^>]*?\b(?:src|href)="(https?:[^"]*)"')
 LINKED = re.compile(r'<a\b[^>]*?\bhref="([^"#]+)(?:#[^"]*)?"')

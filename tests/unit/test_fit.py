@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ TINY: dict[str, Any] = {
 }  # fmt: skip
 
 
+@cache
 def recording(machine: Machine, seed: int = 0, minutes: float = 1.0) -> Recording:
     return driven(machine, 1, 60.0 * minutes, seed)[0]
 

@@ -197,7 +197,9 @@ def test_late_and_lost_frames_of_servos_are_named(
     assert [one.effect for one in answer.selected][:1] == named
 
 
-@pytest.mark.parametrize(("late", "joints"), [(3, [1]), (2, [0, 1])])
+@pytest.mark.parametrize(
+    ("late", "joints"), [(3, [1]), pytest.param(2, [0, 1], marks=pytest.mark.slow)]
+)
 def test_late_servos_are_named_with_their_delay(
     pair: Machine, late: int, joints: list[int]
 ) -> None:
@@ -214,7 +216,7 @@ def test_late_servos_are_named_with_their_delay(
         assert estimate.mean == pytest.approx(late * pair.period_s, rel=0.1)
 
 
-@pytest.mark.parametrize("factor", [0.6, 1.5])
+@pytest.mark.parametrize("factor", [pytest.param(0.6, marks=pytest.mark.slow), 1.5])
 def test_another_damping_is_named_alone_with_its_size(pair: Machine, factor: float) -> None:
     field = []
     changed = record_pair(pair, (4, 5), damping=factor * ARM_DAMPING)
