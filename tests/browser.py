@@ -35,6 +35,7 @@ from deploy.runtime.operator_state import OperatorState
 from deploy.runtime.shared_memory import RecordLayout
 
 TOKEN = "correct horse battery staple"
+SIZE = {"width": 1280, "height": 800}
 CHROMIUM = (
     os.environ.get("CHROMIUM")
     or shutil.which("chromium")
@@ -172,19 +173,39 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
-def watch_page(context: Any, port: int, complaints: list[str], scene: bool) -> Any:
-    """Returns a page whose errors and requests to elsewhere become complaints; without `scene` nothing is drawn."""
-    page = context.new_page()
-    if not scene:
-        page.route(
-            "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
+@contextmanager
+def opening(browser: Any, ready: str, **context: Any) -> Iterator[Callable[..., Any]]:
+    """Yields a function that opens pages of a server and waits until they are `ready`.
+
+    Whatever the browser complains about, and a request to elsewhere, fails the test.
+    """
+    contexts, complaints = [], []
+
+    def open_page(
+        port: int, token: str | None = TOKEN, scene: bool = False, query: str = "", **how: Any
+    ) -> Any:
+        how = context | how
+        contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", **how))
+        page = contexts[-1].new_page()
+        if not scene:  # nothing is drawn
+            page.route(
+                "**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body="")
+            )
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on(
+            "requestfinished",
+            lambda one: None if f":{port}/" in one.url else complaints.append(one.url),
         )
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.on(
-        "requestfinished",
-        lambda request: None if f":{port}/" in request.url else complaints.append(request.url),
-    )
-    return page
+        page.goto(f"http://localhost:{port}/{query}" + (f"#token={token}" if token else ""))
+        until(page, "() => window.measured?.drawn > 0")
+        if token:  # what is wished before the page was let in is refused
+            until(page, ready)
+        return page
+
+    yield open_page
+    for one in contexts:
+        one.close()
+    assert complaints == []
 
 
 def eventually(claim: Callable[[], bool], seconds: float = 30.0) -> None:

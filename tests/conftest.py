@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -64,6 +65,15 @@ def machine() -> Machine:
 def thresholds() -> InspectionThresholds:
     """Limits from which a stretch of a recording is worth telling."""
     return load_part("thresholds")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A headless Chromium."""
+    from browser import chromium
+
+    with chromium() as found:
+        yield found
 
 
 @dataclass(frozen=True)

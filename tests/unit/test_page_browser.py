@@ -14,16 +14,16 @@ import pytest
 from browser import (
     READING,
     SHOWN,
+    SIZE,
     STATE,
     TOKEN,
     Scripted,
     change_state,
-    chromium,
     eventually,
     lever,
+    opening,
     served,
     until,
-    watch_page,
 )  # fmt: skip
 from PIL import Image
 
@@ -31,16 +31,9 @@ from brokk_rl.signals import Frame
 from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.protocol import OperatorRequest, RecordingStatus, SourceAge
 
-SIZE = {"width": 1280, "height": 800}
 TRAVEL = 95.0
 NOT_CONFIRMED = "document.getElementById('answer').textContent.startsWith('STOP NOT CONFIRMED')"
 FAILED = RecordingStatus(on=False, seconds=0.0, dropped=0, failed=True)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture
@@ -56,24 +49,8 @@ def port(feed: Scripted) -> Iterator[int]:
 
 @pytest.fixture
 def opened(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Opens pages; what the browser complains about fails the test."""
-    contexts, complaints = [], []
-
-    def open_page(
-        port: int, token: str | None = TOKEN, scene: bool = False, query: str = "", **how: Any
-    ) -> Any:
-        contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", **how))
-        page = watch_page(contexts[-1], port, complaints, scene)
-        page.goto(f"http://localhost:{port}/{query}" + (f"#token={token}" if token else ""))
-        until(page, "() => window.measured?.drawn > 0")
-        if token:  # what is wished before the page was let in is refused
-            until(page, "() => window.measured.allowed !== null")
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert complaints == []
+    with opening(browser, "() => window.measured.allowed !== null") as found:
+        yield found
 
 
 def drawn(page: Any) -> dict[str, tuple[float, float]]:

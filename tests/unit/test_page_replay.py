@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import TOKEN, chromium, served, until
+from browser import TOKEN, served, until
 from composed import option
 from desk import DBC
 from websockets.asyncio.client import connect
@@ -232,9 +232,9 @@ def test_a_recording_without_guard_page_and_camera_can_be_shown(
     json.dumps(shown.to_plain())
 
 
-def test_the_page_draws_the_timeline_and_moves_along_it(feed: ReplayFeed) -> None:
+def test_the_page_draws_the_timeline_and_moves_along_it(feed: ReplayFeed, browser: Any) -> None:
     feed.submit(OperatorRequest("play", "off"))
-    with served(feed) as port, chromium() as browser:
+    with served(feed) as port:
         page = browser.new_page()
         page.goto(f"http://localhost:{port}/#token={TOKEN}")
         until(page, "window.measured?.allowed && document.querySelector('#marks i') !== null")

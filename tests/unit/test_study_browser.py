@@ -8,20 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import SHOWN, TOKEN, Scripted, chromium, served, until, watch_page
+from browser import SHOWN, Scripted, opening, served, until
 from sitting import MACHINE, Arm, agreed, conductor, done, plan
 
 from study import tlx
 from study.conductor import Conductor
 from study.sitting import StudyFeed, StudyPages
-
-SIZE = {"width": 1280, "height": 800}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture
@@ -51,20 +43,8 @@ def port(lead: Conductor) -> Iterator[int]:
 
 @pytest.fixture
 def opened(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Opens pages; what the browser complains about fails the test."""
-    contexts, complaints = [], []
-
-    def open_page(port: int, query: str = "") -> Any:
-        contexts.append(browser.new_context(viewport=SIZE, locale="en-GB", has_touch=True))
-        page = watch_page(contexts[-1], port, complaints, scene=False)
-        page.goto(f"http://localhost:{port}/{query}#token={TOKEN}")
-        until(page, "() => window.measured?.drawn > 0 && Boolean(window.sitting())")
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert complaints == []
+    with opening(browser, "() => Boolean(window.sitting())", has_touch=True) as found:
+        yield found
 
 
 def at(page: Any, screen: int) -> None:
@@ -115,7 +95,7 @@ def test_a_sitting_is_walked_through_by_touch(
 def test_the_whole_questionnaire_by_key_in_german(
     tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
 ) -> None:
-    page = opened(port, "?lang=de")
+    page = opened(port, query="?lang=de")
     at(page, 0)
     assert page.locator("#study h1").inner_text() == "Geistige Anforderung"
     assert page.evaluate("document.documentElement.lang") == "de"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import TOKEN, Scripted, chromium, eventually, served
+from browser import SIZE, TOKEN, Scripted, eventually, served
 from composed import option
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
@@ -81,16 +81,10 @@ def test_who_has_no_token_does_not_reach_the_video_process(tmp_path: Path) -> No
         assert reached == [TOKEN]
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
-
-
 @pytest.fixture
 def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
     with served(Scripted(), extensions=(VideoRelay(str(tmp_path)),)) as port:
-        context = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en-GB")
+        context = browser.new_context(viewport=SIZE, locale="en-GB")
         page = context.new_page()
         page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript"))
         page.goto(f"http://localhost:{port}/#token={TOKEN}")
