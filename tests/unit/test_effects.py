@@ -275,8 +275,9 @@ def test_actuators_and_effects_can_be_captured_in_a_cuda_graph(
     device, num = torch.device("cuda"), 8
     torch.manual_seed(0)
     u = draw_commands(machine, 40, num).to(device)
-    paths = []
-    for captured in (False, True):
+    home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).expand(num, 5)
+
+    def run(captured: bool) -> torch.Tensor:
         model = shipped("actuator", actuator).build(machine, num, device)
         for name in those:
             model = shipped("effect", name).wrap(model, machine, num, device)
@@ -285,43 +286,32 @@ def test_actuators_and_effects_can_be_captured_in_a_cuda_graph(
         history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
         command, seen = torch.zeros(num, 5, device=device), torch.zeros(num, 8, device=device)
         mask = torch.zeros(num, dtype=torch.bool, device=device)
-        home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).expand(num, 5)
 
-        def period(
-            model: Any = model,
-            history: History = history,
-            command: Any = command,
-            mask: Any = mask,
-            home: Any = home,
-            seen: Any = seen,
-        ) -> None:
+        def period() -> None:
             history.push_u(command)
             history.push_q(model.step(history))
             history.reset(mask, home)
             model.reset(mask)
-            seen.copy_(
-                torch.cat(
-                    (model.measure(history.q[:, -1]), model.misplacement(history.q[:, -1])), 1
-                )
-            )
+            q = history.q[:, -1]
+            seen.copy_(torch.cat((model.measure(q), model.misplacement(q)), 1))
 
         start = {key: value.clone() for key, value in model.state.items()}
-        graph = torch.cuda.CUDAGraph()
-        with torch.no_grad():
-            for _ in range(3):
+        graph, path = torch.cuda.CUDAGraph(), []
+        for _ in range(3):
+            period()
+        if captured:
+            torch.cuda.synchronize()
+            with torch.cuda.graph(graph):
                 period()
-            if captured:
-                torch.cuda.synchronize()
-                with torch.cuda.graph(graph):
-                    period()
-            for key, value in model.state.items():
-                value.copy_(start[key])
-            history.reset(torch.ones_like(mask), home)
-            path = []
-            for k, row in enumerate(u):
-                command.copy_(row)
-                mask.copy_(torch.arange(num, device=device) == k % 20)
-                graph.replay() if captured else period()
-                path.append(torch.cat((history.q[:, -1], seen), 1))
-        paths.append(torch.stack(path))
-    torch.testing.assert_close(*paths, rtol=0, atol=1e-5)
+        for key, value in model.state.items():
+            value.copy_(start[key])
+        history.reset(torch.ones_like(mask), home)
+        for k, row in enumerate(u):
+            command.copy_(row)
+            mask.copy_(torch.arange(num, device=device) == k % 20)
+            graph.replay() if captured else period()
+            path.append(torch.cat((history.q[:, -1], seen), 1))
+        return torch.stack(path)
+
+    with torch.no_grad():
+        torch.testing.assert_close(run(False), run(True), rtol=0, atol=1e-5)
