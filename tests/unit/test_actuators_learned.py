@@ -128,10 +128,7 @@ def test_the_shipped_model_reaches_a_target_and_stays(machine: Machine) -> None:
 
 
 def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
-    with pytest.raises(
-        CheckpointError,
-        match=r"no file 'nowhere\.safetensors'.*brokk170\.safetensors.*mode=identify",
-    ):
+    with pytest.raises(CheckpointError, match=r"nowhere\..*brokk170\..*mode=identify"):
         load_networks("nowhere.safetensors", machine)
 
 

@@ -127,18 +127,12 @@ def put(at: int, cell: int, text: str) -> list[str]:
         (put(7, 1, "off"), r"dig\.csv: line 9 \(row 7\), column 'Boom Cmd': 'off' is not a number"),
         (put(7, 6, ""), r"dig\.csv: line 9 \(row 7\), column 'Stick Ms': '' is not a number"),
         (put(3, 8, "nan"), r"dig\.csv: line 5 \(row 3\), column 'Swing Ms': 'nan' is not a number"),
-        (
-            put(7, 0, "100.1"),
-            r"dig\.csv: line 9 \(row 7\), column 'Time': time does not increase \(100\.318 s, then 100\.1 s\)",
-        ),
+        (put(7, 0, "100.1"), r"line 9 \(row 7\), column 'Time': time does not increase"),
         (
             put(7, 3, "11.5"),
-            r"dig\.csv: line 9 \(row 7\), column 'Bucket Cmd': command 1\.608\d* is beyond full by more than 0\.02",
+            r"line 9 \(row 7\), column 'Bucket Cmd': command 1\.608\d* is beyond full",
         ),
-        (
-            [*lines()[:4], "100.2,7.5", *lines()[4:]],
-            r"dig\.csv: line 6 \(row 4\): 2 cells, the header has 9",
-        ),
+        ([*lines()[:4], "100.2,7.5", *lines()[4:]], r"line 6 \(row 4\): 2 cells, the header has 9"),
         ([], r"dig\.csv: 0 rows of data"),
         (lines(3.0), r"dig\.csv: no piece of 5 s or more"),
     ],
@@ -153,10 +147,7 @@ def test_a_bad_log_is_refused_by_name(
 def test_a_map_of_another_machine_is_refused(
     tmp_path: Path, machine: Machine, reader: ColumnMap
 ) -> None:
-    with pytest.raises(
-        ConfigError,
-        match=r"the map names the joints boom, .* machine 'brokk170' has q1, .*machine=… and import=…",
-    ):
+    with pytest.raises(ConfigError, match=r"joints boom, .* 'brokk170' has q1, .*import=…"):
         reader.read(logged(tmp_path, lines()), machine)
 
 

@@ -153,9 +153,7 @@ def test_commands_that_come_too_seldom_for_the_guard_are_refused_before_anything
         realtime=False,
     )
     asked.check_machine(machine)
-    with pytest.raises(
-        ConfigError, match=r"guard\.request_s: expected more than the control period"
-    ):
+    with pytest.raises(ConfigError, match=r"guard\.request_s: expected more than"):
         asked.check_machine(replace(machine, period_s=0.1))
 
 

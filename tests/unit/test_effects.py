@@ -172,24 +172,12 @@ def test_a_table_gives_values_and_ranges_joint_by_joint(machine: Machine) -> Non
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        (
-            "backlash",
-            {"gap_rad": -0.1},
-            r"effect\.backlash\.gap_rad: expected 0 to 0\.237 rad, got -0\.1",
-        ),
+        ("backlash", {"gap_rad": -0.1}, r"gap_rad: expected 0 to 0\.237 rad, got -0\.1"),
         ("backlash", {"gap_rad": [0.1, 0.05]}, r"effect\.backlash\.gap_rad: .*low <= high"),
-        (
-            "backlash",
-            {"joints": ["q33"]},
-            r"effect\.backlash\.joints: 'q33' is no joint.*did you mean 'q3'",
-        ),
+        ("backlash", {"joints": ["q33"]}, r"joints: 'q33' is no joint.*did you mean 'q3'"),
         ("dead_band", {"extend": 0.9}, r"effect\.dead_band\.extend: expected 0 to 0\.85, got"),
         ("flow_gain", {"gain": {"q1": 1.1}}, r"effect\.flow_gain\.gain: no value for q2"),
-        (
-            "base_tilt",
-            {"roll_rad": {"q1": 0.1, "other": 0}},
-            r"effect\.base_tilt\.roll_rad: .*joints do not differ",
-        ),
+        ("base_tilt", {"roll_rad": {"q1": 0.1, "other": 0}}, "roll_rad: .*joints do not differ"),
         ("lag", {"time_constant_s": "slow"}, r"Lag\.time_constant_s"),
     ],
 )

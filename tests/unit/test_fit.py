@@ -96,8 +96,5 @@ def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> N
     part = recording(machine, minutes=2.0)
     u = part.u.copy()
     u[:, 2] = np.minimum(u[:, 2], 0.0)
-    with pytest.raises(
-        RecordingError,
-        match=r"too little data: q3 0\.0 min forth and 0\.\d min back commanded .* needed are 0\.25 min",
-    ):
+    with pytest.raises(RecordingError, match=r"q3 0\.0 min forth and .* needed are 0\.25 min"):
         training_data.check_enough([dataclasses.replace(part, u=u)], machine)

@@ -232,9 +232,7 @@ def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
     for source, found in ((pendulum, set()), (arm, inside)):
         kinds = effect_library.load_effects(machine, None, api._load_simulator(source))
         assert {kind.name for kind in kinds} & inside == found
-    with pytest.raises(
-        ConfigError, match="'joint_friction' cannot be simulated: my_pendulum:step has no numbers"
-    ):
+    with pytest.raises(ConfigError, match=r"'joint_friction' .* my_pendulum:step has no numbers"):
         effect_library.load_effects(machine, ["joint_friction"], api._load_simulator(pendulum))
 
 

@@ -59,10 +59,8 @@ def test_a_page_of_this_server_may_connect_through_a_forwarded_port_too(
         ("https://localhost:8170", "localhost:8170"),
         ("http://127.0.0.1:8170", "localhost:8170"),
         ("null", "localhost:8170"),
-        (
-            "http://evil.example:8170",
-            "evil.example:8170",
-        ),  # DNS rebinding: its own origin, but not our name
+        # DNS rebinding: its own origin, but not our name
+        ("http://evil.example:8170", "evil.example:8170"),
         (None, "evil.example:8170"),
         (None, "localhost:8170:80"),
         (None, "localhost:"),

@@ -118,20 +118,14 @@ def test_every_breach_is_found_with_its_row_and_column(path: Path, machine: Mach
     assert [(breach.column, breach.row, breach.num_rows) for breach in found] == [
         ("q_q5_rad", None, 1), ("q_q1_rad", 3, 1), ("u_q3", 7, 2), ("u_q3", 20, 1), ("t_s", 30, 1), ("t_s", 31, 1),
     ]  # fmt: skip
-    assert (
-        str(found[2])
-        == "row 7, column 'u_q3': command 1.2 lies outside [-1, 1] (2 such rows on end)"
-    )
+    assert str(found[2]).startswith("row 7, column 'u_q3': command 1.2")
 
 
 def test_a_missing_column_is_refused_with_the_nearest_names(path: Path, machine: Machine) -> None:
     table = pq.read_table(path)
     names = [name.replace("q_q4_rad", "q_q4_deg") for name in table.column_names]
     pq.write_table(table.rename_columns(names).replace_schema_metadata(table.schema.metadata), path)
-    with pytest.raises(
-        RecordingError,
-        match=r"run\.parquet: column 'q_q4_rad' is missing; did you mean 'q_q\d_\w+'\?",
-    ):
+    with pytest.raises(RecordingError, match=r"'q_q4_rad' is missing; did you mean 'q_q\d_\w+'"):
         record.read_recording(path, machine)
 
 

@@ -192,9 +192,7 @@ def test_a_checkpoint_of_another_machine_names_what_differs(
 
 
 def test_a_checkpoint_without_a_stamp_is_of_no_machine(checkpoint: Path, machine: Machine) -> None:
-    with pytest.raises(
-        CheckpointError, match="another machine: name, joints, limits, geometry, control, levers"
-    ):
+    with pytest.raises(CheckpointError, match="another machine: name, joints, limits"):
         loading(machine, changed(checkpoint, lambda content: content.pop("fingerprint")))
 
 
@@ -261,9 +259,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(
         return groups, reward + number if is_spoiled else reward, *rest
 
     runner.env.step = spoils  # type: ignore[method-assign]
-    with pytest.raises(
-        TrainingError, match=rf"iteration 2: .* for {term}.*model_2\.pt is the last"
-    ):
+    with pytest.raises(TrainingError, match=rf"iteration 2: .* for {term}.*model_2\.pt"):
         runner.run()
     assert [path.name for path in list_checkpoints(tmp_path)] == ["model_1.pt", "model_2.pt"]
     assert len(runs.progress(tmp_path)) == 2

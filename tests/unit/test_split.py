@@ -86,8 +86,5 @@ def test_a_joint_that_is_not_commanded_is_named_with_what_to_record(machine: Mac
         [recording([9.0, 9.0, 9.0, 0.0, 9.0], "a"), recording([9.0, 9.0, 9.0, 9.0, 9.0], "b")]
     )
     check_commanded(runs, machine, 1, "why")
-    with pytest.raises(
-        RecordingError,
-        match=r"joint q4 is commanded \(\|u\| > 0\.02\) in 1 \(b\) of 2 runs.*2 or more: why.*move q4",
-    ):
+    with pytest.raises(RecordingError, match=r"joint q4 .* in 1 \(b\) of 2 runs.*move q4"):
         check_commanded(runs, machine, 2, "why")
