@@ -7,10 +7,9 @@ from itertools import chain
 from actuators.recordings import conversion
 from actuators.recordings.conversion import LogReader
 from actuators.recordings.inspection import InspectionThresholds
-from actuators.recordings.recording_checks import examine_recordings
+from actuators.recordings.recording_checks import REMARK_HEAD, examine_recordings, tabulate_remarks
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from brokk_rl.session import Session, read_record
 from brokk_rl.spec import spec
 
@@ -54,7 +53,10 @@ class Convert:
         pieces = conversion.read_logs(self.convert.input, self.reader, self.machine)
         folder = self.session.folder / conversion.FOLDER
         conversion.write_recordings(pieces, folder)
-        self._show_remarks(list(chain.from_iterable(pieces.values())))
+        recordings = list(chain.from_iterable(pieces.values()))
+        remarks = examine_recordings(recordings, self.machine, self.thresholds)
+        if rows := tabulate_remarks(remarks):
+            print_table(REMARK_HEAD, rows, "look at these first")
         choices = (read_record(self.session.folder) or {}).get("choices", {})
         print_text("then:")
         print_text(
@@ -62,13 +64,3 @@ class Convert:
             f"{SIMULATORS[self.machine.interface]}"
         )
         conversion.check_damage(pieces)
-
-    def _show_remarks(self, recordings: list[Recording]) -> None:
-        """Print what limits the conclusions from the recordings, joint by joint."""
-        rows = []
-        for one in examine_recordings(recordings, self.machine, self.thresholds):
-            if one.severity != "note":
-                span = f"{one.from_s:.2f} to {one.to_s:.2f} s"
-                rows.append([one.recording, one.joint or "all", one.name, span, one.amount])
-        if rows:
-            print_table(["run", "joint", "remark", "when", "what"], rows, "look at these first")

@@ -195,16 +195,14 @@ def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder:
     for joint, models in (*result["joints"].items(), ("all joints", result["overall"])):
         delay = result["delay_s"].get(joint)
         key, digits = ("rmse", 4) if joint in result["joints"] else ("percent", 2)
-        least = {}
-        for horizon in horizons:
-            given = [rows[horizon][key] for rows in models.values() if rows[horizon]]
-            least[horizon] = min(given, default=None)
         for row, (name, rows) in enumerate(models.items()):
             cells: list[TableCell] = []
             for horizon in horizons:
-                value = rows[horizon][key] if rows[horizon] else None
-                style = "bold" if value == least[horizon] else ""
-                cells.append(None if value is None else Text(f"{value:.{digits}f}", style))
+                if not rows[horizon]:
+                    cells.append(None)
+                    continue
+                is_least = rows[horizon]["percent"] <= page.find_least(models, horizon)
+                cells.append(Text(f"{rows[horizon][key]:.{digits}f}", "bold" if is_least else ""))
             after = "" if row or delay is None else f"{delay['value']:.2f} s"
             table.append(["" if row else joint, name, *cells, after])
     print_table(

@@ -1,7 +1,6 @@
 """`brokk mode=inspect`: shows the contents of recordings, broken ones too."""
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,9 +10,14 @@ import numpy as np
 
 from actuators.identify import dead_time
 from actuators.recordings import inspection_picture
-from actuators.recordings.finding_kinds import FINDINGS
 from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
-from actuators.recordings.recording_checks import find_targets
+from actuators.recordings.recording_checks import (
+    REMARK_HEAD,
+    REMARKS,
+    examine_recordings,
+    find_targets,
+    tabulate_remarks,
+)
 from brokk_rl import record
 from brokk_rl.commands import view_recordings
 from brokk_rl.console_table import print_table, print_text
@@ -86,6 +90,7 @@ class InspectedFile:
             "num_samples": self.recording.num_samples if self.recording else None,
             "source": metadata.get("source"),
             "created": metadata.get("created"),
+            "resampled_from": metadata.get("resampled_from"),
             "oil_c": _find_range(self.recording.extra.get("oil_c")) if self.recording else None,
             "breaches": [asdict(breach) for breach in self.breaches],
             **(
@@ -116,19 +121,20 @@ class Inspect:
         inspected = [self._look(path) for path in track_items(paths, "inspecting")]
         folder = self.session.folder
         sound = [one.recording for one in inspected if one.recording and not one.breaches]
+        whole = [one.recording for one in inspected if one.recording]
+        remarks = examine_recordings(whole, self.machine, self.thresholds)
         result = {
             "schema": 1,
             "machine": self.machine.name,
             "delay_s": self._delays(sound),
             "joints": self._overall(inspected),
-            "remarks": _list_resampled(inspected),
             "recordings": [one.plain() for one in inspected],
         }
         write_json(folder / "inspection.json", result)
         tables = {
             "recordings": (FILES, [_format_file_row(one) for one in inspected]),
             "joints, all recordings": self._figures(result),
-            "findings": self._counts(result),
+            "findings": (REMARK_HEAD, tabulate_remarks(remarks)),
         }
         pictures: dict[str, str] = {}
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
@@ -142,9 +148,8 @@ class Inspect:
             "title": f"Recordings of {self.machine.name}",
             "inspected": inspected,
             "tables": tables,
-            "remarks": result["remarks"],
             "pictures": pictures,
-            "kinds": FINDINGS,
+            "kinds": REMARKS,
         }
         write_text(folder / PAGE_FILE, render_page(TEMPLATE, values))
         for title, (head, rows) in tables.items():
@@ -152,8 +157,6 @@ class Inspect:
         for one in inspected:
             for breach in one.breaches:
                 print_text(f"{one.path}: {breach}")
-        for remark in result["remarks"]:
-            print_text(remark)
         log.info("report: %s", folder / PAGE_FILE)
 
     def _look(self, path: Path) -> InspectedFile:
@@ -206,18 +209,6 @@ class Inspect:
             ])  # fmt: skip
         return JOINTS, rows
 
-    def _counts(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-        """Return heading and cells of the table of findings: a row a kind that occurs, a column a joint."""
-        counts = Counter(
-            (f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"]
-        )
-        names = [*self.machine.joint_names, None]
-        rows = []
-        for kind in FINDINGS:
-            if any(counts[name, kind] for name in names):
-                rows.append([kind, *(str(counts[name, kind] or "–") for name in names)])
-        return ["finding", *self.machine.joint_names, "all at once"], rows
-
 
 def _combine(key: str, values: np.ndarray, seconds: np.ndarray) -> float | None:
     """Return a figure over recordings from that of each of them, `None` where all lack it."""
@@ -227,19 +218,6 @@ def _combine(key: str, values: np.ndarray, seconds: np.ndarray) -> float | None:
     if key in OVERALL:
         return float(OVERALL[key](values[there]))
     return float(np.average(values[there], weights=seconds[there]))
-
-
-def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
-    """Return the original rates of logs that were resampled when converted."""
-    rates = {}
-    for one in inspected:
-        if one.recording:
-            rates[one.recording.run] = one.recording.metadata.get("resampled_from")
-    resampled = []
-    for run, rate in rates.items():
-        if rate:
-            resampled.append(f"run {run}: resampled from {rate}")
-    return resampled
 
 
 def _format_file_row(one: InspectedFile) -> list[str]:

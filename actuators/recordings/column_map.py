@@ -81,16 +81,12 @@ class CommandColumn:
     full_minus: float | None
 
     def check(self) -> None:
-        if self.full_plus is None or self.full_minus is None:
-            full = self.full_plus if self.full_minus is None else self.full_minus
-            if full is None or full == self.neutral:
-                raise ConfigError(
-                    f"column '{self.column}': expected full_plus or full_minus other than neutral {self.neutral:g}"
-                )
-        elif (self.full_plus - self.neutral) * (self.full_minus - self.neutral) >= 0:
+        given = [full for full in (self.full_plus, self.full_minus) if full is not None]
+        away = [full - self.neutral for full in given]
+        if not given or np.prod(away) == 0.0 or (len(given) == 2 and np.prod(away) > 0.0):
             raise ConfigError(
-                f"column '{self.column}': neutral {self.neutral:g} must lie between full_plus {self.full_plus:g} and full_minus "
-                f"{self.full_minus:g}"
+                f"column '{self.column}': neutral {self.neutral:g} must lie between full_plus and full_minus, or beside the one "
+                f"that is given, got {self.full_plus} and {self.full_minus}"
             )
 
     def command(self, values: np.ndarray) -> np.ndarray:

@@ -84,6 +84,9 @@ REMARKS = FINDINGS | {
     ),
 }
 """All remarks: findings in single recordings, and what only several of them show."""
+MOST_ROWS = 40
+"""Rows of the table of remarks; a page of a terminal."""
+REMARK_HEAD = ["remark", "joint", "run", "when", "what"]
 IGNORED = "command without motion"
 
 
@@ -107,6 +110,16 @@ def examine_recordings(
         remarks,
         key=lambda one: (ORDER.index(one.severity), one.name, one.joint or "", one.recording),
     )
+
+
+def tabulate_remarks(remarks: Sequence[RecordingRemark]) -> list[list[str]]:
+    """Return the cells of a table below `REMARK_HEAD`: the most severe remarks, without notes."""
+    rows = []
+    for one in remarks[:MOST_ROWS]:
+        if one.severity != "note":
+            span = f"{one.from_s:.2f} to {one.to_s:.2f} s"
+            rows.append([one.name, one.joint or "all", one.recording, span, one.amount])
+    return rows
 
 
 def find_targets(recording: Recording, machine: Machine) -> np.ndarray | None:
