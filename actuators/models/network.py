@@ -68,11 +68,14 @@ class JointNetworks(nn.Module):
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """Return normalised increments `(J, B)` before the dead zone, for inputs `(J, B, 2 H)`."""
-        return self._head(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
+        hidden = torch.relu(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
+        hidden = torch.relu(torch.baddbmm(self.bias[1], hidden, self.weight[1]))
+        return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
 
     def increment(self, output: torch.Tensor) -> torch.Tensor:
         """Return increments `(J, B)` in rad or m, after the dead zone."""
-        return self._moved(output) * self.increment_scale[:, None]
+        quiet = (self.quiet / self.increment_scale)[:, None]
+        return (output - output.clamp(-quiet, quiet)) * self.increment_scale[:, None]
 
     def inputs(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Return normalised inputs `(J, B, 2 H)` for `u` and `q` of shape `(J, B, H)`.
@@ -81,14 +84,13 @@ class JointNetworks(nn.Module):
         """
         commands = u / self.command_scale[:, None, None]
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
-        return torch.cat([commands, increments, self._position(q[..., -1])[..., None]], 2)
+        position = (q[..., -1] - self.position_center[:, None]) / self.position_scale[:, None]
+        return torch.cat([commands, increments, position[..., None]], 2)
 
     def roll_out(
         self, u: torch.Tensor, q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor
     ) -> torch.Tensor:
         """Run freely on its own predictions.
-
-        The part of the first layer that sees commands is computed for all steps at once.
 
         Args:
             u: Commands, `(J, B, H - 1 + K)`: the history and the commands of the `K` steps to come.
@@ -99,38 +101,13 @@ class JointNetworks(nn.Module):
         Returns:
             Positions after each of the `K` steps, `(J, B, K)`.
         """
-        (num_joints, batch, _), size = q.shape, self.num_history
-        of_command, of_state = self.weight[0][:, :size], self.weight[0][:, size:]
-        seen = (u / self.command_scale[:, None, None]).unfold(2, size, 1)  # (J, B, K, H)
-        steps = seen.shape[2]
-        seen = seen.reshape(num_joints, batch * steps, size)
-        first = torch.baddbmm(self.bias[0], seen, of_command)
-        from_commands = first.view(num_joints, batch, steps, -1).unbind(2)
-        increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
-        at, path = q[..., -1], []
-        for k in range(steps):
-            state = torch.cat([increments, self._position(at)[..., None]], 2)
-            output = self._head(torch.baddbmm(from_commands[k], state, of_state))
-            moved = self._moved(output)
-            at = torch.addcmul(at, moved, self.increment_scale[:, None])
-            at = at.clamp(lower[:, None], upper[:, None])
-            increments = torch.cat([increments[..., 1:], moved[..., None]], 2)
+        path = []
+        for seen in u.unfold(2, self.num_history, 1).unbind(2):
+            moved = self.increment(self(self.inputs(seen, q)))
+            at = (q[..., -1] + moved).clamp(lower[:, None], upper[:, None])
+            q = torch.cat([q[..., 1:], at[..., None]], 2)
             path.append(at)
         return torch.stack(path, 2)
-
-    def _head(self, hidden: torch.Tensor) -> torch.Tensor:
-        """Return the output of the last layer, `(J, B)`, for the first layer before its ReLU."""
-        hidden = torch.relu(torch.baddbmm(self.bias[1], torch.relu(hidden), self.weight[1]))
-        return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
-
-    def _moved(self, output: torch.Tensor) -> torch.Tensor:
-        """Return normalised increments `(J, B)` after the dead zone."""
-        quiet = (self.quiet / self.increment_scale)[:, None]
-        return output - output.clamp(-quiet, quiet)
-
-    def _position(self, q: torch.Tensor) -> torch.Tensor:
-        """Return normalised positions, `(J, B)`."""
-        return (q - self.position_center[:, None]) / self.position_scale[:, None]
 
 
 def _initialise_weights(
