@@ -57,7 +57,6 @@ class EffectSpec:
         layer: Place among the effects of its side, from the machine outwards; a command passes the
             largest first.
         placed: Whether its `begin` asks for the positions of the joints.
-        weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
         running: Name of the number that is the time since the machine was started. That number is
@@ -78,7 +77,6 @@ class EffectSpec:
     recent: ClassVar[int | None] = None
     layer: ClassVar[int] = 0
     placed: ClassVar[bool] = False
-    weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
     running: ClassVar[str | None] = None
     interfaces: ClassVar[frozenset[str]] = frozenset({"speed"})
@@ -212,7 +210,6 @@ class EffectChain:
         commands: Effects on commands, in the order in which a command passes through them.
         motions: Effects on motion, the first nearest to the machine.
         plant: Constants of the machine.
-        is_weighed: Whether an effect on motion asks for the weight.
         parameters: Numbers by name, `(N, J)` or `(N, 1)`. Write in place or replace an entry to
             simulate `N` candidates side by side.
     """
@@ -261,8 +258,9 @@ class EffectChain:
         self._change_drives(where)
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
-        self.is_weighed = machine.has_bodies and any(e.weighed for e in self.motions.values())
-        self.plant = MachineTensors(machine, device, self.is_weighed, placed=bool(self._placed))
+        self.plant = MachineTensors(machine, device)
+        if machine.has_bodies:
+            self.plant.prepare()
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._memory = self._build_memory(machine, num_envs, device)
         self._ranges.redraw(self._fresh)
@@ -402,9 +400,8 @@ class EffectChain:
             memory: Of the effects.
         """
         q, moved_to = history.q[:, -1], predicted
-        weight = self.plant.weight(q) if self.is_weighed else None
         for name, effect in self.motions.items():
-            now = self.describe(name, history, moved_to - q, counter, weight)
+            now = self.describe(name, history, moved_to - q, counter)
             extra, kept = effect.extra(memory.recall(name, effect, now))
             memory.keep(name, kept)
             moved_to = moved_to + extra
@@ -412,16 +409,11 @@ class EffectChain:
         return moved_to.clamp(lower, torch.maximum(self.plant.upper, predicted))
 
     def describe(
-        self,
-        name: str,
-        history: History,
-        moved: torch.Tensor,
-        counter: torch.Tensor | None,
-        weight: torch.Tensor | None = None,
+        self, name: str, history: History, moved: torch.Tensor, counter: torch.Tensor | None
     ) -> StepInputs:
         """Return the inputs of one effect, without a memory."""
         values, draws = self.get_values(name), self.salt_counter(name, counter)
-        return StepInputs(values, {}, history, self.plant, moved, draws, weight)
+        return StepInputs(values, {}, history, self.plant, moved, draws)
 
     def _change_commands(
         self, history: History, memory: StepMemory, counter: torch.Tensor | None

@@ -38,7 +38,6 @@ class LoadDependence(EffectSpec):
     pose_cos: Value = 0.0  # neutral: files from before this number lack it
     pose_sin: Value = 0.0  # neutral: files from before this number lack it
     side = "speed"
-    weighed = True
     numbers: ClassVar = {
         "sensitivity": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 1.5), masses=True),
         "lowering": EffectNumber("1", none=None, typical=1.0, bounds=(0.0, 1.0), trials=(0.0, 1.0)),
@@ -50,7 +49,7 @@ class LoadDependence(EffectSpec):
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`moved (sqrt(1 + sensitivity load / yield_force) - 1)`: orifice; load + where lowered."""
         if now.plant.has_masses:
-            weight, sensitivity = _weight(now), now.value["sensitivity"]
+            weight, sensitivity = now.plant.weight(now.history.q[:, -1]), now.value["sensitivity"]
         else:
             sin, cos = now.plant.read_pose(now.history.q[:, -1])
             weight, sensitivity = now.value["pose_cos"] * cos + now.value["pose_sin"] * sin, 1.0
@@ -73,7 +72,6 @@ class Creep(EffectSpec):
 
     drift_rad_s: Value = 0.0  # neutral: files from before this number lack it
     side = "speed"
-    weighed = True
     numbers: ClassVar = {
         "sink_rad_s": EffectNumber(
             "rad/s", none=0.0, typical=0.004, bounds=(0.0, 0.1), scale="speed", masses=True
@@ -88,7 +86,9 @@ class Creep(EffectSpec):
         """`sink weight / yield_force period`, in the direction of the weight, moving or not."""
         if not now.plant.has_masses:
             return now.value["drift_rad_s"] * now.plant.period_s + 0.0 * now.moved, {}
-        return now.value["sink_rad_s"] * _weight(now) * now.plant.period_s, {}
+        return now.value["sink_rad_s"] * now.plant.weight(
+            now.history.q[:, -1]
+        ) * now.plant.period_s, {}
 
 
 @spec
@@ -109,8 +109,3 @@ class FlowSharing(EffectSpec):
         demand = now.value["demand"]
         asked = (demand * (now.moved / now.plant.full_step).abs()).sum(1, keepdim=True)
         return now.moved * (1.0 / asked.clamp(min=1.0) - 1.0) * (demand > 0), {}
-
-
-def _weight(now: StepInputs) -> torch.Tensor:
-    """Return the gravity load over the yield force, positive direction, `(N, J)`."""
-    return now.plant.weight(now.history.q[:, -1]) if now.weight is None else now.weight

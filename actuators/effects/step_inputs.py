@@ -26,7 +26,6 @@ class StepInputs:
         plant: Constants of the machine.
         moved: Increment of the inner model, `(N, J)`; speed side only.
         counter: Counter of random draws, `(N,)`; stochastic effects only.
-        weight: `plant.weight` of the newest position, where it is computed already.
     """
 
     value: dict[str, torch.Tensor]
@@ -35,7 +34,6 @@ class StepInputs:
     plant: MachineTensors
     moved: torch.Tensor
     counter: torch.Tensor | None
-    weight: torch.Tensor | None = None
 
     @property
     def chance(self) -> torch.Tensor:

@@ -15,19 +15,14 @@ class MachineTensors:
     """Constants of the machine as tensors, each `(J,)`.
 
     Weight and geometry are built when somebody first asks for them. Most effects do not ask, and
-    so they also work on machines of which only the joints are known. A captured step can hold the
-    computation but not the construction: effects that always need them say so beforehand.
+    so they also work on machines of which only the joints are known.
 
     Args:
         machine: The machine.
         device: Where the tensors live.
-        weighed: Whether the weight is asked for in every step.
-        placed: Whether the geometry is asked for in every step.
     """
 
-    def __init__(
-        self, machine: Machine, device: torch.device, weighed: bool = False, placed: bool = False
-    ) -> None:
+    def __init__(self, machine: Machine, device: torch.device) -> None:
         def tensor(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
@@ -40,10 +35,11 @@ class MachineTensors:
         self.has_masses = machine.has_bodies
         self._slides = torch.tensor([j.kind == "slide" for j in machine.joints], device=device)
         self._machine, self._device = machine, device
-        if weighed:
-            self._weight  # noqa: B018
-        if placed:
-            self.kinematics  # noqa: B018
+
+    def prepare(self) -> None:
+        """Build weight and geometry: a captured step can hold the computation but not the construction."""
+        self._weight  # noqa: B018
+        self.kinematics  # noqa: B018
 
     @cached_property
     def _weight(self) -> JointWeight:
