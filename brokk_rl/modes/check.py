@@ -8,27 +8,25 @@ import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
 import numpy as np
-from annotated_types import Interval
+import torch
 
+from brokk_rl.commands import accept_speeds
 from brokk_rl.console_table import print_table, print_text
-from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import BrokkError, ConfigError
+from brokk_rl.errors import BrokkError
 from brokk_rl.kinematics import Gravity, compute_tool_kinematics
 from brokk_rl.machine import Body, Dimension, Joint, Machine
-from brokk_rl.plain_files import parse_model
 from brokk_rl.session import Session, write_bytes, write_json, write_text
-from brokk_rl.sim.model_choices import ModelChoices
-from brokk_rl.spec import WorldCount, name_spec, spec
-
-if TYPE_CHECKING:
-    import torch
-
-    from brokk_rl.contracts.actuator import ActuatorModel
+from brokk_rl.sim.machine_trial import try_machine
+from brokk_rl.sim.model import list_touching
+from brokk_rl.sim.model_choices import CheckSubject
+from brokk_rl.sim.model_import import import_model
+from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
 
@@ -45,34 +43,6 @@ JOINT_COLUMNS = {
 LARGEST_REACH_M = 80.0
 """Reach beyond which lengths are doubted: the longest booms of concrete pumps have some 70 m."""
 JOINT_UNITS = "rad, rad/s, Nm; of a slide m, m/s, N. The yield force counts beyond the weight."
-
-
-@spec
-class CheckSubject(ModelChoices):
-    """Subject and size of a check.
-
-    Attributes:
-        model: URDF or MJCF of a new machine; `None` checks `machine=…`.
-        name: Name of the new machine; `None`: that of its file.
-        num_poses: Random poses from which the reach is read.
-        num_starts: Starts of the task that are drawn, and worlds that are simulated.
-    """
-
-    model: str | None
-    name: str | None
-    num_poses: Annotated[int, Interval(ge=1, le=10**7)]
-    num_starts: WorldCount
-
-    def check(self) -> None:
-        super().check()
-        if self.model is not None:
-            parse_model(Path(self.model))
-        if self.model is None and (self.chain or self.tip or self.name):
-            raise ConfigError("model: expected the file of a robot beside name, chain and tip")
-        if self.name is not None and not re.fullmatch(r"\w+", self.name):
-            raise ConfigError(
-                f"name: expected letters, digits and _, got '{self.name}'; it names files and recordings"
-            )
 
 
 @dataclass
@@ -162,8 +132,6 @@ class Check:
 
     def _import_model(self) -> tuple[Machine, list[str]]:
         """Return the machine of the model and remarks about it; writes its files."""
-        from brokk_rl.sim.model_import import import_model
-
         path = Path(self.subject.model or "")
         name = self.subject.name or re.sub(r"\W+", "_", path.stem)
         imported = import_model(path, name, self.subject)
@@ -177,8 +145,6 @@ class Check:
 
     def _draw_starts(self, machine: Machine, found: MachineCheck) -> dict[str, torch.Tensor] | None:
         """Return starts of the task, `None` where it has none for this machine."""
-        import torch
-
         if not machine.has_bodies:
             return None
         seed, count = self.session.stream("check"), self.subject.num_starts
@@ -196,12 +162,6 @@ class Check:
         self, machine: Machine, found: MachineCheck, drawn: dict[str, torch.Tensor] | None
     ) -> None:
         """Simulate a second of full commands from drawn starts, and say which joint diverges."""
-        import torch
-
-        from brokk_rl.commands import accept_speeds
-        from brokk_rl.sim.machine_trial import try_machine
-        from brokk_rl.sim.model import list_touching
-
         num, cpu = self.subject.num_starts, torch.device("cpu")
         actuator: ActuatorModel | None = None
         try:

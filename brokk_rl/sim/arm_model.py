@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 
 from brokk_rl.sim.kinematic_tree import KinematicTree
-from brokk_rl.sim.model_choices import ModelChoices
+from brokk_rl.sim.model_choices import CheckSubject
 from brokk_rl.sim.model_source import NUM_SIZES, SMALLEST_KG, SMALLEST_KG_M2, read_source
 
 TIP = "tip"
@@ -55,10 +55,11 @@ class ArmModel:
         ConfigError: The file is missing or invalid, or has no serial chain of hinges and slides.
     """
 
-    def __init__(self, path: Path, name: str, choices: ModelChoices) -> None:
+    def __init__(self, path: Path, name: str, choices: CheckSubject) -> None:
         self.source = read_source(path, choices.packages)
         self.tree = KinematicTree(self.source)
-        self._arm = self.tree.choose(choices.chain_names, choices.tip, choices.gripper)
+        wanted = choices.chain_names or ((choices.tip,) if choices.tip else ())
+        self._arm = self.tree.choose(wanted)
         self.joints = self._arm.joints
         self.tree.note_held(self._arm)
         self._drawn = mujoco.MjData(self.source.model)
@@ -126,13 +127,10 @@ class ArmModel:
     def _find_tool(self, tip: str | None) -> np.ndarray:
         """Return the place of the tool point in the file's own frame: as asked, a named frame, else the far end."""
         model, drawn, last = self.source.model, self._drawn, self.joints[-1]
-        fingers = set(self._arm.gripper)
-        bodies, palm = [], []
+        bodies = []
         for body in range(1, model.nbody):
-            above = self.tree.list_above(body, driven=False)
-            if last in above:
+            if last in self.tree.list_above(body, driven=False):
                 bodies.append(body)
-                palm += [body] if fingers.isdisjoint(above) else []
         frames = self._list_frames(bodies)
         if tip is not None and tip not in frames:
             raise self.source.refuse(
@@ -142,18 +140,12 @@ class ArmModel:
         if (wanted := tip or TIP) in frames:
             return frames[wanted]
         away_m = {}
-        for name, at_m in self._list_frames(palm).items():
+        for name, at_m in frames.items():
             far_m = float(np.linalg.norm(at_m - drawn.xanchor[last]))
             if far_m > NEAREST_TIP_M:
                 away_m[name] = far_m
         if named := [name for name in away_m if TIP_NAMES.search(name)]:
             chosen = named[-1]
-        elif fingers:
-            self.source.remark(
-                "The tool point is the middle of the gripper's fingers; subject.tip=… chooses another."
-            )
-            moved = sorted({int(model.jnt_bodyid[joint]) for joint in fingers})
-            return drawn.xipos[moved].mean(0)
         elif away_m:
             chosen = max(away_m, key=lambda name: away_m[name])
         else:

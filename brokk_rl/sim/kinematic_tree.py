@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -11,9 +10,6 @@ import mujoco
 from brokk_rl.errors import list_choices
 from brokk_rl.sim.model_source import KINDS, ModelSource
 
-FINGER = re.compile("finger|jaw|claw|knuckle|thumb|pincer", re.IGNORECASE)
-GRIPPER = re.compile(f"grip|{FINGER.pattern}", re.IGNORECASE)
-"""Names of links, and of joints, of grippers: a link named `gripper` may be what the wrist turns."""
 LOCK = 1e5
 """Damping beyond which a joint without limits is a lock, as bases in scenes have it (1e11), Nm s/rad."""
 _TIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -27,13 +23,11 @@ class ArmChain:
     Attributes:
         joints: From the base to the tool.
         root: Body at its foot.
-        gripper: Joints of its gripper that are not part of the chain.
         left_out: Other joints of the robot.
     """
 
     joints: list[int]
     root: int
-    gripper: list[int] = field(default_factory=list)
     left_out: list[int] = field(default_factory=list)
 
 
@@ -62,35 +56,23 @@ class KinematicTree:
         self._cut_loops()
         self._chains = self._list_chains()
 
-    def choose(self, chain: Sequence[str], tip: str | None, with_gripper: bool) -> ArmChain:
+    def choose(self, names: Sequence[str]) -> ArmChain:
         """Return the arm: the one that is named, else the longest chain.
 
         Args:
-            chain: Last joint or link, or first and last; empty for the longest.
-            tip: Site or link of the tool point, which the chain must move.
-            with_gripper: Whether the first joint of the gripper is the last of the chain.
+            names: Last joint or link, or first and last; empty for the longest.
 
         Raises:
             ConfigError: There is no chain, several are alike, or a name is unknown.
         """
-        gripper: list[int] = []
-        if chain:
-            joints = self._choose_named(chain)
-        else:
-            joints = self._choose_longest()
-            gripper = self._list_behind(joints)
-            beyond = self._list_up_to(tip) if tip else []
-            if not set(beyond) <= {*joints, *gripper}:
-                joints, gripper = beyond, []
-        if with_gripper and gripper:
-            joints.append(gripper.pop(0))
+        joints = self._choose_named(names) if names else self._choose_longest()
         root = self._find_root(joints[0])
-        used = {*self._passive, *joints, *gripper}
+        used = {*self._passive, *joints}
         others = []
         for joint in range(self.model.njnt):
             if joint not in used and self._find_root(joint) == root:
                 others.append(joint)
-        return ArmChain(joints, root, gripper, others)
+        return ArmChain(joints, root, others)
 
     def name(self, joint: int) -> str:
         """Return the name of a joint; one without is called by its body."""
@@ -116,11 +98,6 @@ class KinematicTree:
         for joint, why in self._passive.items():
             if self._find_root(joint) == chain.root and why != CLOSES_LOOP:
                 self._source.note(self.name(joint), f"{why}; held where drawn.")
-        if chain.gripper:
-            self._source.remark(
-                f"The gripper ({self.list_names(chain.gripper)}) is held where it is drawn; subject.gripper=true makes "
-                "its first joint the last of the machine."
-            )
         for joint in chain.left_out:
             self._source.note(
                 self.name(joint),
@@ -132,15 +109,6 @@ class KinematicTree:
         paths = {tuple(self.list_above(body)) for body in range(1, self.model.nbody)}
         inner = {path[:place] for path in paths for place in range(len(path))}
         return sorted(paths - inner - {()})
-
-    def _list_behind(self, joints: Sequence[int]) -> list[int]:
-        """Return the driven joints that are moved by all of `joints`."""
-        start = tuple(joints)
-        found: set[int] = set()
-        for chain in self._chains:
-            if chain[: len(start)] == start:
-                found.update(chain[len(start) :])
-        return sorted(found)
 
     def _find_root(self, joint: int) -> int:
         return int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
@@ -189,39 +157,11 @@ class KinematicTree:
     # the longest chain
 
     def _choose_longest(self) -> list[int]:
-        """Return the joints of the longest chain, without a gripper.
+        """Return the joints of the longest chain; of fingers that are alike, those before them.
 
         Raises:
             ConfigError: Nothing moves, or several robots, legs or arms are alike.
         """
-        chains = self._list_candidates()
-        palms = {self._cut_gripper(chain) for chain in chains} - set(chains)
-        arms = []
-        for chain in chains:
-            above = [palm for palm in palms if chain[: len(palm)] == palm]
-            arms.append(min(above, key=len, default=chain))
-        arms = sorted(set(arms))
-        longest = max(arms, key=len)
-        alike = []
-        for arm in arms:
-            num_own = len(set(arm) - set(longest))
-            is_shorter = len(arm) == len(longest) - 1 and num_own > 1
-            if len(arm) == len(longest) or is_shorter:
-                alike.append(arm)
-        shared = [joint for joint in longest if all(joint in arm for arm in alike)]
-        num_apart = len(longest) - len(shared)
-        if len(alike) == 1 or _is_gripper(len(shared), num_apart):
-            return shared
-        ends = [self.name(arm[-1]) for arm in alike]
-        raise self._source.refuse(
-            f"{len(alike)} chains of {num_apart} joints are alike ({', '.join(ends)}): legs, arms, wheels, or robots of "
-            "a scene. A machine is one arm on a base that stands still, so a robot that walks cannot be trained "
-            "here (mjlab and Isaac Lab can). Name the last joint of an arm: subject.chain="
-            + " or subject.chain=".join(ends)
-        )
-
-    def _list_candidates(self) -> list[tuple[int, ...]]:
-        """Return chains of robots that stand and are driven, or all where there are none."""
         if not self._chains:
             passive = [f"{self.name(joint)} {why}" for joint, why in self._passive.items()]
             why = f" ({'; '.join(passive)})" if passive else ""
@@ -229,32 +169,19 @@ class KinematicTree:
                 f"it has no joint that moves{why}; a fragment that a scene includes has none either: "
                 "give the scene"
             )
-        model = self.model
-        is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-        moved = set(model.actuator_trnid[is_joint, 0].tolist())
-        standing, driven = [], []
-        for chain in self._chains:
-            if not self._is_floating(self._find_root(chain[0])):
-                standing.append(chain)
-        if max(map(len, standing), default=0) < 2:
-            standing = self._chains
-        for chain in standing:
-            if not moved.isdisjoint(chain):
-                driven.append(chain)
-        return driven or standing
-
-    def _is_floating(self, root: int) -> bool:
-        first = int(self.model.body_jntadr[root])
-        return first >= 0 and self.model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE
-
-    def _cut_gripper(self, chain: tuple[int, ...]) -> tuple[int, ...]:
-        """Return a chain up to the first joint that is named as one of a gripper."""
-        for place, joint in enumerate(chain):
-            link = self.model.body(int(self.model.jnt_bodyid[joint])).name
-            if GRIPPER.search(self.name(joint)) or FINGER.search(link):
-                is_end = _is_gripper(place, len(chain) - place)
-                return chain[:place] if is_end else chain
-        return chain
+        longest = max(self._chains, key=len)
+        alike = [chain for chain in self._chains if len(chain) == len(longest)]
+        shared = [joint for joint in longest if all(joint in chain for chain in alike)]
+        num_apart = len(longest) - len(shared)
+        if num_apart < len(shared):
+            return shared
+        ends = [self.name(chain[-1]) for chain in alike]
+        raise self._source.refuse(
+            f"{len(alike)} chains of {num_apart} joints are alike ({', '.join(ends)}): legs, arms, wheels, or robots of "
+            "a scene. A machine is one arm on a base that stands still, so a robot that walks cannot be trained "
+            "here (mjlab and Isaac Lab can). Name the last joint of an arm: subject.chain="
+            + " or subject.chain=".join(ends)
+        )
 
     # a chain by name
 
@@ -293,8 +220,3 @@ class KinematicTree:
             raise self._source.refuse(f"{name} {self._passive[joint]}")
         path = self.list_above(int(model.jnt_bodyid[joint]))
         return path[: path.index(joint) + 1]
-
-
-def _is_gripper(num_arm: int, num_behind: int) -> bool:
-    """Return whether joints behind an arm are few enough to be a gripper's."""
-    return num_arm > 1 and num_behind < num_arm

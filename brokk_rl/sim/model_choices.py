@@ -1,32 +1,43 @@
-"""Choices of what is taken of a URDF or MJCF."""
+"""Subject of a check: which machine, and what is taken of a URDF or MJCF."""
 
 from __future__ import annotations
 
-from typing import Literal
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+from annotated_types import Interval
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.plain_files import parse_model
+from brokk_rl.spec import WorldCount, spec
 
 
 @spec
-class ModelChoices:
-    """Choices of what is taken of a model file.
+class CheckSubject:
+    """Subject and size of a check.
 
     Attributes:
+        model: URDF or MJCF of a new machine; `None` checks `machine=…`.
+        name: Name of the new machine; `None`: that of its file.
         chain: Last joint or link of the arm, or its first and last; `None` for the longest chain.
         tip: Site or link of the tool point; `None`: a frame named so, else the far end.
-        gripper: Whether the first joint of the gripper is the last one of the machine.
         drive: What moves the joints; `auto` reads it off the model.
         command: Quantity that commands set; `auto`: that of the model's actuators.
         packages: Folders in which meshes of `package://…` are searched first.
+        num_poses: Random poses from which the reach is read.
+        num_starts: Starts of the task that are drawn, and worlds that are simulated.
     """
 
+    model: str | None
+    name: str | None
     chain: str | tuple[str, ...] | None
     tip: str | None
-    gripper: bool
     drive: Literal["auto", "electric", "hydraulic"]
     command: Literal["auto", "valve", "velocity", "position", "torque"]
     packages: tuple[str, ...]
+    num_poses: Annotated[int, Interval(ge=1, le=10**7)]
+    num_starts: WorldCount
 
     @property
     def chain_names(self) -> tuple[str, ...]:
@@ -37,4 +48,12 @@ class ModelChoices:
         if len(self.chain_names) > 2:
             raise ConfigError(
                 f"chain: expected the last joint or link, or [first, last], got {len(self.chain_names)} names"
+            )
+        if self.model is not None:
+            parse_model(Path(self.model))
+        if self.model is None and (self.chain or self.tip or self.name):
+            raise ConfigError("model: expected the file of a robot beside name, chain and tip")
+        if self.name is not None and not re.fullmatch(r"\w+", self.name):
+            raise ConfigError(
+                f"name: expected letters, digits and _, got '{self.name}'; it names files and recordings"
             )

@@ -15,7 +15,7 @@ import yaml
 from brokk_rl.machine import Machine
 from brokk_rl.sim.arm_model import LEAST_KG, TIP, ArmModel, normalise_axis
 from brokk_rl.sim.model import FASTEST_MODE, compute_inertia, find_fastest_mode
-from brokk_rl.sim.model_choices import ModelChoices
+from brokk_rl.sim.model_choices import CheckSubject
 from brokk_rl.sim.model_source import KINDS, UNITS
 
 HYDRAULIC_NAMES = re.compile("boom|stick|bucket|dipper|cylinder", re.IGNORECASE)
@@ -94,7 +94,7 @@ class ImportedMachine:
         return f"# {self.values['title']}.\n{text}"
 
 
-def import_model(path: Path, name: str, choices: ModelChoices) -> ImportedMachine:
+def import_model(path: Path, name: str, choices: CheckSubject) -> ImportedMachine:
     """Return the machine `name` of a URDF or MJCF.
 
     Raises:
@@ -106,7 +106,7 @@ def import_model(path: Path, name: str, choices: ModelChoices) -> ImportedMachin
 class _MachineDescription:
     """Numbers of a machine from an arm of a model."""
 
-    def __init__(self, path: Path, name: str, choices: ModelChoices) -> None:
+    def __init__(self, path: Path, name: str, choices: CheckSubject) -> None:
         self._file, self._name, self._choices = path.name, name, choices
         self._arm = ArmModel(path, name, choices)
         self._made, self._source = self._arm.model, self._arm.source
