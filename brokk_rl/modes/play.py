@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
 from brokk_rl.errors import CheckpointError
-from brokk_rl.gamepad import Gamepad
+from brokk_rl.play.page import PlayPage
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.policy_folder import find_policy
@@ -25,9 +24,6 @@ from brokk_rl.rl.policy import (
 from brokk_rl.session import Session
 from brokk_rl.spec import name_spec, spec
 
-if TYPE_CHECKING:
-    from brokk_rl.play.page import PlayPage
-
 log = logging.getLogger(__name__)
 
 POLICY, CLASSICAL = "policy", "classical"
@@ -36,10 +32,6 @@ NUM_STARTS = 256
 """Starts from which episodes begin. Chosen by hand: drawn in less than a second."""
 FRAME_S = 1 / 30
 """Time between two pictures, s. Chosen by hand for the eye."""
-RATE_S = 30.0
-"""Time between two lines about the rate, s; the first comes after a tenth of it. By hand."""
-
-
 POLL_S = 2.0
 """Seconds between two looks for a newer checkpoint. Chosen by hand."""
 
@@ -67,27 +59,19 @@ class Play(SimulatedPlant):
         """Show the machines until the person ends it.
 
         Raises:
-            ConfigError: The port is taken, or a driver or device is missing.
+            ConfigError: A driver is missing.
             CheckpointError: There is no policy, or it is of another machine or task.
             DeviceError: There is no such GPU.
         """
-        from brokk_rl.play.page import PlayPage, require_free_port
-
-        gamepad = None
-        if self.play.gamepad is not None:
-            gamepad = Gamepad(Path(self.play.gamepad), "play.gamepad")
-        port = self.play.port
-        require_free_port(port)
         session, watch = self._build_session()
-        page = PlayPage(session, port, gamepad, self.play.gamepad_axes)
+        page = PlayPage(session, self.play.port)
+        port = page.port
         log.info("open http://localhost:%d in a browser; end with Ctrl-C", port)
         log.info("over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", port, port)
         try:
             _drive(session, page, watch, self.play.seconds)
         finally:
             page.close()
-            if gamepad is not None:
-                gamepad.close()
 
     def _build_session(self) -> tuple[PlaySession, CheckpointWatch | None]:
         """Return the session, and the watch of the training that is followed, if any."""
@@ -160,7 +144,6 @@ def _drive(
 ) -> None:
     """Simulate at the wanted pace and show it, until the time ends it."""
     begun_s = last_s = time.monotonic()
-    report_s = begun_s + RATE_S / 10
     with torch.no_grad():
         while seconds is None or time.monotonic() - begun_s < seconds:
             now_s = time.monotonic()
@@ -170,11 +153,4 @@ def _drive(
             if watch is not None and (policy := watch.poll()) is not None:
                 session.replace_policy(POLICY, policy, watch.note)
                 log.info("playing %s", watch.note)
-            if now_s >= report_s:
-                report_s = now_s + RATE_S
-                rate = session.measure_rate()
-                steps = round(rate / session.machine.period_s)
-                worlds = session.loop.num_envs
-                text = "%.2f times real time, %d control steps/s in each of %d worlds"
-                log.info(text, rate, steps, worlds)
             time.sleep(max(0.0, FRAME_S - (time.monotonic() - now_s)))

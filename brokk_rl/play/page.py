@@ -7,7 +7,6 @@ import io
 import itertools
 import logging
 import queue
-import socket
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -18,8 +17,7 @@ import viser
 import viser.uplot as uplot
 
 from brokk_rl.contracts.task import SUCCESS
-from brokk_rl.errors import BrokkError, ConfigError
-from brokk_rl.gamepad import Gamepad
+from brokk_rl.errors import BrokkError
 from brokk_rl.play.scene_view import SceneView
 from brokk_rl.play.session import DISTANCE_M, HEIGHT_M, KEY_STEP, PERSON, PlaySession, PlayState
 from brokk_rl.play.settings import SPEEDS
@@ -43,38 +41,16 @@ PUSH_N = 4000.0
 """Force of a push at first, N: above what the slewing gear of a Brokk 170 holds at 3 m."""
 
 
-def require_free_port(port: int) -> None:
-    """Raise an error where the page's port is taken.
-
-    Raises:
-        ConfigError: Another program listens there.
-    """
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, port))
-        except OSError as error:
-            raise ConfigError(
-                f"play.port={port} cannot be used ({error.strerror}): another program, perhaps "
-                f"another mode=play, listens there. End it, or give another port: "
-                f"play.port={port + 1 if port < 65535 else 8080}"
-            ) from error
-
-
 class PlayPage:
     """The page of one session, in any number of browsers.
 
     Args:
         session: The session.
-        port: Port on this computer.
-        gamepad: Gamepad of this computer; `None` for none.
-        axes: Axis of the gamepad for each joint, as in `Gamepad.read_axes`.
+        port: Port on this computer; the next free one where it is taken.
     """
 
-    def __init__(
-        self, session: PlaySession, port: int, gamepad: Gamepad | None, axes: Sequence[int]
-    ) -> None:
-        self._session, self._gamepad, self._axes = session, gamepad, axes
+    def __init__(self, session: PlaySession, port: int) -> None:
+        self._session = session
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         logging.getLogger("websockets").setLevel(logging.WARNING)
         with contextlib.redirect_stdout(io.StringIO()):  # it prints a table of its own
@@ -89,11 +65,14 @@ class PlayPage:
         self._add_keys()
         self._listen_to_handle()
 
+    @property
+    def port(self) -> int:
+        """Port at which the page is."""
+        return self._server.get_port()
+
     def update(self) -> None:
         """Carry out the requests of browsers and show the present state."""
         is_touched = self._follow_requests()
-        if self._gamepad is not None and self._gamepad.poll():
-            self._session.set_levers(self._gamepad.read_axes(self._axes))
         state, now_s = self._session.read(), time.monotonic()
         with self._server.atomic():
             self._scene.draw(state, self._session.selected)
@@ -101,7 +80,7 @@ class PlayPage:
             if is_touched or is_due:
                 self._shown_s = now_s
                 self._show_figures(state)
-                self._show_traces(state)
+                self._show_traces()
 
     def close(self) -> None:
         """Stop serving."""
@@ -246,10 +225,6 @@ class PlayPage:
             self._error = self._plot("Tip from target / cm: beside, above", [beside, above])
             force = uplot.Series(stroke=COLORS[2], width=1.6)
             self._force = self._plot("Contact force / kN", [force])
-        with panel.add_tab("Observation"):
-            self._seen = gui.add_markdown("")
-            entries = uplot.Series(stroke=COLORS[0], width=1.2)
-            self._vector = self._plot("Vector that the policy sees", [entries], (-4.0, 4.0))
         panel.dock_left()
         panel.set_width(380)
 
@@ -293,7 +268,7 @@ class PlayPage:
         # A coroutine: viser keeps the order of its calls, which threads would not.
         @handle.on_update
         async def _(event: Any) -> None:
-            self._scene.hold_handle(event.phase != "end")
+            self._scene.is_dragged = event.phase != "end"
             self._ask(self._session.move_target, self._scene.read_handle(self._session.selected))
 
     def _press(self, button: str) -> None:
@@ -332,24 +307,15 @@ class PlayPage:
         if state.target_m is not None and session.can_move_target:
             _assign(self._target, "value", _round_place(state.target_m[session.selected]))
 
-    def _show_traces(self, state: PlayState) -> None:
+    def _show_traces(self) -> None:
         """Show the last seconds of the selected world."""
-        traces, selected = self._session.read_traces(), self._session.selected
+        traces = self._session.read_traces()
         if not traces:
             return
         t_s = traces["t_s"]
         self._commands.data = (t_s, *traces["given"].T, *traces["proposed"].T)
         self._error.data = (t_s, 100 * traces["lateral_m"], 100 * traces["height_m"])
         self._force.data = (t_s, traces["force_n"] / 1000)
-        vector = self._session.read_observation().astype(float)
-        self._vector.data = (np.arange(len(vector), dtype=float), vector)
-        if state.estimate_m is not None and state.target_m is not None:
-            seen, true = state.estimate_m[selected], state.target_m[selected]
-            distance_mm = 1000 * np.linalg.norm(seen - true)
-            self._seen.content = (
-                f"Target seen (blue): {_round_place(seen)} m\n\n"
-                f"Target true (orange): {_round_place(true)} m, {distance_mm:.0f} mm away"
-            )
 
 
 def _assign(handle: Any, name: str, value: Any) -> None:

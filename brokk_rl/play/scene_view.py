@@ -41,7 +41,7 @@ class SceneView:
         self._posed = PosedScene(machine)
         self._offsets = place_worlds(num_worlds)
         self._blocks: dict[int, tuple[np.ndarray, viser.GlbHandle]] = {}
-        self._is_dragged = False
+        self.is_dragged = False
         model = self._posed.model
         # mjviser draws once what is welded to the ground; a base stands in every world.
         model.body_weldid[1:] = np.arange(1, model.nbody)
@@ -80,13 +80,9 @@ class SceneView:
         if state.scene is not None:
             for world, scene in enumerate(state.scene[: self._num_worlds]):
                 self._draw_block(world, scene)
-        if self.handle is not None and state.target_m is not None and not self._is_dragged:
+        if self.handle is not None and state.target_m is not None and not self.is_dragged:
             offset = self._offsets[min(selected, self._num_worlds - 1)]
             self.handle.position = tuple(state.target_m[selected] + offset)
-
-    def hold_handle(self, held: bool) -> None:
-        """Set whether a person drags the handle; the program does not move it meanwhile."""
-        self._is_dragged = held
 
     def read_handle(self, world: int) -> np.ndarray:
         """Return the place of the handle in the base frame of a world, `(3,)`."""
@@ -98,20 +94,7 @@ class SceneView:
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.configure_environment_map("park", environment_intensity=0.9)
-        scene.add_grid(
-            "/ground",
-            width=60.0,
-            height=60.0,
-            cell_size=0.5,
-            section_size=1.0,
-            cell_color=(196, 192, 186),
-            section_color=(178, 173, 166),
-            plane_color=(214, 210, 203),
-            plane_opacity=1.0,
-            shadow_opacity=0.35,
-            fade_distance=45.0,
-            position=(0.0, 0.0, -0.002),
-        )
+        scene.add_grid("/ground", width=60.0, height=60.0, plane_opacity=1.0, shadow_opacity=0.35)
         camera = self._server.initial_camera
         middle, extent = self._offsets.mean(0), np.ptp(self._offsets, axis=0)
         away = 1.0 + float(np.hypot(*extent[:2])) / 9.0

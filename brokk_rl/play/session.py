@@ -6,7 +6,6 @@ It knows no browser and runs in one thread; the page hands its commands over.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -216,10 +215,6 @@ class PlaySession:
         """Put the person's lever of a joint to a position in [-1, 1]."""
         self._person.levers[joint] = min(max(position, -1.0), 1.0)
 
-    def set_levers(self, levers: Sequence[float]) -> None:
-        """Put the person's levers to positions, `J` of them in [-1, 1]."""
-        self._person.levers.copy_(torch.tensor(levers).clamp(-1.0, 1.0))
-
     def release_levers(self) -> None:
         """Let all levers spring back to neutral."""
         self._person.levers.zero_()
@@ -361,11 +356,6 @@ class PlaySession:
         for name in self._trace[0] if self._trace else ():
             traces[name] = np.array([row[name][self.selected] for row in self._trace])
         return traces
-
-    def read_observation(self) -> np.ndarray:
-        """Return the vector that the policy sees in the selected world, `(O,)`."""
-        groups = self.loop.get_observations()
-        return _to_numpy(groups["policy"][self.selected])
 
     def _apply_pushes(self) -> None:
         """Write the loads of running pushes, and take those of finished ones away."""
