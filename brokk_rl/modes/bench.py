@@ -23,7 +23,7 @@ from brokk_rl.spec import spec
 log = logging.getLogger(__name__)
 
 CALLS = 10
-"""Of one thing before it is the turn of the next."""
+"""Calls between two looks at the clock."""
 RATES = {
     "physics_env_steps_per_s": "physics /s",
     "env_steps_per_s": "control step /s",
@@ -93,11 +93,12 @@ class Benchmark(SimulatedPlant):
             physics = capture_graph(physics, device).replay
         loop.capture(self.rl.fuse)
         action = torch.zeros(num, loop.num_actions, device=device)
-        steps = {"physics_env_steps_per_s": physics, "env_steps_per_s": lambda: loop.step(action)}
         # processes of one computer share its cores and power: measure at the same time
         group.wait()
-        seconds = self._in_turn(steps, loop, device)
-        rates = {name: num / time_s for name, time_s in seconds.items()}
+        rest = loop.world.state_dict()
+        rates = {"physics_env_steps_per_s": num / self._time_call(physics, device)}
+        loop.world.load_state_dict(rest)
+        rates["env_steps_per_s"] = num / self._time_call(lambda: loop.step(action), device)
         rates["train_env_steps_per_s"] = num / self._time_training(loop, device, group)
         return {"num_envs": num, **rates, "graph": loop.graph_active}
 
@@ -116,32 +117,18 @@ class Benchmark(SimulatedPlant):
         _wait(device)
         return (time.perf_counter() - start) / (self.bench.iterations * num_steps)
 
-    def _in_turn(
-        self, steps: dict[str, Callable[[], object]], loop: ControlLoop, device: torch.device
-    ) -> dict[str, float]:
-        """Return the seconds of one call of each, the median over at least `bench.seconds`.
-
-        A few calls of each at a time, so that other load of the computer meets all alike. Calls
-        that are no control step move arms at rest at their starts; the control loop finds its
-        worlds as it left them.
-        """
-        rest = loop.world.state_dict()
-        spent: dict[str, list[float]] = {name: [] for name in steps}
-        while min(map(sum, spent.values())) < self.bench.seconds:
-            for name, step in steps.items():
-                running = loop.world.state_dict()
-                if name != "env_steps_per_s":
-                    loop.world.load_state_dict(rest)
-                step()  # finds what it needs in the caches
-                _wait(device)
-                start = time.perf_counter()
-                for _ in range(CALLS):
-                    step()
-                _wait(device)
-                spent[name].append(time.perf_counter() - start)
-                if name != "env_steps_per_s":
-                    loop.world.load_state_dict(running)
-        return {name: median(values) / CALLS for name, values in spent.items()}
+    def _time_call(self, step: Callable[[], object], device: torch.device) -> float:
+        """Return the seconds of one call, the median over at least `bench.seconds`."""
+        spent: list[float] = []
+        while sum(spent) < self.bench.seconds:
+            step()  # finds what it needs in the caches
+            _wait(device)
+            start = time.perf_counter()
+            for _ in range(CALLS):
+                step()
+            _wait(device)
+            spent.append(time.perf_counter() - start)
+        return median(spent) / CALLS
 
 
 def _name_device(device: torch.device) -> str:

@@ -97,11 +97,6 @@ def collect_words(runs: Sequence[EvaluatedRun], names: Sequence[str]) -> dict[st
     return words
 
 
-def _name_figure(figure: Figure) -> str:
-    unit = "" if figure.unit in ("share", "") else f", {figure.unit}"
-    return figure.title + unit
-
-
 def _print_groups(
     groups: pd.DataFrame, columns: Sequence[str], words: Mapping[str, Figure], rates: Sequence[str]
 ) -> None:
@@ -111,7 +106,8 @@ def _print_groups(
         if name in rates:
             half = (groups[name + HIGH] - groups[name + LOW]) / 2
             shown += half.map(lambda value: "" if pd.isna(value) else f" ±{value:.3f}")
-        cells[_name_figure(figure)] = shown.where(groups[name].notna(), None)
+        unit = "" if figure.unit in ("share", "") else f", {figure.unit}"
+        cells[figure.title + unit] = shown.where(groups[name].notna(), None)
     cells["difference by seed"] = groups.apply(_format_difference, axis=1)
     table = groups[["policy", *columns, "runs"]].join(pd.DataFrame(cells))
     headings = ["policy", *columns, "seeds", *cells]

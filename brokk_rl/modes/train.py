@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import pandas as pd
 import torch
-from scipy import stats
 
 from brokk_rl import distributed
 from brokk_rl.build import describe_spec
@@ -21,19 +19,17 @@ from brokk_rl.policy_folder import (
     describe_policy,
     find_resumed,
     list_checkpoints,
-    read_contract,
     write_policy,
 )
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.group import TrainingGroup
-from brokk_rl.rl.logger import LEVELS, PROGRESS, Tracking, TrainingLogger, draw_curves, find_passing
+from brokk_rl.rl.logger import PROGRESS, Tracking, draw_curves
 from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
 from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy, load_initial_weights
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.spec import name_spec, spec
-from brokk_rl.statistics import CONFIDENCE
 
 log = logging.getLogger(__name__)
 
@@ -103,12 +99,10 @@ class Train(SimulatedPlant):
                 runner.run()
             if not is_first:
                 return None
-            logger = runner.logger
-            _log_success(logger)
             results = self._finish(runner)
             files = [path for name in TRACKED for path in sorted(folder.glob(name))]
             figures = pd.json_normalize(results["policies"], sep="/").select_dtypes("number")
-            logger.writer.report(figures.add_prefix("evaluation/").iloc[0].to_dict(), files)
+            runner.logger.writer.report(figures.add_prefix("evaluation/").iloc[0].to_dict(), files)
         log.info("policy, curves and evaluation are in %s", folder)
         return float(results["success_strict"]["mean"])
 
@@ -123,18 +117,8 @@ class Train(SimulatedPlant):
             return
         if distributed.read_rank().first:  # a run that was stopped before its first checkpoint
             (self.session.folder / PROGRESS).unlink(missing_ok=True)
-        if (beginning := self._find_beginning()) is not None:
-            load_initial_weights(runner.alg.actor, beginning, self.machine)
-
-    def _find_beginning(self) -> str | None:
-        """Return the policy with whose network training begins; `None` for a fresh one."""
-        if self.policy is None:
-            return None
-        folder = self.session.folder
-        if Path(self.policy.path).resolve() != folder.resolve():
-            return self.policy.path
-        earlier = read_contract(folder, self.policy.path)  # it was stopped before a checkpoint
-        return earlier.get("trained", {}).get("began_with")
+        if self.policy is not None:
+            load_initial_weights(runner.alg.actor, self.policy.path, self.machine)
 
     @contextlib.contextmanager
     def _explain_interruption(self) -> Iterator[None]:
@@ -143,27 +127,17 @@ class Train(SimulatedPlant):
             yield
         except KeyboardInterrupt:
             folder = self.session.folder
-            found = list_checkpoints(folder)
-            log.warning(
-                "%s; go on with: brokk mode=train policy=%s session.out=%s",
-                f"{found[-1]} remains" if found else "no checkpoint was written yet",
-                folder,
-                folder,
-            )
+            if found := list_checkpoints(folder):
+                text = "%s remains; go on with: brokk mode=train policy=%s session.out=%s"
+                log.warning(text, found[-1], folder, folder)
+            else:
+                log.warning("no checkpoint was written yet: begin again, in another folder")
             raise
 
     def _describe_run(self) -> dict[str, Any]:
-        """Return what a tracker shows of the run: its parts, commit and whole configuration."""
+        """Return what a tracker shows of the run: commit, chosen options and whole configuration."""
         record = read_record(self.session.folder) or {}
         return {
-            "machine": self.machine.name,
-            "task": name_spec(self.task),
-            "actuator": name_spec(self.actuator),
-            "effect": ", ".join(self.effect) or "none",
-            "event": ", ".join(self.event) or "none",
-            "follower": name_spec(self.follower),
-            "seed": self.session.seed,
-            "num_envs": self.rl.num_envs,
             "commit": record.get("commit") or "unknown",
             "choices": record.get("choices", {}),
             "fingerprint": self.machine.fingerprint(),
@@ -180,7 +154,6 @@ class Train(SimulatedPlant):
             actuator=self.actuator,
         )
         contract["trained"] = {
-            "began_with": self._find_beginning(),
             "beginning": self.rl.describe_beginning(),
             "seed": self.session.seed,
             "device": str(loop.device),
@@ -204,10 +177,6 @@ class Train(SimulatedPlant):
         line, words = None, loop.task.figures
         if controller := results["policies"].get("classical"):
             line = controller[SUCCESS]["mean"]
-            for name, figure in words.items():
-                if figure.unit == "share":
-                    gain = describe_gain(results["policies"]["trained"], controller, name)
-                    log.info("%s %s", figure.title, gain)
         picture = folder / "learning_curves.png"
         draw_curves(folder / PROGRESS, picture, words, book.first_episodes, line)
         task = self.task.build(self.machine, 1, torch.device("cpu"))
@@ -217,28 +186,6 @@ class Train(SimulatedPlant):
             name, text = type(self.task).__name__, "cannot be deployed, so there is no policy.onnx"
             log.warning("the task (%s) %s; %s", name, text, NOT_DEPLOYABLE)
         return results
-
-
-def _log_success(logger: TrainingLogger) -> None:
-    """Log how many seconds of training the levels of success took."""
-    for level in LEVELS:
-        passed = find_passing(logger.rows, level, logger.first_episodes)
-        text = "not reached" if passed is None else f"after {float(passed['seconds']):.1f} s"
-        log.info("success of %.2f while learning: %s", level, text)
-
-
-def describe_gain(trained: Mapping[str, Any], controller: Mapping[str, Any], share: str) -> str:
-    """Return whether training has gained a share over the controller, by Fisher's exact test."""
-    table = []
-    for row in (trained, controller):
-        successes = round(row["episodes"] * row[share]["mean"])
-        table.append([successes, row["episodes"] - successes])
-    own, other = trained[share]["mean"], controller[share]["mean"]
-    verdict = "no gain shown"
-    test: Any = stats.fisher_exact(table, alternative="greater")
-    if test.pvalue < 1.0 - CONFIDENCE:
-        verdict = f"better than the controller by {own - other:.3f}"
-    return f"{own:.3f} against the controller's {other:.3f}: {verdict}"
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

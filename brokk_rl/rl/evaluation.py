@@ -125,9 +125,14 @@ def _summarize(
             continue
         values, word = value.cpu().numpy(), words.get(name)
         if word and word.unit == "share":
-            summary[name] = _estimate_share(values > 0)
+            interval = compute_wilson_interval(int((values > 0).sum()), len(values))
+            summary[name] = {"mean": float((values > 0).mean()), "ci95": list(interval)}
         elif word and word.of_success:
-            summary[name] = _summarize_times(values[success])
+            times_s = values[success]
+            summary[name] = {"median": None, "p95": None}
+            if len(times_s):
+                p95 = float(np.quantile(times_s, 0.95))
+                summary[name] = {"median": float(np.median(times_s)), "p95": p95}
         else:
             summary[name] = float(values.mean())
     endings = reason.cpu().numpy()
@@ -135,18 +140,6 @@ def _summarize(
         name: int((endings == index).sum()) for index, name in enumerate(reasons)
     }
     return summary
-
-
-def _summarize_times(times_s: np.ndarray) -> dict[str, float | None]:
-    """Return median and 95 % quantile, `None` where there is no time."""
-    if not len(times_s):
-        return {"median": None, "p95": None}
-    return {"median": float(np.median(times_s)), "p95": float(np.quantile(times_s, 0.95))}
-
-
-def _estimate_share(happened: np.ndarray) -> dict[str, Any]:
-    low, high = compute_wilson_interval(int(happened.sum()), len(happened))
-    return {"mean": float(happened.mean()), "ci95": [low, high]}
 
 
 def _collect_episodes(

@@ -17,9 +17,6 @@ import torch.distributed as dist
 from brokk_rl import distributed
 from brokk_rl.errors import DistributedError
 
-LOST_CONNECTION = ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer")
-"""Words of a RuntimeError that is a lost connection: gloo has no class of its own for it."""
-
 
 class TrainingGroup:
     """Process group of a training, a context manager; without effect for a single process.
@@ -58,13 +55,6 @@ class TrainingGroup:
         # destroyed after an error: NCCL would wait for processes that have ended.
         if self.device.type == "cpu":
             dist.destroy_process_group()
-        if isinstance(error, dist.DistError) or (
-            isinstance(error, RuntimeError) and any(word in str(error) for word in LOST_CONNECTION)
-        ):
-            raise DistributedError(
-                f"rank {self.rank.index}: another process of this training has ended; its own "
-                f"message says why ({str(error).splitlines()[0]})"
-            ) from error
 
     def wait(self) -> None:
         """Wait until all processes have called this."""

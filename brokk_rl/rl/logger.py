@@ -34,11 +34,6 @@ log = logging.getLogger(__name__)
 PROGRESS = "progress.csv"
 SUCCESS = "episode/success_strict"
 """Column of `progress.csv` with the share of successes among the episodes of an iteration."""
-LEVELS = (0.95, 0.99)
-"""Strict success whose time of training is reported."""
-WINDOW = 4096
-"""Newest finished episodes over which success is averaged. Every iteration is asked: with 1,024 a
-training that succeeds in 0.98 of its episodes passed 0.99 by chance (one H100)."""
 EPISODE = "episode/"
 """Begins the columns of `progress.csv` with means over the episodes of an iteration."""
 NUM_COLUMNS = 3
@@ -229,9 +224,7 @@ class TrainingLogger:
         ones are successes: their success is not told."""
         self._loop, self._training, self._group = loop, training, group
         self._folder, self._path = folder, folder / PROGRESS
-        self.rows: list[dict[str, Any]] = []
-        """Figures of every iteration, as `progress.csv` holds them."""
-        self._num_unwritten = 0
+        self._unwritten: list[dict[str, Any]] = []
         self._told_first = False
         self._last_episode: dict[str, float] = {}
         self._clock = time.perf_counter()
@@ -285,7 +278,7 @@ class TrainingLogger:
         self._clock = now
         self.env_steps += self.steps_per_iteration
         statistics = self._group.pool_statistics(self._loop.statistics())
-        self._require_sound(it, statistics["fault_rate"], loss_dict)
+        self._require_sound(it, statistics["fault_rate"], loss_dict | statistics)
         figures = {
             "env_steps": float(self.env_steps),
             "seconds": self.seconds,
@@ -303,8 +296,7 @@ class TrainingLogger:
         if figures["episodes"] or not self._last_episode:
             self._last_episode = episode
         figures |= self._last_episode
-        self.rows.append({"iteration": it, **figures})
-        self._num_unwritten += 1
+        self._unwritten.append({"iteration": it, **figures})
         self.writer.log(figures, it)
         note = f"{figures['rate/env_steps_per_s']:,.0f} steps/s"
         if self.env_steps > self.first_episodes and SUCCESS in figures:
@@ -315,7 +307,7 @@ class TrainingLogger:
             self._told_first = True
             log.info("first iteration after %.1f s: %s", self.seconds, note)
 
-    def _require_sound(self, it: int, fault_rate: float, losses: Mapping[str, float]) -> None:
+    def _require_sound(self, it: int, fault_rate: float, figures: Mapping[str, float]) -> None:
         """Refuse to go on after an iteration that lost worlds or spoiled the policy."""
         most = self._training.max_fault_rate
         if fault_rate > most:
@@ -325,25 +317,26 @@ class TrainingLogger:
                 f"{most:.2%}); the log names the first ones. Look at the drive's stiffness, the time "
                 "step (sim.substeps) and the sizes of the buffers (sim)."
             )
-        spoiled = [name for name, value in losses.items() if not math.isfinite(value)]
+        spoiled = [name for name, value in figures.items() if not math.isfinite(value)]
         if spoiled:
             kept = list_checkpoints(self._folder)
             remains = (
                 f"{kept[-1]} is the last whole checkpoint" if kept else "there is no checkpoint"
             )
             raise TrainingError(
-                f"iteration {it}: expected finite numbers, got {losses[spoiled[0]]} for "
+                f"iteration {it}: expected finite numbers, got {figures[spoiled[0]]} for "
                 f"{', '.join(spoiled)}; {remains}. Change rl.runner.algorithm.learning_rate, or the "
                 "weights of task.reward"
             )
 
     def flush(self) -> None:
         """Append new rows to `progress.csv`; called with every checkpoint so that both agree."""
-        if not self._num_unwritten or self._quiet:
+        if not self._unwritten or self._quiet:
             return
         import pandas as pd  # this import takes 0.3 s
 
-        rows, self._num_unwritten = pd.DataFrame(self.rows[-self._num_unwritten :]), 0
+        rows = pd.DataFrame(self._unwritten)
+        self._unwritten = []
         is_new = not self._path.exists()
         if not is_new:  # perhaps of a version with fewer figures
             rows = rows.reindex(columns=pd.read_csv(self._path, nrows=0).columns)
@@ -361,43 +354,8 @@ class TrainingLogger:
         import pandas as pd
 
         rows = pd.read_csv(self._path, dtype=str)
-        self._path.unlink()
         kept: Any = rows[rows["env_steps"].astype(float) <= self.env_steps]
-        self.rows = kept.to_dict("records")
-        self._num_unwritten = len(self.rows)
-        self.flush()
-
-
-def find_passing(
-    rows: Sequence[Mapping[str, Any]], level: float, after: int = 0, window: int = WINDOW
-) -> Mapping[str, Any] | None:
-    """Return the first row of `progress.csv` at which the newest episodes reach a level of success.
-
-    Args:
-        rows: One an iteration, with `episodes` and `episode/success_strict`.
-        level: Share of strict successes.
-        after: Control steps whose episodes do not count. Among the first episodes to end are mostly
-            short ones, and short ones are successes: give the steps of a whole episode in every
-            world.
-        window: Least number of newest episodes that are averaged; whole iterations.
-
-    Returns:
-        The row, or `None` where the level was never reached.
-    """
-    first, episodes, successes = 0, 0.0, 0.0
-    if after:
-        rows = [row for row in rows if float(row["env_steps"]) > after]
-    for row in rows:
-        episodes += float(row["episodes"])
-        successes += float(row["episodes"]) * float(row[SUCCESS])
-        while episodes - float(rows[first]["episodes"]) >= window:
-            gone = float(rows[first]["episodes"])
-            episodes -= gone
-            successes -= gone * float(rows[first][SUCCESS])
-            first += 1
-        if episodes >= window and successes >= level * episodes:
-            return row
-    return None
+        kept.to_csv(self._path, index=False, lineterminator="\r\n")
 
 
 def draw_curves(

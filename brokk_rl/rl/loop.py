@@ -27,9 +27,8 @@ from brokk_rl.contracts.actuator import (
     SensingModel,
 )
 from brokk_rl.contracts.target import TargetSensor, TargetSensorSpec
-from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
+from brokk_rl.contracts.task import FAULT, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import ExplainedWorld, Simulator, World
-from brokk_rl.errors import SimulationError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import TaskDescription, describe_task
@@ -185,9 +184,6 @@ class ControlLoop(VecEnv):
             name: torch.zeros_like(value) for name, value in task.observe(self.history).items()
         }
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._is_odd = torch.zeros(1 + len(task.episode), dtype=torch.bool, device=self.device)
-        """Figures of the episode, and last the reward, that were not finite since `statistics` was
-        last asked."""
         self.begin()
 
     @property
@@ -311,37 +307,19 @@ class ControlLoop(VecEnv):
     def statistics(self) -> dict[str, float]:
         """Return figures of the episodes that finished since the last call: means, endings, number.
 
-        Reads back from the device once.
-
-        Raises:
-            SimulationError: A reward was not finite: the next update would spoil the policy.
+        Reads back from the device once. A figure of any environment that is not finite makes its
+        mean not finite.
         """
-        num = len(self._total_names)
-        found = torch.cat((self._totals, self._is_odd.to(self._totals.dtype))).tolist()
-        self._require_finite_rewards(found[num:])
-        values = dict(zip(self._total_names, found[:num], strict=True))
-        episodes = sum(found[len(self.task.episode) : num])
+        found = self._totals.tolist()
+        values = dict(zip(self._total_names, found, strict=True))
+        episodes = sum(found[len(self.task.episode) :])
         fault_rate = values[f"end/{FAULT}"] / max(1, self._steps * self.num_envs)
         if fault_rate and isinstance(self.world, ExplainedWorld):
             log.warning("worlds diverged: %s", self.world.explain_faults())
         self._totals.zero_()
-        self._is_odd.zero_()
         self._steps = 0
         means = {name: value / max(1.0, episodes) for name, value in values.items()}
         return means | {"episodes": episodes, "fault_rate": fault_rate}
-
-    def _require_finite_rewards(self, is_odd: list[float]) -> None:
-        """Refuse rewards that were not finite, by the name of their terms."""
-        terms = []
-        for name, odd in zip(self.task.episode, is_odd, strict=False):
-            if odd and name.startswith(REWARD):
-                terms.append(name.removeprefix(REWARD))
-        if terms or is_odd[-1]:
-            what = f"the reward term {', '.join(terms)}" if terms else "the reward"
-            raise SimulationError(
-                f"{what} was not finite: expected finite rewards; change task.reward. The newest "
-                "checkpoint is from before."
-            )
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all that is needed to go on exactly, but for random generators."""
@@ -423,8 +401,6 @@ class ControlLoop(VecEnv):
         self.end_force_n.copy_(self.world.contact_force_n)
         finished = torch.stack(tuple(self.task.episode.values()))
         self._finished.copy_(finished)
-        summed = torch.cat((finished, transition.reward[None]))
-        self._is_odd.logical_or_(~summed.isfinite().all(1))
         reasons = torch.arange(len(self.task.reasons), device=self.device)
         ending = reasons[:, None] == transition.reason
         self._totals.add_((torch.cat((finished, ending)) * done).sum(1))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
 import torch
@@ -191,13 +191,20 @@ def make_actor(network: Mapping[str, Any], observations: TensorDict, num_actions
     # a copy by way of JSON: rsl-rl writes into its configuration
     config = json.loads(json.dumps(network))
     actor_class, arguments = resolve_class(config["actor"])
-    missing = set(config["obs_groups"]["actor"]) - set(observations.keys())
-    if missing:
-        raise ConfigError(
-            f"rl.runner.obs_groups.actor: the task gives no group {', '.join(sorted(missing))}"
-        )
+    require_groups(config["obs_groups"], observations)
     actor = actor_class(observations, config["obs_groups"], "actor", num_actions, **arguments)
     return actor.to(observations.device)
+
+
+def require_groups(asked: Mapping[str, Sequence[str]], observations: TensorDict) -> None:
+    """Raise a `ConfigError` where a network wants observations that the task does not give."""
+    offered = set(map(str, observations.keys()))
+    for network, names in asked.items():
+        if missing := sorted(set(names) - offered):
+            raise ConfigError(
+                f"rl.runner.obs_groups.{network}: the task gives no group {', '.join(missing)}; "
+                f"it gives {', '.join(sorted(offered))}: rl.runner.obs_groups.{network}=[policy]"
+            )
 
 
 def observe_once(task: TaskProcess, machine: Machine, device: torch.device) -> TensorDict:

@@ -35,8 +35,6 @@ from brokk_rl.rl.rollout import CapturedRollout, pad_columns, run_network
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds and step of the adaptive learning rate, as in rsl-rl."""
 FIGURES = ("value", "surrogate", "entropy")
-SIZES = ("returns", "gradients", "weights of the actor", "weights of the critic")
-"""Largest sizes that an update is checked by, in words."""
 PARAMETER = "parameter_"
 """Beginning of the names under which samples hold the parameters of the old distribution."""
 CLIP_MARGIN = 1e-6
@@ -111,8 +109,7 @@ class DevicePPO(PPO):
     def update(self) -> dict[str, float]:
         """Learn from the stored steps; return mean losses (`rsl_rl.algorithms.PPO.update`).
 
-        Where a gradient or a weight is not finite, it stands among the losses by its name in
-        `SIZES`.
+        Where a weight is not finite, `weights` stands among the losses.
         """
         order = torch.randperm(self._batch_size() * self.num_mini_batches, device=self.device)
         self.shuffle(order)
@@ -129,26 +126,20 @@ class DevicePPO(PPO):
         for model in (self.actor, self.critic):
             self._normalise(model)
         self.storage.clear()
-        found = torch.cat((self._sums, self._rate[None], self._measure_sizes())).tolist()
+        found = torch.cat((self._sums, self._rate[None], self._measure_weights()[None])).tolist()
         self.learning_rate = found[len(FIGURES)]
         updates = self.num_learning_epochs * self.num_mini_batches
         losses = {name: value / updates for name, value in zip(FIGURES, found, strict=False)}
-        return _name_spoiled(found[-len(SIZES) :]) | losses
+        return losses if math.isfinite(found[-1]) else losses | {"weights": found[-1]}
 
     @torch.no_grad()
-    def _measure_sizes(self) -> torch.Tensor:
-        """Return the norms of `SIZES` after an update, `(4,)`; the host does not wait for them.
+    def _measure_weights(self) -> torch.Tensor:
+        """Return the norm of all weights after an update; the host does not wait for it.
 
-        A gradient that is not finite in an earlier mini-batch has spoiled the weights.
+        Returns and gradients that are not finite have spoiled the weights.
         """
-        parameters = chain(self.actor.parameters(), self.critic.parameters())
-        groups = [[self.storage.returns]]
-        groups += [[one.grad for one in parameters if one.grad is not None]]
-        for model in (self.actor, self.critic):
-            groups.append(
-                [value for value in model.state_dict().values() if value.is_floating_point()]
-            )
-        return torch.stack([get_total_norm(group) for group in groups])
+        weights = chain(self.actor.state_dict().values(), self.critic.state_dict().values())
+        return get_total_norm([value for value in weights if value.is_floating_point()])
 
     def save(self) -> dict[str, Any]:
         """Return the state without device-specific entries, so that any device can load it."""
@@ -344,15 +335,11 @@ class DevicePPO(PPO):
         """Take one step of the optimiser along the mean gradient of all processes."""
         if self.is_multi_gpu:
             self._gathered.div_(self.gpu_world_size)
-        if self._is_adaptive:
+        if self.desired_kl is not None and self.schedule == "adaptive":
             self._adapt_rate(self._gathered[-1])
         for part in self._gathered[:-1].split(self._sizes):  # of the actor, of the critic
             part.mul_((self.max_grad_norm / (part.norm() + CLIP_MARGIN)).clamp(max=1.0))
         self.optimizer.step()
-
-    @property
-    def _is_adaptive(self) -> bool:
-        return self.desired_kl is not None and self.schedule == "adaptive"
 
     def _adapt_rate(self, divergence: torch.Tensor) -> None:
         """Raise the learning rate where the policy moves too little, lower it where too much.
@@ -376,12 +363,6 @@ def _measure_divergence(
     (old_mean, old_std), (new_mean, new_std) = old, new
     spread, shift = (old_std / new_std).square(), ((old_mean - new_mean) / new_std).square()
     return (0.5 * (spread + shift - 1.0 - spread.log())).sum(-1).mean()
-
-
-def _name_spoiled(sizes: Sequence[float]) -> dict[str, float]:
-    """Return the sizes that are not finite by their names."""
-    named = zip(SIZES, sizes, strict=True)
-    return {name: value for name, value in named if not math.isfinite(value)}
 
 
 class CappedGaussian(GaussianDistribution):

@@ -5,20 +5,21 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.errors import CheckpointError, ConfigError, StorageError
+from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.policy_folder import TaskDescription, list_checkpoints, read_checkpoint
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.loop import ControlLoop
+from brokk_rl.rl.policy import require_groups
 from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
-from brokk_rl.rl.settings import REFUSED_CLASSES, TrainingConfig
+from brokk_rl.rl.settings import SUPPORTED, TrainingConfig
+from brokk_rl.session import write_bytes
 
 log = logging.getLogger(__name__)
 
@@ -57,16 +58,14 @@ class TrainingRunner(OnPolicyRunner):
         self.training, self.folder = training, folder
         self._share_spent = 0.0
         self.group = group or TrainingGroup(env.device)
-        offered = list(map(str, env.get_observations().keys()))
-        _require_groups(training.runner["obs_groups"], offered)
+        require_groups(training.runner["obs_groups"], env.get_observations())
         config = training.runner_config()
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, config, log_dir=None, device=str(env.device))
         log.debug(printed.getvalue())
         if self.alg.actor.is_recurrent or self.alg.critic.is_recurrent:  # a subclass of RNNModel
-            reason = REFUSED_CLASSES["RNNModel"]
-            raise ConfigError(f"rl.runner: expected networks without memory, got {reason}")
+            raise ConfigError(f"rl.runner: a network with memory {SUPPORTED}")
         self.logger = TrainingLogger(folder, env, training, self.group)
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
@@ -178,20 +177,10 @@ class TrainingRunner(OnPolicyRunner):
             "network": self.training.describe_network(),
             "answers": self.record_answers(),
         }
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
-        part = path.with_suffix(".part")
-        try:
-            torch.save(content, part)
-            with part.open("rb") as file:
-                os.fsync(file.fileno())
-            part.replace(path)
-        # torch's writer reports a full disk as a RuntimeError
-        except (OSError, RuntimeError) as error:
-            part.unlink(missing_ok=True)
-            raise StorageError(
-                f"cannot write the checkpoint {path}: {error}. The checkpoint before it is "
-                "untouched; make room and resume."
-            ) from error
+        write_bytes(path, buffer.getvalue())
         for old in list_checkpoints(self.folder)[: -self.training.keep_checkpoints]:
             old.unlink()
 
@@ -273,14 +262,3 @@ def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str)
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
-
-
-def _require_groups(asked: Mapping[str, Sequence[str]], offered: Collection[str]) -> None:
-    """Raise a `ConfigError` where a network wants observations that the task does not give."""
-    for network, names in asked.items():
-        missing = [name for name in names if name not in offered]
-        if missing:
-            raise ConfigError(
-                f"rl.runner.obs_groups.{network}: the task gives no group {', '.join(missing)}; "
-                f"it gives {', '.join(sorted(offered))}: rl.runner.obs_groups.{network}=[policy]"
-            )

@@ -72,22 +72,16 @@ BEGINNING = (
     "runner.actor.distribution_cfg.init_std",
 )
 """Values that count only when a training begins: a checkpoint holds what has become of them."""
-REFUSED_CLASSES = {
-    "RNNModel": "recurrent networks are neither exported nor deployed; a policy sees a history",
-    "CNNModel": "observations are vectors, not pictures",
-    "BetaDistribution": "actions are drawn from Gaussians",
-    "Distillation": "train with PPO",
-    "StudentTeacher": "train with PPO",
-}
-"""Classes of rsl-rl that would fail after the whole budget, and the reason or another way."""
+REFUSED_CLASSES = ("RNNModel", "CNNModel", "BetaDistribution", "Distillation", "StudentTeacher")
+"""Classes of rsl-rl that would fail after the whole budget."""
+REFUSED_PARTS = ("rnd_cfg", "symmetry_cfg")
+"""Parts of rsl-rl's algorithm that are not supported; mirrored steps showed no gain."""
+SUPPORTED = (
+    "of rsl-rl is not supported: a policy is a feed-forward network of the machine's history with "
+    "Gaussian actions, trained with PPO"
+)
 PRIVILEGED = "privileged"
 """Observation group of what only a simulator knows."""
-REFUSED_PARTS = {
-    "rnd_cfg": "random network distillation is not supported; more exploration comes from "
-    "rl.runner.actor.distribution_cfg.std_range",
-    "symmetry_cfg": "mirrored steps are not supported: they showed no gain",
-}
-"""Parts of rsl-rl's algorithm that are not supported, and another way."""
 
 
 @spec
@@ -237,18 +231,16 @@ class TrainingConfig:
                 raise ConfigError(f"runner.{name}: expected a table, got {self.runner.get(name)}")
         for name in ("algorithm", "actor", "critic", "actor.distribution_cfg"):
             class_name = str(self._read_runner(f"{name}.class_name"))
-            if reason := REFUSED_CLASSES.get(class_name.replace(":", ".").rpartition(".")[2]):
-                raise ConfigError(
-                    f"runner.{name}.class_name: {class_name} of rsl-rl is not supported: {reason}"
-                )
+            if class_name.replace(":", ".").rpartition(".")[2] in REFUSED_CLASSES:
+                raise ConfigError(f"runner.{name}.class_name: {class_name} {SUPPORTED}")
         if PRIVILEGED in (self._read_runner("obs_groups.actor") or ()):
             raise ConfigError(
                 f"runner.obs_groups.actor: the machine does not know the group {PRIVILEGED}, so such a "
                 "policy cannot be exported; give it to the critic alone"
             )
-        for name, reason in REFUSED_PARTS.items():
+        for name in REFUSED_PARTS:
             if self._read_runner(f"algorithm.{name}") is not None:
-                raise ConfigError(f"runner.algorithm.{name}: {reason}")
+                raise ConfigError(f"runner.algorithm.{name}: this part {SUPPORTED}")
         if self.num_envs is not None:
             self._check_batches(self.num_envs)
         distribution = self._read_runner("actor.distribution_cfg.class_name")

@@ -19,8 +19,8 @@ from brokk_rl.signals import Command, JointState
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.spec import NonNegative, name_spec, spec
 
-LOGGED_STATES = ("oil_c",)
-"""States of an actuator model, one number a machine, that the machine's sensors show."""
+OIL_C = "oil_c"
+"""State of an actuator model, one number a machine, that the machine's sensors show."""
 
 
 class SimulatedLink:
@@ -55,7 +55,8 @@ class SimulatedLink:
             torch.manual_seed(session.stream("link"))
             self._model = config.actuator.build(machine, num_runs, device)
             self._model.reset(self._everywhere)
-        self._logged = _find_logged_states(self._model)
+        # paths of effects have dots
+        self._oil = [path for path in self._model.state if path.rpartition(".")[2] == OIL_C]
         self._steps = 0
         self._begin(config)
 
@@ -88,8 +89,9 @@ class SimulatedLink:
 
     def extra(self) -> dict[str, np.ndarray]:
         """Return further sensors, each `(N,)`: the oil's temperature where the model has one."""
-        state = self._model.state if self._logged else {}
-        return {name: state[path].cpu().numpy().copy() for name, path in self._logged.items()}
+        if not self._oil:
+            return {}
+        return {OIL_C: self._model.state[self._oil[-1]].cpu().numpy().copy()}
 
     def __enter__(self) -> Self:
         return self
@@ -215,16 +217,6 @@ def _share_drawn_numbers(model: ActuatorModel) -> None:
     for path, value in model.state.items():
         if "drawn" in path.split("."):
             value.copy_(value[:1].clone().expand_as(value))
-
-
-def _find_logged_states(model: ActuatorModel) -> dict[str, str]:
-    """Return the path in `model.state` of each logged state; paths of effects have dots."""
-    logged = {}
-    for path in model.state:
-        name = path.rpartition(".")[2]
-        if name in LOGGED_STATES:
-            logged[name] = path
-    return logged
 
 
 def _limit_command(command: Command) -> np.ndarray:

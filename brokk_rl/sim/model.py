@@ -425,10 +425,6 @@ class DriveReferences:
 # what backends leave out
 
 
-def _has_branches(model: mujoco.MjModel) -> bool:
-    return bool((model.dof_parentid != np.arange(-1, model.nv - 1)).any())
-
-
 FEATURES: dict[str, tuple[Callable[[mujoco.MjModel], Any], bool]] = {
     "a flag actuation=disable, sensor=disable or autoreset=disable": (
         lambda model: model.opt.disableflags & _NEEDED,
@@ -442,7 +438,7 @@ FEATURES: dict[str, tuple[Callable[[mujoco.MjModel], Any], bool]] = {
     "equalities": (lambda model: model.neq, True),
     "deformable bodies": (lambda model: model.nflex, True),
     "plugins": (lambda model: model.nplugin, True),
-    "branches": (_has_branches, True),
+    "branches": (lambda model: (np.diff(model.dof_parentid) != 1).any(), True),
     f"more than {MAX_DOFS} joints": (lambda model: model.nv > MAX_DOFS, True),
 }
 """By name: whether a model has the part, and whether `sim=native` simulates it; `sim=warp` does not.

@@ -14,16 +14,11 @@ from brokk_rl.sim.events import Event
 from brokk_rl.sim.model import check_simulated, compile_model, mask_normal_forces
 from brokk_rl.sim.properties import StoredWorld, list_fields
 
-ALARMS = {
-    1 << int(mujoco.mjtWarning.mjWARN_INERTIA): "inertia near zero",
-    1 << int(mujoco.mjtWarning.mjWARN_CONTACTFULL): "the contact buffer is full",
-    1 << int(mujoco.mjtWarning.mjWARN_CNSTRFULL): "the buffer of constraint rows is full",
-    1 << int(mujoco.mjtWarning.mjWARN_BADQPOS): "bad position",
-    1 << int(mujoco.mjtWarning.mjWARN_BADQVEL): "bad speed",
-    1 << int(mujoco.mjtWarning.mjWARN_BADQACC): "bad acceleration",
-    1 << int(mujoco.mjtWarning.mjWARN_BADCTRL): "bad command of a drive",
-}
-"""MuJoCo's warnings in words, by the bits of an alarm."""
+ALARMS: dict[int, str] = {}
+"""MuJoCo's warnings in its words, by the bits of an alarm."""
+for _warning in range(int(mujoco.mjtWarning.mjNWARNING)):
+    # the place that follows is that of the last warning, which is not kept
+    ALARMS[1 << _warning] = mujoco.mju_warningText(_warning, 0).partition(" at ")[0]
 
 
 class NativeWorld(StoredWorld):

