@@ -19,7 +19,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from brokk_rl import registry
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import SpecError
 
@@ -51,34 +50,19 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     """
     if RUN not in values:
         raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
-    nodes = {key: value for key, value in values.items() if key != RUN}
-    known = registry.list_fields(values[RUN])
-    if known is not None:
-        _check_keys(known, nodes, shared)
     built = build_quick_nodes(values, shared)
     kind = load_class(values[RUN], "")
     own = [field.name for field in fields(kind)]
-    if known is None:  # its source was not found
-        _check_keys(dict.fromkeys(own, " = "), nodes, shared)
-    for key in nodes.keys() - built.keys():
+    given: dict[str, Any] = {}
+    for key, value in values.items():
         if key in own:
-            built[key] = build_node(nodes[key], key)
-    return _call(kind, {key: built[key] for key in nodes if key in built}, "")
-
-
-def _check_keys(known: Mapping[str, str], given: Collection[str], shared: Collection[str]) -> None:
-    """Refuse keys that a mode does not have, and a mode that lacks one without a default."""
-    for key in sorted(given):
-        if key not in known and key not in shared:
+            given[key] = built[key] if key in built else build_node(value, key)
+        elif key not in shared and key != RUN:
             raise ConfigError(
-                f"the mode has no '{key}'; {list_choices(key, known)}. A preset or experiment that "
+                f"the mode has no '{key}'; {list_choices(key, own)}. A preset or experiment that "
                 "sets it is for other modes: leave it out"
             )
-    for key, stated in known.items():
-        if key not in given and " = " not in stated:
-            raise ConfigError(
-                f"the mode needs '{key}': give {key}=<option> in place of ~{key} or none"
-            )
+    return _call(kind, given, "")
 
 
 def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -> dict[str, Any]:
@@ -200,39 +184,18 @@ def load_class(target: object, place: str) -> Any:
             text = extras.explain_missing_module(str(error.name), str(target))
             if text:
                 raise _LackingPackageError(text) from error
-        reason = _explain_import(module, name, error)
-        if reason is None:
+        where = ""
+        for frame in traceback.extract_tb(error.__traceback__):
+            is_import = frame.filename == __file__ or "importlib" in Path(frame.filename).parts
+            if not frame.filename.startswith("<") and not is_import:
+                where = f"{frame.filename}, line {frame.lineno}: "
+        if where.startswith(str(Path(__file__).parents[1])) and "site-packages" not in where:
             raise
+        reason = (
+            f"{target} cannot be imported: {where}{type(error).__name__}: {error} (seen from "
+            f"{Path.cwd()}); its package must be installed, or its folder be in PYTHONPATH"
+        )
         raise ConfigError(_complete("", reason, place)) from error
-
-
-def _explain_import(module: str, name: str, error: Exception) -> str | None:
-    """Return why a class cannot be imported, `None` for a defect of this package."""
-    target = f"{module}.{name}"
-    found = _find_line(error)
-    if found is None:
-        if isinstance(error, ModuleNotFoundError) and "is not a package" not in str(error):
-            return (
-                f"{target}: there is no module '{error.name}' (seen from {Path.cwd()}); install its "
-                "package, or add its folder to PYTHONPATH"
-            )
-        return f"{target}: the module '{module}' has no '{name}'"
-    file, line = found
-    if Path(file).is_relative_to(Path(__file__).parents[1]) and "site-packages" not in file:
-        return None
-    return f"{target} cannot be imported: {file}, line {line}: {type(error).__name__}: {error}"
-
-
-def _find_line(error: BaseException) -> tuple[str, int] | None:
-    """Return file and line that raised an error, `None` where only the import itself did."""
-    if isinstance(error, SyntaxError) and error.filename:
-        return error.filename, error.lineno or 1
-    found = None
-    for frame in traceback.extract_tb(error.__traceback__):
-        importing = frame.filename == __file__ or "importlib" in Path(frame.filename).parts
-        if not frame.filename.startswith("<") and not importing:
-            found = frame.filename, frame.lineno or 1
-    return found
 
 
 def _call(kind: Any, values: dict[str, Any], place: str) -> Any:

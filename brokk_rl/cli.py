@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import logging
 import os
 import shutil
@@ -11,7 +9,7 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from typing import Any
 
 import hydra
 import yaml
@@ -26,7 +24,7 @@ from brokk_rl import distributed, extensions
 from brokk_rl.arguments import read_arguments
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.explain import compose_choices, explain, list_sources
-from brokk_rl.help import add_comments, collect_comments, describe_command, describe_mode
+from brokk_rl.help import collect_comments, describe_command, describe_mode
 from brokk_rl.sim import probe
 
 log = logging.getLogger(__name__)
@@ -83,14 +81,16 @@ def main() -> int:
     # Hydra raises its errors instead of printing them and leaving.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        sys.argv[1:] = _prepare_policy(read_arguments(sys.argv[1:]))
+        sys.argv[1:] = read_arguments(sys.argv[1:])
+        if any(word.startswith("policy") for word in sys.argv[1:]):
+            from brokk_rl.policy_choice import prepare_arguments  # it takes 0.25 s to import
+
+            sys.argv[1:] = prepare_arguments(sys.argv[1:])
         extensions.register_options(sys.argv[1:])
         if {"--help", "-h"} & set(sys.argv[1:]):
             sys.stdout.write(_describe_chosen_mode())
             return 0
-        command = hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")
-        with _add_comments() if "--cfg" in sys.argv[1:] else contextlib.nullcontext():
-            command(run_job)()
+        hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(run_job)()
         sys.stdout.flush()
     except BrokenPipeError:
         # Python flushes stdout once more when it ends; that must not fail again.
@@ -140,15 +140,6 @@ def run_job(cfg: DictConfig) -> float | None:
         raise SweepError(message, os.getpid()) from error
 
 
-def _prepare_policy(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments with the policy that they name, if any, as an option of Hydra."""
-    if not any(one.startswith("policy") for one in arguments):
-        return list(arguments)  # the readers of policies take a quarter of a second to import
-    from brokk_rl.policy_choice import prepare_arguments
-
-    return prepare_arguments(arguments)
-
-
 def _is_first_process() -> bool:
     """Return true for the process that reports to the user: the first one."""
     try:
@@ -178,24 +169,7 @@ def set_up_logging() -> None:
 
 def _describe_chosen_mode() -> str:
     """Return the help of the mode of the command line, with the options chosen there."""
-    cfg = compose_choices()
-    own = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
-    choices, node = map(OmegaConf.to_container, (cfg.hydra.runtime.choices, own))
-    assert isinstance(choices, dict) and isinstance(node, dict)
-    return describe_mode(
-        {str(key): value for key, value in choices.items()},
-        {str(key): value for key, value in node.items()},
-        collect_comments(list_sources()),
-        shutil.get_terminal_size().columns,
-    )
-
-
-@contextlib.contextmanager
-def _add_comments() -> Iterator[None]:
-    """Put comments into the configuration that Hydra prints in the block."""
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        yield
-    text = printed.getvalue()
-    if "--config-name" not in sys.argv and "-cn" not in sys.argv:
-        text = add_comments(text, collect_comments(list_sources()))
-    sys.stdout.write(text)
+    node: Any = OmegaConf.to_container(compose_choices())
+    choices = node.pop("hydra")["runtime"]["choices"]
+    comments = collect_comments(list_sources())
+    return describe_mode(choices, node, comments, shutil.get_terminal_size().columns)

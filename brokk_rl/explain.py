@@ -23,7 +23,14 @@ from omegaconf.errors import (
 )
 
 from brokk_rl import registry
-from brokk_rl.arguments import ROBOT_FILES, explain_robot, is_list_group, list_names, parse_words
+from brokk_rl.arguments import (
+    ROBOT_FILES,
+    explain_robot,
+    is_given_whole,
+    is_list_group,
+    list_names,
+    parse_words,
+)
 from brokk_rl.errors import BrokkError, list_choices
 
 CLOSE = 0.85
@@ -87,29 +94,22 @@ def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def _explain_missing_option(error: MissingConfigException) -> str:
-    typed = _find_typed(str(error.missing_cfg_file))
-    group, _, name = typed or str(error.missing_cfg_file).rpartition("/")
-    if not group:
+    place = str(error.missing_cfg_file)
+    groups = {option.group for option in registry.list_options()} | {"hydra/sweeper"}
+    above = [group for group in groups if place.startswith(f"{group}/")]
+    if not above:
         return str(error).split("\nConfig search path")[0]
+    group = max(above, key=len)
+    name = place.removeprefix(f"{group}/")
+    if name.endswith(ROBOT_FILES):
+        return f"{group}={name}: expected an option or a YAML file; {explain_robot(name)}"
     if Path(name).is_file():
         return f"there is no {group}={name}; a file is given by its path after @: {group}=@{name}"
-    if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
+    if group.startswith("hydra/sweeper"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
     # Hydra lists none where a list of options was given.
     offered = error.options or [option.name for option in registry.list_options(group)]
-    if not offered:
-        return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
     return f"there is no {group}={name}; {_list_options(group, name, offered)}"
-
-
-def _find_typed(place: str) -> tuple[str, str, str] | None:
-    """Return group, `=` and option as typed, of which Hydra made the place of a file."""
-    for argument in sys.argv[1:]:
-        group, equals, value = argument.partition("=")
-        for name in value.strip("[]").split(","):
-            if f"{group}/{name}" == place:
-                return group, equals, name
-    return None
 
 
 def _explain_interpolation(error: InterpolationResolutionError) -> str:
@@ -139,11 +139,17 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
             )
         return text
     where, key = found[1], found[2].split("@")[0]
+    if is_given_whole(sys.argv[1:]):
+        return (
+            f"'{key}': a configuration given by --config-name was composed already and has neither "
+            "groups nor this value; leave it out, or give session.out=, policy=<path> and values "
+            "that stand in the file"
+        )
     source = f"{where} changes" if where and where != "config" else "you gave"
     # The mode itself may not compose; the message is then shorter.
     with contextlib.suppress(Exception):
         cfg = compose_choices()
-        return f"{source} '{key}', but {_explain_absence(cfg, key, _find_value(key))}"
+        return f"{source} '{key}', but {_explain_absence(cfg, key)}"
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --help` lists what it has"
 
 
@@ -158,13 +164,13 @@ def _list_options(group: str, name: str, offered: Sequence[str]) -> str:
     return list_choices(name, offered) + path * (group == "policy")
 
 
-def _explain_absence(cfg: DictConfig, key: str, value: str) -> str:
+def _explain_absence(cfg: DictConfig, key: str) -> str:
     """Return what a configuration has in the place of a key that it does not have."""
     mode = f"mode={cfg.hydra.runtime.choices['mode']}"
     groups = [str(group) for group in cfg.hydra.runtime.choices if str(group)[:5] != "hydra"]
     keys = sorted({*_list_keys(cfg), *groups}, key=lambda one: one.count("."))
     if fields := _list_inside(keys, key):
-        return f"'{key}' is a table, whose values are given as {key}.<name>=…; {list_choices(value, fields)}"
+        return f"'{key}' is a table, whose values are given as {key}.<name>=…; {list_choices('', fields)}"
     for option in registry.list_options():
         place = f"{option.group}.{option.name}"
         if option.name == key and option.group in groups:
@@ -173,28 +179,21 @@ def _explain_absence(cfg: DictConfig, key: str, value: str) -> str:
             chosen = f"[{option.name}]" if is_list_group(option.group) else option.name
             return f"'{option.name}' is not chosen: add {option.group}={chosen}"
     parent, _, leaf = key.rpartition(".")
-    typed = leaf.lower().rpartition("/")[2]
     while parent and parent not in keys:
         parent, _, leaf = parent.rpartition(".")
-    inside = _list_inside(keys, parent)
-    names = {one.rpartition(".")[2] for one in keys}
-    near = get_close_matches(typed, [*names, *map(_shorten, names)], n=1, cutoff=CLOSE)
-    if typed not in names and get_close_matches(leaf, inside):
-        near = []
-    wanted = {name for name in names if near and near[0] in (name, _shorten(name))}
     lacks = f"'{parent or mode}' has no '{leaf}'"
-    if "policy" in groups and (value.endswith(".pt") or "policy" in key):
-        return f"{lacks}; a policy is given by policy={value}"
-    if found := [f"{one}={value}" for one in keys if one.rpartition(".")[2] in wanted]:
-        return f"{lacks}; did you mean {' or '.join(found[:3])}?"
-    if value.endswith(ROBOT_FILES):
-        return f"{lacks}; {explain_robot(value)}"
+    inside = _list_inside(keys, parent)
+    typed = re.split("[./]", key)[-1].lower()
+    by_name: dict[str, list[str]] = {}
+    for one in keys:
+        name = one.rpartition(".")[2]
+        initials = "".join(word[:1] for word in name.split("_"))  # `lr` of `learning_rate`
+        for word in (name, initials):
+            by_name.setdefault(word, []).append(one)
+    near = get_close_matches(typed, by_name, n=1, cutoff=CLOSE)
+    if near and (typed in by_name or not get_close_matches(leaf, inside)):
+        return f"{lacks}; did you mean {' or '.join(by_name[near[0]][:3])}?"
     return f"{lacks}; {list_choices(leaf, inside)}; `brokk {mode} --help` lists all values"
-
-
-def _shorten(name: str) -> str:
-    """Return the initials of a name: `lr` of `learning_rate`."""
-    return "".join(word[:1] for word in name.split("_"))
 
 
 def _list_keys(cfg: DictConfig) -> set[str]:
@@ -209,15 +208,6 @@ def _list_keys(cfg: DictConfig) -> set[str]:
 def _list_inside(keys: Sequence[str], table: str) -> list[str]:
     """Return the names of what a table holds; the empty table is the whole."""
     return [key.rpartition(".")[2] for key in keys if key.rpartition(".")[0] == table]
-
-
-def _find_value(key: str) -> str:
-    """Return the value that was typed for a key."""
-    for argument in sys.argv[1:]:
-        name, _, value = argument.lstrip("+").partition("=")
-        if name == key:
-            return value.strip("'")
-    return "<value>"
 
 
 def compose_choices() -> DictConfig:

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from brokk_rl import registry
-from brokk_rl.arguments import list_names, parse_words
+from brokk_rl.arguments import ROBOT_FILES, explain_robot, list_names, parse_words
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.explain import explain_missing_value
 from brokk_rl.plain_files import check_yaml_size, read_plain_file
@@ -168,6 +168,8 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     that a registered option has, and nothing in the file is resolved.
     """
     where = f"{group}=@{name}"
+    if name.endswith(ROBOT_FILES):
+        raise ConfigError(f"{where}: expected a YAML file; {explain_robot(name)}")
     try:
         text = read_plain_file(Path(name).expanduser(), MOST_BYTES).decode()
         check_yaml_size(text)
@@ -217,20 +219,14 @@ def _drop_parts(node: dict[Any, Any]) -> None:
 
 def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:
     """Refuse interpolations and Hydra settings, which only registered options may hold."""
-    named = f"{where}: '{'.'.join(place)}'"
-    for text in (*place, value):
-        if isinstance(text, str) and "${" in text:
-            raise ConfigError(
-                f"{named} holds an interpolation, {text}; a file given by @ holds plain values"
-            )
-    if any(key.startswith("_") and key != "_target_" for key in place):
+    words = [word for word in (*place, value) if isinstance(word, str)]
+    is_setting = any(key.startswith("_") and key != "_target_" for key in place)
+    is_setting |= "hydra" in place or (place[0] == "defaults" and "hydra/" in " ".join(words))
+    if is_setting or any("${" in word for word in words):
         raise ConfigError(
-            f"{named} is a setting of Hydra's; a file given by @ has none but _target_"
+            f"{where}: '{'.'.join(place)}: {value}': a file given by @ holds plain values, without "
+            "interpolations and settings of Hydra"
         )
-    if "hydra" in place or (
-        place[0] == "defaults" and any("hydra/" in str(text) for text in (*place, value))
-    ):
-        raise ConfigError(f"{named} changes Hydra's own settings, which a file given by @ cannot")
 
 
 def _find_package(

@@ -124,22 +124,6 @@ def collect_comments(sources: Iterable[tuple[str, Path]]) -> dict[str, str]:
     return comments
 
 
-def add_comments(text: str, comments: Mapping[str, str]) -> str:
-    """Return the YAML of a composed configuration with comments beside its values.
-
-    Args:
-        text: As Hydra prints it; `# @package <node>` in its first line says what is left out above.
-        comments: Comment of each value by dotted name.
-    """
-    package = re.match(r"# @package (\S+)", text)
-    prefix = f"{package[1]}." if package and package[1] != "_global_" else ""
-    lines = text.splitlines()
-    for key, _, line, _ in _locate_values(text):
-        if comment := comments.get(prefix + key):
-            lines[line] += f"  # {comment}"
-    return "\n".join(lines) + "\n"
-
-
 def _locate_values(text: str) -> Iterator[tuple[str, int, int, int]]:
     """Yield the dotted name of each value, the line of its key, and where it ends in the text.
 

@@ -71,19 +71,12 @@ def run(cfg: DictConfig) -> float | None:
         distributed.check_together(type(mode), sweep)
         return mode.run()
     folder = choose_run_folder(values)
-    try:
-        if not (sweep or goes_on) and distributed.read_rank().first:
-            require_new_folder(folder)
-        built["session"] = values["session"] | {"out": str(folder)}
-        mode = build_mode(values | built, shared)
-        distributed.check_together(type(mode), sweep)
-        return _run_in_session(mode, values, sweep, goes_on)
-    except Exception:
-        if sweep:
-            # Hydra made these folders, in several levels where an override holds a path. A folder
-            # into which a job has written stays.
-            remove_empty_folders([folder, *folder.parents])
-        raise
+    if not (sweep or goes_on) and distributed.read_rank().first:
+        require_new_folder(folder)
+    built["session"] = values["session"] | {"out": str(folder)}
+    mode = build_mode(values | built, shared)
+    distributed.check_together(type(mode), sweep)
+    return _run_in_session(mode, values, sweep, goes_on)
 
 
 def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: bool) -> float | None:

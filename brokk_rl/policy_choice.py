@@ -18,18 +18,15 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
-from brokk_rl.arguments import list_names, parse_words
+from brokk_rl.arguments import is_given_whole, list_names, parse_words
 from brokk_rl.build import RUN, TARGET, build_node, drop_targets
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.extensions import store_option
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import (
-    CONTRACT,
     StoredPolicy,
     TaskDescription,
-    find_checkpoint,
     find_policy,
-    find_resumed,
     format_value,
     list_differences,
     name_target,
@@ -41,11 +38,9 @@ log = logging.getLogger(__name__)
 PLACE = "brokk_rl.rl.policy"
 CLASSICAL, TRAINED = f"{PLACE}.ClassicalPolicy", f"{PLACE}.TrainedPolicy"
 SHIPPED = f"{PLACE}.ShippedPolicy"
-TRAIN, EXPORT = "brokk_rl.modes.train.Train", "brokk_rl.modes.export.Export"
+TRAIN = "brokk_rl.modes.train.Train"
 RIVALS_OWN = ("classical", "advice")
 """Fields of a task that the classical controller keeps beside a policy."""
-WHOLE = ("--config-name", "-cn")
-"""Arguments of a command whose configuration is given whole, as `resolved.yaml` is."""
 
 
 def prepare_arguments(arguments: Sequence[str]) -> list[str]:
@@ -58,7 +53,7 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     # `policy@rivals.<name>` is another key than `policy`
     given = {one.key_or_group: one for one in overrides if one.package is None}
     prepared = list(arguments)
-    is_whole = any(word.startswith(WHOLE) for word in arguments)
+    is_whole = is_given_whole(arguments)
     for override in overrides:
         if override.key_or_group == "policy":
             for name in _list_paths(override):
@@ -81,13 +76,11 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
     OmegaConf.set_readonly(cfg, False)
     OmegaConf.set_struct(cfg, False)
     target = OmegaConf.select(cfg, f"policy.{TARGET}", default=None)
-    _require_network(cfg, target)
-    if cfg.get(RUN) == TRAIN:
-        target = _choose_beginning(cfg, target)
     built: dict[str, Any] = {}
-    if target == TRAINED:
+    if target == TRAINED or (target == SHIPPED and cfg.get(RUN) == TRAIN):
+        cfg.policy[TARGET] = TRAINED
         cfg = _take_over(cfg, built)
-    if target == SHIPPED:
+    elif target == SHIPPED:
         try:
             cfg = _take_over(cfg.copy(), built)
         except (CheckpointError, ConfigError) as error:
@@ -147,6 +140,13 @@ def _list_paths(override: Override) -> list[str]:
     return paths
 
 
+def _is_continuing(policy: str, out: str | None) -> bool:
+    """Return whether a training goes on: from a checkpoint, or in its own folder."""
+    return policy.endswith(".pt") or (
+        out is not None and Path(out).resolve() == Path(policy).resolve()
+    )
+
+
 def _find_run(policy: str) -> Path:
     """Return the run folder of a policy: that of a checkpoint, or the folder itself."""
     return Path(policy).parent if policy.endswith(".pt") else Path(policy)
@@ -157,35 +157,14 @@ def _recall_overrides(given: Mapping[str, Override]) -> list[str]:
     policy, out = _read_value(given, "policy"), _read_value(given, "session.out")
     if policy is None or _read_value(given, "mode") not in (None, "train"):
         return []
-    run = _find_run(policy)
-    if not policy.endswith(".pt") and (out is None or Path(out).resolve() != run.resolve()):
+    if not _is_continuing(policy, out):
         return []
     recalled = []
-    lines = (read_record(run) or {}).get("overrides", [])
+    lines = (read_record(_find_run(policy)) or {}).get("overrides", [])
     for override in parse_words(lines):
         if override.key_or_group not in {*given, "session.out"}:
             recalled.append(str(override.input_line))
     return recalled
-
-
-def _require_network(cfg: DictConfig, target: str | None) -> None:
-    """Refuse a policy that is no network where the mode, or a part of it, takes no other."""
-    hint = (registry.list_fields(str(cfg.get(RUN))) or {}).get("policy", "TrainedPolicy")
-    if target not in (None, TRAINED, SHIPPED) and "TrainedPolicy" in hint:
-        raise ConfigError(
-            f"policy={HydraConfig.get().runtime.choices.get('policy')}: this mode takes a network; "
-            "expected policy=shipped, or the path of a run folder, a policy folder or a checkpoint"
-        )
-
-
-def _choose_beginning(cfg: DictConfig, target: str | None) -> str | None:
-    """Return the class of the policy with which training begins."""
-    if target is None:
-        return None
-    cfg.policy[TARGET] = TRAINED
-    run = _find_run(str(cfg.policy.path))
-    is_new = is_going_on(cfg) and read_record(run) and not (run / CONTRACT).exists()
-    return None if is_new else TRAINED  # a run that was stopped before it began knows nothing
 
 
 def _take_over(cfg: DictConfig, built: dict[str, Any]) -> DictConfig:
@@ -193,15 +172,13 @@ def _take_over(cfg: DictConfig, built: dict[str, Any]) -> DictConfig:
 
     A machine that is built and stays is put into `built`.
     """
-    stored = find_policy(str(cfg.policy.path), may_lack=cfg.get(RUN) == TRAIN)
-    if cfg.get(RUN) == EXPORT:
-        find_checkpoint(stored.name)
+    stored = find_policy(str(cfg.policy.path))
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
         return cfg
     if cfg.get(RUN) == TRAIN:
         out = OmegaConf.select(cfg, "session.out", default=None)
-        if find_resumed(str(cfg.policy.path), Path(out or "runs")):  # else a new folder there
+        if _is_continuing(str(cfg.policy.path), out):
             _refuse_late_values(cfg, stored)
     given = _list_given()
     brought = []

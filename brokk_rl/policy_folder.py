@@ -334,12 +334,11 @@ class StoredPolicy:
         return self.contract | {"weights": weights}
 
 
-def find_policy(name: str, may_lack: bool = False) -> StoredPolicy:
+def find_policy(name: str) -> StoredPolicy:
     """Return the policy at a path: a policy folder, a run folder or a checkpoint.
 
     Args:
         name: The path, or `package:path` within an installed package.
-        may_lack: Take a training that has not written its first checkpoint.
 
     Raises:
         CheckpointError: There is none, or its contract cannot be read.
@@ -362,9 +361,10 @@ def find_policy(name: str, may_lack: bool = False) -> StoredPolicy:
         return StoredPolicy(name, _require_whole(path), read_contract(path.parent, name))
     weights, checkpoints = path / WEIGHTS, list_checkpoints(path)
     contract = read_contract(path, name)
-    if checkpoints and _is_newer(checkpoints[-1], weights):
+    exported_s = weights.stat().st_mtime if weights.exists() else 0.0
+    if checkpoints and checkpoints[-1].stat().st_mtime > exported_s:
         return StoredPolicy(name, _require_whole(checkpoints[-1]), contract)
-    if contract and (may_lack or weights.exists() or (path / ONNX).exists()):
+    if contract and (weights.exists() or (path / ONNX).exists()):
         return StoredPolicy(name, weights, contract)
     lacks = CONTRACT if not contract else f"neither {WEIGHTS} nor a checkpoint, model_*.pt,"
     raise CheckpointError(
@@ -473,7 +473,3 @@ def _require_finite(weights: Mapping[str, torch.Tensor], who: str, advice: str) 
 
 def _explain_corrupt(name: str, error: Exception) -> str:
     return f"the policy in {name} is corrupt: {error}; export it again (mode=export)"
-
-
-def _is_newer(checkpoint: Path, weights: Path) -> bool:
-    return not weights.exists() or checkpoint.stat().st_mtime > weights.stat().st_mtime

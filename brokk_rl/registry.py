@@ -159,43 +159,6 @@ def read_attributes(target: str) -> dict[str, str]:
     return found
 
 
-def list_fields(target: str) -> dict[str, str] | None:
-    """Return the fields of the class `target` with annotation and default, from its source.
-
-    Nothing is imported. The answer is `None` where the source of the class or of one of its bases
-    cannot be found.
-    """
-    module, _, name = str(target).rpartition(".")
-    nodes = _read_source(module)
-    imported: dict[str, str] = {}
-    for node in nodes:
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                first = alias.name.partition(".")[0]
-                imported[alias.asname or first] = alias.name if alias.asname else first
-        if isinstance(node, ast.ImportFrom):
-            stated = "." * node.level + (node.module or "")
-            place = util.resolve_name(stated, module.rpartition(".")[0])
-            for alias in node.names:
-                imported[alias.asname or alias.name] = f"{place}.{alias.name}"
-    found: dict[str, str] | None = None
-    for node in nodes:
-        if not isinstance(node, ast.ClassDef) or node.name != name:
-            continue
-        found = {}
-        for base in map(ast.unparse, node.bases):
-            head, dot, rest = base.partition("[")[0].partition(".")
-            inherited = list_fields(imported.get(head, f"{module}.{head}") + dot + rest)
-            if inherited is None:
-                return None
-            found |= inherited
-        for item in node.body:
-            if isinstance(item, ast.AnnAssign) and "ClassVar" not in ast.unparse(item.annotation):
-                field, _, stated = ast.unparse(item).partition(": ")
-                found[field] = stated
-    return found
-
-
 def _read_docstring(target: str) -> str:
     """Return the docstring of the class or function `target` from its source, or an empty string."""
     module, _, name = str(target).rpartition(".")

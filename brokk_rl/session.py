@@ -8,6 +8,7 @@ import os
 import random
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -225,13 +226,18 @@ def require_new_folder(folder: Path) -> None:
     """Refuse a folder that holds a run or that cannot be made.
 
     Raises:
-        StorageError: It does, or its place is a file or may not be written.
+        StorageError: It does, or it cannot be written.
     """
-    place = next(path for path in (folder, *folder.parents) if path.exists())
-    if not place.is_dir():
-        raise StorageError(f"{place} is a file. Give a folder with session.out=<folder>.")
-    if not os.access(place, os.W_OK):
-        raise StorageError(f"cannot write into {place}. Choose session.out=<folder>.")
+    missing = list_missing_folders(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise StorageError(
+            f"cannot write into {folder}: {error.strerror}. Choose session.out=<folder>."
+        ) from error
+    finally:
+        remove_empty_folders(missing)
     before, checkpoints = read_record(folder), list(folder.glob("model_*.pt"))
     if before is not None or checkpoints:
         before = before or {}
@@ -306,9 +312,9 @@ def list_missing_folders(folder: Path) -> list[Path]:
 
 
 def remove_empty_folders(folders: Sequence[Path]) -> None:
-    """Remove folders, the innermost first, up to the first one that is not empty."""
-    with suppress(OSError):
-        for folder in folders:
+    """Remove folders, the innermost first, as far as they are there and empty."""
+    for folder in folders:
+        with suppress(OSError):
             folder.rmdir()
 
 

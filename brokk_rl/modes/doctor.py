@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import subprocess
 import tempfile
@@ -12,14 +11,12 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from rich.text import Text
 
 import brokk_rl
-from brokk_rl import extras, registry
+from brokk_rl import extras
 from brokk_rl.console_table import print_table
-from brokk_rl.errors import BrokkError
 from brokk_rl.sim import probe
 from brokk_rl.spec import NonNegative, spec
 
@@ -68,14 +65,12 @@ class Doctor:
         """
         folder, min_free_gib = Path(self.doctor.folder), self.doctor.min_free_gib
         checks: dict[str, Callable[[], DoctorFinding]] = {
-            "Python": check_python,
             "packages": check_packages,
             "torch": check_torch,
             "Warp": check_warp,
             "rendering": check_rendering,
             "disk": lambda: check_disk(folder, min_free_gib),
             "import names": check_import_names,
-            "extensions": check_extensions,
         }
         rows, has_failed = [], False
         for topic, check in checks.items():
@@ -99,18 +94,6 @@ def _run_check(check: Callable[[], DoctorFinding]) -> DoctorFinding:
     # A failure inside another package must not hide the rest of the report.
     except Exception as error:
         return DoctorFinding("warn", f"cannot tell: {type(error).__name__}: {error}")
-
-
-def check_python() -> DoctorFinding:
-    """Compare the Python version with the required one."""
-    version = platform.python_version()
-    text = f"{version} on {platform.platform(terse=True)}"
-    about = extras.read_metadata()
-    wanted = SpecifierSet(about["Requires-Python"] if about else "")
-    if wanted.contains(version):
-        return DoctorFinding("ok", text)
-    advice = "make the environment again with such a Python: make clean setup"
-    return DoctorFinding("fail", f"{text}, but the project wants {wanted}", advice)
 
 
 def check_packages() -> DoctorFinding:
@@ -172,12 +155,10 @@ def _read_driver_version() -> str | None:
 
 
 def check_warp() -> DoctorFinding:
-    """Report Warp, its kernel cache, and whether a GPU captures a control step in a CUDA graph."""
+    """Report Warp, and whether a GPU captures a control step in a CUDA graph."""
     import torch
 
-    cache = probe.find_kernel_cache()
-    num_bytes = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
-    text = f"{probe.get_warp_version()}, kernel cache {cache} ({num_bytes / 2**20:.1f} MiB)"
+    text = f"Warp {metadata.version('warp-lang')}"
     if not torch.cuda.is_available():
         return DoctorFinding("ok", f"{text}; without a GPU no CUDA graphs are needed")
     try:
@@ -223,13 +204,3 @@ def check_import_names() -> DoctorFinding:
         advice = "install the project in an environment of its own"
         return DoctorFinding("fail", "; ".join(foreign), advice)
     return DoctorFinding("ok", f"all {len(IMPORT_NAMES)} come from {home}")
-
-
-def check_extensions() -> DoctorFinding:
-    """Report installed packages that add options by entry point."""
-    try:
-        registry.list_options()
-    except BrokkError as error:
-        return DoctorFinding("fail", str(error))
-    others = [one for one in registry.find_packages() if one != registry.CORE]
-    return DoctorFinding("ok", ", ".join(others) or "none installed")

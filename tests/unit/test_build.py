@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from brokk_rl import build, extensions, registry
+from brokk_rl import build, extensions
 from brokk_rl.build import build_node
 from brokk_rl.errors import ConfigError
 
@@ -44,8 +44,8 @@ def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (FAST | {"rate": 3.0}, "a.b.rate: expected up to 2.0, got 3.0 (change a.b.rate=…"),
         (FAST | {"siez_m": 1}, "a.b: has no field 'siez_m'; did you mean 'size_m'?"),
         ([FAST, FAST | {"rate": "x"}], "a.b[1].rate: expected a valid number, got 'x'"),
-        ({"_target_": "nowhere.at.All"}, "nowhere.at.All: there is no module 'nowhere'"),
-        ({"_target_": "some_parts.Fest"}, "the module 'some_parts' has no 'Fest' (in 'a.b': change a.b.<field>=…"),
+        ({"_target_": "nowhere.at.All"}, "nowhere.at.All cannot be imported: ModuleNotFoundError: No module named 'nowhere'"),
+        ({"_target_": "some_parts.Fest"}, "module 'some_parts' has no attribute 'Fest'"),
     ],
 )  # fmt: skip
 def test_a_refused_node_is_named_as_typed(node: Any, message: str, parts: Path) -> None:
@@ -60,24 +60,6 @@ def test_the_error_of_an_own_module_is_told_with_its_line(parts: Path) -> None:
         build_node(FAST, "actuator")
     assert "no attribute 'nothing'" in str(told.value)
     assert f"{parts / 'some_parts.py'}, line 3" in str(told.value)
-
-
-@pytest.mark.parametrize(
-    ("head", "base", "fields"),
-    [
-        ("from some_parts import Fast", "Fast", {"size_m": "Positive", "rate": "float", "more": "int = 1"}),
-        ("import some_parts as parts", "parts.Fast", {"size_m": "Positive", "rate": "float", "more": "int = 1"}),
-        ("from typing import Generic, TypeVar\nT = TypeVar('T')", "Generic[T]", {"more": "int = 1"}),
-        ("from some_parts import *", "Fast", None),
-    ],
-)  # fmt: skip
-def test_fields_are_read_without_an_import_or_not_at_all(
-    head: str, base: str, fields: dict[str, str] | None, parts: Path
-) -> None:
-    text = f"{head}\n\nclass Own({base}):\n    more: int = 1\n    kind: ClassVar[int] = 2\n"
-    (parts / "own_mode.py").write_text(text)
-    assert registry.list_fields("own_mode.Own") == fields
-    assert "own_mode" not in sys.modules and "some_parts" not in sys.modules
 
 
 def test_each_node_of_a_mode_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,10 +8,9 @@ from typing import Any
 
 import hydra
 import pytest
-import yaml
 from omegaconf import OmegaConf
 
-from brokk_rl.help import MAIN_MODES, add_comments, collect_comments
+from brokk_rl.help import MAIN_MODES, collect_comments
 
 
 def test_a_mode_has_a_help_of_its_own(brokk: Callable[..., Any]) -> None:
@@ -65,19 +64,9 @@ def test_values_that_bear_the_name_of_a_group_are_values(brokk: Callable[..., An
     assert "bench.num_envs=[128,256]" in told and "bench=[" not in told
 
 
-def test_comments_follow_their_values_into_the_composed_text(tmp_path: Path) -> None:
+def test_comments_are_found_beside_and_above_their_values(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(
         "# Head of the file.\nx: 1   # m\ninner:   # of two\n  # s\n  y: {z: 2, w: '#3'}   # rad\nlist: [1]\n"
     )
     comments = collect_comments([("node", tmp_path / "a.yaml")])
     assert comments == {"node.x": "m", "node.inner": "of two", "node.inner.y": "rad"}
-    text = "node:\n  x: 5\n  list:\n  - 1\n"
-    assert add_comments(text, comments) == "node:\n  x: 5  # m\n  list:\n  - 1\n"
-    assert add_comments("# @package node\nx: 5\n", comments) == "# @package node\nx: 5  # m\n"
-
-
-def test_the_printed_configuration_keeps_values_and_comments(brokk: Callable[..., Any]) -> None:
-    text = brokk("mode=train", "session.seed=3", "--cfg", "job").out
-    (line,) = [line for line in text.splitlines() if line.startswith("  seed: 3")]
-    assert "# " in line
-    assert yaml.safe_load(text)["machine"]["period_s"] == 0.05

@@ -152,7 +152,7 @@ def test_a_checkpoint_is_exported_by_what_it_says(
     content["answers"] = (content["answers"][0], content["answers"][1] + 0.01)
     torch.save(content, tmp_path / "model_2.pt")
     other = replace(policy, path=str(tmp_path / "model_2.pt"))
-    told = r"differs from the answers .* not the one of the run"
+    told = r"differs from the answers .* not that of the run"
     with pytest.raises(CheckpointError, match=told):
         replace(export, policy=other).run()
 

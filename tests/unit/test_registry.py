@@ -65,7 +65,7 @@ def test_a_check_that_breaks_is_a_warning_and_the_others_go_on(
 def test_the_doctor_leaves_with_1_when_something_essential_fails(
     healthy: pytest.MonkeyPatch,
 ) -> None:
-    healthy.setattr(doctor, "check_python", lambda: DoctorFinding("fail", "too old"))
+    healthy.setattr(doctor, "check_packages", lambda: DoctorFinding("fail", "too old"))
     with pytest.raises(SystemExit) as left:
         Doctor(doctor=LIMITS).run()
     assert left.value.code == 1
