@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from brokk_rl.errors import RecordingError
 from brokk_rl.session import write_json
-from diagnosis.closure import ErrorInUnit, Estimate, Gap, Gate, RivalError
+from diagnosis.closure import Estimate, Gap, Gate, RivalError
 from diagnosis.free_runs import WindowedRuns
 
 SCHEMA = 1
@@ -67,39 +67,6 @@ class Ranked:
     probability: float
 
 
-@dataclass(frozen=True)
-class JointGap(ErrorInUnit):
-    """Error of one joint over free runs, its floor, both in `unit` (rad or m), and its share of the gap."""
-
-    rmse: float
-    floor: float
-    share: float
-    unit: str = "rad"
-
-
-@dataclass(frozen=True)
-class Where:
-    """Where the gap lies.
-
-    Attributes:
-        joints: By joint.
-        stage: On which part of the way from command to estimate; `None` where nothing is to be
-            said.
-    """
-
-    joints: Mapping[str, JointGap]
-    stage: Stage | None
-
-
-@dataclass(frozen=True)
-class NextExperiment:
-    """The most informative next excitation, and the effects that it separates."""
-
-    excitation: str
-    separates: tuple[str, ...]
-    why: str = ""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Answer:
     """The answer of a diagnosis, the content of `diagnosis.json`.
@@ -109,9 +76,7 @@ class Answer:
             and nothing of the library explains it, or the recordings do not allow to tell.
         selected: Most probable first; empty unless the verdict is `effects`.
         ranking: All rivals worth naming, `none` and `unknown` among them, most probable first.
-        where: Where the gap lies.
-        gap: Its size, and the remainder.
-        next_experiment: `None` where nothing is left to tell apart.
+        gap: Its size, and the remainder, joint by joint too.
         rivals: Errors of simple rivals on the windows of the gap, by name.
         gates: Conditions of the verdict.
         reason: One sentence in words.
@@ -121,9 +86,7 @@ class Answer:
     verdict: Verdict
     selected: tuple[Selected, ...]
     ranking: tuple[Ranked, ...]
-    where: Where
     gap: Gap | None
-    next_experiment: NextExperiment | None = None
     rivals: Mapping[str, RivalError] = field(default_factory=dict)
     gates: tuple[Gate, ...] = ()
     reason: str = ""
@@ -184,14 +147,11 @@ class Outcome:
         before: Free runs of the simulator as it was through field recordings that no effect was
             fitted to.
         after: The same with the selected effects; `None` where none was selected.
-        floor: The simulator's through reference recordings that it was not fitted to; `None`
-            without any.
     """
 
     answer: Answer
     before: WindowedRuns
     after: WindowedRuns | None
-    floor: WindowedRuns | None
 
 
 def format_error(value: float, unit: str) -> str:

@@ -62,6 +62,7 @@ class JointClosed:
         floor: Of the unchanged machine under the field's motion.
         share: `1 - after / before`.
         closed: `(before - after) / (before - floor)`; `None` without a floor below `before`.
+        part: Part of the gap of all joints: of their squared errors beyond the floor, over their travel.
     """
 
     before: float
@@ -69,6 +70,7 @@ class JointClosed:
     floor: float
     share: float
     closed: float | None
+    part: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -136,34 +138,25 @@ class Gate:
     text: str
 
 
-class ErrorInUnit:
-    """Base of errors that `diagnosis.json` names with their unit, such as `rmse_rad`."""
-
-    @model_serializer(mode="wrap")
-    def _write(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        told, found = write(self), {}
-        for name, value in told.items():
-            if name != "unit":
-                found[f"{name}_{told['unit']}" if name in ("rmse", "floor") else name] = value
-        return found
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read(cls, told: Any) -> Any:
-        found = {}
-        for key, value in told.items():
-            name, _, unit = key.partition("_")
-            found[name] = value
-            if unit:
-                found["unit"] = unit
-        return found
-
-
 @dataclass(frozen=True)
-class RivalError(ErrorInUnit):
+class RivalError:
     """Error of a rival on the windows of the gap, all joints together and by joint; `None`: not to be had."""
 
     rmse: float | None
     joints: Mapping[str, float]
     reason: str = ""
     unit: str = "rad"
+
+    @model_serializer(mode="wrap")
+    def _write(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found = write(self)
+        return {f"rmse_{found.pop('unit')}": found.pop("rmse"), **found}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, told: Any) -> Any:
+        found = dict(told)
+        for key in told:
+            if key.startswith("rmse_"):
+                found |= {"rmse": found.pop(key), "unit": key.removeprefix("rmse_")}
+        return found

@@ -18,6 +18,8 @@ from diagnosis.closure import JointClosed
 MIN_GAP_RATIO = 1.02
 """Error over floor from which there is a gap whose share is told. Its interval shows how surely:
 the limit only keeps the denominator off 0. Chosen by hand; not searched."""
+TINY = np.finfo(float).tiny
+"""Smallest divisor: a sum of squares may be 0."""
 
 
 def choose_unit(machine: Machine) -> str:
@@ -52,13 +54,18 @@ def compute_shapley(
 def describe_joints(
     machine: Machine, before: np.ndarray, after: np.ndarray, floor: np.ndarray
 ) -> dict[str, JointClosed]:
-    """Return errors `(J,)` before, after and at the floor, joint by joint."""
+    """Return errors `(J,)` before, after and at the floor, joint by joint; their parts of the gap add up to 1."""
+    excess = np.maximum(np.square(before) - np.square(floor), 0.0)
+    if not excess.any():
+        excess = np.square(before)
+    parts = excess / np.square(machine.upper - machine.lower)
+    parts = parts / max(float(parts.sum()), TINY)
     found = {}
-    rows = zip(before.tolist(), after.tolist(), floor.tolist(), strict=True)
-    for name, (error, left, least) in zip(machine.joint_names, rows, strict=True):
+    for name, *row in zip(machine.joint_names, before, after, floor, parts, strict=True):
+        error, left, least, part = map(float, row)
         closed = None
         if error > MIN_GAP_RATIO * least:
             closed = (error - left) / (error - least)
         share = 1.0 - left / max(error, 1e-12)
-        found[name] = JointClosed(error, left, least, share, closed)
+        found[name] = JointClosed(error, left, least, share, closed, part)
     return found

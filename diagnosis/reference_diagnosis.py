@@ -23,7 +23,7 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import gates, geometry, sensors
-from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, Verdict
+from diagnosis.answer import Answer, Outcome, Ranked, Selected, Verdict
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.effect_library import DetectedEffect, EffectType
@@ -31,7 +31,6 @@ from diagnosis.engine.decide import Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import SIGMAS, describe_numbers
 from diagnosis.repair_proof import EngineProof, RepairProof
-from diagnosis.where import find_stage, locate_gap
 
 SizesByName = Mapping[str, Mapping[str, Estimate]]
 """Sizes by number and joint, or `machine`."""
@@ -127,24 +126,22 @@ class Diagnosis(ABC):
                 reason = "; ".join(f"{one.effect} on {', '.join(one.joints)}" for one in selected)
         elif failed or verdict != "none":
             verdict = "unknown"
-        before, floor = proof.view(proof.before), proof.view_floor()
+        after = proof.view(proof.after) if selected else None
         weighed = {"rivals": describe_rivals(found.rivals, machine), "unit": "log likelihood"}
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
             ranking=rank_effects(selected, found.rivals, verdict, machine),
-            where=locate_gap(before, floor, machine, find_stage(selected, self.kinds)),
             gap=proof.measure_gap(bool(selected)),
             rivals=proof.rivals,
             gates=tuple(told),
-            next_experiment=propose_measurement(selected),
             reason=reason,
             more={
                 "sanity": [remark.plain() for remark in remarks],
                 "evidence": {**weighed, **found.evidence},
             },
         )
-        return Outcome(answer, before, proof.view(proof.after) if selected else None, floor)
+        return Outcome(answer, proof.view(proof.before), after)
 
     @cached_property
     def detected(self) -> list[DetectedEffect]:
@@ -398,16 +395,6 @@ def describe_rivals(rivals: Sequence[EffectFinding], machine: Machine) -> list[d
         told = {"name": one.name, "effect": one.name, "score": one.nats}
         rows.append(told | {"joints": list(name_joints(one.joints, machine))})
     return rows
-
-
-def propose_measurement(selected: Sequence[Selected]) -> NextExperiment | None:
-    """Return the measurement that would tell apart what these recordings cannot."""
-    for one in selected:
-        if one.same_as and one.decided_by:
-            return NextExperiment(
-                "", (one.effect, *one.same_as), f"no excitation does; {one.decided_by} would"
-            )
-    return None
 
 
 def _explain(decision: Decision) -> str:

@@ -90,10 +90,6 @@ class RepairProof(ABC):
         """Return free runs beside the recordings of the field."""
 
     @abstractmethod
-    def view_floor(self) -> WindowedRuns | None:
-        """Return left-out runs beside the recordings of the reference; `None` without any."""
-
-    @abstractmethod
     def _simulate(self, effects: frozenset[str], half: int) -> np.ndarray:
         """Return free runs with some of the named effects, `(W, K, J)`, with the sizes for a half."""
 
@@ -333,14 +329,6 @@ class EngineProof(RepairProof):
     def view(self, paths: np.ndarray) -> WindowedRuns:
         """Return free runs beside the recordings of the field."""
         return _view_runs(self._case.field, self._field, self.windows, paths)
-
-    def view_floor(self) -> WindowedRuns:
-        """Return the left-out runs beside the recordings of the reference."""
-        reference = self._decider.evidence.reference
-        windows = self.floor.windows
-        measured = reference.q[windows.rows]
-        paths = (measured - self.floor.errors) * measure_units(self.machine)
-        return _view_runs(self._case.reference, reference, windows, paths)
 
 
 def _view_runs(

@@ -160,10 +160,10 @@ def format_estimate(
 
 
 def _describe_place(answer: Answer) -> str:
-    if not answer.where.joints:
+    if answer.gap is None or not answer.gap.joints:
         return ""
-    joint, gap = max(answer.where.joints.items(), key=lambda pair: pair[1].share)
-    return f"; {100 * gap.share:.0f} % of it lies in {joint}"
+    joint, gap = max(answer.gap.joints.items(), key=lambda pair: pair[1].part)
+    return f"; {100 * gap.part:.0f} % of it lies in {joint}"
 
 
 def _format_share(value: Estimate, of: str = "") -> str:

@@ -16,7 +16,7 @@ from actuators.models.linear import Hold
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.machine import Machine
 from diagnosis import sensors
-from diagnosis.answer import Answer, Outcome, Ranked, Where
+from diagnosis.answer import Answer, Outcome, Ranked
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.engine.decide import EffectFinding
@@ -92,9 +92,9 @@ class SimulatorProof(RepairProof):
     def floor_squares(self) -> np.ndarray:
         """Mean squares at the floor in each draw, `(1 + B, J)`."""
         after = self.measure_squares(self.after)
-        known = self.view_floor()
-        if known is not None:
-            squares = np.square(known.error).mean((0, 1))
+        reference = self._reference
+        if reference is not None:
+            squares = np.square(reference.plain_runs - reference.cut.measured).mean((0, 1))
         else:
             joints = self.rivals["arx"].joints
             squares = np.square([joints.get(name, np.inf) for name in self.machine.joint_names])
@@ -121,12 +121,6 @@ class SimulatorProof(RepairProof):
     def view(self, paths: np.ndarray) -> WindowedRuns:
         """Return free runs beside the recordings of the field."""
         return self._search.runs.view(paths)
-
-    def view_floor(self) -> WindowedRuns | None:
-        """Return free runs beside the recordings of the reference; `None` without any."""
-        if self._reference is None:
-            return None
-        return self._reference.view(self._reference.plain_runs)
 
 
 @dataclass(frozen=True)
@@ -197,13 +191,11 @@ def describe_doubts(case: GapCase, why: str) -> Outcome:
         verdict="unknown",
         selected=(),
         ranking=(Ranked("unknown", (), 1.0),),
-        where=Where({}, None),
         gap=None,
         gates=(Gate("enough_data", False, None, None, why),),
-        next_experiment=None,
         reason=f"cannot tell, because {why}",
     )
-    return Outcome(answer, runs.view(runs.plain_runs), None, None)
+    return Outcome(answer, runs.view(runs.plain_runs), None)
 
 
 def estimate_numbers(

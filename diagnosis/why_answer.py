@@ -222,15 +222,12 @@ def list_records(result: WhyResult) -> list[NextStep]:
     elif doctor["actuator"]["cannot_tell"]:
         texts.append(doctor["actuator"]["cannot_tell"])
     records = [(f"Not judged: {text}.", "") for text in dict.fromkeys(texts)]
-    following = found.next_experiment if found else None
-    excitation, text = "'[levels,ramps,holds,reversals]'", ""
-    if following is not None:
-        names = report.join_words([report.name_effect(name) for name in following.separates])
-        text = f"These recordings cannot tell {names} apart. These motions can:"
-        excitation = following.excitation
-    elif result.cause != "code" and not result.has_effects and (found is None or found.reason):
+    for one in found.selected if found else ():
+        if one.same_as:
+            records.append((report.describe_class(one), ""))
+    if result.cause != "code" and not result.has_effects and (found is None or found.reason):
         text = "The diagnosis names no effect. Log a minute or more in two files; motions made for it tell most:"
-    if text:
+        excitation = "'[levels,ramps,holds,reversals]'"
         command = f"brokk mode=collect {_name_machine(result)} excitation={excitation} collect.only_plan=true"
         records.append((text, command))
     return records

@@ -22,7 +22,7 @@ from exam.metrics import compute_metrics
 
 log = logging.getLogger(__name__)
 
-PUBLISHED = ("schema", "verdict", "reason", "selected", "ranking", "where", "gap")
+PUBLISHED = ("schema", "verdict", "reason", "selected", "ranking", "gap")
 """Parts of an answer that are published: those that a score reads. The others are nine in ten of its bytes; a
 published file names them as `left_out`."""
 RUN_FILE = "run.json"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Share, spec
-from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict, Where
+from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict
 
 
 @spec
@@ -35,8 +35,6 @@ class ConstantAnswer:
             verdict=verdict,
             selected=selected,
             ranking=(Ranked(self.effect or "none", joints, self.probability),),
-            where=Where({}, None),
             gap=None,
-            next_experiment=None,
         )
         said.write(out / ANSWER_FILE)

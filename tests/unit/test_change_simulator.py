@@ -18,7 +18,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
 from brokk_rl.session import Session
 from diagnosis import api, effect_library
-from diagnosis.answer import ANSWER_FILE, Answer, Selected, Where
+from diagnosis.answer import ANSWER_FILE, Answer, Selected
 from diagnosis.closure import Estimate
 from diagnosis.mjcf.changes import JointFinding, write_changed_mjcf
 from diagnosis.mjcf.plant import MjcfPlant
@@ -54,7 +54,7 @@ def name_effects() -> Answer:
 
 
 NOTHING = Answer(
-    verdict="none", selected=(), ranking=(), where=Where({}, None), gap=None, next_experiment=None
+    verdict="none", selected=(), ranking=(), gap=None
 )  # fmt: skip
 
 

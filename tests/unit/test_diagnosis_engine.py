@@ -12,16 +12,8 @@ import pytest
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
-from diagnosis.answer import (
-    Answer,
-    Estimate,
-    Gap,
-    JointGap,
-    NextExperiment,
-    Ranked,
-    Selected,
-    Where,
-)
+from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected
+from diagnosis.gap import describe_joints
 
 
 def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) -> None:
@@ -39,11 +31,10 @@ def said() -> Answer:
         parameters={"gap_rad": {"q3": Estimate(0.031, (0.028, 0.034))}}, gap_closed=Estimate(0.91, (0.86, 0.95)),
         same_as=("lag",), decided_by="a dial gauge",
     )  # fmt: skip
-    where = Where({"q3": JointGap(0.03, 0.002, 1.0)}, "actuation")
     return Answer(
-        verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),), where=where,
+        verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),),
         gap=Gap(0.03, 0.004, 0.002, Estimate(0.93, (0.88, 0.96))),
-        next_experiment=NextExperiment("reversals", ("backlash", "lag"), "because"), reason="play", more={"sanity": [{"a": 1}]},
+        reason="play", more={"sanity": [{"a": 1}]},
     )  # fmt: skip
 
 
@@ -56,7 +47,6 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
         "mean": 0.031,
         "ci95": [0.028, 0.034],
     }
-    assert found["where"]["joints"]["q3"] == {"rmse_rad": 0.03, "floor_rad": 0.002, "share": 1.0}
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
     assert answer.read_answer(path) == said()
     path.write_text(json.dumps(found | {"schema": 2}))
@@ -73,3 +63,15 @@ def test_training_takes_the_found_effects_as_they_are(
     assert done.code == 0, done.err
     text = done.out[done.out.index("backlash:") :]
     assert "q3: 0.031" in text and "other: 0.0" in text
+
+
+def test_parts_of_the_gap_are_those_of_the_squares_beyond_the_floor(machine: Machine) -> None:
+    percent = 0.01 * (machine.upper - machine.lower)
+    before, floor = percent * [0.0, 5.0, 2.0, 3.0, 0.0], percent * [0.0, 3.0, 2.0, 4.0, 0.0]
+    plain = describe_joints(machine, before, before, 0.0 * floor)
+    parts = [one.part for one in plain.values()]
+    assert parts == pytest.approx([0.0, 25 / 38, 4 / 38, 9 / 38, 0.0])
+    found = describe_joints(machine, before, before, floor)
+    assert [one.part for one in found.values()] == pytest.approx([0.0, 1.0, 0.0, 0.0, 0.0])
+    below = describe_joints(machine, before, before, 9.0 * before)
+    assert [one.part for one in below.values()] == pytest.approx(parts)

@@ -13,7 +13,7 @@ from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
 from diagnosis import gates
-from diagnosis.answer import Answer, Where, parse_answer
+from diagnosis.answer import Answer, parse_answer
 from diagnosis.closure import Gap, Gate, RivalError
 
 
@@ -116,8 +116,8 @@ def test_fast_motion_without_command_is_an_unlogged_input_and_slow_one_a_leak(
 def test_gates_and_rivals_are_written_as_the_format_says() -> None:
     gate = Gate("near_floor", False, 2.5, 1.75, "too far")
     told = Answer(
-        verdict="unknown", selected=(), ranking=(), where=Where({}, None),
-        gap=Gap(0.03, 0.03, 0.01, None), next_experiment=None,
+        verdict="unknown", selected=(), ranking=(),
+        gap=Gap(0.03, 0.03, 0.01, None),
         rivals={"hold": RivalError(0.09, {"q1": 0.1}), "arx": RivalError(None, {}, "too few windows")},
         gates=(gate,),
     )  # fmt: skip

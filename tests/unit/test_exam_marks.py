@@ -13,7 +13,7 @@ import pytest
 from composed import option
 
 from brokk_rl.errors import RecordingError
-from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
+from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected
 from exam import metrics, score
 from exam.answer_scoring import GivenAnswer, build_table, publish_answers, read_answers
 from exam.dataset import open_labels
@@ -55,9 +55,7 @@ def answered(
         verdict=verdict or ("effects" if selected else "none"),  # pyright: ignore[reportArgumentType]
         selected=selected,
         ranking=tuple(ranking),
-        where=Where({}, None),
         gap=Gap(0.03, 0.01, 0.008, Estimate(0.9, (0.8, 0.95))),
-        next_experiment=None,
     )
 
 

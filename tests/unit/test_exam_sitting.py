@@ -16,7 +16,7 @@ from small_exam import run_model
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import write_recording
-from diagnosis.answer import Answer, Estimate, Gap, Where
+from diagnosis.answer import Answer, Estimate, Gap
 from exam.examiner import ExaminerSimulator, compute_closed, read_effects
 from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER
 
@@ -46,14 +46,7 @@ def slow_case(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Pat
 def say(closed: float | None) -> Answer:
     """An answer that states how far it closes the gap."""
     estimate = None if closed is None else Estimate(closed, (closed - 0.02, closed + 0.02))
-    return Answer(
-        verdict="effects",
-        selected=(),
-        ranking=(),
-        where=Where({}, None),
-        gap=Gap(0.03, 0.01, 0.008, estimate),
-        next_experiment=None,
-    )
+    return Answer(verdict="effects", selected=(), ranking=(), gap=Gap(0.03, 0.01, 0.008, estimate))
 
 
 def test_the_examiner_believes_its_own_simulation(

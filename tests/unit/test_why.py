@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from brokk_rl.statistics import compute_wilson_interval
-from diagnosis.answer import Answer, Selected, Where
+from diagnosis.answer import Answer, Selected
 from diagnosis.why_answer import (
     ALL_EFFECTS,
     BEFORE,
@@ -44,8 +44,7 @@ def make_result(tmp_path: Path, after: float | None, verdict: str = "nothing") -
     """A doctor's verdict, and an effect with which the policy succeeds in a share `after`."""
     lag = Selected(effect="lag", joints=("q3",), probability=0.9, parameters={}, gap_closed=None)
     found = Answer(
-        verdict="effects", selected=(lag,), ranking=(), where=Where({}, None), gap=None,
-        next_experiment=None,
+        verdict="effects", selected=(lag,), ranking=(), gap=None,
     )  # fmt: skip
     success = {} if after is None else {BEFORE: RATES[1.0], ALL_EFFECTS: RATES[after]}
     return WhyResult(tmp_path, DOCTOR | {"verdict": verdict}, found, success, "runs/policy", "mlp")
