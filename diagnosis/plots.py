@@ -24,15 +24,12 @@ def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
     rows = {}
     for joint in np.argsort(foremost, kind="stable")[:MAX_JOINTS].tolist():
         worst = np.argsort(-np.nan_to_num(error[:, joint]))
-        others = [w for w in worst[1:] if before.source[w] != before.source[worst[0]]]
-        second = (*others, worst[min(1, len(worst) - 1)])[0]
         whole = np.flatnonzero(before.source == before.source[worst[0]])
         rows[joint] = [
             _show_windows(outcome, joint, "a whole recording", whole),
             _show_windows(outcome, joint, "worst window", worst[:1]),
-            _show_windows(outcome, joint, "elsewhere", np.array([second])),
         ]
-    return draw_motion_panels(rows, machine, (1.9, 1.0, 1.0))
+    return draw_motion_panels(rows, machine, (1.9, 1.0))
 
 
 def _show_windows(outcome: Outcome, joint: int, title: str, windows: np.ndarray) -> MotionWindow:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -19,6 +18,9 @@ NUM_DRAWS = 1000
 """Bootstrap draws; the usual number for 95 % intervals."""
 NUM_BINS = 10
 """Bins of the expected calibration error; the usual number."""
+
+COUNTS = ("right", "wrong", "missed")
+"""Ways in which an effect can be named."""
 
 Metric = dict[str, Any]
 """`value`, `of` and `ci95`; `None` where there is nothing to count."""
@@ -114,7 +116,6 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
     by_kind: dict[str, list[CaseScore]] = {kind: [] for kind in KINDS}
     for score in scores:
         by_kind[score.kind].append(score)
-    one, outside = by_kind["one"], by_kind["outside"]
     found: dict[str, Any] = {
         "cases": {kind: len(of_kind) for kind, of_kind in by_kind.items()},
         "sat": {"value": len(scores), "of": len(scores) + not_begun},
@@ -130,9 +131,8 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
     median = float(np.median(seconds)) if seconds else None
     return found | {
         "seconds": {"median": median, "most": max(seconds, default=None)},
-        "by_effect": summarize_effects(scores),
-        "confusion": _count_answers((s.truth[0], (*s.named, s.verdict)[0]) for s in one),
-        "outside": _count_answers((s.outside, "+".join(s.named) or s.verdict) for s in outside),
+        "by_effect": count_effects(scores),
+        "said": count_answers([*by_kind["one"], *by_kind["outside"]]),
     }
 
 
@@ -164,35 +164,23 @@ def bootstrap_cases(
     return {"value": value, "of": len(parts), "ci95": interval}
 
 
-def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, dict[str, float | None]]:
-    """Return precision, recall and F1 of each effect, strictly, over all cases but those below the noise."""
-    right, wrong, missed = Counter[str](), Counter[str](), Counter[str]()
-    errors: dict[str, list[float]] = {}
-    for score in scores:
-        for number in score.numbers:
-            errors.setdefault(number.effect, []).append(number.error)
-        if score.kind != "faint":
-            truth, named = {*score.truth}, {*score.named}
-            right.update(truth & named)
-            wrong.update(named - truth)
-            missed.update(truth - named)
-    found = {}
-    for effect in sorted({*right, *wrong, *missed}):
-        row = {"right": right[effect], "wrong": wrong[effect], "missed": missed[effect]}
-        named, there = row["right"] + row["wrong"], row["right"] + row["missed"]
-        found[effect] = {
-            **row,
-            "precision": row["right"] / named if named else None,
-            "recall": row["right"] / there if there else None,
-            "f1": 2.0 * row["right"] / (named + there) if there else None,
-            "parameter_error": float(np.median(errors[effect])) if effect in errors else None,
-        }
-    return found
-
-
-def _count_answers(pairs: Iterable[tuple[Any, str]]) -> dict[str, dict[str, int]]:
-    """Return how often each answer was given, by what is there."""
+def count_effects(scores: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
+    """Return how often each effect was named rightly, wrongly and missed, over all cases but those below the noise."""
     found: dict[str, dict[str, int]] = {}
-    for (there, said), count in Counter(pairs).items():
-        found.setdefault(str(there), {})[said] = count
+    for score in scores:
+        truth, named = {*score.truth}, {*score.named}
+        for effect in sorted(truth | named) if score.kind != "faint" else ():
+            counts = found.setdefault(effect, dict.fromkeys(COUNTS, 0))
+            right = "right" if effect in truth else "wrong"
+            counts[right if effect in named else "missed"] += 1
+    return dict(sorted(found.items()))
+
+
+def count_answers(scores: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
+    """Return how often each answer was given to a cause that was alone."""
+    found: dict[str, dict[str, int]] = {}
+    for score in scores:
+        said = found.setdefault(score.outside or score.truth[0], {})
+        answer = "+".join(score.named) or score.verdict
+        said[answer] = said.get(answer, 0) + 1
     return found

@@ -8,7 +8,7 @@ from typing import Any
 
 from brokk_rl.console_table import MISSING
 from brokk_rl.session import write_text
-from exam.metrics import METRICS
+from exam.metrics import COUNTS, METRICS
 
 REPORT_FILE = "exam.md"
 STRICT = (
@@ -17,7 +17,6 @@ STRICT = (
     "intervals, other metrics bootstrap intervals over cases."
 )
 OPEN = "A development seed: the authors of the candidates may have looked at its cases."
-BY_EFFECT = ("right", "wrong", "missed", "precision", "recall", "f1", "parameter_error")
 
 
 def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
@@ -71,21 +70,19 @@ def write_report(
         format_markdown(["", *tables], build_rows(tables)),
     ]
     for name, table in tables.items():
-        parts += [f"## {name}", f"Commit {table['commit'] or MISSING}.", _format_effects(table)]
-        outside = [[kind, _join_counts(said)] for kind, said in table["outside"].items()]
-        parts.append(format_markdown(["cause outside the library", "said"], outside))
+        parts += [f"## {name}", f"Commit {table['commit'] or MISSING}.", _format_causes(table)]
     parts.append(f"Labels, SHA-256: {exam['labels_sha256']}.")
     write_text(folder / REPORT_FILE, "\n\n".join(part.rstrip() for part in parts) + "\n")
 
 
-def _format_effects(table: Mapping[str, Any]) -> str:
-    """Return a row for each effect: how often it was named, and what was said where it was alone."""
-    rows = []
-    for effect, one in table["by_effect"].items():
-        numbers = [MISSING if one[key] is None else f"{one[key]:.3g}" for key in BY_EFFECT]
-        rows.append([effect, *numbers, _join_counts(table["confusion"].get(effect, {}))])
-    titles = [key.replace("_", " ") for key in BY_EFFECT]
-    return format_markdown(["effect", *titles, "said where it was alone"], rows)
+def _format_causes(table: Mapping[str, Any]) -> str:
+    """Return a row for each cause: how often it was named, and what was said where it was alone."""
+    rows, by_effect, said = [], table["by_effect"], table["said"]
+    for cause in [*by_effect, *(one for one in said if one not in by_effect)]:
+        counts = by_effect.get(cause, {})
+        numbers = [str(counts.get(key, MISSING)) for key in COUNTS]
+        rows.append([cause, *numbers, _join_counts(said.get(cause, {}))])
+    return format_markdown(["cause", *COUNTS, "said where it was alone"], rows)
 
 
 def _join_counts(counts: Mapping[str, int]) -> str:

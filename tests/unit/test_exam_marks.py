@@ -139,10 +139,12 @@ def test_the_figures_of_a_table_are_those_worked_by_hand() -> None:
     assert found["set_f1"]["value"] == pytest.approx(6 / 8)
     assert found["false_alarms_none"]["value"] == 0.5 and found["false_alarms_none"]["of"] == 2
     assert found["unknown_recall"]["value"] == 1.0 and found["unknown_auroc"]["value"] == 1.0
-    assert found["by_effect"]["lag"] == {
-        "right": 4, "wrong": 1, "missed": 0, "precision": 0.8, "recall": 1.0, "f1": pytest.approx(8 / 9), "parameter_error": 0.0,
-    }  # fmt: skip
-    assert found["confusion"] == {"lag": {"lag": 2}, "creep": {"backlash": 1}}
+    assert found["by_effect"] == {
+        "backlash": {"right": 0, "wrong": 2, "missed": 0},
+        "creep": {"right": 1, "wrong": 0, "missed": 2},
+        "lag": {"right": 4, "wrong": 1, "missed": 0},
+    }
+    assert found["said"] == {"lag": {"lag": 2}, "creep": {"backlash": 1}, "fading": {"unknown": 1}}
     assert found["seconds"] == {"median": 10.0, "most": 10.0}
 
 
