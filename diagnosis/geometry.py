@@ -1,7 +1,7 @@
 """Errors of geometry and encoders, from measured tool points and forward kinematics alone.
 
 No simulator takes part, so the actuators do not matter. `find_geometry_errors` compares sets of errors
-by least squares: the errors are small, so their effects add up. The sizes of the best set are then
+by linear least squares: the errors are small, so their effects add up. The sizes of the best set are then
 fitted to the tool points of a machine that has them.
 Axes: `S` samples, `J` joints, `D` coordinates of all samples (`S` times 3), `P` numbers.
 """
@@ -38,12 +38,6 @@ MIN_NOISE_M = 3e-4
 MIN_SIZE = 0.3
 """Smallest size, over the typical one, that is named; chosen by hand: trackers see millimetres
 below the accuracy of any drawing or zero."""
-
-MIN_RATIO = 1.0
-"""Least displacement by an error of geometry, over that of tool points on the reference (both root
-mean square per coordinate): an error below the instruments' own is no cause of a gap. On 120
-answers from practice plants of other making, this drops every link length that is named without
-being off, and no error that is there."""
 
 
 @dataclass(frozen=True)
@@ -113,77 +107,34 @@ def find_geometry_errors(
     size_m = max(MIN_NOISE_M, float(np.std(left)))
     if is_tracked(case.reference, machine):
         size_m = max(size_m, float(np.std(_TrackedPoints(case.reference, machine).off)))
-    sets = _ErrorSets(field, causes, size_m, price, name_price)
-    named = sets.choose()
+    gains: dict[tuple[_GeometryError, ...], float] = {(): 0.0}
+    worth = dict(gains)
+    for count in range(1, MAX_ERRORS + 1):
+        for some in combinations(causes, count):
+            gains[some] = _fit_set(some, field.off, size_m).gain
+            names = {cause.kind for cause in some}
+            worth[some] = gains[some] - price * count - name_price * len(names)
+    named = max(worth, key=worth.__getitem__)
+    fit = field.refine(named, size_m)
+    named = tuple(cause for cause in named if _is_large(cause, named, fit))
     fit = field.refine(named, size_m)
     found = []
     for kind in dict.fromkeys(cause.kind for cause in named):
         rest = tuple(cause for cause in named if cause.kind is not kind)
-        gain = sets.gains[named] - sets.gains[rest]
-        without = [w for some, w in sets.worth.items() if all(one.kind is not kind for one in some)]
+        gain = gains[named] - gains[rest]
+        without = [w for some, w in worth.items() if all(one.kind is not kind for one in some)]
         joints, parameters = _describe_numbers(kind, named, fit, machine)
-        closed = float(np.clip(gain / max(sets.gains[named], 1e-9), 0.0, 1.0))
-        net = sets.worth[named] - max(without)
+        closed = float(np.clip(gain / max(gains[named], 1e-9), 0.0, 1.0))
+        net = worth[named] - max(without)
         found.append(DetectedEffect(kind, joints, parameters, net, gain, closed))
     return found
 
 
-class _ErrorSets:
-    """All sets of errors, with what each earns.
-
-    Args:
-        field: The tool points.
-        causes: The errors.
-        size_m: Noise of tool points, m.
-        price: Cost of an error.
-        name_price: Cost of an effect, on however many joints.
-    """
-
-    def __init__(
-        self,
-        field: _TrackedPoints,
-        causes: Sequence[_GeometryError],
-        size_m: float,
-        price: float,
-        name_price: float,
-    ) -> None:
-        self._field, self._causes, self._size_m = field, causes, size_m
-        self._price, self._name_price = price, name_price
-        self.gains: dict[tuple[_GeometryError, ...], float] = {(): 0.0}
-        """Gain in log likelihood."""
-        self.worth = dict(self.gains)
-        """The same less all costs."""
-
-    def choose(self) -> tuple[_GeometryError, ...]:
-        """Return the errors of the best set that matter: large, and beyond what instruments err by."""
-        straight, best = self._field.off, ()
-        for _ in range(NUM_ROUNDS):
-            self._weigh(straight)
-            before, best = best, max(self.worth, key=self.worth.__getitem__)
-            if best in ((), before):
-                break
-            straight = self._field.straighten(best, self._size_m)
-        fit = self._field.refine(best, self._size_m)
-        found = []
-        for cause in best:
-            rest = tuple(other for other in best if other is not cause)
-            # Undoes the scale of `_solve`: a gain is a sum of squares over 2 * 3 * size_m ** 2.
-            gain = max(self.gains[best] - self.gains[rest], 0.0)
-            explained_m = np.sqrt(6.0 * gain * self._size_m**2 / len(self._field.off))
-            sizes = _select_sizes(cause, best, fit)[0]
-            share = max(abs(s) / n.typical for s, n in zip(sizes, cause.numbers, strict=True))
-            if share >= MIN_SIZE and explained_m >= MIN_RATIO * self._size_m:
-                found.append(cause)
-        return tuple(found)
-
-    def _weigh(self, off: np.ndarray) -> None:
-        """Set what all sets earn on errors of tool points `(D,)`."""
-        for count in range(1, MAX_ERRORS + 1):
-            for some in combinations(self._causes, count):
-                self.gains[some] = _fit_set(some, off, self._size_m).gain
-                names = {cause.kind.name for cause in some}
-                cost = self._price * count + self._name_price * len(names)
-                self.worth[some] = self.gains[some] - cost
+def _is_large(cause: _GeometryError, named: Sequence[_GeometryError], fit: SetFit) -> bool:
+    """Return whether an error of a fitted set is large enough to be named."""
+    sizes = _select_sizes(cause, named, fit)[0]
+    shares = [abs(size) / n.typical for size, n in zip(sizes, cause.numbers, strict=True)]
+    return max(shares) >= MIN_SIZE
 
 
 def _is_geometric(kind: EffectType) -> bool:
@@ -287,13 +238,6 @@ class _TrackedPoints:
                 if np.abs(columns).max() > 1e-6:
                     found.append(_GeometryError(numbers, columns))
         return found
-
-    def straighten(self, causes: Sequence[_GeometryError], size_m: float) -> np.ndarray:
-        """Return the errors of the tool points as if these causes acted in proportion to their sizes, `(D,)`."""
-        numbers = [number for cause in causes for number in cause.numbers]
-        columns = np.concatenate([cause.columns for cause in causes], 1)
-        sizes = self.refine(causes, size_m).sizes
-        return self.off - self._displace(numbers, sizes) + columns @ sizes
 
     def refine(self, causes: Sequence[_GeometryError], size_m: float) -> SetFit:
         """Return the fit of a set of errors as they act on the machine, by Gauss's and Newton's method."""
