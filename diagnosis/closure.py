@@ -144,7 +144,6 @@ class RivalError:
 
     rmse: float | None
     joints: Mapping[str, float]
-    reason: str = ""
     unit: str = "rad"
 
     @model_serializer(mode="wrap")

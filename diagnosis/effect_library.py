@@ -223,7 +223,6 @@ class DetectedEffect:
         parameters: By name and joint, or `machine`.
         net_gain: Log-likelihood gain less its penalty, nats.
         gain: Log-likelihood gain, nats.
-        closed: Share of the statistic that the effect explains.
     """
 
     kind: EffectType
@@ -231,7 +230,6 @@ class DetectedEffect:
     parameters: Mapping[str, Mapping[str, Estimate]]
     net_gain: float
     gain: float
-    closed: float
 
     def values(self) -> dict[str, np.ndarray]:
         """Return its numbers, each `(J,)` or `(1,)`."""

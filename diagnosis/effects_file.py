@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from actuators.effects.simulator import EFFECTS as INSIDE_EFFECTS
 from brokk_rl.session import write_text
 from diagnosis.answer import Answer, Estimate, Selected
 from diagnosis.effect_library import EffectType
@@ -90,7 +91,7 @@ def _write(
         kind, sizes = by_name[one.effect], {}
         for number, values in one.parameters.items():
             sizes[number] = {j: choose(kind, number, j, size) for j, size in values.items()}
-        if kind.target.side == "simulator":
+        if one.effect in INSIDE_EFFECTS:
             lines.append(
                 f"# {one.effect}: {sizes}, numbers of the MJCF file, see mode=change_simulator"
             )

@@ -124,9 +124,8 @@ def find_geometry_errors(
         gain = gains[named] - gains[rest]
         without = [w for some, w in worth.items() if all(one.kind is not kind for one in some)]
         joints, parameters = _describe_numbers(kind, named, fit, machine)
-        closed = float(np.clip(gain / max(gains[named], 1e-9), 0.0, 1.0))
         net = worth[named] - max(without)
-        found.append(DetectedEffect(kind, joints, parameters, net, gain, closed))
+        found.append(DetectedEffect(kind, joints, parameters, net, gain))
     return found
 
 

@@ -261,7 +261,6 @@ def describe_detected(one: DetectedEffect, machine: Machine) -> Selected:
         probability=estimate_probability(one.net_gain),
         parameters=one.parameters,
         gap_closed=None,
-        edit={"own_statistic_explained": one.closed},
     )
 
 

@@ -30,7 +30,7 @@ from diagnosis.engine.side import Side, choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
-from diagnosis.rivals import TOO_FEW, measure_rivals
+from diagnosis.rivals import measure_rivals
 
 NOISE_FACTOR = 3.0
 """An error within so many deviations of the sensor's noise is none."""
@@ -176,11 +176,11 @@ class RepairProof(ABC):
         unit = choose_unit(self.machine)
         for name, squares in measure_rivals(cut).items():
             if squares is None:
-                found[name] = RivalError(None, {}, TOO_FEW, unit)
+                found[name] = RivalError(None, {}, unit)
                 continue
             mean = squares.mean(0)
             joints = dict(zip(self.machine.joint_names, np.sqrt(mean).tolist(), strict=True))
-            found[name] = RivalError(float(combine_joints(mean, self.machine)), joints, unit=unit)
+            found[name] = RivalError(float(combine_joints(mean, self.machine)), joints, unit)
         return found
 
     def judge(self) -> list[Gate]:

@@ -12,7 +12,7 @@ from brokk_rl.report import Tone, embed_picture, render_page
 from brokk_rl.session import write_text
 from diagnosis import plots
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
-from diagnosis.closure import MIN_RESTORED, Gate
+from diagnosis.closure import MIN_RESTORED
 
 REPORT_FILE = "report.html"
 TEMPLATE = Path(__file__).with_name("diagnosis.html.jinja")
@@ -102,40 +102,6 @@ def describe_class(one: Selected) -> str:
     return f"{text} What would decide: {one.decided_by}." if one.decided_by else text
 
 
-def list_failed_gates(gates: Sequence[Gate]) -> list[str]:
-    """Return a line for each gate that failed."""
-    lines = []
-    for gate in gates:
-        if not gate.passed:
-            numbers = "" if gate.value is None else f" ({gate.value:.3g}, limit {gate.limit:.3g})"
-            lines.append(f"failed: {gate.name}{numbers}: {gate.text}")
-    return lines
-
-
-def list_beyond(changes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line for each of the largest measured changes beyond what the machine repeats."""
-    lines = []
-    for one in changes:
-        if one["is_beyond"]:
-            after = one["before"] + one["change"]
-            lines.append(
-                f"measured: {one['joint']}, {one['quantity']}: {one['before']:.3g} before, "
-                f"{after:.3g} ± {one['half_width']:.2g} {one['unit']} now"
-            )
-    return lines[:MAX_LISTED]
-
-
-def describe_bounds(one: Selected) -> str:
-    """Return which sizes of an effect ended at a bound, or nothing."""
-    names = []
-    for name, values in one.parameters.items():
-        names += [f"{name} {joint}" for joint, value in values.items() if value.at_bound]
-    if not names:
-        return ""
-    effect = one.effect.replace("_", " ")
-    return f"At its bound: {', '.join(names)} of {effect}. The true size may lie beyond, or another effect is meant."
-
-
 def describe_edit(one: Selected) -> str:
     """Return that an effect failed the edit test, or nothing."""
     if one.identified is not False or one.edit is None:
@@ -195,7 +161,6 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "max_listed": MAX_LISTED,
         "earned": _rank_rivals(more.get("evidence")),
         "describe_class": describe_class,
-        "describe_bounds": describe_bounds,
         "describe_edit": describe_edit,
         "name_effect": name_effect,
         "join_words": join_words,

@@ -28,11 +28,10 @@ RIDGES = (1e-3, 3e-2, 1.0)
 """Pulls towards 0, for features of unit size, over the number of steps."""
 MAX_SPEED_RATIO = 1.2
 """A step is no larger than so many times the largest measured one: a fit may be unstable."""
-TOO_FEW = "too few windows to leave some out"
 
 
 def measure_rivals(cut: FreeRunWindows) -> dict[str, np.ndarray | None]:
-    """Return mean square errors `(W, J)` of `hold` and `arx` on windows; `None` where they are `TOO_FEW`."""
+    """Return mean square errors `(W, J)` of `hold` and `arx` on windows; `None` where too few windows can be left out."""
     start = cut.q[:, cut.num_before - 1]
     arx = None
     if len(cut.q) > 1:

@@ -91,8 +91,7 @@ def find_sensor_noise(
         parameters[machine.joint_names[j]] = Estimate(size, (size / factor, size * factor))
     (name,) = kind.fitted
     earned = float(gain[mask].sum())
-    # The size is the one that explains all of the scatter.
-    return DetectedEffect(kind, mask, {name: parameters}, worth, earned, closed=1.0)
+    return DetectedEffect(kind, mask, {name: parameters}, worth, earned)
 
 
 def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:

@@ -7,21 +7,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
-from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
-from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from diagnosis import answer, effect_library, effects_file
 from diagnosis.answer import Answer
 from diagnosis.own_simulator import OwnSimulator
-from diagnosis.simulator_runs import cut_simulator_runs
 
 MJCF_FILE = "changed.xml"
 CHANGES_FILE = "changes.json"
@@ -33,11 +28,9 @@ class ChangeRequest:
 
     Attributes:
         diagnosis: Run folder of `mode=diagnose`.
-        recordings: Glob or globs of recordings that the changed file is replayed on.
     """
 
     diagnosis: str
-    recordings: str | tuple[str, ...] | None
 
 
 @spec
@@ -65,7 +58,7 @@ class ChangeSimulator:
         """Write the files.
 
         Raises:
-            RecordingError: The diagnosis or the recordings cannot be read.
+            RecordingError: The diagnosis cannot be read.
             ConfigError: The MJCF file does not have the machine's joints, or nothing was found.
             StorageError: A file could not be written.
         """
@@ -79,52 +72,26 @@ class ChangeSimulator:
             )
         own = replace(self.own, source=self.simulator)
         kinds = effect_library.load_effects(self.machine, None, own)
-        recordings = self._read_recordings()
         folder.mkdir(parents=True, exist_ok=True)
         effects_file.write_ranges(given, kinds, folder / effects_file.RANGES_FILE)
-        told: dict[str, Any] = {"changes": [], "not_in_the_file": {}, "replay": {}}
+        told: dict[str, Any] = {"changes": [], "not_in_the_file": {}}
         if own.path is not None:
-            told = self._change_file(own, own.path, given, recordings)
+            told = self._change_file(own.path, given)
         write_json(folder / CHANGES_FILE, told)
         _print(told, effects_file.describe_parts(given), folder)
 
-    def _read_recordings(self) -> list[Recording]:
-        if self.changes.recordings is None:
-            return []
-        return record.read_recordings(self.changes.recordings, self.machine)
-
-    def _change_file(
-        self, own: OwnSimulator, path: Path, given: Answer, recordings: Sequence[Recording]
-    ) -> dict[str, Any]:
+    def _change_file(self, path: Path, given: Answer) -> dict[str, Any]:
         """Write the changed MJCF; return what was done."""
         from diagnosis.mjcf import changes as mjcf_changes  # MuJoCo is not in every installation
 
-        folder = self.session.folder
         findings = []
         for one in given.selected:
             for joint in one.joints or self.machine.joint_names:
                 sizes = {name: row[joint] for name, row in one.parameters.items() if joint in row}
                 findings.append(mjcf_changes.JointFinding(one.effect, joint, sizes))
-        changed = folder / MJCF_FILE
+        changed = self.session.folder / MJCF_FILE
         changes, left = mjcf_changes.write_changed_mjcf(path, self.machine, findings, changed)
-        told: dict[str, Any] = {
-            "changes": [asdict(one) for one in changes],
-            "not_in_the_file": left,
-            "replay": {},
-        }
-        if recordings:
-            told["replay"] = {
-                "before": self._replay(own, recordings),
-                "after": self._replay(replace(own, source=str(changed)), recordings),
-            }
-        return told
-
-    def _replay(self, simulator: Actuator, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Return the error of free runs on the recordings by joint, rad or m."""
-        runs = cut_simulator_runs(simulator, recordings, self.machine, 0)
-        error = runs.cut.measured - runs.plain_runs
-        rmse = np.sqrt(np.square(error).mean((0, 1)))
-        return dict(zip(self.machine.joint_names, rmse.tolist(), strict=True))
+        return {"changes": [asdict(one) for one in changes], "not_in_the_file": left}
 
 
 def _print(told: dict[str, Any], parts: Sequence[str], folder: Path) -> None:
@@ -137,9 +104,6 @@ def _print(told: dict[str, Any], parts: Sequence[str], folder: Path) -> None:
         print_table(("finding", "joint", "attribute", "before", "after"), rows)
     for name, reason in told["not_in_the_file"].items():
         print_text(f"not in {MJCF_FILE}: {name}: {reason}")
-    for joint, before in told["replay"].get("before", {}).items():
-        after = told["replay"]["after"][joint]
-        print_text(f"{joint}: error {before:.4g}, with the changes {after:.4g}")
     for part in parts:
         print_text(part)
     print_text(f"written: {folder}")

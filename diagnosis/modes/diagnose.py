@@ -188,12 +188,4 @@ def _print_answer(found: Answer, folder: Path) -> None:
     print_text(f"{found.verdict}: {found.reason}", "bold")
     if found.selected:
         print_table(("effect", "joints", "probability", "numbers", "closes", "same as"), rows)
-    for line in report.list_beyond(found.more.get("changes", ())):
-        print_text(line)
-    for line in report.list_failed_gates(found.gates):
-        print_text(line)
-    for one in found.selected:
-        for line in (report.describe_bounds(one), report.describe_edit(one)):
-            if line:
-                print_text(line)
     print_text(f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}")

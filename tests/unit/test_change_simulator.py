@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,6 @@ import yaml
 from arm import ARM, NOISE_RAD, make_machine, record_arm, rub
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.record import write_recording
 from brokk_rl.session import Session
 from diagnosis import api, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Selected
@@ -58,7 +56,7 @@ NOTHING = Answer(
 )  # fmt: skip
 
 
-def build_mode(folder: Path, answer: Answer, recordings: str | None) -> ChangeSimulator:
+def build_mode(folder: Path, answer: Answer) -> ChangeSimulator:
     """Returns the mode for the arm and an answer."""
     (folder / "arm.xml").write_text(ARM)
     answer.write(folder / ANSWER_FILE)
@@ -67,31 +65,30 @@ def build_mode(folder: Path, answer: Answer, recordings: str | None) -> ChangeSi
         machine=make_machine("shoulder", "elbow"),
         simulator=str(folder / "arm.xml"),
         own=api._load_option("actuator", "own"),
-        changes=ChangeRequest(diagnosis=str(folder), recordings=recordings),
+        changes=ChangeRequest(diagnosis=str(folder)),
     )
 
 
-def change_arm(folder: Path) -> dict[str, Any]:
-    """Returns `changes.json` of the arm with delay and friction, replayed on two recordings."""
+def measure_error_rad(simulator: Path) -> np.ndarray:
+    """Returns the error of a file, `(J,)`, on two recordings of the arm with delay and friction."""
     machine = make_machine("shoulder", "elbow")
-    for seed in range(2):
-        late = record_arm(machine, rub, round(DELAY_S / machine.period_s), seed)
-        write_recording(late, folder / f"{seed}.parquet")
-    build_mode(folder, name_effects(), str(folder / "*.parquet")).run()
-    return json.loads((folder / "out" / "changes.json").read_text())
+    rows = round(DELAY_S / machine.period_s)
+    late = [record_arm(machine, rub, rows, seed) for seed in range(2)]
+    runs = cut_simulator_runs(api._load_simulator(simulator), late, machine, 0)
+    return np.sqrt(np.square(runs.cut.measured - runs.plain_runs).mean((0, 1)))
 
 
 def test_the_changed_file_is_the_faulty_machine(tmp_path: Path) -> None:
-    told = change_arm(tmp_path)
+    build_mode(tmp_path, name_effects()).run()
     text = (tmp_path / "out" / "changed.xml").read_text()
     assert "<!-- joint_friction: frictionloss 0 to 0.5 [" in text
     assert "Not in this file: backlash: MJCF has no play on a target" in text
     model = mujoco.MjModel.from_xml_string(text)
     assert model.dof_frictionloss.tolist() == [0.0, pytest.approx(FRICTION_NM)]
     assert model.actuator_delay.tolist() == [DELAY_S, DELAY_S]
-    assert min(told["replay"]["before"].values()) > 100 * NOISE_RAD
+    assert measure_error_rad(tmp_path / "arm.xml").min() > 100 * NOISE_RAD
     # MuJoCo begins a run with an empty buffer of commands; the warm-up fills it.
-    assert max(told["replay"]["after"].values()) < 8 * NOISE_RAD
+    assert measure_error_rad(tmp_path / "out" / "changed.xml").max() < 8 * NOISE_RAD
     ranges = (tmp_path / "out" / "randomisation.yaml").read_text()
     ranked = re.findall("^# (.*): closes", ranges, re.MULTILINE)
     assert ranked == ["dead_time", "joint_friction", "backlash"]  # by the gap
@@ -144,7 +141,7 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
 
 
 def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
-    mode = build_mode(tmp_path, NOTHING, None)
+    mode = build_mode(tmp_path, NOTHING)
     with pytest.raises(ConfigError, match="its verdict is 'none', so there is nothing to change"):
         mode.run()
     assert not (tmp_path / "out").exists()

@@ -118,7 +118,7 @@ def test_gates_and_rivals_are_written_as_the_format_says() -> None:
     told = Answer(
         verdict="unknown", selected=(), ranking=(),
         gap=Gap(0.03, 0.03, 0.01, None),
-        rivals={"hold": RivalError(0.09, {"q1": 0.1}), "arx": RivalError(None, {}, "too few windows")},
+        rivals={"hold": RivalError(0.09, {"q1": 0.1}), "arx": RivalError(None, {})},
         gates=(gate,),
     )  # fmt: skip
     found = told.to_json()
