@@ -22,7 +22,6 @@ from annotated_types import MinLen
 from scipy import stats
 
 from brokk_rl.console_table import print_table
-from brokk_rl.contracts.task import Figure
 from brokk_rl.errors import ConfigError
 from brokk_rl.plain_files import read_json
 from brokk_rl.session import RESOLVED, Session, read_record, write_json, write_text
@@ -80,38 +79,22 @@ class Compare:
             content[name] = json.loads(text)
         write_json(folder / "comparison.json", content)
         write_text(folder / "comparison.csv", table.to_csv(index=False, lineterminator="\n"))
-        words = collect_words(runs, list_figures(table))
-        _print_groups(groups, columns, words, list_rates(table))
+        _print_groups(groups, columns, table)
         log.info("%d runs compared in %s", len(runs), folder)
 
 
-def collect_words(runs: Sequence[EvaluatedRun], names: Sequence[str]) -> dict[str, Figure]:
-    """Return the words of figures: those of the runs' tasks, else their names."""
-    told: dict[str, Mapping[str, Any]] = {}
-    for run in runs:
-        told |= run.evaluation.get("figures", {})
-    words = {}
-    for name in names:
-        plain = Figure(name.replace("_", " "), "", 1.0, 3, of_success=False)
-        words[name] = Figure(**told[name]) if name in told else plain
-    return words
-
-
-def _print_groups(
-    groups: pd.DataFrame, columns: Sequence[str], words: Mapping[str, Figure], rates: Sequence[str]
-) -> None:
+def _print_groups(groups: pd.DataFrame, columns: Sequence[str], table: pd.DataFrame) -> None:
     cells = {}
-    for name, figure in words.items():
-        shown = groups[name].map(lambda value, by=figure.factor: f"{by * value:.3g}")
-        if name in rates:
+    for name in list_figures(table):
+        shown = groups[name].map("{:.3g}".format)
+        if name in list_rates(table):
             half = (groups[name + HIGH] - groups[name + LOW]) / 2
             shown += half.map(lambda value: "" if pd.isna(value) else f" ±{value:.3f}")
-        unit = "" if figure.unit in ("share", "") else f", {figure.unit}"
-        cells[figure.title + unit] = shown.where(groups[name].notna(), None)
+        cells[name.replace("_", " ")] = shown.where(groups[name].notna(), None)
     cells["difference by seed"] = groups.apply(_format_difference, axis=1)
-    table = groups[["policy", *columns, "runs"]].join(pd.DataFrame(cells))
+    printed = groups[["policy", *columns, "runs"]].join(pd.DataFrame(cells))
     headings = ["policy", *columns, "seeds", *cells]
-    print_table(headings, table.astype(object).where(table.notna(), None).to_numpy().tolist())
+    print_table(headings, printed.astype(object).where(printed.notna(), None).to_numpy().tolist())
 
 
 def _format_difference(group: Any) -> str | None:

@@ -139,7 +139,7 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
 
     Args:
         spec: Written.
-        visual: Add also the geoms and the camera that only pictures need.
+        visual: Add also the geoms that only pictures need.
     """
     body = spec.worldbody.add_body(
         name="block", mocap=True, pos=make_nominal_scenes(1)[0, :3].numpy()
@@ -166,8 +166,9 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         friction=_FRICTION,
         group=3,
     )
-    if visual:
-        _add_visuals(body)
+    if visual:  # the round wall of the hole
+        for _, box in _list_boxes(build_visual_wall(HOLE_RADIUS_M)):
+            body.add_geom(**box, conaffinity=0, group=2, material="concrete")
 
 
 def add_site(spec: mujoco.MjSpec, path: Path | None) -> None:
@@ -197,19 +198,6 @@ def add_site(spec: mujoco.MjSpec, path: Path | None) -> None:
             geom.contype, geom.conaffinity = 0, _TOOL | _ARM
             geom.group = SOLID_GROUP
     spec.attach(site, prefix="site/", frame=spec.worldbody.add_frame())
-
-
-def _add_visuals(body: mujoco.MjsBody) -> None:
-    """Add the round wall of the hole, and a camera that looks at the block."""
-    for _, box in _list_boxes(build_visual_wall(HOLE_RADIUS_M)):
-        body.add_geom(**box, conaffinity=0, group=2, material="concrete")
-    body.add_camera(
-        name="close",
-        pos=(-0.65, -1.05, 0.70),
-        fovy=52,
-        mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
-        targetbody="block",
-    )
 
 
 def _list_boxes(geoms: BlockGeoms) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -44,11 +44,9 @@ FONT_SIZE = 18
 """Size of the text, px. Chosen by hand; not searched."""
 MARK_RADIUS_M, MARK_RGBA = 0.06, (0.1, 0.75, 0.35, 0.8)
 """Ball that marks a target without a block: seen beside the arm, smaller than the breaker."""
-TARGET_VIEW = (2.6, 130.0, -20.0)
-"""Close-up of such a target: distance in m, azimuth and elevation in degrees. Chosen by eye."""
-TOOL_VIEW = (1.2, 30.0, -30.0)
-"""The same for the tool of a task without target: along the arm from above, so that what stands
-before the tool does not hide it."""
+CLOSE_VIEW = (1.6, 58.0, -30.0)
+"""Close-up of rim, target or tool: distance in m, azimuth from the direction of the arm and elevation
+in degrees. Chosen by eye: from aside and above, so that the arm does not hide it."""
 VIDEO_QUALITY = 7
 """Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
 
@@ -209,7 +207,7 @@ def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
     lines, font, (width, height) = write_captions(job), ImageFont.load_default(FONT_SIZE), SIZE
     split = width - CLOSE_WIDTH
     outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
-    fixed = None if job.mark_m is None else _look_at(job.mark_m, TARGET_VIEW)
+    fixed_m = job.episode.scene[:3] if job.has_block else job.episode.target_m
     posed = PosedScene(job.machine, job.site)
     with (
         mujoco.Renderer(posed.model, height, split) as wide,
@@ -219,13 +217,12 @@ def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
             posed.set_pose(job.episode.q[step], job.episode.scene)
             mujoco.mj_comPos(posed.model, posed.data)
             mujoco.mj_camlight(posed.model, posed.data)
-            close = "close" if job.has_block else fixed
-            if close is None:  # neither a block nor a target: the tool
-                tool = compute_tool_kinematics(job.machine, job.episode.q[step])
-                close = _look_at(tool.tip_in_base_m, TOOL_VIEW)
+            point_m = fixed_m
+            if point_m is None:  # neither a block nor a target: the tool
+                point_m = compute_tool_kinematics(job.machine, job.episode.q[step]).tip_in_base_m
             views = (
                 _draw_view(wide, posed, "overview", job.mark_m),
-                _draw_view(near, posed, close, job.mark_m),
+                _draw_view(near, posed, _look_at(point_m), job.mark_m),
             )
             picture = Image.fromarray(np.concatenate(views, axis=1))
             pen = ImageDraw.Draw(picture)
@@ -260,11 +257,12 @@ def _draw_view(
     return renderer.render()
 
 
-def _look_at(point_m: np.ndarray, view: tuple[float, float, float]) -> mujoco.MjvCamera:
-    """Return a camera that looks at a point from a distance (m), azimuth and elevation (degrees)."""
+def _look_at(point_m: np.ndarray) -> mujoco.MjvCamera:
+    """Return a camera that sees a point by `CLOSE_VIEW`."""
     camera = mujoco.MjvCamera()
     camera.lookat[:] = point_m
-    camera.distance, camera.azimuth, camera.elevation = view
+    camera.distance, azimuth, camera.elevation = CLOSE_VIEW
+    camera.azimuth = azimuth + math.degrees(math.atan2(point_m[1], point_m[0]))
     return camera
 
 
