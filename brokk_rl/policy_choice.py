@@ -112,23 +112,6 @@ def is_going_on(cfg: DictConfig) -> bool:
     return _find_run(path).resolve() == Path(out).resolve()
 
 
-def _refuse_late_values(cfg: DictConfig, stored: StoredPolicy) -> None:
-    """Refuse values that count only when a training begins, where it goes on with others."""
-    trained = stored.contract.get("trained", {})
-    for key, began_with in trained.get("beginning", {}).items():
-        value = OmegaConf.select(cfg, key)
-        if value != began_with:
-            raise ConfigError(
-                f"{key}={value} was asked for, but the training in {stored.name} began with "
-                f"{began_with}, and one that goes on keeps what it has made of it. Leave it out, or "
-                "begin anew with its network: policy=<run folder> session.out=<another folder>"
-            )
-
-
-def _read_value(given: Mapping[str, Override], key: str) -> str | None:
-    return str(given[key].value()) if key in given else None
-
-
 def _list_paths(override: Override) -> list[str]:
     """Return the values of `policy=` that are no options; of a sweep there may be several."""
     offered = {option.name for option in registry.list_options("policy")}
@@ -140,13 +123,6 @@ def _list_paths(override: Override) -> list[str]:
     return paths
 
 
-def _is_continuing(policy: str, out: str | None) -> bool:
-    """Return whether a training goes on: from a checkpoint, or in its own folder."""
-    return policy.endswith(".pt") or (
-        out is not None and Path(out).resolve() == Path(policy).resolve()
-    )
-
-
 def _find_run(policy: str) -> Path:
     """Return the run folder of a policy: that of a checkpoint, or the folder itself."""
     return Path(policy).parent if policy.endswith(".pt") else Path(policy)
@@ -154,13 +130,15 @@ def _find_run(policy: str) -> Path:
 
 def _recall_overrides(given: Mapping[str, Override]) -> list[str]:
     """Return the overrides of the run with which a training goes on, but for those given anew."""
-    policy, out = _read_value(given, "policy"), _read_value(given, "session.out")
-    if policy is None or _read_value(given, "mode") not in (None, "train"):
-        return []
-    if not _is_continuing(policy, out):
+    values = {key: str(override.value()) for key, override in given.items()}
+    policy, out = values.get("policy", ""), values.get("session.out")
+    run = _find_run(policy)
+    is_own = out is not None and Path(out).resolve() == run.resolve()
+    is_training = values.get("mode", "train") == "train"
+    if not (policy and is_training and (policy.endswith(".pt") or is_own)):
         return []
     recalled = []
-    lines = (read_record(_find_run(policy)) or {}).get("overrides", [])
+    lines = (read_record(run) or {}).get("overrides", [])
     for override in parse_words(lines):
         if override.key_or_group not in {*given, "session.out"}:
             recalled.append(str(override.input_line))
@@ -176,10 +154,6 @@ def _take_over(cfg: DictConfig, built: dict[str, Any]) -> DictConfig:
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
         return cfg
-    if cfg.get(RUN) == TRAIN:
-        out = OmegaConf.select(cfg, "session.out", default=None)
-        if _is_continuing(str(cfg.policy.path), out):
-            _refuse_late_values(cfg, stored)
     given = _list_given()
     brought = []
     if "task" in cfg:

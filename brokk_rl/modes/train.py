@@ -112,7 +112,7 @@ class Train(SimulatedPlant):
         if checkpoint is not None:
             runner.load(str(checkpoint))
             book = runner.logger
-            text = "going on from %s: %d control steps, %.0f s"
+            text = "going on from %s, its learning rate and exploration: %d control steps, %.0f s"
             log.info(text, checkpoint, book.env_steps, book.seconds)
             return
         if distributed.read_rank().first:  # a run that was stopped before its first checkpoint
@@ -154,7 +154,6 @@ class Train(SimulatedPlant):
             actuator=self.actuator,
         )
         contract["trained"] = {
-            "beginning": self.rl.describe_beginning(),
             "seed": self.session.seed,
             "device": str(loop.device),
             "follower": describe_spec(self.follower),

@@ -65,13 +65,6 @@ RUNNER_VALUES: dict[str, Any] = {
 """Allowed values of rsl-rl's own configuration. It does not check numbers itself: outside of these
 it divides by zero, climbs instead of descends, or trains nothing; unknown words end it late."""
 
-BEGINNING = (
-    "random_episode_lengths",
-    "runner.algorithm.learning_rate",
-    "runner.algorithm.optimizer",
-    "runner.actor.distribution_cfg.init_std",
-)
-"""Values that count only when a training begins: a checkpoint holds what has become of them."""
 REFUSED_CLASSES = ("RNNModel", "CNNModel", "BetaDistribution", "Distillation", "StudentTeacher")
 """Classes of rsl-rl that would fail after the whole budget."""
 REFUSED_PARTS = ("rnd_cfg", "symmetry_cfg")
@@ -272,14 +265,6 @@ class TrainingConfig:
         for part in path.split("."):
             value = value.get(part) if isinstance(value, dict) else None
         return value
-
-    def describe_beginning(self) -> dict[str, Any]:
-        """Return the values of `BEGINNING` by the keys under which they are typed."""
-        found = {}
-        for path in BEGINNING:
-            name, _, inside = path.partition(".")
-            found[f"rl.{path}"] = self._read_runner(inside) if inside else getattr(self, name)
-        return found
 
     def divergence(self, share_spent: float) -> float | None:
         """Return the `desired_kl` of updates when this share of the budget is spent."""

@@ -272,19 +272,3 @@ def test_a_training_that_goes_on_takes_up_the_words_of_its_run(tmp_path: Path) -
     assert prepare_arguments(begun) == begun, "it begins with the network, by words of its own"
     exact = [f"policy={run}/model_1.pt", "session.out=new"]
     assert prepare_arguments(exact)[2:] == kept[:3]
-
-
-def test_a_value_that_counts_only_at_the_beginning_is_refused_before_the_run_is_touched(
-    brokk: Callable[..., Done], tmp_path: Path
-) -> None:
-    small = ("sim=native", "rl.num_envs=8", "rl.num_starts=16", "rl.budget.max_env_steps=192")
-    run = ("mode=train", "session.out=run", "session.device=cpu", "task.episode_s=1.0")
-    assert brokk(*run, *small, *FEW, "evaluation.episodes=1").code == 0
-    before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
-    settings = ("algorithm.learning_rate=0.001", "actor.distribution_cfg.init_std=2.0")
-    for value in (f"rl.runner.{setting}" for setting in settings):
-        done = brokk("mode=train", "policy=run", "session.out=run", value)
-        assert done.code == 2 and f"{value} was asked for, but the training in run" in done.err
-    done = brokk("mode=train", "policy=run/model_1.pt", "session.out=new", value)
-    assert done.code == 2 and not (tmp_path / "new").exists()
-    assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
