@@ -102,13 +102,10 @@ def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: boo
 def _collect_facts(name: str, mode: Any) -> dict[str, Any]:
     """Return the fields of `session.json` about mode, options, overrides and machine."""
     settings = HydraConfig.get()
-    made = OmegaConf.to_container(settings.runtime.choices)
-    assert isinstance(made, dict)
-    chosen = {
-        str(key): value
-        for key, value in made.items()
-        if value and str(key).split("/")[0] != "hydra"
-    }
+    chosen = {}
+    for key, value in settings.runtime.choices.items():
+        if value and not str(key).startswith("hydra"):
+            chosen[str(key)] = str(value)
     overrides = list(settings.overrides.task)
     for override in overrides:
         key, _, value = override.partition("=")

@@ -81,28 +81,15 @@ class Session:
 
         kind, _, index = self.device.partition(":")
         rank = distributed.read_rank()
-        if rank.count > 1:
-            if index:
-                raise DeviceError(
-                    f"session.device={self.device}: torchrun gives each process its own GPU; use cuda, cpu or auto"
-                )
-            index = str(rank.local)
         if kind == "cpu" or (kind == "auto" and not torch.cuda.is_available()):
             return torch.device("cpu")
-        number = int(index or 0)
-        if not torch.cuda.is_available():
+        number = rank.local if rank.count > 1 else int(index or 0)
+        count = torch.cuda.device_count()
+        if number >= count:
             raise DeviceError(
-                f"session.device={self.device} asks for a GPU, but torch {torch.__version__} sees none. Use session.device=cpu or "
-                "session.device=auto; `brokk mode=doctor` says what is missing."
-            )
-        if number >= torch.cuda.device_count():
-            raise DeviceError(
-                f"session.device={self.device}: there are {torch.cuda.device_count()} GPUs, numbered from 0"
-                + (
-                    f"; torchrun started a process for number {number}, start no more than there are GPUs"
-                    if rank.count > 1
-                    else ""
-                )
+                f"session.device={self.device} asks for GPU {number}, but torch {torch.__version__} sees {count}, "
+                "numbered from 0. Use session.device=cpu or auto, and with torchrun no more processes than GPUs; `brokk "
+                "mode=doctor` says what is missing."
             )
         return torch.device("cuda", number)
 

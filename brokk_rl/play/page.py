@@ -19,7 +19,7 @@ import viser.uplot as uplot
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.errors import BrokkError
 from brokk_rl.play.scene_view import SceneView
-from brokk_rl.play.session import DISTANCE_M, HEIGHT_M, KEY_STEP, PERSON, PlaySession, PlayState
+from brokk_rl.play.session import KEY_STEP, PERSON, PlaySession
 from brokk_rl.play.settings import SPEEDS
 from brokk_rl.plot import BLUE, ORANGE, OTHERS
 
@@ -79,7 +79,7 @@ class PlayPage:
             is_due = now_s - self._shown_s >= SHOW_S and not self._session.paused
             if is_touched or is_due:
                 self._shown_s = now_s
-                self._show_figures(state)
+                self._show_figures()
                 self._show_traces()
 
     def close(self) -> None:
@@ -142,17 +142,8 @@ class PlayPage:
 
     def _build_touch(self) -> None:
         gui, session = self._server.gui, self._session
-        place = session.read().target_m
-        if session.can_move_target and place is not None:
-            self._target = gui.add_vector3(
-                "Target / m",
-                _round_place(place[0]),
-                min=(-DISTANCE_M[1], -DISTANCE_M[1], HEIGHT_M[0]),
-                max=(DISTANCE_M[1], DISTANCE_M[1], HEIGHT_M[1]),
-                step=0.01,
-                hint="Drag the arrows at the target, or type: x, y, z from the machine's base",
-            )
-            self._ask_on_change(self._target, session.move_target)
+        if session.can_move_target:
+            gui.add_markdown("Drag the arrows at the target to move it.")
             free = gui.add_button("Draw the target again at each reset")
             free.on_click(lambda _: self._ask(session.free_target))
         if not session.can_push:
@@ -281,7 +272,7 @@ class PlayPage:
         else:
             session.reset(session.selected if button == "Reset" else None)
 
-    def _show_figures(self, state: PlayState) -> None:
+    def _show_figures(self) -> None:
         """Show status and levers as they are."""
         session = self._session
         num_worlds, finished = session.loop.num_envs, sum(session.endings.values())
@@ -304,8 +295,6 @@ class PlayPage:
         for lever, value in zip(self._levers, session.levers, strict=True):
             _assign(lever, "value", round(float(value), 2))
         _assign(self._driver, "value", session.driver)
-        if state.target_m is not None and session.can_move_target:
-            _assign(self._target, "value", _round_place(state.target_m[session.selected]))
 
     def _show_traces(self) -> None:
         """Show the last seconds of the selected world."""
@@ -322,8 +311,3 @@ def _assign(handle: Any, name: str, value: Any) -> None:
     """Set a property of the page where it differs."""
     if getattr(handle, name) != value:
         setattr(handle, name, value)
-
-
-def _round_place(point_m: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = np.round(point_m.astype(float), 3).tolist()
-    return x, y, z

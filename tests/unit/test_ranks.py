@@ -76,10 +76,8 @@ def test_each_process_has_its_own_gpu(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
     told(monkeypatch, RANK=5, LOCAL_RANK=1, WORLD_SIZE=8)
     assert session(tmp_path, "auto").torch_device() == torch.device("cuda", 1)
-    with pytest.raises(DeviceError, match="its own GPU"):
-        session(tmp_path, "cuda:0").torch_device()
     told(monkeypatch, RANK=2, LOCAL_RANK=2, WORLD_SIZE=8)
-    with pytest.raises(DeviceError, match="no more than there are GPUs"):
+    with pytest.raises(DeviceError, match="no more processes than GPUs"):
         session(tmp_path, "cuda").torch_device()
 
 
