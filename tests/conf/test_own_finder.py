@@ -14,7 +14,6 @@ from composed import option
 from drawn import CENTER, K, drawn
 from packages import install_package
 
-from brokk_rl.checks import check_finder
 from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from deploy.runtime import perception_process
@@ -34,10 +33,6 @@ def finder_spec(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mo
     files = {"finder.py": FINDER.read_text(), "conf/perception/darkest.yaml": OPTION}
     install_package(folder, "spots", files, monkeypatch)
     return importlib.import_module("spots.finder").DarkestSpot(radius_m=0.05, std_m=0.05)
-
-
-def test_it_passes_the_checker(finder_spec: Any) -> None:
-    check_finder(finder_spec)
 
 
 def test_mode_perceive_takes_it_by_name(finder_spec: Any, brokk: Callable, tmp_path: Path) -> None:

@@ -84,11 +84,6 @@ def test_the_trained_policy_is_evaluated_beside_the_classical_one(run: Path) -> 
     assert record["objective"] == found["success_strict"]["mean"]
 
 
-def test_the_resolved_config_runs_again_to_the_same_result(run: Path) -> None:
-    command(run.parent, "--config-dir", str(run), "--config-name", "resolved", "session.out=again")
-    check_same(run, run.parent / "again")
-
-
 def test_a_resumed_command_ends_where_an_uninterrupted_one_does(run: Path) -> None:
     arguments = ("mode=train", "session.out=parts", *SMALL, *FEW)
     command(run.parent, *arguments, "rl.budget.max_env_steps=768")

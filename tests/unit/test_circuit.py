@@ -266,13 +266,6 @@ def test_pump_stays_within_its_power(machine: Machine) -> None:
     assert abs(limited.speed(Q3, 10, machine)) < 0.8 * abs(free.speed(Q3, 10, machine))
 
 
-def test_pump_keeps_its_margin_above_the_highest_load(machine: Machine) -> None:
-    run = Run(circuit(), machine, {"q3": -0.5}, 30)
-    assert run.get("supply")[-1] == pytest.approx(run.get("rod", Q3)[-1] + 0.08, abs=0.01)
-    idle = Run(circuit(), machine, {}, 30)
-    assert idle.get("supply")[-1] == pytest.approx(0.08, abs=1e-3)
-
-
 def test_a_counterbalance_valve_makes_the_pump_push_a_falling_load(machine: Machine) -> None:
     """Lowering with the valve takes inlet pressure: ratio * inlet + outlet = setting + opening."""
     held, free = (
@@ -289,12 +282,12 @@ def test_a_counterbalance_valve_makes_the_pump_push_a_falling_load(machine: Mach
 @pytest.mark.parametrize("name", CIRCUITS)
 def test_closed_valves_hold_the_arm_but_for_the_leak(name: str, machine: Machine) -> None:
     config = circuit(name)
-    run = Run(config, machine, {}, 200)
-    sunk = np.abs(run.q[-1] - run.q[20]) / (machine.max_speed * 180 * machine.period_s)
+    run = Run(config, machine, {}, 100)
+    sunk = np.abs(run.q[-1] - run.q[20]) / (machine.max_speed * 80 * machine.period_s)
     assert isinstance(config.leak, float)
     assert (sunk <= config.leak * 3.0).all()
-    leaking = Run(circuit(name, leak=0.05), machine, {}, 200)
-    assert leaking.q[-1, Q3] - leaking.q[20, Q3] > 0.005
+    leaking = Run(circuit(name, leak=0.05), machine, {}, 100)
+    assert leaking.q[-1, Q3] - leaking.q[20, Q3] > 0.002
 
 
 @pytest.mark.parametrize("name", CIRCUITS)

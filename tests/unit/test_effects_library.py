@@ -91,24 +91,6 @@ def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_
     )
 
 
-def test_a_run_goes_on_exactly_from_its_state(machine: Machine) -> None:
-    def fresh() -> Any:
-        return replace(option("effect", "library"), share=0.5).wrap(
-            option("actuator", "lag").build(machine, 4, CPU), machine, 4, CPU
-        )
-
-    torch.manual_seed(0)
-    model, u = fresh(), draw_commands(machine, 30, 4, 1)
-    roll(model, machine, u)
-    kept = {key: value.clone() for key, value in model.state.items()}
-    on, seen = roll(model, machine, u), model.measure(u[0])
-    torch.manual_seed(1)
-    other = fresh()
-    for key, value in other.state.items():
-        value.copy_(kept[key])
-    assert torch.equal(roll(other, machine, u), on) and torch.equal(other.measure(u[0]), seen)
-
-
 def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: Machine) -> None:
     """Both would break the trace; a CUDA graph can hold what is left."""
     u = draw_commands(machine, 20, 4, 1)

@@ -210,17 +210,6 @@ def test_values_of_an_experiment_yield_to_the_policy(
     assert found["task"] == json.loads((SHIPPED / "policy.json").read_text())["task"]
 
 
-def test_the_command_finds_the_task_of_its_policy(
-    shallow: Path, brokk: Callable[..., Done], tmp_path: Path
-) -> None:
-    """A follower is of the plant: what it brings to the task is no request."""
-    words = ("task.episode_s=1.0", "task.depth_m=0.1", "follower=person")
-    done = brokk(*EVALUATE, *FEW, f"policy={shallow}", *words)
-    assert done.code == 0, done.err
-    found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
-    assert found["task"]["behaviour"]["advice"] is None and found["follower"] == "person"
-
-
 @pytest.fixture
 def foreign(shallow: Path, tmp_path: Path) -> Path:
     """The policy as one of a machine whose file nobody has any more."""

@@ -194,20 +194,3 @@ def test_a_policy_commands_speeds_and_the_servo_gets_targets(
     drive = option("machine", "emps")
     with pytest.raises(ConfigError, match="commanded by torque"):
         accept_speeds(option("actuator", "force").build(drive, 1, CPU), drive, 1, CPU)
-
-
-def test_play_holds_a_joint_about_its_target_less_the_sag(arm: Machine) -> None:
-    """The servo model itself has both: effects around the ideal one must give the same path."""
-    u = 0.4 * np.sin(np.arange(120)[:, None] / 9.0) * np.ones(arm.num_joints)
-    ideal = option("actuator", "servo")
-    whole = replace(ideal, play_rad=0.05, sag_rad=0.03).build(arm, 1, CPU)
-    numbers = {"sag": {"sag_rad": 0.03}, "backlash": {"gap_rad": 0.05}}
-    kinds = [kind for kind in load_effects(arm) if kind.name in numbers]
-    model = ideal.build(arm, 1, CPU)
-    for kind in sorted(kinds, key=lambda one: one.order):
-        model = kind.wrap(model, arm, 1, CPU)
-        for name, value in numbers[kind.name].items():
-            model.parameters[name].fill_(value)
-    np.testing.assert_allclose(
-        run_servo(model, arm, u)[20:], run_servo(whole, arm, u)[20:], atol=1e-5
-    )

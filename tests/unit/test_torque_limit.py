@@ -47,42 +47,6 @@ def draw_levels(machine: Machine, seed: int, count: int = 12, hold: int = 15) ->
     return np.repeat(generator.uniform(-0.4, 0.4, (count, machine.num_joints)), hold, 0)
 
 
-def test_a_saturated_joint_accelerates_by_its_limit(arm: Machine) -> None:
-    """0.02 rad over (0.05 s)^2 are 8 rad/s^2: 14.4 mrad in 60 ms from rest."""
-    servo = make_servo(response_s=0.05, damping=1e-6, limit_rad=0.02)
-    u = np.tile([[0.0, 0.0]], (8, 1))
-    u[5:] = 0.5  # 0.75 rad away
-    found = run_servo(servo.build(arm, 1, CPU), arm, u)
-    np.testing.assert_allclose(found[-1], 0.5 * 8.0 * 0.06**2, rtol=1e-3)
-    np.testing.assert_allclose(found[5], 0.5 * 8.0 * 0.02**2, rtol=1e-3)
-
-
-def test_a_saturated_joint_comes_up_slower_than_down(arm: Machine) -> None:
-    """The final speed is (limit -+ sag) / (2 damping response): 0.2 up and 0.6 rad/s down."""
-    servo = make_servo(response_s=0.05, damping=0.5, limit_rad=0.02, sag_rad=0.01)
-    for to, speed_rad_s in ((0.9, 0.2), (-0.9, -0.6)):
-        u = np.zeros((40, 2))
-        u[5:] = to
-        found = run_servo(servo.build(arm, 1, CPU), arm, u)
-        np.testing.assert_allclose(
-            (found[-1] - found[-6]) / (5 * arm.period_s), speed_rad_s, rtol=1e-3
-        )
-
-
-def test_damping_of_the_firmware_lies_within_the_limit(arm: Machine) -> None:
-    """With half of it inside, the final speeds are (0.02 -+ 0.01) / (0.5 * 0.05): 0.4 and 1.2 rad/s."""
-    servo = make_servo(
-        response_s=0.05, damping=0.5, limit_rad=0.02, sag_rad=0.01, firmware_damping=0.5
-    )
-    for to, speed_rad_s in ((0.9, 0.4), (-0.9, -1.2)):
-        u = np.zeros((45, 2))
-        u[5:] = to
-        found = run_servo(servo.build(arm, 1, CPU), arm, u)
-        np.testing.assert_allclose(
-            (found[-1] - found[-6]) / (5 * arm.period_s), speed_rad_s, rtol=2e-3
-        )
-
-
 @pytest.mark.parametrize("response_s", [0.0, 0.04])
 def test_a_joint_falls_where_the_limit_is_below_its_sag(arm: Machine, response_s: float) -> None:
     """It comes to rest at its lower stop; the same joint above that limit keeps its sag."""
@@ -100,12 +64,12 @@ def test_a_joint_falls_where_the_limit_is_below_its_sag(arm: Machine, response_s
 def test_the_weight_of_a_falling_joint_is_that_of_its_place(arm: Machine) -> None:
     """With 0.06 + 0.1 q of sag and a limit of 0.04 the joint falls no further than -0.2 rad."""
     servo = make_servo(response_s=0.04, damping=1.0, sag_rad=0.06, sag_slope=0.1, limit_rad=0.04)
-    found = run_servo(servo.build(arm, 1, CPU), arm, np.zeros((1500, 2)))
+    found = run_servo(servo.build(arm, 1, CPU), arm, np.zeros((500, 2)))
     np.testing.assert_allclose(found[-1], -0.2, atol=1e-3)
 
 
 @pytest.mark.parametrize("inside", [0.0, 0.6])
-@pytest.mark.parametrize("limit_rad", [0.01, 0.03, 0.08])
+@pytest.mark.parametrize("limit_rad", [0.01, 0.08])
 @pytest.mark.parametrize(("response_s", "damping"), [(0.03, 0.8), (0.06, 0.4), (0.02, 2.0)])
 def test_a_limited_servo_follows_its_differential_equation(
     arm: Machine, inside: float, limit_rad: float, response_s: float, damping: float
