@@ -37,27 +37,15 @@ def draw_negative(kind: str) -> np.ndarray:
     gray = np.full((384, 512), 190, np.float32)
     if kind == "noise":
         return generator.integers(0, 256, (384, 512)).astype(np.uint8)
-    if kind == "salt":
-        gray[generator.random(gray.shape) < 0.03] = 20
-    turn = np.linspace(0, 2 * np.pi, 200)
     if kind == "spiral":
         way = np.linspace(0, 14 * np.pi, 2000)
         line = np.column_stack([256 + 3.8 * way * np.cos(way), 192 + 3.8 * way * np.sin(way)])
         cv2.polylines(gray, [np.int32(line * 16)], False, 40.0, 3, cv2.LINE_AA, 4)
-    shapes = {
-        "octagons": np.column_stack([np.cos(turn[::25]), np.sin(turn[::25])]),
-        "squares": np.array([[-0.7, -0.7], [0.7, -0.7], [0.7, 0.7], [-0.7, 0.7]]),
-        "hearts": np.column_stack(
-            [
-                np.sin(turn) ** 3,
-                -(13 * np.cos(turn) - 5 * np.cos(2 * turn) - 2 * np.cos(3 * turn)) / 16,
-            ]
-        ),
-    }
-    if kind in shapes:
+    if kind == "squares":
+        square = np.array([[-0.7, -0.7], [0.7, -0.7], [0.7, 0.7], [-0.7, 0.7]])
         for x in range(70, 480, 90):
             for y in range(60, 350, 90):
-                place = shapes[kind] * generator.uniform(18, 36) + (x, y)
+                place = square * generator.uniform(18, 36) + (x, y)
                 cv2.fillPoly(gray, [np.int32(place * 16)], 40.0, cv2.LINE_AA, 4)
     gray = cv2.GaussianBlur(gray, (0, 0), 0.8) + generator.normal(0, 1, gray.shape)
     return np.clip(gray, 0, 255).astype(np.uint8)

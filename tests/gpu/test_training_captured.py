@@ -1,13 +1,11 @@
-"""Training on a real GPU: faults and rewards in CUDA graphs; episodes of both simulators."""
+"""Training on a real GPU: faults and rewards in CUDA graphs."""
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import training as runs
@@ -18,7 +16,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import Teacher
-from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
+from brokk_rl.sim.simulator import WarpSimulator
 
 pytestmark = [
     pytest.mark.gpu,
@@ -34,7 +32,6 @@ WARP: Any = WarpSimulator(
     num_worlds=NUM, substeps=5, num_contacts=16, num_constraints=40, iterations=12,
     linesearch_iterations=8, tolerance=1e-6, parity_worlds=0,
 )  # fmt: skip
-NATIVE: Any = NativeSimulator(num_worlds=NUM, substeps=5, num_threads=0)
 WILD = 5
 """The world that diverges."""
 
@@ -104,45 +101,6 @@ def test_the_terms_of_a_captured_reward_add_up_to_the_return(machine: Machine) -
     assert sum(abs(value) > 1e-3 for value in terms) >= 3
     assert sum(terms) == pytest.approx(float(finished.mean()), abs=2e-3)
     assert figures["return"] == pytest.approx(float(finished.mean()), abs=2e-3)
-
-
-# --- episodes of both simulators ---
-
-
-def test_paired_episodes_of_the_task_end_alike(
-    machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Classical controller with the same noise in the command: insertions, tools on the block."""
-    native, warp = make_loop(machine, NATIVE, torch.device("cpu")), make_loop(machine)
-    # errors of perception are drawn; without them both see the same hole
-    monkeypatch.setattr(
-        torch, "rand", lambda *size, device=None, **kw: torch.full(size[:2], 0.5, device=device)
-    )
-    monkeypatch.setattr(torch, "rand_like", lambda value, **kwargs: torch.full_like(value, 0.5))
-    start = {name: value[:NUM].clone() for name, value in native.starts.items()}
-    found = []
-    for loop in (native, warp):
-        loop.begin({name: value.to(loop.device) for name, value in start.items()})
-        generator = torch.Generator().manual_seed(4)
-        reason, force_n = np.full(NUM, -1.0), np.zeros(NUM)
-        noise = torch.zeros(NUM, 5)
-        for _ in range(loop.max_episode_length):
-            going = reason < 0
-            noise = 0.9 * noise + 0.25 * torch.randn(NUM, 5, generator=generator)
-            loop.step(noise.to(loop.device))  # the network's part; the controller's comes on top
-            force = loop.end_force_n.cpu().numpy()
-            force_n[going] = np.maximum(force_n, force)[going]
-            reason = np.where(going, loop.reason.cpu().numpy(), reason)
-        found.append((reason, force_n))
-    (reasons, forces_n), (other_reasons, other_forces_n) = found
-    names = native.task.reasons
-    ends = Counter(names[int(reason)] for reason in reasons)
-    assert (reasons >= 0).all() and (forces_n > 1_000.0).sum() > NUM // 4, ends
-    # contact amplifies rounding: a tool that meets the rim edge on may slip to either side
-    assert (reasons == other_reasons).mean() >= 0.9, (ends, reasons, other_reasons)
-    touched = forces_n > 1_000.0
-    apart = np.abs(other_forces_n - forces_n)[touched] / forces_n[touched]
-    assert np.median(apart) < 0.1, apart
 
 
 @pytest.mark.parametrize(

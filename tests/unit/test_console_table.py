@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from rich.text import Text
 
 from brokk_rl.console_table import print_table, print_text
 
@@ -18,18 +17,6 @@ def test_a_file_gets_every_row_in_one_line(
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["policy", "a[b]", "c"]
     assert lines[1].split()[1:] == [f"{k}.5" for k in range(20)]
-
-
-def test_a_narrow_terminal_breaks_no_number(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "60")
-    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes this for a terminal
-    rows = [["classical", *("0.12345" for _ in range(5))]]
-    print_table(HEADINGS[:6], rows)
-    shown = Text.from_ansi(capsys.readouterr().out).plain
-    assert shown.count("0.12345") == 5 and "classical" in shown
-    assert max(map(len, shown.splitlines())) <= 60
 
 
 def test_missing_values_are_dashes_and_text_is_no_markup(

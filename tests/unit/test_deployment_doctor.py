@@ -19,8 +19,6 @@ from onnx import TensorProto, helper, numpy_helper
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, write_recording
-from diagnosis import why_answer
-from diagnosis.deployment import page
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
 from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
 from diagnosis.deployment.run_log import measure_resolution
@@ -263,18 +261,6 @@ def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy, machine: Machin
     assert measure_resolution(rounded[:, 0].astype(float)) == pytest.approx(1e-3, rel=1e-2)
     found = ask(policy, replace(recording, q=rounded.astype(np.float32)), machine)
     assert found.verdict == "nothing"
-
-
-def test_the_page_of_the_whole_question_holds_verdict_and_next_step(
-    policy: LoadedPolicy, machine: Machine, tmp_path: Path
-) -> None:
-    found = ask(policy, run_loop(policy, machine, see_q=turn_joint), machine)
-    (tmp_path / "doctor").mkdir()
-    found.write(tmp_path / "doctor")
-    why_answer.write_page(why_answer.read_result(tmp_path, "policy", "mlp"))
-    text = (tmp_path / why_answer.WHY_PAGE).read_text()
-    assert "q.q3 has the wrong sign" in text
-    assert page.REMEDIES["sign"] in text
 
 
 def drop_term(contract: dict[str, Any]) -> None:

@@ -44,13 +44,6 @@ def test_a_dead_band_is_learned_with_hinges() -> None:
     assert rmse(found["arx"]) < 0.05 * rmse(found["hold"])
 
 
-def test_without_hinges_a_dead_band_is_not_learned(monkeypatch: pytest.MonkeyPatch) -> None:
-    cut = driven(40, 0.3)
-    with_hinges = rmse(measure_rivals(cut)["arx"])
-    monkeypatch.setattr(rivals, "HINGES", ())
-    assert rmse(measure_rivals(cut)["arx"]) > 3.0 * with_hinges
-
-
 def test_no_window_is_predicted_by_a_fit_to_it() -> None:
     cut = driven(32, 0.2)
     changed = driven(32, 0.2)

@@ -138,12 +138,6 @@ def test_times_follow_the_longer_of_control_period_and_dead_time(machine: Machin
     assert choose_horizon_s(replace(machine, dead_time_s=0.6)) == 5.0, "no free run is longer"
 
 
-def test_a_backlash_is_no_longer_a_fifth_of_a_short_cylinder() -> None:
-    small = option("machine", "mini_excavator")
-    boom, *_, swing = typical(small, "backlash", "gap_rad")
-    assert boom == pytest.approx(0.01 / 2.7 * 0.0534) and swing == pytest.approx(0.01 / 2.7 * 2.38)
-
-
 def test_a_range_over_the_typical_size_is_mirrored_about_the_neutral_value(
     machine: Machine,
 ) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import shlex
-import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
@@ -551,28 +549,6 @@ def test_advice_that_is_followed_to_the_letter_reads_the_log(
 
 def test_each_advice_is_followed_by_a_test() -> None:
     assert set(ADVISED.values()) == set(ADVICE)
-
-
-@pytest.mark.parametrize("page", ["docs/logs.md", "docs/tutorials/your_simulator.md"])
-def test_commands_for_logs_that_a_page_prints_run_as_they_stand(
-    brokk: Callable[..., Done], page: str
-) -> None:
-    rows = make_rows()
-    Path("raw").mkdir()
-    text = (Path(__file__).parents[2] / page).read_text()
-    commands = re.findall(
-        r"^brokk (mode=(?:import log|convert convert)\.input=raw .*)$", text, re.MULTILINE
-    )
-    assert len(commands) >= 2
-    for command in commands:
-        given = re.search(r"\[(\w+), (\w+)\]", command)
-        names = ("t", given[1], given[2], "a", "b") if given else NAMES
-        write_text("raw/a.csv", rows, names)
-        for folder in ("draft", "read"):
-            if f"session.out={folder}" in command:
-                shutil.rmtree(folder, ignore_errors=True)
-        done = brokk(*shlex.split(command))
-        assert done.code == 0, done.err
 
 
 def test_arm_and_wheels_on_one_topic_keep_their_own_rates() -> None:

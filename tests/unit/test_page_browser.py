@@ -248,19 +248,6 @@ def test_safety_and_connection_are_told_apart_in_words(
     assert page.locator("#left.stale").count() == 1
 
 
-def test_a_recording_that_has_failed_is_an_alarm_and_a_stop_that_is_not_confirmed_is_said(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
-    feed.now, feed.confirms = replace(SHOWN, recording=FAILED), False
-    page = opened(port)
-    alarm = page.locator("#recording")
-    eventually(lambda: alarm.inner_text() == "RECORDING HAS FAILED")
-    assert "bad" in alarm.get_attribute("class")
-    page.keyboard.press("Escape")
-    told = page.locator("#answer")
-    eventually(lambda: told.inner_text().startswith("STOP NOT CONFIRMED"))
-
-
 def test_alarms_are_listed_by_gravity_and_stay_a_while_after_they_have_passed(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:

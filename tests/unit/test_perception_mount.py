@@ -99,14 +99,6 @@ class _Wall:
         return Capsules(ends, ends + 1e-3, np.array([0.1]))
 
 
-def test_a_camera_that_sees_the_hole_as_well_as_any_stays(machine: Machine) -> None:
-    mount, planner = plan(machine, "mast")
-    q = np.stack([machine.home] * 7)
-    view = planner.choose(believe(), mount.start, q).view
-    assert not view.is_moving and view.travel_s == 0.0
-    assert "stays" in view.explain()
-
-
 def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:
     source = option("perception/source", "simulator").build()
     scene = source.compose()

@@ -198,23 +198,3 @@ def test_the_shared_covariance_is_what_a_wrong_disparity_does() -> None:
     # relative to the largest entry: the circle on the plane moves a little with it
     np.testing.assert_allclose(told.shared_m2, moved_m2, atol=0.06 * moved_m2.max())
     np.testing.assert_allclose(told.shared_rad2, turned_rad2, atol=0.06 * turned_rad2.max())
-
-
-def test_a_pair_that_was_never_calibrated_is_as_uncertain_as_a_real_one() -> None:
-    estimator = option("perception/pose", "plane_conic").build()
-    frame, masks, ellipse = drawn()
-    frame = replace(frame, baseline_m=BASELINE_M)
-    unknown = estimator.estimate(frame, masks, ellipse)
-    told = estimator.estimate(replace(frame, disparity_std_px=0.25), masks, ellipse)
-    assert isinstance(unknown, HolePose)
-    assert isinstance(told, HolePose)
-    np.testing.assert_allclose(unknown.cov_m2, told.cov_m2)
-    # moved into the base, the part that no averaging reduces is still told
-    turn = np.eye(4)
-    turn[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0]
-    moved = unknown.moved(turn, 1e-6 * np.eye(6))
-    assert unknown.shared_m2 is not None
-    assert moved.shared_m2 is not None
-    own_m2 = turn[:3, :3] @ (unknown.cov_m2 - unknown.shared_m2) @ turn[:3, :3].T
-    np.testing.assert_allclose(moved.cov_m2 - moved.shared_m2, own_m2, atol=1e-12)
-    assert np.trace(moved.shared_m2) > np.trace(unknown.shared_m2)

@@ -417,25 +417,6 @@ def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(
     np.testing.assert_array_equal(frame.camera_matrix, MATRIX)
 
 
-def test_a_recording_of_a_zed_ends_and_knows_where_the_camera_was(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    pyzed(monkeypatch)
-    monkeypatch.setattr(StubZed, "left", 1)
-    (tmp_path / "calibration.yaml").write_text(
-        yaml.safe_dump({"schema": 1, "T_base_cam": POSE.tolist()})
-    )
-    place = str(tmp_path / "calibration.yaml")
-    with replace(
-        option("perception/source", "zed"), recording="a.svo", base_from_camera=place
-    ).build() as source:
-        first = source.read_latest()
-        assert first is not None and source.read_latest() is None
-    np.testing.assert_allclose(first.base_from_camera, POSE)
-    with pytest.raises(FrameError, match=r"source.base_from_camera: nowhere.yaml cannot be read"):
-        replace(option("perception/source", "zed"), base_from_camera="nowhere.yaml").build()
-
-
 def test_a_lens_whose_inverse_is_told_bends_as_opencv_says() -> None:
     inverse = np.array([0.06, -0.04, 0.0008, -0.0005, 0.01])
     matrix = np.array([[640.0, 0.0, 639.5], [0.0, 640.0, 359.5], [0.0, 0.0, 1.0]])

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from composed import option
 
-from brokk_rl.errors import ConfigError
-from brokk_rl.gamepad import Gamepad
 from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
 from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import ClassicalPolicy
@@ -195,18 +191,3 @@ def test_effects_begin_off_and_a_dial_gives_them_to_all_machines(made: Callable)
     assert (
         made(neutral=False).dials["dead_time.dead_time_s"].parameters["dead_time.dead_time_s"].any()
     )
-
-
-def test_a_gamepad_moves_the_levers(tmp_path: Path) -> None:
-    events = [(0, 32767, 0x82, 3), (9, 16384, 0x02, 0), (12, -3000, 0x02, 1), (15, 1, 0x01, 4)]
-    path = tmp_path / "js0"
-    path.write_bytes(b"".join(struct.pack("IhBB", *event) for event in events))
-    pad = Gamepad(path, "play.gamepad")
-    assert pad.poll()
-    levers = pad.read_axes((0, -3, 1, 7, 2))
-    # half a stroke less the dead zone; turned round; within the dead zone; never moved
-    np.testing.assert_allclose(levers, [(0.5 - 0.12) / 0.88, -1.0, 0.0, 0.0, 0.0], atol=1e-3)
-    assert not pad.poll()
-    pad.close()
-    with pytest.raises(ConfigError, match=r"play.gamepad=.*gone: No such file.*ls /dev/input"):
-        Gamepad(tmp_path / "gone", "play.gamepad")

@@ -39,16 +39,3 @@ def test_a_repeated_step_does_not_go_back_and_quiet_work_says_nothing(
     clock[0] = 100.0
     work.reach(3, title="looking")
     assert work.describe() == "7" and caplog.messages == []
-
-
-def test_resumed_work_has_the_speed_of_this_run_and_ends_at_the_total(clock: list[float]) -> None:
-    work = ItemProgress("training", SHARE)
-    work.skip(0.5)
-    for second in (10.0, 20.0, 30.0):
-        clock[0] = second
-        work.reach(0.5 + second / 100)
-    # 0.01 a second: 0.2 are left
-    clock[0] = 30.0
-    assert work.describe() == "80%, about 0 min left"
-    work.reach(1.01, note="300 steps/s")
-    assert work.describe() == "100%, 300 steps/s"

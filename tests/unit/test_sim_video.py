@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from brokk_rl.errors import StorageError
-from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.sim import video
 from brokk_rl.sim.probe import RENDERERS, find_renderer, keep_renderer_for_drawing
 from brokk_rl.sim.scene import make_nominal_scenes
@@ -58,11 +57,3 @@ def test_a_gl_library_gives_pictures_of_the_machine(machine, motion, tmp_path):
     assert picture.shape == (540, 1200, 3) and yellow.mean() > 0.01
     with pytest.raises(StorageError, match="cannot write"):
         video.render_video(machine, motion, tmp_path / "film.mp4" / "film.mp4")
-
-
-def test_a_caption_tells_the_distance_to_a_target_without_a_block(machine, motion, tmp_path):
-    motion.scene[0] = 50.0
-    tip = compute_tool_kinematics(machine, motion.q[0]).tip_in_base_m
-    motion.target_m = tip + np.array([0.3, 0.0, 0.4])
-    job = video.RenderJob(machine, motion, tmp_path)
-    assert "50.0 cm to the target" in video.write_captions(job)[0]

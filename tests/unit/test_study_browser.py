@@ -121,19 +121,6 @@ def test_the_whole_questionnaire_by_key_in_german(
     assert tlx.compute_scores(found)[0]["raw"] == 57.5
 
 
-def test_nobody_leads_a_sitting_without_the_key(port: int, lead: Conductor, browser: Any) -> None:
-    page = browser.new_context().new_page()
-    page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript", body=""))
-    for token in ("", "#token=wrong horse"):
-        page.goto(f"http://localhost:{port}/{token}")
-        until(
-            page,
-            "() => document.querySelector('#study h1')?.textContent === 'Open this page by the link with the key'",
-        )
-    assert lead.view()["kind"] == "choose"
-    page.context.close()
-
-
 def test_stopping_takes_two_presses_and_is_kept(
     tmp_path: Path, asked: Conductor, port: int, opened: Callable[..., Any]
 ) -> None:

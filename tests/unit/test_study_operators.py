@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,6 @@ RNG = np.random.default_rng(0)
 SPREAD = RNG.uniform(-0.3, 0.3, (8, 5)) * [1.5, 0.2, 0.5, 0.5, 0.5]
 STARTS = np.array([0.0, -0.95, 0.5, 1.15, 0.6]) + SPREAD
 RIMS_M = np.column_stack((RNG.uniform(2.4, 2.8, 8), RNG.uniform(-0.8, 0.8, 8), np.full(8, 0.75)))
-ROOT = Path(__file__).parents[2]
 
 
 def test_a_person_is_the_same_in_every_trial_and_condition() -> None:
@@ -130,14 +127,3 @@ def test_what_a_step_lacks_is_said(
 ) -> None:
     done = brokk("mode=study", *words)
     assert done.code == 2 and message in done.err
-
-
-def test_a_study_needs_neither_torch_nor_simulator() -> None:
-    code = (
-        "import sys, study.modes.study, study.report;"
-        "print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
-    )
-    assert done.stdout == "[]\n"

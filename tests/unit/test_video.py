@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -96,51 +95,6 @@ def test_a_page_without_its_video_says_so_and_goes_on(page: Any) -> None:
     eventually(lambda: any("NO LIVE PICTURE" in one for one in page.evaluate(ALARMS)))
     drawn = page.evaluate("window.measured.drawn")
     eventually(lambda: page.evaluate("window.measured.drawn") > drawn + 5)
-
-
-@pytest.mark.parametrize("size", [(640, 1000), (1024, 768), (1600, 900)], ids=str)
-def test_pictures_cover_nothing_and_their_words_are_whole(
-    page: Any, tmp_path: Path, size: tuple[int, int]
-) -> None:
-    ending = threading.Event()
-
-    async def promise_cameras() -> None:
-        relays: list[asyncio.StreamWriter] = []
-
-        def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            writer.write(b'{"cameras": ["front", "boom"]}\n')
-            relays.append(writer)
-
-        async with await asyncio.start_unix_server(answer, tmp_path / SOCKET):
-            await asyncio.to_thread(ending.wait)
-            for relay in relays:
-                relay.close()
-
-    cameras = threading.Thread(target=asyncio.run, args=(promise_cameras(),))
-    cameras.start()
-    try:
-        page.set_viewport_size({"width": size[0], "height": size[1]})
-        page.locator("#language").click()  # German words are longer
-        eventually(lambda: page.locator("#videos figure").count() == 2)
-        page.evaluate(
-            """() => { for (const one of document.querySelectorAll("#videos .numbers"))
-            one.textContent = "1888 ms · 88.8 % verloren"; }"""
-        )
-        covered = page.evaluate(
-            """() => { const box = node => node.getBoundingClientRect(), inside = (one, other) =>
-            one.left < other.right && other.left < one.right && one.top < other.bottom && other.top < one.bottom;
-            const others = ["along", "streams", "scene"].map(name => document.getElementById(name));
-            const [front, boom] = [...document.querySelectorAll("#videos figure")];
-            const cut = [...document.querySelectorAll("#videos span")].filter(one =>
-                box(one).right > box(one.closest("figure")).right || one.scrollWidth > one.clientWidth + 1);
-            return [...others, boom].filter(one => inside(box(one), box(front))).concat(cut).map(one => one.id + one.textContent);
-        }"""
-        )
-        assert covered == []
-    finally:
-        page.close()
-        ending.set()
-        cameras.join(10)
 
 
 def test_pictures_come_with_their_age_and_a_dead_process_is_an_alarm(

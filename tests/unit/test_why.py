@@ -14,12 +14,10 @@ from diagnosis.answer import Answer, Selected
 from diagnosis.why_answer import (
     ALL_EFFECTS,
     BEFORE,
-    WHY_PAGE,
     WhyResult,
     list_changes,
     list_records,
     subtract_rates,
-    write_page,
     write_summary,
 )
 
@@ -111,13 +109,6 @@ def test_inputs_are_refused_before_the_first_stage(
     assert done.code == 2
     assert expected in done.err
     assert not Path("out/doctor").exists()
-
-
-def test_the_page_says_cost_and_next_step(tmp_path: Path) -> None:
-    write_page(make_result(tmp_path, 0.5))
-    text = (tmp_path / WHY_PAGE).read_text()
-    for part in ("-50", "brokk mode=train", "diagnosis/report.html"):
-        assert part in text, part
 
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
