@@ -231,9 +231,9 @@ def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
         ({"schema": 9}, "schema"),
         ({"command": {"order": ["q1"], "masked": True}}, "masked commands"),
         ({"fingerprint": {}}, "another machine"),
-        ({"observation": {}}, ""),
-        ({"command": []}, ""),
-        ({"task": [1]}, ""),
+        ({"observation": {}}, "."),
+        ({"command": []}, "."),
+        ({"task": [1]}, "."),
     ],
     ids=str,
 )

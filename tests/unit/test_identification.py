@@ -22,7 +22,6 @@ from actuators.modes.identify import Identify
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from brokk_rl.session import Session
 
 CPU = torch.device("cpu")
@@ -171,23 +170,6 @@ def test_the_report_of_a_good_model_says_so(
     assert "Judged by 2 runs" in result["verdict"][-1]["text"]
     text = (tmp_path / "out" / "identification.html").read_text()
     assert text.count("data:image/png;base64,") == 1 and "Better beyond doubt" in text
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_short_recordings_leave_out_the_horizons_that_do_not_fit(
-    machine: Machine, recordings: Path, tmp_path: Path
-) -> None:
-    cut = tmp_path / "short"
-    for path in recordings.iterdir():
-        whole = record.read_recording(path, machine)
-        part = {"t_s": whole.t_s[:100], "u": whole.u[:100], "q": whole.q[:100]}
-        # 5 s less 1.65 s: no window of 5 s.
-        record.write_recording(Recording(**{**vars(whole), **part}), cut / path.name)
-    result = run(identify(machine, tmp_path / "out", cut, Fit()))
-    assert result["joints"]["q1"]["plant"]["5"] is None
-    assert result["joints"]["q1"]["plant"]["2"] is not None
-    assert result["missing"].keys() == {"5", "10"} and "leaves 3.4 s" in result["missing"]["10"]
-    assert any("after 2 s" in sentence["text"] for sentence in result["verdict"])
 
 
 @pytest.mark.usefixtures("undrawn")

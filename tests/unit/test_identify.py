@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -53,32 +50,3 @@ def test_a_linear_machine_is_learned_by_the_linear_model(machine: Machine, tmp_p
         for model in (actuator, Hold())
     )
     assert error < 0.02 * still
-
-
-TINY = (
-    "identify.hold_out=3", "fit.one_step_updates=120", "fit.one_step_batch=256", "fit.updates=40", "fit.horizons_s=[0.5]",
-    "fit.batch=64", "fit.validate_every=40",
-)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_collect_and_identify_from_the_command(
-    brokk: Callable[..., Any], tmp_path: Path, machine: Machine
-) -> None:
-    small = ("collect.run_minutes=1.0", "collect.file_minutes=0.5", "actuator=lag")
-    sine = ("session.out=sine", "collect.num_runs=10")
-    levels = ("session.out=levels", "excitation=levels", "collect.num_runs=3", "session.seed=1")
-    for words in (sine, levels):
-        assert brokk("mode=collect", *words, *small).code == 0
-    done = brokk(
-        "mode=identify", "session.out=fit", "session.device=cpu", "identify.recordings=sine/recordings/*",
-        "identify.test=levels/recordings/*", *TINY,
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    result = json.loads(Path("fit/identification.json").read_text())
-    for rows in result["joints"].values():
-        assert rows["mlp"]["5"]["rmse"] < rows["hold"]["5"]["rmse"]
-        assert set(rows["arx"]) == {"1", "2", "5", "10"}
-    # With the lag of 0.1 s.
-    assert result["delay_s"]["q1"]["value"] == pytest.approx(0.55 + 0.1, abs=0.06)
-    assert Path("fit/prediction.png").stat().st_size > 1000

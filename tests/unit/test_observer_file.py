@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -132,21 +131,6 @@ def test_thresholds_of_a_simulator_or_of_another_machine_count_for_nothing_on_a_
             assert build_observer(limits, MACHINE, interface, commands) is None
             assert reason in caplog.text and "mode=observe" in caplog.text
     assert read_observer_content(replace(GUARD, observer=None), MACHINE, "socketcan", True) is None
-
-
-def test_the_guard_says_whose_thresholds_it_has(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO)
-    for source, interface in (
-        ("machine: socketcan can0", "socketcan"),
-        ("machine: socketcan can0", "udp_multicast"),
-        ("simulator: Hydraulic", "virtual"),
-    ):
-        limits = write_file(tmp_path / "observer.json", MACHINE, source)
-        caplog.clear()
-        assert build_observer(limits, MACHINE, interface, commands=True) is not None
-        assert f"from {source}, 30 minutes: q1 0.06 s, q2 0.07 s" in caplog.text
 
 
 def test_a_loop_that_would_command_a_machine_by_a_simulators_thresholds_does_not_start(
