@@ -81,14 +81,5 @@ def test_a_full_disk_is_a_warning_and_our_import_names_are_ours(tmp_path: Path) 
 def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
     done = brokk("mode=doctor")
     assert done.code == 0, done.out
-    for topic in (
-        "Python",
-        "torch",
-        "Warp",
-        "kernel cache",
-        "rendering",
-        "disk",
-        "import names",
-        "extensions",
-    ):
+    for topic in ("packages", "torch", "Warp", "rendering", "disk", "import names"):
         assert topic in done.out
