@@ -20,8 +20,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.modes.check import check_machine
-from brokk_rl.sim.machine_trial import try_machine
+from brokk_rl.modes.check import check_machine, try_machine
 from brokk_rl.sim.model import ASSETS
 from brokk_rl.sim.model_choices import CheckSubject
 from brokk_rl.sim.model_import import ImportedMachine, import_model
