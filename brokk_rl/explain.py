@@ -71,7 +71,8 @@ def explain(error: BaseException) -> str | None:
     if isinstance(error, ConfigCompositionException):
         return _explain_bad_override(error)
     if isinstance(error, InterpolationResolutionError):
-        return _explain_interpolation(error)
+        reason = f"{error.full_key or 'a value'}: {str(error).splitlines()[0]}"
+        return f"{reason}. A text with a dollar sign before a brace is written \\${{…}}"
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark:
         mark = error.problem_mark
         return f"{mark.name}, line {mark.line + 1}: no valid YAML ({error.problem})"
@@ -112,18 +113,12 @@ def _explain_missing_option(error: MissingConfigException) -> str:
     return f"there is no {group}={name}; {_list_options(group, name, offered)}"
 
 
-def _explain_interpolation(error: InterpolationResolutionError) -> str:
-    typed = [argument for argument in sys.argv[1:] if "${" in argument]
-    place = error.full_key or ", ".join(typed)
-    reason = str(error).splitlines()[0]
-    return f"{place}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
-
-
 def _explain_bad_override(error: ConfigCompositionException) -> str:
     """Explain an override of a key that the configuration does not have."""
     text = str(error)
     if lacking := re.search(r"must specify '([^']+)'", text):
-        return _explain_missing_choice(lacking[1])
+        names = [option.name for option in registry.list_options(lacking[1])]
+        return f"{explain_missing_value(lacking[1])}; {_list_options(lacking[1], '', names)}"
     if twice := re.search(r"(\S+) appears more than once", text):
         return f"{twice[1]} is chosen already; another option is given without the '+': {twice[1]}=<option>"
     found = re.search(
@@ -132,10 +127,8 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
     if not found:
         text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
         if "Cannot merge" in text:
-            key = text.partition("override ")[2].partition("=")[0]
-            return (
-                f"{key} holds a list and you gave a table, or the reverse. Take the old value away, "
-                f"'~{key}' '+{key}=…', or give the option as a file, <group>=@<path>."
+            text += (
+                "\nA list and a table do not merge: take the old value away, '~<key>' '+<key>=…'"
             )
         return text
     where, key = found[1], found[2].split("@")[0]
@@ -151,11 +144,6 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
         cfg = compose_choices()
         return f"{source} '{key}', but {_explain_absence(cfg, key)}"
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --help` lists what it has"
-
-
-def _explain_missing_choice(group: str) -> str:
-    names = [option.name for option in registry.list_options(group)]
-    return f"{explain_missing_value(group)}; {_list_options(group, '', names)}"
 
 
 def _list_options(group: str, name: str, offered: Sequence[str]) -> str:

@@ -50,6 +50,8 @@ TOLERANCE = 1e-3
 hand: far above the rounding of float32, far below what a valve resolves."""
 NUM_GOLDEN = 16
 """Answers in `golden.json`: whoever runs the file elsewhere compares with them first."""
+OTHERWISE = "take an older checkpoint, or export the policy again (mode=export)"
+"""Advice for a policy that cannot be read."""
 STAMP = "task"
 """Key in the metadata of the weights: fingerprint of the task of the contract beside them."""
 
@@ -392,7 +394,7 @@ def find_checkpoint(name: str) -> Path:
 def _require_whole(file: Path) -> Path:
     """Return a file; refuse a checkpoint that is no whole archive, without torch."""
     if file.suffix == ".pt" and not zipfile.is_zipfile(file):
-        raise CheckpointError(f"{file} is corrupt or not a checkpoint of ours; take an older one")
+        raise CheckpointError(_explain_corrupt(str(file), "no whole archive"))
     return file
 
 
@@ -426,15 +428,11 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
     try:
         content = torch.load(path, weights_only=True, map_location=device)
         states = [content["actor_state_dict"], content["critic_state_dict"]]
-    except FileNotFoundError as error:
-        raise CheckpointError(f"there is no checkpoint {path}") from error
-    except Exception as error:  # torch raises many kinds: pickle, zip, runtime, end of file
-        raise CheckpointError(
-            f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an "
-            "older one"
-        ) from error
+    except Exception as error:  # torch raises many kinds, whose texts advise to trust the file
+        reason = f"no checkpoint of ours ({type(error).__name__})"
+        raise CheckpointError(_explain_corrupt(str(path), reason)) from error
     for state in states:
-        _require_finite(state, str(path), "take an older checkpoint")
+        _require_finite(state, str(path))
     return content
 
 
@@ -459,17 +457,17 @@ def _read_weights(path: Path) -> tuple[dict[str, torch.Tensor], str | None]:
         weights = load_file(path)
     except (OSError, ValueError, SafetensorError) as error:
         raise CheckpointError(_explain_corrupt(str(path.parent), error)) from error
-    _require_finite(weights, f"the policy in {path.parent}", "export it again from a checkpoint")
+    _require_finite(weights, f"the policy in {path.parent}")
     return weights, stamp
 
 
-def _require_finite(weights: Mapping[str, torch.Tensor], who: str, advice: str) -> None:
+def _require_finite(weights: Mapping[str, torch.Tensor], who: str) -> None:
     bad = [name for name, value in weights.items() if not value.isfinite().all()]
     if bad:
         raise CheckpointError(
-            f"{who} holds NaN or infinite weights in {', '.join(bad[:3])}; {advice}"
+            f"{who} holds NaN or infinite weights in {', '.join(bad[:3])}; {OTHERWISE}"
         )
 
 
-def _explain_corrupt(name: str, error: Exception) -> str:
-    return f"the policy in {name} is corrupt: {error}; export it again (mode=export)"
+def _explain_corrupt(name: str, error: object) -> str:
+    return f"{name} is missing or corrupt: {error}; {OTHERWISE}"

@@ -151,7 +151,7 @@ def test_a_table_in_the_place_of_a_range_is_explained(brokk: Callable[..., Any])
     words = ("mode=train", "effect=[stiction]")
     done = brokk(*words, f"effect.stiction.start={table}")
     assert done.code == 2
-    assert "effect.stiction.start holds a list and you gave a table" in done.err
+    assert "effect.stiction.start" in done.err and "A list and a table do not merge" in done.err
     anew = ("~effect.stiction.start", f"+effect.stiction.start={table}")
     effect = composed(brokk, *words, *anew)
     assert effect["effect"]["stiction"]["start"] == {"q1": [0.05, 0.1], "other": 0.12}

@@ -172,12 +172,12 @@ def spoil(path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "damage", "told"),
     [
-        ("policy.safetensors", lambda path: corrupt(path, b""), r"is corrupt: .*mode=export"),
-        ("policy.safetensors", lambda path: corrupt(path, b"{"), r"is corrupt: .*mode=export"),
-        ("policy.safetensors", cut_off, r"is corrupt: .*mode=export"),
+        ("policy.safetensors", lambda path: corrupt(path, b""), r"or corrupt: .*mode=export"),
+        ("policy.safetensors", lambda path: corrupt(path, b"{"), r"or corrupt: .*mode=export"),
+        ("policy.safetensors", cut_off, r"or corrupt: .*mode=export"),
         ("policy.safetensors", spoil, r"NaN or infinite weights in mlp\.0\.weight"),
-        ("policy.json", lambda path: corrupt(path, b"{"), r"is corrupt: .*mode=export"),
-        ("policy.safetensors", Path.unlink, r"is corrupt: No such file"),
+        ("policy.json", lambda path: corrupt(path, b"{"), r"or corrupt: .*mode=export"),
+        ("policy.safetensors", Path.unlink, r"or corrupt: No such file"),
     ],
 )
 def test_a_damaged_file_is_named_with_the_way_out(

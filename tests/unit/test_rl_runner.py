@@ -148,7 +148,7 @@ def test_bytes_that_are_no_checkpoint_are_named_corrupt_and_change_nothing(
     before = progress.read_text()
     for content in (checkpoint.read_bytes()[:2000], b"", b"hello", b"\x80\x04]q\x00."):
         checkpoint.write_bytes(content)
-        with pytest.raises(CheckpointError, match=r"model_1\.pt is corrupt or not a checkpoint"):
+        with pytest.raises(CheckpointError, match=r"model_1\.pt is missing or corrupt"):
             loading(machine, checkpoint)
     assert progress.read_text() == before
 
@@ -159,7 +159,7 @@ def test_a_checkpoint_cannot_run_code(checkpoint: Path, machine: Machine) -> Non
             return (Path.touch, (checkpoint.with_name("trapped"),))
 
     torch.save({"actor_state_dict": Trap()}, checkpoint)
-    with pytest.raises(CheckpointError, match="corrupt or not a checkpoint"):
+    with pytest.raises(CheckpointError, match="corrupt: no checkpoint of ours"):
         loading(machine, checkpoint)
     assert not checkpoint.with_name("trapped").exists()
 
