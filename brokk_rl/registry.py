@@ -1,8 +1,7 @@
 """Registries: the options of each config group, of this package and of installed extensions.
 
 A registry is a folder of YAML files. Nothing here imports the target of an option. Its summary is
-the first comment of its file, else the first docstring line in the source of its target. Listing
-is therefore cheap, and a broken option can be listed too.
+the first comment of its file. Listing is therefore cheap, and a broken option can be listed too.
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ from dataclasses import dataclass
 from importlib import metadata, resources, util
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from brokk_rl.errors import ConfigError
 
@@ -45,13 +42,8 @@ class Option:
     path: Path
 
     def summary(self) -> str:
-        """Return the first sentence of the file's comment, else the first line of its target."""
-        text = self.path.read_text()
-        if comment := _read_comment(text):
-            return re.split(r"(?<=\.) ", comment)[0]
-        content = yaml.safe_load(text) or {}
-        target = content.get("_target_") or content.get("run")
-        return _read_docstring(target).split("\n")[0] if target else ""
+        """Return the first sentence of the file's comment."""
+        return re.split(r"(?<=\.) ", self.comment())[0]
 
     def comment(self) -> str:
         """Return the whole comment at the top of the file, in one line."""

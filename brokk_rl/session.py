@@ -15,10 +15,12 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import StringConstraints
 
 from brokk_rl import distributed
-from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
+from brokk_rl.errors import BrokkError, DeviceError, StorageError
 from brokk_rl.plain_files import read_json
 from brokk_rl.spec import Seed, spec
 
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     import numpy as np
     import torch
 
+Device = Annotated[str, StringConstraints(pattern=r"^(auto|cpu|cuda|cuda:\d+)$")]
 RECORD = "session.json"
 RESOLVED = "resolved.yaml"
 STAMPED = (
@@ -54,16 +57,7 @@ class Session:
 
     out: str
     seed: Seed
-    device: str
-
-    def check(self) -> None:
-        kind, _, index = self.device.partition(":")
-        if kind not in ("auto", "cpu", "cuda") or (
-            index and (kind != "cuda" or not index.isdigit())
-        ):
-            raise ConfigError(
-                f"device: expected auto, cpu, cuda or cuda:<index>, got '{self.device}'"
-            )
+    device: Device
 
     @property
     def folder(self) -> Path:

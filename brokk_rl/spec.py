@@ -33,6 +33,7 @@ WORDS = {
     "be greater": "be a number greater",
     "be less": "be a number less",
     "Input should be": "expected",
+    "String should match pattern": "expected",
     "dictionary": "table",
     "tuple": "list",
     "Tuple should have": "expected",

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from brokk_rl.session import Session
+from brokk_rl.session import Device
 from brokk_rl.spec import Positive, Seed, WorldCount, spec
 
 SPEEDS = (0.1, 10.0)
@@ -36,8 +36,5 @@ class PlaySettings:
     driver: Literal["policy", "classical", "person"]
     neutral: bool
     seed: Seed
-    device: str
+    device: Device
     seconds: Positive | None
-
-    def check(self) -> None:
-        Session(out=".", seed=self.seed, device=self.device)  # refuses an unknown device

@@ -33,7 +33,7 @@ CAPPED = "brokk_rl.rl.ppo:CappedGaussian"
 """The distribution whose cap `Exploration` moves."""
 PositiveShare = Annotated[float, Interval(gt=0, le=1)]
 ShareBelowOne = Annotated[float, Interval(ge=0, lt=1)]
-Widths = Annotated[tuple[Count, ...], MinLen(1)]
+Counts = Annotated[tuple[Count, ...], MinLen(1)]
 Activation = Literal[
     "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish",
     "identity",
@@ -54,12 +54,12 @@ RUNNER_VALUES: dict[str, Any] = {
     "algorithm.desired_kl": Positive,
     "algorithm.schedule": Literal["adaptive", "fixed"],
     "algorithm.optimizer": Literal["adam", "adamw", "sgd", "rmsprop"],
-    "actor.hidden_dims": Widths,
+    "actor.hidden_dims": Counts,
     "actor.activation": Activation,
     "actor.distribution_cfg.init_std": Positive,
     "actor.distribution_cfg.std_type": Literal["scalar", "log"],
     "actor.distribution_cfg.std_range": NonNegativeRange,
-    "critic.hidden_dims": Widths,
+    "critic.hidden_dims": Counts,
     "critic.activation": Activation,
 }
 """Allowed values of rsl-rl's own configuration. It does not check numbers itself: outside of these
@@ -327,10 +327,6 @@ class BenchmarkSizes:
         iterations: Training iterations timed, after one to warm up.
     """
 
-    num_envs: tuple[Count, ...]
+    num_envs: Counts
     seconds: Positive
     iterations: Count
-
-    def check(self) -> None:
-        if not self.num_envs:
-            raise ConfigError("num_envs: expected one or more numbers of environments, got none")

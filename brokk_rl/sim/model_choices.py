@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from annotated_types import Interval
+from annotated_types import Interval, MaxLen
+from pydantic import StringConstraints
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.plain_files import parse_model
@@ -30,8 +30,8 @@ class CheckSubject:
     """
 
     model: str | None
-    name: str | None
-    chain: str | tuple[str, ...] | None
+    name: Annotated[str, StringConstraints(pattern=r"^\w+$")] | None
+    chain: Annotated[tuple[str, ...], MaxLen(2)] | str | None
     tip: str | None
     drive: Literal["auto", "electric", "hydraulic"]
     command: Literal["auto", "valve", "velocity", "position", "torque"]
@@ -45,15 +45,7 @@ class CheckSubject:
         return (self.chain,) if isinstance(self.chain, str) else self.chain or ()
 
     def check(self) -> None:
-        if len(self.chain_names) > 2:
-            raise ConfigError(
-                f"chain: expected the last joint or link, or [first, last], got {len(self.chain_names)} names"
-            )
         if self.model is not None:
             parse_model(Path(self.model))
         if self.model is None and (self.chain or self.tip or self.name):
             raise ConfigError("model: expected the file of a robot beside name, chain and tip")
-        if self.name is not None and not re.fullmatch(r"\w+", self.name):
-            raise ConfigError(
-                f"name: expected letters, digits and _, got '{self.name}'; it names files and recordings"
-            )

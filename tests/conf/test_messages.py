@@ -143,7 +143,7 @@ VALUES = {
     "task.hole.distance_m=[3.5,2.3]": "task.hole.distance_m: expected (lowest, highest)",
     "task.scaling.target_std_m=[0.5,0.0,0.1]": "task.scaling.target_std_m[1]",
     "mode=identify": "identify.recordings has no default and must be given",
-    "mode=play play.device=tpu": "play.device: expected auto, cpu, cuda or cuda:<index>, got 'tpu'",
+    "mode=play play.device=tpu": "play.device: expected '^(auto|cpu|cuda",
     "mode=diagnose": "give either case=<folder with reference/ and field/>, or field=<glob>",
     "mode=diagnose diagnosis.case=nowhere": "diagnosis.case=nowhere: there is no such folder",
     "mode=export": "policy has no default and must be given",
