@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 from brokk_rl.errors import RecordingError
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.progress import ItemProgress
-from brokk_rl.session import write_json, write_text
+from brokk_rl.session import write_text
 from diagnosis.answer import ANSWER_FILE, parse_answer
 from exam import run_cases, score
 from exam.case_distribution import CaseDistribution
@@ -27,8 +26,6 @@ PUBLISHED = ("schema", "verdict", "reason", "selected", "ranking", "gap")
 published file names them as `left_out`."""
 RUN_FILE = "run.json"
 """File beside answers: who gave them, at which commit, to which labels."""
-EXAMINED_FILE, EXAMINED_FOLDER = "examined.json", "examined"
-"""The examiner's figures, beside a score and beside published answers; those of each case."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +36,15 @@ class GivenAnswer:
         note: Seconds that it took, or the reason why there is no answer; empty where nothing was noted.
         content: Content of its `diagnosis.json`, `None` without an answer.
         left_out: Parts of it that are not published.
+        labels_sha256: Hash of the labels of the exam that was answered; `None` where nobody noted it.
+        examined: The examiner's figures; see `exam.examiner.Examination`.
     """
 
     note: Mapping[str, Any]
     content: Mapping[str, Any] | None
     left_out: tuple[str, ...] = ()
+    labels_sha256: str | None = None
+    examined: Mapping[str, Any] | None = None
 
     @property
     def seconds(self) -> float | None:
@@ -64,13 +65,17 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
     try:
         if path.is_file():
             for row in map(json.loads, path.read_text().splitlines()):
-                left_out = tuple(row.get("left_out", ()))
-                found[row["case"]] = GivenAnswer(row["note"], row["answer"], left_out)
+                found[row["case"]] = GivenAnswer(
+                    row["note"], row["answer"], tuple(row.get("left_out", ())),
+                    row.get("labels_sha256"), row.get("examined"),
+                )  # fmt: skip
         elif path.is_dir():
+            answered = read_run(path).get("labels_sha256")
             for place in filter(run_cases.is_begun, path.iterdir()):
                 where = place / ANSWER_FILE
                 content = json.loads(where.read_text()) if where.is_file() else None
-                found[place.name] = GivenAnswer(run_cases.read_note(place), content)
+                note = run_cases.read_note(place)
+                found[place.name] = GivenAnswer(note, content, labels_sha256=answered)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(
             f"exam.answers: {where}: expected {ANSWER_FILE} in a folder a case, or a line a case of a published file "
@@ -101,22 +106,21 @@ def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
         if one.content is not None:
             row["answer"] = {key: one.content[key] for key in PUBLISHED if key in one.content}
             row["left_out"] = sorted({*one.left_out, *one.content} - {*PUBLISHED})
+        # Files from before hold neither.
+        beside = {"labels_sha256": one.labels_sha256, "examined": one.examined}
+        row |= {key: value for key, value in beside.items() if value is not None}
         lines.append(json.dumps(row) + "\n")
     write_text(path, "".join(lines))
 
 
 def build_table(
-    labels: Sequence[Mapping[str, Any]],
-    given: Mapping[str, GivenAnswer],
-    examined: Mapping[str, Any],
-    mix: CaseDistribution,
+    labels: Sequence[Mapping[str, Any]], given: Mapping[str, GivenAnswer], mix: CaseDistribution
 ) -> dict[str, Any]:
     """Return the figures of answers; cases that nobody began are left out and counted.
 
     Args:
         labels: Opened labels of the exam.
         given: Answers by case.
-        examined: The examiner's figures by case.
         mix: Says which effects cannot be told apart, and which ones all joints have together.
     """
     scores, shared = [], mix.list_shared()
@@ -124,9 +128,9 @@ def build_table(
         case = label["case"]
         if case not in given:
             continue
-        one, examination = given[case], examined.get(case)
+        one = given[case]
         answer = None if one.content is None else parse_answer(one.content, f"case {case}")
-        row = score.score_answer(label, answer, mix.classes, shared, one.seconds, examination)
+        row = score.score_answer(label, answer, mix.classes, shared, one.seconds, one.examined)
         scores.append(row)
     not_begun = len(labels) - len(scores)
     if not_begun:
@@ -139,24 +143,17 @@ def examine_answers(
     labels: Sequence[Mapping[str, Any]],
     folders: Mapping[str, Path],
     examine: Callable[[str, Sequence[Path]], list[dict[str, Any]]],
-    out: Path,
     workers: int,
 ) -> dict[str, dict[str, Any]]:
-    """Return the examiner's figures by candidate and case; empty without withheld recordings.
+    """Return the examiner's figures by case and candidate; none without withheld recordings.
 
     Args:
         exam: Folder of the exam.
         labels: Its opened labels.
-        folders: Answers of each candidate. Of a published file the figures beside it are taken.
+        folders: Answers of each candidate.
         examine: Returns the figures of answers to a case.
-        out: Folder that gets the figures; those of each case at once, so that an interrupted score goes on.
         workers: Processes.
     """
-    found: dict[str, dict[str, Any]] = {}
-    for name, folder in folders.items():
-        beside = folder.parent / EXAMINED_FILE
-        is_known = folder.is_file() and beside.is_file()
-        found[name] = json.loads(beside.read_text()).get(name, {}) if is_known else {}
     cases = []
     for label in labels:
         is_withheld = (exam / WITHHELD_FOLDER / label["case"]).is_dir()
@@ -165,19 +162,9 @@ def examine_answers(
 
     def examine_begun(case: str) -> dict[str, Any]:
         begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
-        path = out / EXAMINED_FOLDER / f"{case}.json"
-        known = json.loads(path.read_text()) if path.is_file() else {}
-        if begun and {*begun} - {*known}:
-            results = examine(case, [folders[name] / case for name in begun])
-            known = dict(zip(begun, results, strict=True))
-            write_json(path, known)
-        return known
+        results = examine(case, [folders[name] / case for name in begun]) if begun else []
+        return dict(zip(begun, results, strict=True))
 
     with ItemProgress("repairs examined", len(cases)) as progress, use_workers(workers):
         tell = lambda _, share: progress.reach(share * len(cases))  # noqa: E731
-        for case, known in zip(cases, map_parallel(examine_begun, cases, tell), strict=True):
-            for name, result in known.items():
-                found[name][case] = result
-    write_json(out / EXAMINED_FILE, found)
-    shutil.rmtree(out / EXAMINED_FOLDER, ignore_errors=True)
-    return found
+        return dict(zip(cases, map_parallel(examine_begun, cases, tell), strict=True))

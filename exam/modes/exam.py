@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import secrets
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -256,6 +257,12 @@ class Exam:
         labels = facts.pop("cases")
         answers = {name: Path(path) for name, path in self.exam.answers.items()}
         given = {name: read_answers(path) for name, path in answers.items()}
+        for name, path in answers.items():
+            hashes = {one.labels_sha256 for one in given[name].values()}
+            if hashes - {None, facts["labels_sha256"]}:
+                raise RecordingError(
+                    f"{path}: expected answers to the labels of {self._folder}, got answers to others; choose another exam.folder"
+                )
         facts["ledger"] = []
         for path in answers.values():
             run = read_run(path)
@@ -265,10 +272,13 @@ class Exam:
             ledger.append_entry(self._folder, ledger.OPENED, hashes)
         out = self.session.folder
         examine = partial(examine_case, self._folder, self.exam.fit, self.machine)
-        examined = examine_answers(self._folder, labels, answers, examine, out, self.exam.workers)
+        examined = examine_answers(self._folder, labels, answers, examine, self.exam.workers)
         tables = {}
         for name, one in given.items():
-            tables[name] = build_table(labels, one, examined[name], self.exam.mix)
+            for case, figures in examined.items():
+                if name in figures:
+                    one[case] = replace(one[case], examined=figures[name])
+            tables[name] = build_table(labels, one, self.exam.mix)
             tables[name]["commit"] = read_run(answers[name]).get("commit")
             # Answers and labels stand beside the score, so that anybody can score them again.
             publish_answers(one, out / f"answers_{name}.jsonl")

@@ -142,8 +142,9 @@ def test_an_exam_is_sat_and_scored_and_its_ledger_knows_the_engine_before_the_la
     said = [json.loads(text) for text in (marks / "answers_none.jsonl").read_text().splitlines()]
     assert [one["answer"]["verdict"] for one in said] == ["none", "none"]
     # whoever says "none" repairs nothing, by the examiner's own simulation
-    for one in json.loads((marks / "examined.json").read_text())["none"].values():
-        assert one["before"] == one["after"]
+    (examined,) = [one["examined"] for one in said if "examined" in one]
+    assert examined["before"] == examined["after"]
+    assert {one["labels_sha256"] for one in said} == {facts["labels_sha256"]}
     noted = json.loads((answers / "run.json").read_text())
     (answers / "run.json").write_text(json.dumps(noted | {"labels_sha256": "other"}))
     refused = brokk(*score, f"session.out={tmp_path / 'refused'}")

@@ -194,7 +194,7 @@ def test_published_answers_have_the_published_score(
     labels, _ = open_labels(RESULTS / name)
     given = read_answers(RESULTS / name / "answers_diagnosis.jsonl")
     mix = option("exam_mix", {"exam_valves": "main"}.get(name, name.removeprefix("exam_")))
-    found = build_table(labels["cases"], given, {}, mix)
+    found = build_table(labels["cases"], given, mix)
     result = json.loads((RESULTS / f"{name}.json").read_text())
     published = {row[""]: row for row in result["rows"]}
     rates = "top1 top1_equivalent exact_set joints false_alarms_none unknown_recall cover_90"
@@ -208,12 +208,14 @@ def test_a_published_answer_says_what_it_leaves_out(tmp_path: Path) -> None:
     said = answered(chosen("lag")).to_json() | {"curves": [1.0]}
     path = tmp_path / "answers.jsonl"
     ended = GivenAnswer({"seconds": 1.0, "error": "in /home/me/run.py\nKeyError: 'x'"}, None)
-    answers = {"0001": GivenAnswer({"seconds": 1.0, "error": None}, said), "0002": ended}
+    sealed = GivenAnswer({"seconds": 1.0, "error": None}, said, (), "f00d", {"closed": 0.5})
+    answers = {"0001": sealed, "0002": ended}
     publish_answers(answers, path)
     row, second = map(json.loads, path.read_text().splitlines())
     assert second["note"]["error"] == "KeyError: 'x'"
     assert "curves" in row["left_out"] and "curves" not in row["answer"]
     assert {*row["left_out"], *row["answer"]} == {*said}
+    assert (row["labels_sha256"], row["examined"]) == ("f00d", {"closed": 0.5})
     again = tmp_path / "again.jsonl"
     publish_answers(read_answers(path), again)
     assert again.read_text() == path.read_text()
@@ -233,4 +235,4 @@ def test_a_file_that_holds_no_answers_is_refused(text: str, told: str, tmp_path:
     path.write_text(text)
     truth = [label("one", ("lag", "q3", 1.0))]
     with pytest.raises(RecordingError, match=told):
-        build_table(truth, read_answers(path), {}, option("exam_mix", "main"))
+        build_table(truth, read_answers(path), option("exam_mix", "main"))
