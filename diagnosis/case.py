@@ -118,17 +118,32 @@ def _check_stamp(stamp: str, recording: Recording, machine: Machine) -> None:
 
 def estimate_running_s(recordings: Sequence[Recording]) -> list[float]:
     """Return how long the machine had been running at the beginning of each recording, as far as their dates tell."""
+    stamps, day = _read_stamps(recordings), number_days(recordings)
+    return [float(stamp - stamps[day == own].min()) for stamp, own in zip(stamps, day, strict=True)]
+
+
+def number_days(recordings: Sequence[Recording]) -> np.ndarray:
+    """Return the day of each recording, `(R,)`: the machine was off between two; one day where no dates are known."""
+    stamps = _read_stamps(recordings)
+    begins = np.diff(np.sort(stamps), prepend=-np.inf) > PAUSE_S
+    day = np.zeros(len(stamps), dtype=int)
+    day[np.argsort(stamps, kind="stable")] = np.cumsum(begins)
+    return day
+
+
+def _read_stamps(recordings: Sequence[Recording]) -> np.ndarray:
+    """Return when each recording was made, s; zeros where not all are known."""
     dates = [recording.metadata.get("created") for recording in recordings]
     if not all(dates):
-        return [0.0] * len(recordings)
-    stamps = np.array([datetime.fromisoformat(date).timestamp() for date in dates if date])
-    order = np.argsort(stamps, kind="stable")
-    begun, found = stamps[order[0]], np.zeros(len(stamps))
-    for before, at in zip([order[0], *order[:-1]], order, strict=True):
-        if stamps[at] - stamps[before] > PAUSE_S:
-            begun = stamps[at]
-        found[at] = stamps[at] - begun
-    return found.tolist()
+        return np.zeros(len(recordings))
+    return np.array([datetime.fromisoformat(date).timestamp() for date in dates if date])
+
+
+def select_rows(recording: Recording, rows: np.ndarray | slice) -> Recording:
+    """Return some rows of a recording."""
+    extra = {name: values[rows] for name, values in recording.extra.items()}
+    t_s, u, q = recording.t_s[rows], recording.u[rows], recording.q[rows]
+    return replace(recording, t_s=t_s, u=u, q=q, extra=extra)
 
 
 def split_recordings(recordings: Sequence[Recording], machine: Machine) -> list[Recording]:
@@ -136,21 +151,11 @@ def split_recordings(recordings: Sequence[Recording], machine: Machine) -> list[
     found, longest_s = [], MAX_PART_RUNS * choose_horizon_s(machine)
     for number, recording in enumerate(recordings):
         count = max(1, round(recording.duration_s / longest_s))
-        for part, rows in enumerate(np.array_split(np.arange(recording.num_samples), count)):
-            rows = slice(rows[0], rows[-1] + 1)
-            extra = {name: values[rows] for name, values in recording.extra.items()}
-            named = {**recording.metadata, "run": f"{number}.{part}"}
+        for place, rows in enumerate(np.array_split(np.arange(recording.num_samples), count)):
+            part = select_rows(recording, rows)
+            begun_s = float(part.t_s[0])
+            named = {**recording.metadata, "run": f"{number}.{place}"}
             if created := recording.metadata.get("created"):
-                named["created"] = record.add_seconds(created, float(recording.t_s[rows][0]))
-            t_s = recording.t_s[rows] - recording.t_s[rows][0]
-            found.append(
-                replace(
-                    recording,
-                    t_s=t_s,
-                    u=recording.u[rows],
-                    q=recording.q[rows],
-                    extra=extra,
-                    metadata=named,
-                )
-            )
+                named["created"] = record.add_seconds(created, begun_s)
+            found.append(replace(part, t_s=part.t_s - begun_s, metadata=named))
     return found

@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from scipy.ndimage import minimum_filter1d
 
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.case import PAUSE_S
+from diagnosis.case import number_days, select_rows
 
 PART_S = 30.0
 """Length of the parts of recordings that are measured by themselves, s."""
@@ -90,7 +89,7 @@ def measure_changes(
     known, now = _cut_parts(reference), _cut_parts(field)
     before = [_measure_part(part, machine, laws) for part in known]
     after = [_measure_part(part, machine, laws) for part in now]
-    day, found, chances = _number_days(known), [], []
+    day, found, chances = number_days(known), [], []
     for key in dict.fromkeys(key for part in before for key in part):
         then = np.array([part.get(key, np.nan) for part in before])
         later = np.array([part[key] for part in after if key in part])
@@ -140,22 +139,8 @@ def _cut_parts(recordings: Sequence[Recording]) -> list[Recording]:
     for one in recordings:
         count = max(1, round(one.duration_s / PART_S)) if len(recordings) < MIN_RECORDINGS else 1
         for rows in np.array_split(np.arange(one.num_samples), count):
-            extra = {name: values[rows] for name, values in one.extra.items()}
-            part = replace(one, t_s=one.t_s[rows], u=one.u[rows], q=one.q[rows], extra=extra)
-            found.append(part)
+            found.append(select_rows(one, rows))
     return found
-
-
-def _number_days(recordings: Sequence[Recording]) -> np.ndarray:
-    """Return the day of each recording, `(R,)`; all of one day where their dates are not known."""
-    dates = [one.metadata.get("created", "") for one in recordings]
-    if not all(dates):
-        return np.zeros(len(recordings), dtype=int)
-    stamps = np.array([datetime.fromisoformat(date).timestamp() for date in dates])
-    begins = np.diff(np.sort(stamps), prepend=-np.inf) > PAUSE_S
-    day = np.zeros(len(stamps), dtype=int)
-    day[np.argsort(stamps)] = np.cumsum(begins)
-    return day
 
 
 def _measure_speed(q: np.ndarray, period_s: float) -> np.ndarray:

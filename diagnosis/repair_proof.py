@@ -8,7 +8,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +19,7 @@ from brokk_rl.commands import view_recordings
 from brokk_rl.record import Recording
 from diagnosis import sensors
 from diagnosis.bootstrap import BLOCK_WINDOWS, draw_weights, summarise_draws
-from diagnosis.case import GapCase
+from diagnosis.case import GapCase, select_rows
 from diagnosis.closure import MIN_RESTORED, Estimate, Gap, Gate, RivalError
 from diagnosis.engine.decide import Decider, EffectFinding
 from diagnosis.engine.holds import hold_commands
@@ -339,9 +338,7 @@ def _view_runs(
     thin = []
     for one in recordings:
         rows = slice(0, one.num_samples // stride * stride, stride)
-        extra = {name: values[rows] for name, values in one.extra.items()}
-        part = replace(one, t_s=one.t_s[rows], u=one.u[rows], q=one.q[rows], extra=extra)
-        thin.append(part)
+        thin.append(select_rows(one, rows))
     source = np.searchsorted(side.starts, windows.first, "right") - 1
     row = windows.first + 1 - side.starts[source]
     return WindowedRuns(thin, source, row, paths)

@@ -39,9 +39,9 @@ UNKNOWN = 1.0
 LEAST_GAIN = 0.5
 """Share of the loss that a named mistake removes at least: what explains a few rows at the edge of a
 mask by a number that is nearly neutral is none. Chosen by hand."""
-SCREEN_ROWS, SEARCH_ROWS = 40, 96
-"""Departing rows by which mistakes are screened on their grids, and by which the best of them are
-refined; a quarter as many of the others. Chosen by hand."""
+SEARCH_ROWS = 96
+"""Departing rows by which mistakes are compared on their grids, and the best of them refined; a quarter as
+many of the others. Chosen by hand."""
 NUM_SCREENED = 40
 """Mistakes that are refined. Chosen by hand."""
 NUM_REFINED = 12
@@ -182,20 +182,15 @@ class _FaultSearch:
         self._stage, self._rows = stage, rows
         self._ok = np.asarray((np.abs(residual[rows]) <= stage.floor[rows]).all(1))
         self._loss = _measure_loss(residual[rows])
-        self._screen = self._choose_sample(SCREEN_ROWS)
-        self._sample = self._choose_sample(SEARCH_ROWS)
-
-    def _choose_sample(self, num: int) -> np.ndarray:
-        """Return so many departing places in the judged rows, and a quarter as many others."""
         departed, others = np.flatnonzero(~self._ok), np.flatnonzero(self._ok)
-        parts = [_select_evenly(departed, num), _select_evenly(others, num // 4)]
-        return np.sort(np.concatenate(parts))
+        some = _select_evenly(departed, SEARCH_ROWS), _select_evenly(others, SEARCH_ROWS // 4)
+        self._sample = np.sort(np.concatenate(some))
 
     def rank(self, given: tuple[Change, ...]) -> tuple[FittedDistortion, ...]:
         """Return the mistakes that come nearest, beside those of `given`, best first."""
         screened = []
         for distortion in self._stage.distortions:
-            tried = [self._try(distortion, one, given, self._screen) for one in distortion.values]
+            tried = [self._try(distortion, one, given, self._sample) for one in distortion.values]
             screened.append(max(tried, key=_get_gain))
         screened.sort(key=_get_gain, reverse=True)
         refined = [self._refine(one, given) for one in screened[:NUM_SCREENED]]
@@ -227,9 +222,8 @@ class _FaultSearch:
     def _refine(self, screened: FittedDistortion, given: tuple[Change, ...]) -> FittedDistortion:
         """Return a distortion with a number near that of its grid."""
         distortion, values = screened.distortion, screened.distortion.values
-        found = self._try(distortion, screened.value, given, self._sample)
         if not distortion.is_continuous:
-            return found
+            return screened
         place = values.index(screened.value)
         low, high = values[max(0, place - 1)], values[min(len(values) - 1, place + 1)]
         best = minimize_scalar(
@@ -238,7 +232,8 @@ class _FaultSearch:
             method="bounded",
             options={"xatol": TOLERANCE_REFINED * max(abs(low), abs(high))},
         )
-        return max(found, self._try(distortion, float(best.x), given, self._sample), key=_get_gain)
+        refined = self._try(distortion, float(best.x), given, self._sample)
+        return max(screened, refined, key=_get_gain)
 
     def _try(
         self, distortion: Distortion, value: float, given: tuple[Change, ...], places: np.ndarray
