@@ -60,7 +60,7 @@ class Selected:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A rival and how probable it is that it is there; they need not exclude each other."""
+    """An effect, `none` or `unknown`, and how probable it is that it is there."""
 
     effect: str
     joints: tuple[str, ...]
@@ -75,7 +75,7 @@ class Answer:
         verdict: `effects`; `none` when no effect earns its place; `unknown` when the gap is real
             and nothing of the library explains it, or the recordings do not allow to tell.
         selected: Most probable first; empty unless the verdict is `effects`.
-        ranking: All rivals worth naming, `none` and `unknown` among them, most probable first.
+        ranking: What is named with its probability, the most probable first; else `none` or `unknown`.
         gap: Its size, and the remainder, joint by joint too.
         rivals: Errors of simple rivals on the windows of the gap, by name.
         gates: Conditions of the verdict.

@@ -49,11 +49,6 @@ class EffectType:
     target: Any
     machine: Machine
 
-    @property
-    def num_joints(self) -> int:
-        """Number of joints, `J`."""
-        return self.machine.num_joints
-
     @cached_property
     def numbers(self) -> dict[str, Any]:
         """Facts about each of its numbers on this machine: `none`, `trials`, `unit`, `per_joint`.
@@ -77,11 +72,6 @@ class EffectType:
     def running(self) -> str | None:
         """Name of the number that is the time since the machine was started; it is given, not fitted."""
         return getattr(self.target, "running", None)
-
-    @property
-    def together(self) -> bool:
-        """True if its effect on one joint depends on the others."""
-        return self.target.side == "joints"
 
     @cached_property
     def fitted(self) -> tuple[str, ...]:

@@ -46,8 +46,8 @@ SLOPE_S = 0.4
 """Time over which the velocity of a tool point is taken."""
 CLOCK_ERROR_S, CLOCK_ERROR = 0.001, 0.05
 """Standard error of that shift, s and over it; five cases with one show 1.00 to 1.07 of it."""
-MAX_RIVALS = 4
-"""Most rivals of the named effects in a ranking."""
+UNNAMED_PROBABILITY = 0.8
+"""Probability of a verdict that names no effect; chosen by hand."""
 NATS_OF_HALF = 20.0
 NATS_OF_SURE = 15.0
 """An effect of so many nats is there in half of the cases, and how fast that grows."""
@@ -127,11 +127,14 @@ class Diagnosis(ABC):
         elif failed or verdict != "none":
             verdict = "unknown"
         after = proof.view(proof.after) if selected else None
+        ranking = [Ranked(one.effect, one.joints, one.probability) for one in selected]
+        if verdict != "effects":
+            ranking.append(Ranked(verdict, (), UNNAMED_PROBABILITY))
         weighed = {"rivals": describe_rivals(found.rivals, machine), "unit": "log likelihood"}
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
-            ranking=rank_effects(selected, found.rivals, verdict, machine),
+            ranking=tuple(ranking),
             gap=proof.measure_gap(bool(selected)),
             rivals=proof.rivals,
             gates=tuple(told),
@@ -355,31 +358,6 @@ def measure_clock_shift(recordings: Sequence[Recording], machine: Machine) -> fl
     left = both - known @ np.linalg.lstsq(known, both)[0]
     error, velocity = left[:, :3], left[:, 3:]
     return float((error * velocity).sum() / max(np.square(velocity).sum(), 1e-12))
-
-
-def rank_effects(
-    selected: Sequence[Selected], rivals: Sequence[EffectFinding], verdict: str, machine: Machine
-) -> tuple[Ranked, ...]:
-    """Return all that is worth naming, the most probable first.
-
-    Args:
-        selected: What is named.
-        rivals: All effects with what they earn, the best first.
-        verdict: `effects`, `none` or `unknown`.
-        machine: Gives the joints' names.
-    """
-    found = [Ranked(one.effect, one.joints, one.probability) for one in selected]
-    left = 1.0 - max([one.probability for one in selected], default=0.0)
-    if verdict != "effects":
-        found.append(Ranked(verdict, (), 0.8))
-        left = 0.2
-    names = {one.effect for one in selected}
-    for one in rivals[:MAX_RIVALS]:
-        if one.name not in names and one.nats > 0.0:
-            chance = left * float(np.clip(one.nats / 100.0, 0.01, 0.5))
-            found.append(Ranked(one.name, name_joints(one.joints, machine), chance))
-            names.add(one.name)
-    return tuple(sorted(found, key=lambda one: -one.probability))
 
 
 def name_joints(joints: Sequence[int], machine: Machine) -> tuple[str, ...]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
@@ -159,7 +158,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "rivals": RIVALS,
         "severities": SEVERITIES,
         "max_listed": MAX_LISTED,
-        "earned": _rank_rivals(more.get("evidence")),
+        "earned": more.get("evidence", {}).get("rivals", ())[:MAX_RIVALS],
         "describe_class": describe_class,
         "describe_edit": describe_edit,
         "name_effect": name_effect,
@@ -168,12 +167,6 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "format_estimate": format_estimate,
     }
     write_text(folder / REPORT_FILE, render_page(TEMPLATE, values))
-
-
-def _rank_rivals(evidence: Any) -> list[Mapping[str, Any]]:
-    """Return the rivals with the largest gains; `undecided` answers hold a sentence instead."""
-    rows = evidence.get("rivals", []) if isinstance(evidence, Mapping) else []
-    return sorted(rows, key=lambda row: -row["score"])[:MAX_RIVALS]
 
 
 def _draw_pictures(outcome: Outcome, machine: Machine) -> dict[str, str]:
