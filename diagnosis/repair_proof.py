@@ -16,16 +16,15 @@ import numpy as np
 from actuators import open_loop
 from actuators.scales import choose_horizon_s
 from brokk_rl.commands import view_recordings
-from brokk_rl.record import Recording
 from diagnosis import sensors
 from diagnosis.bootstrap import BLOCK_WINDOWS, draw_weights, summarise_draws
 from diagnosis.case import GapCase, select_rows
 from diagnosis.closure import MIN_RESTORED, Estimate, Gap, Gate, RivalError
 from diagnosis.engine.decide import Decider, EffectFinding
 from diagnosis.engine.holds import hold_commands
-from diagnosis.engine.proof import Floor, Windows, list_windows, run_free
+from diagnosis.engine.proof import Floor, list_windows, run_free
 from diagnosis.engine.rows import Row
-from diagnosis.engine.side import Side, choose_stride, measure_units
+from diagnosis.engine.side import choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
@@ -326,19 +325,13 @@ class EngineProof(RepairProof):
         return self.weights @ self.floor.foresee(self.windows, joints)
 
     def view(self, paths: np.ndarray) -> WindowedRuns:
-        """Return free runs beside the recordings of the field."""
-        return _view_runs(self._case.field, self._field, self.windows, paths)
-
-
-def _view_runs(
-    recordings: Sequence[Recording], side: Side, windows: Windows, paths: np.ndarray
-) -> WindowedRuns:
-    """Return paths `(W, K, J)` beside their recordings, thinned out as the engine read them."""
-    stride = choose_stride(side.machine)
-    thin = []
-    for one in recordings:
-        rows = slice(0, one.num_samples // stride * stride, stride)
-        thin.append(select_rows(one, rows))
-    source = np.searchsorted(side.starts, windows.first, "right") - 1
-    row = windows.first + 1 - side.starts[source]
-    return WindowedRuns(thin, source, row, paths)
+        """Return free runs beside the recordings of the field, thinned out as the engine read them."""
+        side, windows = self._field, self.windows
+        stride = choose_stride(self.machine)
+        thin = []
+        for one in self._case.field:
+            rows = slice(0, one.num_samples // stride * stride, stride)
+            thin.append(select_rows(one, rows))
+        source = np.searchsorted(side.starts, windows.first, "right") - 1
+        row = windows.first + 1 - side.starts[source]
+        return WindowedRuns(thin, source, row, paths, self.measured)

@@ -63,7 +63,8 @@ class EffectSimulator:
 
     def view(self, paths: np.ndarray) -> WindowedRuns:
         """Return free runs `(W, K, J)` beside their recordings."""
-        return WindowedRuns(self.recordings, self.source, self.row, paths.astype(float))
+        measured = self.cut.measured
+        return WindowedRuns(self.recordings, self.source, self.row, paths.astype(float), measured)
 
     def select(self, windows: np.ndarray) -> EffectSimulator:
         """Return the same with some of the windows."""

@@ -30,8 +30,10 @@ def runs(machine: Machine, count: int, seed: int, factor: float) -> WindowedRuns
         recordings.append(make_recording(machine, u, q, f"<run> {seed}-{number}"))
         row += range(40, 1140, 100)
         source += [number] * 11
-    found = WindowedRuns(recordings, np.array(source), np.array(row), np.zeros((len(row), 100, 5)))
-    start = np.stack([recordings[s].q[k - 1] for s, k in zip(source, row, strict=True)])[:, None]
+    pairs = list(zip(source, row, strict=True))
+    measured = np.stack([recordings[s].q[k : k + 100] for s, k in pairs])
+    found = WindowedRuns(recordings, np.array(source), np.array(row), measured, measured)
+    start = np.stack([recordings[s].q[k - 1] for s, k in pairs])[:, None]
     way = np.where(np.arange(5) == 3, factor, 1.0) * (found.measured - start)
     return replace(found, simulated=start + way + 2e-4 * rng.standard_normal(way.shape).cumsum(1))
 
