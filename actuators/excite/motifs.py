@@ -1,7 +1,7 @@
 """Motifs: short single-joint programs that separate effects which look alike otherwise."""
 
-from collections.abc import Callable, Iterable, Iterator
-from itertools import count, product
+from collections.abc import Callable
+from itertools import product
 from typing import Annotated
 
 import numpy as np
@@ -30,39 +30,28 @@ class Motif:
     def segments(
         self, machine: Machine, duration_s: float, generator: np.random.Generator
     ) -> list[Segment]:
-        """Return as many segments as fit into `duration_s`."""
-        candidates = self._candidates(machine, generator)
-        return fill_duration(type(self).__name__.lower(), candidates, duration_s, machine)
+        """Return as many segments as fit into `duration_s`.
 
-    def _candidates(self, machine: Machine, generator: np.random.Generator) -> Iterator[Segment]:
-        number = count()
-        for start in draw_start_poses(machine, self.stop_margin, generator):
-            found = self.programs(machine, generator)
-            for i in generator.permutation(len(found)):
-                name, u = found[i]
-                yield Segment(f"{name}_{next(number):02d}", start, u, "inward", self.stop_margin)
-
-
-def fill_duration(
-    name: str, candidates: Iterable[Segment], duration_s: float, machine: Machine
-) -> list[Segment]:
-    """Return segments as long as they fit into `duration_s`.
-
-    Raises:
-        ConfigError: the first one does not fit.
-    """
-    found, left = [], int(duration_s / machine.period_s + 1e-6)
-    for segment in candidates:
-        left -= len(segment.u)
-        if left < 0:
-            break
-        found.append(segment)
-    if not found:
-        raise ConfigError(
-            f"excitation={name}: its part of a run, {duration_s:.0f} s, does not hold its first segment; raise collect.run_minutes "
-            "(or its share), or leave it out"
-        )
-    return found
+        Raises:
+            ConfigError: the first one does not fit.
+        """
+        found, left = [], int(duration_s / machine.period_s + 1e-6)
+        starts = draw_start_poses(machine, self.stop_margin, generator)
+        while True:
+            start, programs = next(starts), self.programs(machine, generator)
+            for i in generator.permutation(len(programs)):
+                name, u = programs[i]
+                left -= len(u)
+                if left >= 0:
+                    name = f"{name}_{len(found):02d}"
+                    found.append(Segment(name, start, u, "inward", self.stop_margin))
+                elif found:
+                    return found
+                else:
+                    raise ConfigError(
+                        f"excitation={type(self).__name__.lower()}: its part of a run, {duration_s:.0f} s, does not hold its first "
+                        "segment; raise collect.run_minutes (or its share), or leave it out"
+                    )
 
 
 def build_joint_programs(

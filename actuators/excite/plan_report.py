@@ -47,13 +47,10 @@ class PlanTrack:
 
     def list_actions(self, run: int) -> list[tuple[int, int]]:
         """Return first sample and end of each way and each program of a run, in order."""
-        found = []
-        for begin, end in split_stretches(
-            self.segment[:, run] * 2 + (self.stage[:, run] != BEFORE)
-        ):
-            if self.stage[begin, run] != AFTER:
-                found.append((begin, end))
-        return found
+        stage, segment = self.stage[:, run], self.segment[:, run]
+        changes = np.diff(segment * 2 + (stage != BEFORE))
+        edges = [0, *(np.flatnonzero(changes) + 1).tolist(), len(stage)]
+        return [(begin, end) for begin, end in pairwise(edges) if stage[begin] != AFTER]
 
 
 def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> dict[str, Any]:
@@ -85,12 +82,6 @@ def _summarise_run(
         }
         found.append(entry)
     return found
-
-
-def split_stretches(values: np.ndarray) -> list[tuple[int, int]]:
-    """Return begin and end of each stretch of equal values."""
-    edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
-    return list(pairwise(edges))
 
 
 def _round_ms(value_s: Any) -> float:

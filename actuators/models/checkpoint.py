@@ -71,14 +71,15 @@ def write_checkpoint(
 
 
 def read_checkpoint(
-    path: Path, kind: str, machine: Machine
+    name: str, kind: str, machine: Machine
 ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Return the tensors and the header of a checkpoint made for `machine`.
+    """Return the tensors and the header of a checkpoint made for `machine`; see `find_checkpoint`.
 
     Raises:
-        CheckpointError: it is corrupt, of another kind, made for another machine, or holds numbers
+        CheckpointError: it is missing, corrupt, of another kind, made for another machine, or holds numbers
             that are not finite.
     """
+    path = find_checkpoint(name)
     try:
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {})["brokk"])

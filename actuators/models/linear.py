@@ -66,11 +66,12 @@ class Arx:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
                 NaN.
         """
-        path = checkpoint.find_checkpoint(self.checkpoint)
-        tensors, _ = checkpoint.read_checkpoint(path, "arx", machine)
+        tensors, _ = checkpoint.read_checkpoint(self.checkpoint, "arx", machine)
         expected = (machine.num_joints, 3 * machine.num_history - 1)
         if "weight" not in tensors or tuple(tensors["weight"].shape) != expected:
-            raise CheckpointError(f"{path}: expected a tensor 'weight' of shape {expected}")
+            raise CheckpointError(
+                f"{self.checkpoint}: expected a tensor 'weight' of shape {expected}"
+            )
         return ArxModel(tensors["weight"].to(device), machine, device)
 
 

@@ -159,14 +159,13 @@ def load_networks(name: str, machine: Machine) -> JointNetworks:
     Raises:
         CheckpointError: as for `Mlp.build`.
     """
-    path = checkpoint.find_checkpoint(name)
-    tensors, header = checkpoint.read_checkpoint(path, "mlp", machine)
+    tensors, header = checkpoint.read_checkpoint(name, "mlp", machine)
     width = int(header.get("width", 0))
     networks = JointNetworks(machine.num_joints, machine.num_history, width)
     try:
         networks.load_state_dict(tensors)
     except RuntimeError as error:
         raise CheckpointError(
-            f"{path}: the tensors do not fit the network that its header describes ({error})"
+            f"{name}: the tensors do not fit the network that its header describes ({error})"
         ) from error
     return networks

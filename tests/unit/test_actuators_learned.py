@@ -159,9 +159,8 @@ def test_a_checkpoint_of_another_machine_names_what_differs(
 def test_tensors_of_another_network_are_refused(tmp_path: Path, machine: Machine) -> None:
     path = written(tmp_path / "a.safetensors", machine)
     tensors = load_file(path)
-    header = {
-        "brokk": json.dumps(checkpoint.read_checkpoint(path, "mlp", machine)[1] | {"width": 16})
-    }
+    made = checkpoint.read_checkpoint(str(path), "mlp", machine)[1]
+    header = {"brokk": json.dumps(made | {"width": 16})}
     save_file(tensors, path, metadata=header)
     with pytest.raises(CheckpointError, match="do not fit the network"):
         load_networks(str(path), machine)
