@@ -71,14 +71,6 @@ def test_a_pause_stops_time_and_a_step_is_one_control_period(made: Callable) -> 
     assert session.advance(PERIOD_S) == 1
 
 
-def test_the_controller_inserts_and_the_ending_is_counted(made: Callable) -> None:
-    session = made()
-    run(session, 380)
-    assert session.successes >= 1
-    # A strict success bounds force and tilt too.
-    assert session.endings["success"] >= session.successes
-
-
 def test_a_reset_begins_one_episode_anew_and_is_no_ending(made: Callable) -> None:
     session = made()
     run(session, 10)
