@@ -423,7 +423,7 @@ def test_the_machines_computer_needs_no_torch_no_simulator_and_no_trainer() -> N
         "recorder.capture",
         "link",
     )
-    modules = ", ".join(f"deploy.{name}" for name in rooms)
+    modules = ", ".join(("study.modes.study", *(f"deploy.{name}" for name in rooms)))
     code = f"import sys, {modules}; print([m for m in ('torch', 'warp', 'mujoco', 'rsl_rl') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -68,11 +68,13 @@ def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
     assert (found & view.mouth).sum() > 0.9 * view.mouth.sum()
 
 
+def black() -> Frame:
+    color = np.zeros((360, 640, 3), np.uint8)
+    return Frame(color, np.ones((360, 640), np.float32), np.eye(3), None, 0.0)
+
+
 def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
-    frame = Frame(
-        color=np.zeros((360, 640, 3), np.uint8), depth_m=np.ones((360, 640), np.float32), camera_matrix=np.eye(3),
-        base_from_camera=None, t_s=0.0,
-    )  # fmt: skip
+    frame = black()
     frame.color[100:200, 300:450] = 128  # the block
     frame.color[140:150, 380:390] = 255  # its mouth, two pixels at the first look
     shown = []
@@ -96,10 +98,7 @@ def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
 def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_where_more_of_it_is() -> (
     None
 ):
-    frame = Frame(
-        color=np.zeros((360, 640, 3), np.uint8), depth_m=np.ones((360, 640), np.float32), camera_matrix=np.eye(3),
-        base_from_camera=None, t_s=0.0,
-    )  # fmt: skip
+    frame = black()
     frame.color[100:200, 300:450] = 128
     shown = []
 
