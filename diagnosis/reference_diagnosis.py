@@ -17,7 +17,7 @@ from scipy.signal import savgol_filter
 
 from actuators.models.linear import Hold
 from actuators.recordings.inspection import InspectionThresholds
-from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
+from actuators.recordings.recording_checks import examine_recordings
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -103,7 +103,8 @@ class Diagnosis(ABC):
         machine = self.case.machine
         tell("recordings", 0.02)
         remarks = examine_recordings(self.case.field, machine, self.thresholds)
-        told = self._judge_recordings(remarks)
+        known = examine_recordings(self.case.reference, machine, self.thresholds)
+        told = gates.judge_recordings(remarks, known, self.case.field, self.case.reference, machine)
         found = self.search(told, tell)
         tell("sizes and proof", 0.9)
         proof, verdict, detected = found.proof, found.verdict, self.detected
@@ -156,11 +157,6 @@ class Diagnosis(ABC):
                 noise = sensors.find_sensor_noise(self.case, kind, DIRECT_NATS, NAME_NATS)
                 found += [] if noise is None else [noise]
         return found
-
-    def _judge_recordings(self, remarks: Sequence[RecordingRemark]) -> list[Gate]:
-        case = self.case
-        known = examine_recordings(case.reference, case.machine, self.thresholds)
-        return gates.judge_recordings(remarks, known, case.field, case.reference, case.machine)
 
     def _describe(self, one: EffectFinding, proof: RepairProof) -> Selected:
         """Return the answer about an effect in the motion."""

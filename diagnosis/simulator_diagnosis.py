@@ -80,7 +80,7 @@ class SimulatorProof(RepairProof):
 
     def _simulate(self, effects: frozenset[str], half: int) -> np.ndarray:
         some = [one for one in self._fitted[half] if one.kind.name in effects]
-        return self._search.simulate(some)
+        return self._search.whole.simulate(some)
 
     @cached_property
     def sizes(self) -> dict[str, SizesByName]:
@@ -202,7 +202,7 @@ def estimate_numbers(
     search: SimulatorSearch, effects: Sequence[GrownEffect], machine: Machine
 ) -> list[dict[str, dict[str, Estimate]]]:
     """Return the numbers of each effect with 95 % intervals, by name and joint (or `machine`)."""
-    deviations = search.linearise(effects).estimate_deviations(effects)
+    deviations = search.whole.linearise(effects).estimate_deviations(effects)
     found = []
     for place, one in enumerate(effects):
         numbers: dict[str, dict[str, Estimate]] = {}

@@ -59,7 +59,8 @@ class SimulatorSearch:
         ]
         self.shared = shared
         count = len(runs.row)
-        self._whole = WindowView(runs, 1.0)
+        self.whole = WindowView(runs, 1.0)
+        """All windows of the field."""
         self._views = []
         for one in (runs, reference):
             if one is not None:
@@ -75,7 +76,7 @@ class SimulatorSearch:
         while len(found) < MAX_EFFECTS:
             tell(len(found) / MAX_EFFECTS)
             names = {one.kind.name for one in found}
-            for view in (self._whole, *self._views):
+            for view in (self.whole, *self._views):
                 view.settle(found)
             proposed = [self._propose(k) for k in self.kinds if k.name not in names]
             proposed.sort(key=lambda one: -one.nats)
@@ -88,18 +89,10 @@ class SimulatorSearch:
             fitted = [self.fit([*found, one], rounds=FIRST_ROUNDS) for one in some]
             found = max(fitted, key=self._weigh)
         # A deviation that was taken beside wrong numbers explains their error, and holds them there.
-        self._whole.settle(())
+        self.whole.settle(())
         found = self.fit(found)
-        self._whole.settle(found)
+        self.whole.settle(found)
         return self.fit(found)
-
-    def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
-        """Return free runs with effects, `(W, K, J)`."""
-        return self._whole.simulate(effects)
-
-    def linearise(self, effects: Sequence[GrownEffect]) -> NumberSlopes:
-        """Return the slopes of all errors over all numbers."""
-        return self._whole.linearise(effects, None)
 
     def _propose(self, kind: EffectType) -> GrownEffect:
         """Return an effect with the form and size that earns most on each joint."""
@@ -125,7 +118,7 @@ class SimulatorSearch:
 
     def _weigh(self, effects: Sequence[GrownEffect]) -> float:
         """Return the log likelihood with effects, less the price of their numbers, nats."""
-        nats = float(self._whole.weigh_numbers(effects, {}, None).sum())
+        nats = float(self.whole.weigh_numbers(effects, {}, None).sum())
         return nats - JOINT_NATS * sum(one.count_numbers() for one in effects)
 
     def fit(
@@ -133,11 +126,11 @@ class SimulatorSearch:
     ) -> list[GrownEffect]:
         """Return the effects with all numbers fitted together to the windows `used`, `(W,)` bool."""
         found = list(effects)
-        best = float(self._whole.weigh_numbers(found, {}, used).sum())
+        best = float(self.whole.weigh_numbers(found, {}, used).sum())
         for _ in range(rounds if found else 0):
-            slopes = self._whole.linearise(found, used)
+            slopes = self.whole.linearise(found, used)
             trials = slopes.list_steps(found)
-            gains = self._whole.weigh_numbers(found, trials, used).sum(1)
+            gains = self.whole.weigh_numbers(found, trials, used).sum(1)
             top = int(np.argmax(gains))
             if gains[top] < best + LEAST_GAIN:
                 break

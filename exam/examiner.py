@@ -23,7 +23,6 @@ from actuators.contracts import ActuatorFit, FitTask
 from brokk_rl import record
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, read_answer
 from diagnosis.case import estimate_running_s
@@ -91,9 +90,10 @@ class ExaminerSimulator:
             self._actuator = fit.fit(FitTask(machine, reference, [], Path(scratch)))
         # of the field an answer knows how long the machine had run; the withheld part goes on
         running = estimate_running_s([*field, *withheld])[len(field) :]
-        self._runs = self._cut_runs(withheld, running)
+        about = (machine, 0, HORIZON_S, STRIDE_S, running)
+        self._runs = cut_simulator_runs(self._actuator, withheld, *about)
         self._before = self._squares(self._runs, {})
-        self._floor = self._squares(self._cut_runs(unchanged, running), {})
+        self._floor = self._squares(cut_simulator_runs(self._actuator, unchanged, *about), {})
 
     def examine(self, effects: Mapping[str, Any], said: Answer | None) -> Examination:
         """Return the errors with these effects, specs by name, beside what the answer says."""
@@ -120,14 +120,6 @@ class ExaminerSimulator:
             ci95=interval,
             said=None if stated is None else stated.mean,
             differs=differs,
-        )
-
-    def _cut_runs(
-        self, recordings: Sequence[Recording], running_s: Sequence[float]
-    ) -> EffectSimulator:
-        """Return free runs through windows of recordings; `running_s`: when each of them begins."""
-        return cut_simulator_runs(
-            self._actuator, recordings, self._machine, 0, HORIZON_S, STRIDE_S, running_s
         )
 
     def _squares(self, runs: EffectSimulator, effects: Mapping[str, Any]) -> np.ndarray:
