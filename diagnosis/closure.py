@@ -53,15 +53,14 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class JointClosed:
-    """Error of one joint over free runs, in rad or m, and the closed share of its gap.
+class JointError:
+    """Error of one joint over free runs, in rad or m, and its part of the gap.
 
     Attributes:
         before: Of the simulator as it was.
         after: With the selected effects.
         floor: Of the unchanged machine under the field's motion.
         share: `1 - after / before`.
-        closed: `(before - after) / (before - floor)`; `None` without a floor below `before`.
         part: Part of the gap of all joints: of their squared errors beyond the floor, over their travel.
     """
 
@@ -69,7 +68,6 @@ class JointClosed:
     after: float
     floor: float
     share: float
-    closed: float | None
     part: float = 0.0
 
 
@@ -98,7 +96,7 @@ class Gap:
     closed: Estimate | None
     unit: str = "rad"
     floor_of: str = "reference"
-    joints: Mapping[str, JointClosed] = field(default_factory=dict)
+    joints: Mapping[str, JointError] = field(default_factory=dict)
     reduced: Estimate | None = None
 
     @model_serializer(mode="wrap")

@@ -13,11 +13,8 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.machine import Machine
-from diagnosis.closure import JointClosed
+from diagnosis.closure import JointError
 
-MIN_GAP_RATIO = 1.02
-"""Error over floor from which there is a gap whose share is told. Its interval shows how surely:
-the limit only keeps the denominator off 0. Chosen by hand; not searched."""
 TINY = np.finfo(float).tiny
 """Smallest divisor: a sum of squares may be 0."""
 
@@ -53,7 +50,7 @@ def compute_shapley(
 
 def describe_joints(
     machine: Machine, before: np.ndarray, after: np.ndarray, floor: np.ndarray
-) -> dict[str, JointClosed]:
+) -> dict[str, JointError]:
     """Return errors `(J,)` before, after and at the floor, joint by joint; their parts of the gap add up to 1."""
     excess = np.maximum(np.square(before) - np.square(floor), 0.0)
     if not excess.any():
@@ -63,9 +60,5 @@ def describe_joints(
     found = {}
     for name, *row in zip(machine.joint_names, before, after, floor, parts, strict=True):
         error, left, least, part = map(float, row)
-        closed = None
-        if error > MIN_GAP_RATIO * least:
-            closed = (error - left) / (error - least)
-        share = 1.0 - left / max(error, 1e-12)
-        found[name] = JointClosed(error, left, least, share, closed, part)
+        found[name] = JointError(error, left, least, 1.0 - left / max(error, 1e-12), part)
     return found
