@@ -1,9 +1,7 @@
 """`brokk mode=list`: every registry, one line per option."""
 
-from rich.console import Console
-from rich.markup import escape
-
 from brokk_rl import registry
+from brokk_rl.console_table import print_text
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import spec
 
@@ -38,15 +36,10 @@ class ListOptions:
             raise ConfigError(
                 f"list.group: there is no group '{wanted}'; {list_choices(wanted, groups)}"
             )
-        console = Console(highlight=False)
         width = max(len(option.name) for option in options)
         for group in [wanted] if wanted else groups:
-            console.print(f"[bold]{escape(group)}[/bold]")
+            print_text(group, "bold")
             for option in options:
-                if option.group != group:
-                    continue
-                own = option.package == registry.CORE
-                origin = "" if own else f" [dim]({escape(option.package)})[/dim]"
-                line = f"  {option.name:<{width}}  {escape(option.summary())}{origin}"
-                # a text that is cut loses its end without a trace: the terminal may wrap it instead
-                console.print(line, soft_wrap=True)
+                if option.group == group:
+                    origin = "" if option.package == registry.CORE else f" ({option.package})"
+                    print_text(f"  {option.name:<{width}}  {option.summary()}{origin}")
