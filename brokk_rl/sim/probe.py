@@ -42,6 +42,7 @@ def capture_graph() -> str:
     with wp.ScopedCapture(device="cuda:0") as capture:
         wp.copy(copy, source)
     source.fill_(2.0)
+    assert capture.graph is not None, "it was captured above"
     wp.capture_launch(capture.graph)
     if float(copy.numpy()[0]) != 2.0:
         raise RuntimeError("a captured graph replays, but the copy in it did not happen")
