@@ -19,7 +19,7 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -150,8 +150,17 @@ def describe_task(task: object) -> TaskDescription:
         value: Any = task
         for part in path.split("."):
             value = getattr(value, part)
-        behaviour[path] = json.loads(json.dumps(value, default=asdict))
+        behaviour[path] = json.loads(json.dumps(value, default=list_values))
     return TaskDescription(name=name_target(name_class(task)), behaviour=behaviour)
+
+
+def list_values(one: Any) -> dict[str, Any]:
+    """Return the fields of a spec by name, without those at a default.
+
+    A field with a default came after the first policies, whose descriptions it leaves as they are.
+    """
+    values = {field.name: (getattr(one, field.name), field.default) for field in fields(one)}
+    return {name: value for name, (value, default) in values.items() if value is not default}
 
 
 def name_target(target: str) -> str:

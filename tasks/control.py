@@ -43,8 +43,6 @@ PLAN_END_RAD = 0.2
 by hand."""
 PLAN_DONE = -1.0
 """Marks a plan whose path is done."""
-PLAN_STEP_S = 0.1
-"""Step of a planned motion: joints turn by 0.05 rad at most. Chosen by hand."""
 REACH_CENTER_M = 2.0
 """Subtracted from the reach; about the middle of the paper's range, 1.7 to 2.4 m."""
 REACH_DAMPING = 0.05
@@ -288,12 +286,11 @@ class ToolPoseControl:
             values: `target_in_base_m` `(N, 3)`, histories `q` and `u` `(N, H, J)`, `pitch_rad`
                 `(N,)`, and `proposals` `(N, H, J)` where there is an adviser.
         """
-        target_m, pitch_rad = values[TARGET], values[PITCH]
         q, u = values["q"], values["u"]
         coming = None
         if self.adviser is not None:
             coming = self.adviser.coming(values[PROPOSALS], u[:, -1])
-        guidance, base = self._guide(q, u, target_m, pitch_rad, coming)
+        guidance, base = self.guide(q, u, values[TARGET], values[PITCH], coming)
         return ControlInput(
             vector=self.encoder.encode(values),
             features=compute_features(guidance, base.positioning, u[:, -1]),
@@ -315,13 +312,14 @@ class ToolPoseControl:
                 `PLAN_DONE` from the end of the path on.
         """
         q, u = values["q"], values["u"]
-        _, base = self._guide(q, u, values[TARGET], values[PITCH])
+        guidance, base = self.guide(q, u, values[TARGET], values[PITCH])
         left = self.measure_rest(values, plan)
         waits = (plan[:, -1] > 0.5) & (left[:, 1:].abs().amax(1) > PLAN_END_RAD)
         left[:, 0] *= ~waits
         share = PLAN_GAIN_1_S * left / self.controller.speed
         share = share / share.abs().amax(1, keepdim=True).clamp(min=1.0)
-        u_planned = self.controller.valve(share).minimum(base.highest).maximum(base.lowest)
+        u_planned = self.controller.valve(share)
+        u_planned = u_planned.minimum(guidance.highest).maximum(guidance.lowest)
         is_led = base.positioning | (plan[:, -1] == PLAN_DONE)
         return base.command.where(is_led[:, None], u_planned), base.command
 
@@ -336,7 +334,7 @@ class ToolPoseControl:
             return target_m - self._down
         return target_m + self.task.aim_below_m * find_tool_direction(target_m, pitch_rad)
 
-    def _guide(
+    def guide(
         self,
         q: torch.Tensor,
         u: torch.Tensor,
@@ -344,43 +342,14 @@ class ToolPoseControl:
         pitch_rad: torch.Tensor,
         coming: torch.Tensor | None = None,
     ) -> tuple[ControllerGuidance, CommandBase]:
+        """Return what the classical controller makes of an observation; see its `guide`."""
         switch = self.task.switch
         along = find_tool_direction(target_m, pitch_rad) if self.task.leans else None
         aim_m = self.aim(target_m, pitch_rad)
         guidance = self.controller.guide(q, u, aim_m, pitch_rad, switch.reach_m, coming, along)
         positioning = switch.positioning(guidance)
-        bounds = (guidance.command, guidance.lowest, guidance.highest)
-        return guidance, CommandBase(*bounds, positioning)
-
-    def plan(
-        self,
-        q: torch.Tensor,
-        target_m: torch.Tensor,
-        pitch_rad: torch.Tensor,
-        num_times: int,
-        step_s: float,
-    ) -> torch.Tensor:
-        """Return the motion that the controller would make of an ideal machine, `(N, T, J)`.
-
-        A learned policy corrects this controller; dead time and valves are left out.
-
-        Args:
-            q: Present joint positions, `(N, J)`.
-            target_m: Targets, `(N, 3)`.
-            pitch_rad: Wanted pitches, `(N,)`.
-            num_times: `T`; the first time is now.
-            step_s: Time between two of them.
-        """
-        rest = torch.zeros_like(q)
-        num_parts = max(1, round(step_s / PLAN_STEP_S))
-        planned = [q]
-        for _ in range(num_times - 1):
-            for _ in range(num_parts):
-                _, base = self._guide(q[:, None], rest[:, None], target_m, pitch_rad)
-                u = self.task.action.command(rest, base, self.exclusive)
-                q = q + self.controller.rate(u) * (step_s / num_parts)
-            planned.append(q)
-        return torch.stack(planned, 1)
+        lowest, highest = self.task.action.bound(guidance.lowest, guidance.highest, u[:, -1])
+        return guidance, CommandBase(guidance.command, lowest, highest, positioning)
 
     def command(
         self, output: torch.Tensor, base: CommandBase, proposed: torch.Tensor | None

@@ -65,8 +65,8 @@ class CommandBase:
 
     Attributes:
         command: Command of the classical controller, `(N, J)`.
-        lowest: Least commands that do not drive joints into their ends, `(N, J)`.
-        highest: Largest such commands, `(N, J)`.
+        lowest: Least commands, `(N, J)`; see `ActionMapping.bound`.
+        highest: Largest commands, `(N, J)`.
         positioning: Whether only the exclusive joints move, `(N,)` bool.
     """
 
@@ -280,12 +280,35 @@ class ActionMapping:
             it off.
         limits: Slow joints down before their ends, as far as the commands in flight let them be
             foreseen.
+        step: Largest change of a command from one control period to the next, of full command. A
+            joint that must stand still, or comes to its end, is let go at once. Take more than
+            `noise.u_scale`: the last command counts as observed, and a joint whose command is seen
+            too small by more could not stay at full speed. `None`: no bound.
     """
 
     kind: Literal["direct", "residual"]
     scale: Positive
     mask: bool
     limits: bool
+    step: Positive | None = None
+
+    def bound(
+        self, lowest: torch.Tensor, highest: torch.Tensor, last: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return least and largest commands, each `(N, J)`.
+
+        Args:
+            lowest: Least commands that do not drive joints into their ends, `(N, J)`.
+            highest: Largest such commands, `(N, J)`.
+            last: The command given last, as observed, `(N, J)`.
+        """
+        if not self.limits:
+            lowest, highest = lowest.clamp(max=-1.0), highest.clamp(min=1.0)
+        if self.step is None:
+            return lowest, highest
+        least = (last - self.step).minimum(highest).maximum(lowest)
+        largest = (last + self.step).minimum(highest).maximum(lowest)
+        return least, largest
 
     def command(
         self, output: torch.Tensor, base: CommandBase, exclusive: torch.Tensor
@@ -298,8 +321,7 @@ class ActionMapping:
             exclusive: Which joints are exclusive, `(J,)` bool.
         """
         u = self.scale * output + (base.command if self.kind == "residual" else 0.0)
-        if self.limits:
-            u = u.minimum(base.highest).maximum(base.lowest)
+        u = u.minimum(base.highest).maximum(base.lowest)
         if self.mask:
             u = u.where(mask_exclusive_joints(exclusive, base.positioning), 0.0)
         return u.clamp(-1.0, 1.0)

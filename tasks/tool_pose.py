@@ -27,6 +27,8 @@ from tasks.starts import DrawTally, StartSearch
 from tasks.term_task import ObservedTerm
 from tasks.terms import ToolState
 
+PLAN_STEP_S = 0.1
+"""Step of a planned motion: joints turn by 0.05 rad at most. Chosen by hand."""
 FORCE_SCALE_N, MAX_SCALED_FORCE = 2000.0, 5.0
 """Scale and bound of forces in the critic's group: 10 kN, where reward terms saturate too."""
 JUDGED = tuple(field.name for field in fields(PoseJudgement))
@@ -260,6 +262,19 @@ class ToolPoseProcess(EpisodeProcess):
     def plan(
         self, q: torch.Tensor, target_m: torch.Tensor, num_times: int, step_s: float
     ) -> torch.Tensor:
-        """Return the controller's plan, `(N, T, J)`; see `TaskProcess.plan`."""
+        """Return the motion that the controller would make of an ideal machine, `(N, T, J)`.
+
+        A learned policy corrects this controller; dead time and valves are left out. See
+        `TaskProcess.plan`.
+        """
         pitch_rad = self.state[f"{START}target_pitch_rad"]
-        return self.control.plan(q, target_m, pitch_rad, num_times, step_s)
+        rest = torch.zeros_like(q)
+        num_parts = max(1, round(step_s / PLAN_STEP_S))
+        planned = [q]
+        for _ in range(num_times - 1):
+            for _ in range(num_parts):
+                _, base = self.control.guide(q[:, None], rest[:, None], target_m, pitch_rad)
+                u = self.control.command(rest, base, None)
+                q = q + self.control.controller.rate(u) * (step_s / num_parts)
+            planned.append(q)
+        return torch.stack(planned, 1)

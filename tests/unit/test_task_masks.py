@@ -60,38 +60,35 @@ FREE = torch.ones(5)
 """No joint is near its end."""
 
 
-def test_no_action_drives_a_joint_into_its_end() -> None:
-    action = ActionMapping(kind="residual", scale=1.0, mask=False, limits=True)
-    lowest, highest = (
-        torch.tensor([[-1.0, 0.0, -0.3, -1.0, -1.0]]),
-        torch.tensor([[0.0, 1.0, 1.0, 0.4, 1.0]]),
-    )
-    for output in (torch.full((1, 5), 3.0), torch.full((1, 5), -3.0)):
-        base = CommandBase(torch.full((1, 5), 0.1), lowest, highest, torch.tensor([False]))
-        u = action.command(output, base, torch.zeros(5, dtype=torch.bool))
-        assert torch.equal(u, highest if output[0, 0] > 0 else lowest)
+@pytest.mark.parametrize(
+    ("limits", "step", "least", "largest"),
+    [
+        (True, None, [-1.0, 0.0, -0.3, -1.0], [0.0, 1.0, 1.0, 0.4]),
+        (False, 0.1, [-0.1, 0.4, -1.0, 0.8], [0.1, 0.6, -0.8, 1.0]),
+        # before its end a joint is let go at once
+        (True, 0.1, [-0.1, 0.4, -0.3, 0.4], [0.0, 0.6, -0.3, 0.4]),
+    ],
+)
+def test_commands_stay_before_ends_and_within_a_step(
+    limits: bool, step: float | None, least: list[float], largest: list[float]
+) -> None:
+    action = ActionMapping(kind="residual", scale=1.0, mask=False, limits=limits, step=step)
+    lowest, highest = torch.tensor([[-1.0, 0.0, -0.3, -1.0]]), torch.tensor([[0.0, 1.0, 1.0, 0.4]])
+    last = torch.tensor([[0.0, 0.5, -0.9, 0.9]])
+    bounds = action.bound(lowest, highest, last)
+    base = CommandBase(torch.full((1, 4), 0.1), *bounds, torch.tensor([False]))
+    for output, expected in ((-3.0, least), (3.0, largest)):
+        u = action.command(torch.full((1, 4), output), base, torch.zeros(4, dtype=torch.bool))
+        torch.testing.assert_close(u, torch.tensor([expected]))
 
 
 @pytest.mark.parametrize("kind", ["direct", "residual"])
-def test_q2_never_moves_with_another_joint(kind: str, machine: Machine) -> None:
-    torch.manual_seed(0)
+def test_the_masks_are_the_papers_and_those_of_the_machine(kind: str, machine: Machine) -> None:
     action = ActionMapping(kind=kind, scale=0.5, mask=True, limits=False)  # type: ignore[arg-type]
-    positioning = torch.arange(64) % 2 == 0
-    exclusive = torch.as_tensor(machine.is_exclusive)
-    output = 5 * torch.randn(64, 5)
-    base = CommandBase(torch.rand(64, 5) * 2 - 1, -FREE, FREE, positioning)
-    u = action.command(output, base, exclusive)
-    assert (u[positioning][:, [0, 2, 3, 4]] == 0).all() and (u[positioning][:, 1] != 0).any()
-    assert (u[~positioning][:, 1] == 0).all() and (u[~positioning][:, [0, 2, 3, 4]] != 0).any()
-    assert (u.abs() <= 1).all()
-
-
-def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> None:
-    action = ActionMapping(kind="direct", scale=1.0, mask=True, limits=False)
     for positioning, paper in ((True, [0, 1, 0, 0, 0]), (False, [1, 0, 1, 1, 1])):
         flag = torch.tensor([positioning])
-        base = CommandBase(torch.zeros(1, 5), -FREE, FREE, flag)
-        u = action.command(torch.ones(1, 5), base, torch.as_tensor(machine.is_exclusive))
+        base = CommandBase(torch.full((1, 5), 0.3), -FREE, FREE, flag)
+        u = action.command(5 * torch.ones(1, 5), base, torch.as_tensor(machine.is_exclusive))
         machines = mask_exclusive_joints(machine.is_exclusive, positioning)
         assert u[0].tolist() == paper == machines.astype(int).tolist()
 
