@@ -426,6 +426,8 @@ def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
         termination=terminations(success=None),
         action=replace(task.action, kind="direct", scale=1.0, limits=False),
     )
+    stage.process.state["lowest"].fill_(-1.0)
+    stage.process.state["highest"].fill_(1.0)
     script = [  # command of q1, force, tool from the target
         (0.5, 0.0, (0.03, 0.0, 0.5)),
         (0.5, 900.0, (0.03, 0.0, 0.3)),
