@@ -30,8 +30,7 @@ class Measurement:
             folder.
         code: Files and folders that the figures depend on.
         read: Reads the rows of the table from that folder.
-        where: Computer that it needs, in words.
-        minutes: Time that it takes there.
+        where: Computer that it needs and time that it takes there, in words.
     """
 
     name: str
@@ -41,7 +40,6 @@ class Measurement:
     code: tuple[str, ...]
     read: Callable[[Path], Table]
     where: str
-    minutes: float
 
 
 def load_json(path: Path) -> Any:

@@ -131,7 +131,7 @@ def render_result(one: Measurement, result: dict[str, Any]) -> str:
     """Return heading, conditions, table and origin of one result."""
     shown = [command.replace("{out}", "<out>") for command in result["commands"][:SHOWN]]
     if len(result["commands"]) > SHOWN:
-        shown.append(f"# {len(result['commands']) - SHOWN} more: in the file")
+        shown.append(f"# {len(result['commands']) - SHOWN} more")
     age = "Today's code." if is_current(result) else "**Older than its code.**"
     origin = f"{result['machine']}; commit {result['commit']}, {result['date']}"
     lines = [
@@ -176,7 +176,7 @@ def main() -> None:
     known = list_measurements()
     if given.do == "list":
         for one in known.values():
-            print(f"{one.name:22} {one.minutes:5.0f} min  {one.where}")
+            print(f"{one.name:22} {one.where}")
     elif given.do == "page":
         PAGE.write_text(render_page())
     elif given.name is None:

@@ -60,8 +60,7 @@ MEASUREMENTS = (
         ),
         code=CODE,
         read=read_plant,
-        where="two cores",
-        minutes=15,
+        where="two cores, 15 min",
     ),
     Measurement(
         name="real_excavator",
@@ -73,7 +72,6 @@ MEASUREMENTS = (
         ),
         code=CODE,
         read=read_joints,
-        where="two cores, and the logs in `logs`",
-        minutes=15,
+        where="two cores, and the logs in `logs`, 15 min",
     ),
 )

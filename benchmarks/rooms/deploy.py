@@ -110,8 +110,7 @@ MEASUREMENTS = (
         ),
         code=(*CODE, "deploy/page", "deploy/policy", "deploy/recorder"),
         read=read_found,
-        where="two cores",
-        minutes=4,
+        where="two cores, 4 min",
     ),
     Measurement(
         name="reactions",
@@ -120,8 +119,7 @@ MEASUREMENTS = (
         commands=("python benchmarks/deploy/reactions.py {out}/reactions.json 40",),
         code=CODE,
         read=read_reactions,
-        where="two cores",
-        minutes=10,
+        where="two cores, 10 min",
     ),
     Measurement(
         name="injections",
@@ -130,8 +128,7 @@ MEASUREMENTS = (
         commands=("python benchmarks/deploy/injections.py {out}/injections.json 4",),
         code=CODE,
         read=read_injections,
-        where="one core",
-        minutes=3,
+        where="one core, 3 min",
     ),
     Measurement(
         name="soak",
@@ -142,7 +139,6 @@ MEASUREMENTS = (
         ),
         code=CODE,
         read=read_lateness,
-        where="two cores",
-        minutes=10,
+        where="two cores, 10 min",
     ),
 )

@@ -41,8 +41,7 @@ def describe_exam(
         ),
         code=(*CODE, "exam"),
         read=read_marks,
-        where="two cores",
-        minutes=4 * num_cases,
+        where=f"two cores, {4 * num_cases} min",
     )
 
 
@@ -72,7 +71,6 @@ MEASUREMENTS = (
         ),
         code=CODE,
         read=lambda folder: load_json(folder / "ablations.json")["rows"],
-        where="32 cores",
-        minutes=30,
+        where="32 cores, 30 min",
     ),
 )  # fmt: skip

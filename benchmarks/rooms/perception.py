@@ -47,8 +47,7 @@ MEASUREMENTS = (
         ),
         code=CODE,
         read=read_holes,
-        where="two cores",
-        minutes=60,
+        where="two cores, 60 min",
     ),
     Measurement(
         name="stage_times",
@@ -57,7 +56,6 @@ MEASUREMENTS = (
         commands=("python benchmarks/perception/speed.py {out}/speed.json --count 1",),
         code=CODE,
         read=read_times,
-        where="one core",
-        minutes=5,
+        where="one core, 5 min",
     ),
 )

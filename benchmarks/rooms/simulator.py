@@ -50,8 +50,7 @@ MEASUREMENTS = (
         ),
         code=CODE,
         read=read_rates,
-        where="one GPU of 80 GB",
-        minutes=5,
+        where="one GPU of 80 GB, 5 min",
     ),
     Measurement(
         name="scaling",
@@ -64,7 +63,6 @@ MEASUREMENTS = (
         ),
         code=CODE,
         read=read_scaling,
-        where="four GPUs of one computer",
-        minutes=10,
+        where="four GPUs of one computer, 10 min",
     ),
 )

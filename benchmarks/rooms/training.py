@@ -11,11 +11,22 @@ CIRCUITS = ("load_sensing", "post_compensated", "open_center")
 LEVELS = ("flat", "gentle", "tight", "several")
 DELAYS_S = ("0.1", "0.3", "0.5")
 EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=false"
+PAPER_LEVEL = (
+    "policy={out}/trained/policy effect=[] task.termination.success=null "
+    "task.noise.target_bias_m=0 task.noise.q_scale=0.1 task.noise.q_scale_of=motion"
+)
+BEHIND = "follower=person evaluation.episodes=256"
 POLICY_CODE = (
     "tasks", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects",
     "actuators/weights", "conf/task", "conf/machine", "conf/actuator", "conf/effect",
 )  # fmt: skip
 TRAINING_CODE = (*POLICY_CODE, "brokk_rl/rl", "conf/rl", "conf/preset")
+
+
+def evaluate_each(option: str, values: tuple[str, ...], *words: str) -> tuple[str, ...]:
+    """Return the command that evaluates, once for each value of an option."""
+    fixed = " ".join((EVALUATE, *words))
+    return tuple(f"{fixed} {option}={value} session.out={{out}}/{value}" for value in values)
 
 
 def read_evaluations(folder: Path, varied: str) -> Table:
@@ -58,26 +69,19 @@ MEASUREMENTS = (
         name="shipped_policy",
         title="The policy that ships",
         conditions="The shipped policy and the classical controller (baseline) from the same random starts, one seed, MuJoCo C. An episode lasts 20 s. Boreholes, their errors, dead time and effects are random. The policy learned from nothing, on one H200 in 694 million steps on the level `flat`; the seed of the starts chose nothing.",
-        commands=tuple(
-            f"{EVALUATE} actuator={plant} session.out={{out}}/{plant}" for plant in PLANTS
-        ),
+        commands=evaluate_each("actuator", PLANTS),
         code=POLICY_CODE,
         read=lambda folder: read_evaluations(folder, "plant"),
-        where="two cores",
-        minutes=3,
+        where="two cores, 3 min",
     ),
     Measurement(
         name="other_circuits",
         title="The policy that ships, on circuits to which nothing was fitted",
         conditions="Nothing was fitted to these plants. The baseline is the classical controller, from the same 256 starts.",
-        commands=tuple(
-            f"{EVALUATE} actuator={plant} evaluation.episodes=256 session.out={{out}}/{plant}"
-            for plant in CIRCUITS
-        ),
+        commands=evaluate_each("actuator", CIRCUITS, "evaluation.episodes=256"),
         code=POLICY_CODE,
         read=lambda folder: read_evaluations(folder, "plant"),
-        where="two cores",
-        minutes=4,
+        where="two cores, 4 min",
     ),
     Measurement(
         name="levels",
@@ -85,29 +89,24 @@ MEASUREMENTS = (
         conditions="The shipped policy and the classical controller (baseline), from the same 256 starts. `flat`: the chisel ends flat, and 10 kN end an episode; the policy learned there. `gentle`: 5 kN end it. `tight`: a hole of 8.4 cm, for which nothing was trained. "
         "`several`: three holes in a row in a block that moves by a centimetre when struck with 5 kN; the shipped policy never learned to draw the chisel out. `slanted`: holes lean by up to 15 degrees, which the shipped policy does not observe.",
         commands=(
-            *(
-                f"{EVALUATE} policy=shipped task={level} evaluation.episodes=256 session.out={{out}}/{level}"
-                for level in LEVELS
-            ),
+            *evaluate_each("task", LEVELS, "policy=shipped evaluation.episodes=256"),
             f"{EVALUATE} policy=classical ~rivals.classical task=slanted evaluation.episodes=256 session.out={{out}}/slanted",
         ),
         code=POLICY_CODE,
         read=lambda folder: read_evaluations(folder, "task"),
-        where="two cores",
-        minutes=3,
+        where="two cores, 3 min",
     ),
     Measurement(
         name="short_training",
         title="`make train`",
         conditions="Training from nothing for 290 s: the policy commands alone; its loss also imitates, less and less, an example that knows a clear path. The baseline is the "
-        "classical controller. The seeds ran one after the other on two cores that did little else.",
+        "classical controller.",
         commands=(
             "brokk -m mode=train preset=laptop session.seed=1,2,3,4 evaluation.video=false session.out={out}/seeds",
         ),
         code=TRAINING_CODE,
         read=lambda folder: read_evaluations(folder / "seeds", "seed"),
-        where="two cores",
-        minutes=22,
+        where="two cores, 22 min",
     ),
     Measurement(
         name="paper",
@@ -120,22 +119,31 @@ MEASUREMENTS = (
         ),
         code=TRAINING_CODE,
         read=read_comparison,
-        where="one GPU of 80 GB",
-        minutes=25,
+        where="one GPU of 80 GB, 25 min",
+    ),
+    Measurement(
+        name="paper_smooth",
+        title="The paper's configuration, smooth",
+        conditions="`experiment=paper_smooth`, one seed, 265 s and 1,010 million steps. Judged by MuJoCo C with the errors of its training, in episodes of 20 s; behind a person 40 s. The baseline is the classical controller, which knows of the person; the policy does not.",
+        commands=(
+            "brokk mode=train preset=gpu experiment=paper_smooth rl.budget.max_seconds=265 evaluation.video=false session.out={out}/trained/policy",
+            *evaluate_each("actuator", PLANTS, PAPER_LEVEL),
+            *evaluate_each("follower.delay_s", DELAYS_S, PAPER_LEVEL, BEHIND),
+        ),
+        code=TRAINING_CODE,
+        read=lambda folder: read_evaluations(folder, "plant, or delay of a person in s"),
+        where="one GPU of 80 GB, then two cores, 15 min",
     ),
     Measurement(
         name="guided_person",
         title="A simulated person follows the advice",
         conditions="The policy that ships for a person and the classical controller (baseline) with the same assumption, one seed; an episode lasts 40 s. The person moves two to four levers at once. No real person took part.",
-        commands=tuple(
-            f"{EVALUATE} evaluation.episodes=256 follower=person follower.delay_s={delay_s} "
-            f"policy=tasks:policies/behind_a_person session.out={{out}}/{delay_s}"
-            for delay_s in DELAYS_S
+        commands=evaluate_each(
+            "follower.delay_s", DELAYS_S, "policy=tasks:policies/behind_a_person", BEHIND
         ),
         code=POLICY_CODE,
         read=lambda folder: read_evaluations(folder, "delay of the person, s"),
-        where="two cores",
-        minutes=8,
+        where="two cores, 8 min",
     ),
     Measurement(
         name="gap_loop",
@@ -147,7 +155,6 @@ MEASUREMENTS = (
         ),
         code=(*TRAINING_CODE, "diagnosis"),
         read=read_story,
-        where="one GPU of 80 GB",
-        minutes=10,
+        where="one GPU of 80 GB, 10 min",
     ),
 )
