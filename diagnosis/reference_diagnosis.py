@@ -200,7 +200,7 @@ class ReferenceDiagnosis(Diagnosis):
             proof=prove(findings=findings),
             prove_nothing=partial(prove, findings=()),
             rivals=decision.rivals,
-            otherwise=_explain(decision),
+            otherwise=_explain(decision, self.case.machine),
             evidence=_describe_evidence(decision),
         )
 
@@ -370,15 +370,18 @@ def describe_rivals(rivals: Sequence[EffectFinding], machine: Machine) -> list[d
     return rows
 
 
-def _explain(decision: Decision) -> str:
+def _explain(decision: Decision, machine: Machine) -> str:
     """Return why nothing is named."""
     if decision.verdict == "none":
         return "no effect earns more on the field recordings than it would by chance"
     group, nats = decision.generic
-    return (
-        "the gap is real, and no effect of the library explains it; "
-        f"the field follows a law of: {group} ({nats:.0f} nats)"
-    )
+    shown = f"the field follows a law of: {group} ({nats:.0f} nats)"
+    outside = decision.outside
+    if outside is not None and outside.nats > nats:
+        cause = outside.effect.replace("_", " ")
+        joints = ", ".join(name_joints(outside.joints, machine))
+        shown = f"the field moves as by {cause} on {joints} ({outside.nats:.0f} nats)"
+    return f"the gap is real, and no effect of the library explains it; {shown}"
 
 
 def _describe_evidence(decision: Decision) -> dict[str, Any]:

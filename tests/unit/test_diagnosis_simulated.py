@@ -140,14 +140,17 @@ def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Ma
     assert ways == pytest.approx([1.5, 1.8, 1.35], rel=0.01)
 
 
-def test_the_limit_of_a_pump_that_was_always_small_is_found(two_joints: Machine) -> None:
+@pytest.mark.parametrize(("name", "value"), [("pump_load", 0.8), ("pump_lag_s", 0.4)])
+def test_a_pump_that_was_always_small_or_slow_to_start_is_found(
+    two_joints: Machine, name: str, value: float
+) -> None:
     numbers = VALVE.list_values("mean").copy()
-    numbers[VALVE.place["pump_load"]] = 0.8
+    numbers[VALVE.place[name]] = value
     side = make_side(two_joints, np.clip(2.0 * make_commands(120.0, 3), -1.0, 1.0))
     side.ask_others([numbers, numbers])
     side.q = np.stack([side.simulate(j, numbers)[0] for j in (0, 1)], 1).astype(float)
-    found = [one.numbers[VALVE.place["pump_load"]] for one in fit_reference(side)]
-    assert found == pytest.approx([0.8, 0.8], abs=0.05)
+    found = [one.numbers[VALVE.place[name]] for one in fit_reference(side)]
+    assert found == pytest.approx([value, value], abs=0.05)
 
 
 def test_rows_do_not_depend_on_those_simulated_beside_them(two_joints: Machine) -> None:
