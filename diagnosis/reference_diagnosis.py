@@ -391,5 +391,4 @@ def _describe_evidence(decision: Decision) -> dict[str, Any]:
         "second": [{"effect": one.name, "score": one.nats} for one in decision.seconds[:5]],
         "outside": None if outside is None else {"cause": outside.effect, "score": outside.nats},
         "generic": {"group": decision.generic[0], "score": decision.generic[1]},
-        "left": decision.left,
     }

@@ -53,11 +53,6 @@ SLOW_RATE = 3.5
 OUTSIDE_NATS = 18.0
 GENERIC_NATS = 45.0
 """A row outside the library, or a flexible column, that earns so much more than the best effect."""
-LEFT_SHARE = 0.6
-LEFT_NATS = 40.0
-"""Most that may remain beside the named effects, of what they earn, and beyond."""
-HUNTING_NATS = 150.0
-HUNTING_FACTOR = 1.5
 
 HELD = frozenset({"frame_loss", "delay_jitter"})
 WHOLE = SHARED | HELD | {"thermal_all"}
@@ -99,7 +94,6 @@ class Decision:
         seconds: The same beside the first named effect.
         outside: Best row outside the library.
         generic: Best group of flexible columns, and what it earns, nats.
-        left: What remains beside the named effects, nats.
     """
 
     verdict: Literal["effects", "none", "unknown"]
@@ -108,7 +102,6 @@ class Decision:
     seconds: tuple[EffectFinding, ...]
     outside: EffectFinding | None
     generic: tuple[str, float]
-    left: float
 
 
 class Decider:
@@ -157,10 +150,12 @@ class Decider:
             shown.append(EffectFinding("quantisation", tuple(coarse), SHOWN_NATS))
         named = list(shown)
         best = library[0]
+        most = max(best.nats, 0.0)
+        is_odd = outside[0].nats > most + OUTSIDE_NATS or strongest[1] > most + GENERIC_NATS
+        is_unknown = is_odd and not coarse
         needed = HELD_NATS if best.effect in HELD else LEAST_NATS
-        further = library if best.nats >= needed else []
+        further = library if best.nats >= needed and not is_unknown else []
         seconds: list[EffectFinding] = []
-        left = 0.0
         while further:
             one = further[0]
             # A dead time beside a late clock is not told: an unchanged joint of a practice machine
@@ -170,11 +165,10 @@ class Decider:
             if one is not best and not self._is_further(best, one):
                 break
             named.append(one)
-            numbers = [joint.numbers for joint in joints]
-            joints = self._apply(numbers, one, joints[0].side)
-            left = _find_strongest(self._weigh_generic(joints))[1]
             if len(named) == len(shown) + MAX_SIMULATED:
                 break
+            numbers = [joint.numbers for joint in joints]
+            joints = self._apply(numbers, one, joints[0].side)
             table = evidence.weigh_rows(joints)
             can_hold = joints[0].side is evidence.field
             held = self._find_held(joints) if can_hold else None
@@ -182,18 +176,9 @@ class Decider:
             names = {other.name for other in named}
             known = [other for other in found if other.effect not in self.outside]
             further = [other for other in known if other.name not in names]
-            left = max([left, *(other.nats for other in found if other.effect in self.outside)])
             seconds = seconds or further
         verdict = "none"
-        earned = sum(one.nats for one in named if one not in shown)
-        hunting = groups.get("hunting", 0.0)
-        most = max(best.nats, 0.0)
-        pump = max([one.nats for one in outside if one.effect == "pump_lag"], default=0.0)
-        is_odd = outside[0].nats > most + OUTSIDE_NATS
-        is_odd |= strongest[1] > most + GENERIC_NATS
-        is_odd |= left > LEFT_SHARE * earned + LEFT_NATS
-        is_odd |= best.effect in HELD and pump > 0.5 * most
-        if (is_odd and not coarse) or hunting > HUNTING_FACTOR * most + HUNTING_NATS:
+        if is_unknown:
             verdict = "unknown"
             named = []
         elif named:
@@ -205,7 +190,6 @@ class Decider:
             tuple(seconds),
             outside[0] if outside else None,
             strongest,
-            left,
         )
 
     def _describe_clock(self) -> EffectFinding:
