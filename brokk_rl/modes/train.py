@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import pandas as pd
@@ -146,18 +146,12 @@ class Train(SimulatedPlant):
 
     def _describe_policy(self, loop: ControlLoop) -> dict[str, Any]:
         """Return the contract of the policy that is trained; see `brokk_rl.policy_folder`."""
+        network = self.rl.describe_network()
         contract = describe_policy(
-            self.rl.describe_network(),
-            loop.task,
-            loop.description,
-            self.machine,
-            actuator=self.actuator,
+            network, loop.task, loop.description, self.machine, actuator=self.actuator
         )
-        contract["trained"] = {
-            "seed": self.session.seed,
-            "device": str(loop.device),
-            "follower": describe_spec(self.follower),
-        }
+        contract["trained"] = {"seed": self.session.seed, "device": str(loop.device)}
+        contract["trained"]["follower"] = describe_spec(self.follower)
         return contract
 
     def _finish(self, runner: TrainingRunner) -> dict[str, Any]:
@@ -176,24 +170,33 @@ class Train(SimulatedPlant):
         line, words = None, loop.task.figures
         if controller := results["policies"].get("classical"):
             line = controller[SUCCESS]["mean"]
+            gain = describe_gain(results["policies"]["trained"][SUCCESS], controller[SUCCESS])
+            log.info("%s: %s", words[SUCCESS].title, gain)
         picture = folder / "learning_curves.png"
         draw_curves(folder / PROGRESS, picture, words, book.first_episodes, line)
         task = self.task.build(self.machine, 1, torch.device("cpu"))
         if "deployable" in task.offers:
             export_onnx(folder, actor, task, self.machine, contract, answers)
         else:
-            name, text = type(self.task).__name__, "cannot be deployed, so there is no policy.onnx"
-            log.warning("the task (%s) %s; %s", name, text, NOT_DEPLOYABLE)
+            text = "the task (%s) cannot be deployed, so there is no policy.onnx; %s"
+            log.warning(text, type(self.task).__name__, NOT_DEPLOYABLE)
         return results
+
+
+def describe_gain(trained: Mapping[str, Any], controller: Mapping[str, Any]) -> str:
+    """Return whether a rate is above the controller's for sure: their intervals lie apart."""
+    if trained["ci95"][0] > controller["ci95"][1]:
+        return f"better than the controller by {trained['mean'] - controller['mean']:.3f}"
+    return "no gain over the controller shown"
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:
     """Log number of environments, device, world and whether CUDA graphs run."""
-    device = str(loop.device)
+    processes = f", in each of {group.rank.count} processes" if group.together else ""
     log.info(
         "%d environments on %s, %s; CUDA graphs: %s",
         loop.num_envs,
-        f"{device}, in each of {group.rank.count} processes" if group.together else device,
+        f"{loop.device}{processes}",
         type(loop.world).__name__,
         "active" if loop.graph_active else "not used (they need sim=warp on a GPU)",
     )

@@ -20,7 +20,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.modes.export import Export
-from brokk_rl.modes.train import Train
+from brokk_rl.modes.train import Train, describe_gain
 from brokk_rl.rl.logger import NoTracking
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.session import Session
@@ -49,10 +49,8 @@ class HoldStillProcess(TaskProcess):
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         generator = torch.Generator().manual_seed(seed)
         share = 0.4 + 0.2 * torch.rand(count, self.num_actions, generator=generator)
-        lower, upper = (
-            torch.as_tensor(bound, dtype=torch.float32)
-            for bound in (self._machine.lower, self._machine.upper)
-        )
+        lower = torch.as_tensor(self._machine.lower, dtype=torch.float32)
+        upper = torch.as_tensor(self._machine.upper, dtype=torch.float32)
         return {"q": lower + share * (upper - lower), "scene": make_nominal_scenes(count)}
 
     def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
@@ -166,3 +164,10 @@ def test_the_classical_policy_of_a_task_without_one_is_refused(machine: Machine)
     loop = runs.plant(machine, HoldStill()).build(CPU, 4, 8, 0)
     with pytest.raises(ConfigError, match=r"HoldStillProcess. has no classical controller"):
         ClassicalPolicy(task=None).build(loop, 0)
+
+
+def test_a_gain_is_said_only_where_the_intervals_lie_apart() -> None:
+    low, high = {"mean": 0.95, "ci95": (0.93, 0.97)}, {"mean": 0.99, "ci95": (0.98, 1.0)}
+    near = {"mean": 0.98, "ci95": (0.96, 0.99)}
+    assert describe_gain(high, low) == "better than the controller by 0.040"
+    assert {describe_gain(near, low), describe_gain(low, high)} == {describe_gain(low, low)}
