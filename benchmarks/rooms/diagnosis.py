@@ -48,8 +48,8 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "150 simulated machines of a make that nothing was fitted to until then (`held_out`, today `valves`), answered once, sealed by a hash. An earlier engine had 0.58 of 105, exact sets 0.20 of 60.",
-        "exam_plants=valves", 150, "diagnosis", "valve",
+        "60 simulated machines, answered once. Open cases of this make were seen before. A person drives 29 of the fields. An earlier engine had 0.63 of 52 by test programmes alone.",
+        "exam_plants=valves exam_recording=operators", 60, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
