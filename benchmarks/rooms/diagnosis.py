@@ -48,7 +48,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "60 simulated machines, answered once. Open cases of this make were seen before. A person drives 29 of the fields. An earlier engine had 0.63 of 52 by test programmes alone.",
+        "60 simulated machines, answered once. Open cases of this make were seen before. A person drives 29 of the fields. An earlier engine had 0.63 of 52 by test programmes alone. The three accusations led to a change of the engine since.",
         "exam_plants=valves exam_recording=operators", 60, "diagnosis", "valve",
     ),
     describe_exam(
