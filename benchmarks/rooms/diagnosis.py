@@ -48,17 +48,17 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "60 simulated machines, answered once. Open cases of this make were seen before. A person drives 29 of the fields. An earlier engine had 0.63 of 52 by test programmes alone. The three accusations led to a change of the engine since.",
+        "60 simulated machines, answered once. A person drives 29 fields. Its false accusations changed the engine since.",
         "exam_plants=valves exam_recording=operators", 60, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "48 simulated cranes, answered once. Six open cases of this make were seen before. A person drives 27 of the fields.",
+        "48 simulated cranes, answered once. A person drives 27 fields. Six open cases were seen before.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 48, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "100 simulated arms, the fourth sealed exam of this kind. An earlier engine had 33 of 35 single effects.",
+        "100 simulated arms. An earlier engine had 33 of 35 single effects.",
         "machine=so101 exam_plants=servos exam_mix=servos", 100, "servo_diagnosis", "servo",
     ),
     Measurement(
