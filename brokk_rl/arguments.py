@@ -44,6 +44,8 @@ def read_arguments(words: Sequence[str]) -> list[str]:
         _refuse_option("--package and --resolve are about what --cfg job prints")
     if given.shell_completion and len(given.overrides) != 1:
         _refuse_option("completion of words: brokk -sc install=bash, or uninstall=bash")
+    if sum(word.startswith("mode=") for word in given.overrides) > 1:
+        raise ConfigError("expected one mode, got several: for each a command of its own")
     options = [word for word in words if word not in given.overrides]
     return options + [_read_value(word, groups) for word in given.overrides]
 
@@ -70,18 +72,31 @@ def _read_value(word: str, groups: Mapping[str, list[str]]) -> str:
     quoted = f"{key}={_quote(value)}"
     is_plain = MEANINGFUL.isdisjoint(value)
     if _is_readable(f"{key}={value}"):
+        _refuse_empty(key, value, is_single=key in groups and not is_list_group(key))
         return f"{key}={value}"
     if is_plain and _is_readable(quoted):
         return quoted
     if _is_readable(quoted):
         raise ConfigError(
-            f"{word} cannot be read: brackets do not match, a function has other arguments, or a "
-            f"text must be quoted: {shlex.quote(quoted)}"
+            f"{word} cannot be read: brackets do not match, a list stands in others than [], a "
+            f"function has other arguments, or a text must be quoted: {shlex.quote(quoted)}"
         )
     raise ConfigError(
         f"'{key}' in '{word}' is no key; it is names with dots between, without spaces or dashes: "
         "session.seed=3, machine.joints.0.home=2"
     )
+
+
+def _refuse_empty(key: str, value: str, is_single: bool) -> None:
+    """Refuse what Hydra reads and what chooses nothing; `is_single`: an option of its group is one."""
+    override = OverridesParser.create().parse_override(f"{key}={value}")
+    if not value.strip():
+        raise ConfigError(f"'{key}=' has no value; `brokk mode=<mode> --help` lists what it takes")
+    if override.is_range_sweep() and not any(override.sweep_string_iterator()):
+        raise ConfigError(f"{key}={value} holds no value: range(first, beyond the last, step)")
+    if is_single and value.startswith("["):
+        first = value.strip("[]").split(",")[0]
+        raise ConfigError(f"{key}={value}: expected one option, as in {key}={first}")
 
 
 def _explain_word(word: str, modes: Sequence[str]) -> str:

@@ -93,9 +93,8 @@ def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: boo
     facts = _collect_facts(registry.read_mode_name(values), mode)
     with mode.session.start(resolved, facts, resume) as record:
         objective = mode.run()
-        record.fields["objective"] = (
-            objective if objective is not None and math.isfinite(objective) else None
-        )
+        is_number = objective is not None and math.isfinite(objective)
+        record.fields["objective"] = objective if is_number else None
         return objective
 
 
@@ -126,9 +125,8 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
         fixed = settings.job.config.override_dirname.exclude_keys
-        return Path(settings.sweep.dir) / name_job(
-            int(settings.job.num), list(settings.overrides.task), list(fixed)
-        )
+        job = name_job(int(settings.job.num), list(settings.overrides.task), list(fixed))
+        return Path(settings.sweep.dir) / job
     session = values["session"]
     if not isinstance(session, Mapping):
         raise ConfigError(
@@ -142,10 +140,8 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
         return Path(str(out))
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
     name = Path(name).stem if name else None  # An option may be a file: experiment=@<path>.
-    stem = "_".join(
-        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", registry.read_mode_name(values), name))
-    )
-    return Path("runs") / stem
+    parts = [f"{datetime.now():%Y-%m-%d_%H-%M-%S}", registry.read_mode_name(values), name]
+    return Path("runs") / "_".join(part for part in parts if part)
 
 
 def _format_resolved(mode: Any, values: dict[str, Any]) -> str:
@@ -155,10 +151,8 @@ def _format_resolved(mode: Any, values: dict[str, Any]) -> str:
         if field.name in values:
             content[field.name] = values[field.name]
     content["session"] = values["session"] | {"out": "???"}
-    return (
-        "# Runs again: brokk --config-dir <this folder> --config-name resolved\n"
-        + OmegaConf.to_yaml(OmegaConf.create(content))
-    )
+    text = OmegaConf.to_yaml(OmegaConf.create(content))
+    return f"# Runs again: brokk --config-dir <this folder> --config-name resolved\n{text}"
 
 
 def name_job(number: int, overrides: Sequence[str], fixed: Sequence[str]) -> str:
@@ -224,10 +218,9 @@ def offer_places() -> None:
         return
     import torch
 
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(
-        map(str, range(torch.cuda.device_count()))
-    )
-    os.environ[OFFERED] = visible if torch.cuda.device_count() else NO_GPU
+    count = torch.cuda.device_count()
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(count)))
+    os.environ[OFFERED] = visible if count else NO_GPU
 
 
 @contextmanager

@@ -86,9 +86,8 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
         except (CheckpointError, ConfigError) as error:
             if "policy" in _list_given():  # the caller asked for this one
                 raise
-            log.info(
-                "the classical controller acts, for the shipped policy does not fit: %s", error
-            )
+            text = "the classical controller acts, for the shipped policy does not fit: %s"
+            log.info(text, error)
             cfg.policy = {TARGET: CLASSICAL, "task": None}
     for node in _list_rivals(cfg):
         if node[TARGET] == TRAINED:

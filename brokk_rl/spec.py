@@ -226,7 +226,7 @@ def _explain(kind: type, error: ValidationError, given: Any) -> SpecError:
         else:
             problems.setdefault(_follow(problem["loc"], given)[0], _describe_problem(problem))
     for key, names in lacking.items():
-        problems[key] = f"lacks {', '.join(names)}"
+        problems[key] = f"no {', '.join(names)} was given"
     for key, (name, others) in unknown.items():  # a misspelt field is lacking too
         known = {*others, *lacking.get(key, ())} - {name}
         problems[key] = f"has no field '{name}'; {list_choices(name, known)}"

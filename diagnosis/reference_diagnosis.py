@@ -55,7 +55,7 @@ NATS_OF_SURE = 15.0
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search for effects in the motion found.
+    """Result of a search for effects in the motion.
 
     Attributes:
         verdict: Its verdict, before the gates.

@@ -65,9 +65,5 @@ class Export:
         largest = export_onnx(folder, actor, task, self.machine, contract, answers)
         if self.machine.mjcf is not None:
             write_shapes(self.machine, folder)
-        log.info(
-            "%s: onnxruntime and the training run differ by at most %.1e over %d observations",
-            folder,
-            largest,
-            len(answers[0]),
-        )
+        text = "%s: onnxruntime and the training run differ by at most %.1e over %d observations"
+        log.info(text, folder, largest, len(answers[0]))

@@ -85,7 +85,7 @@ def test_values_are_taken_as_people_write_them() -> None:
         ("motor", Wheel(), "Budget.motor: expected an option of its group (Motor with turn), got Wheel"),
         ("limits", {"q1": {"highest": 0}}, "Budget.limits.q1.highest: expected a number greater than 0"),
         ("limits", {"q1": {"hihgest": 1}}, "has no field 'hihgest'; did you mean 'highest'?"),
-        ("limits", {"q1": {}}, "Budget.limits.q1: lacks highest"),
+        ("limits", {"q1": {}}, "Budget.limits.q1: no highest was given"),
         ("second", 1, "Budget: has no field 'second'; did you mean 'seconds'?"),
         ("steps", 3, "seconds: expected up to 3, got 60.0"),
     ],
