@@ -24,8 +24,8 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Gravity, compute_tool_kinematics
 from brokk_rl.machine import Body, Dimension, Joint, Machine
 from brokk_rl.session import Session, write_bytes, write_json, write_text
+from brokk_rl.sim.check_subject import CheckSubject
 from brokk_rl.sim.model import FASTEST_MODE, find_fastest_mode, list_touching
-from brokk_rl.sim.model_choices import CheckSubject
 from brokk_rl.sim.model_import import import_model
 from brokk_rl.sim.scene import make_empty_scenes
 from brokk_rl.spec import name_spec, spec

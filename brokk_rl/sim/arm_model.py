@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 import trimesh
 
+from brokk_rl.sim.check_subject import CheckSubject
 from brokk_rl.sim.kinematic_tree import KinematicTree
-from brokk_rl.sim.model_choices import CheckSubject
 from brokk_rl.sim.model_source import NUM_SIZES, SMALLEST_KG, SMALLEST_KG_M2, read_source
 
 TIP = "tip"

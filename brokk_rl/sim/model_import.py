@@ -14,8 +14,8 @@ import yaml
 
 from brokk_rl.machine import Machine
 from brokk_rl.sim.arm_model import LEAST_KG, TIP, ArmModel, normalise_axis
+from brokk_rl.sim.check_subject import CheckSubject
 from brokk_rl.sim.model import FASTEST_MODE, compute_inertia, find_fastest_mode
-from brokk_rl.sim.model_choices import CheckSubject
 from brokk_rl.sim.model_source import KINDS, UNITS
 
 HYDRAULIC_NAMES = re.compile("boom|stick|bucket|dipper|cylinder", re.IGNORECASE)

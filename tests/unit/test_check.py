@@ -21,8 +21,8 @@ from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.check import check_machine, try_machine
+from brokk_rl.sim.check_subject import CheckSubject
 from brokk_rl.sim.model import ASSETS
-from brokk_rl.sim.model_choices import CheckSubject
 from brokk_rl.sim.model_import import ImportedMachine, import_model
 from brokk_rl.sim.scene import make_empty_scenes
 
