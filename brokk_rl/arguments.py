@@ -94,9 +94,9 @@ def _refuse_empty(key: str, value: str, is_single: bool) -> None:
         raise ConfigError(f"'{key}=' has no value; `brokk mode=<mode> --help` lists what it takes")
     if override.is_range_sweep() and not any(override.sweep_string_iterator()):
         raise ConfigError(f"{key}={value} holds no value: range(first, beyond the last, step)")
-    if is_single and value.startswith("["):
-        first = value.strip("[]").split(",")[0]
-        raise ConfigError(f"{key}={value}: expected one option, as in {key}={first}")
+    options = override.value()
+    if is_single and isinstance(options, list) and len(options) > 1:
+        raise ConfigError(f"{key}={value}: expected one option, as in {key}={options[0]}")
 
 
 def _explain_word(word: str, modes: Sequence[str]) -> str:
