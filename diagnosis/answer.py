@@ -67,6 +67,40 @@ class Ranked:
     probability: float
 
 
+@dataclass(frozen=True)
+class RegimeGap:
+    """Share of the gap that arises in one joint in one regime of its motion."""
+
+    joint: str
+    regime: str
+    share: float
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where the gap lies.
+
+    Attributes:
+        joints: Of each joint the root mean square error of the simulator as it was (`rmse_rad`), of the
+            unchanged machine (`floor_rad`) and of the repaired simulator (`after_rad`), in m for a joint
+            that slides, and its `share` of the squared errors beyond the floor, over the travel.
+        regimes: The largest shares first.
+        stage: Part of the way from command to estimate on which the first named effect acts.
+    """
+
+    joints: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    regimes: tuple[RegimeGap, ...] = ()
+    stage: Stage | None = None
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """The excitation or the measurement that tells effects apart, and which ones."""
+
+    excitation: str
+    separates: tuple[str, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Answer:
     """The answer of a diagnosis, the content of `diagnosis.json`.
@@ -75,10 +109,12 @@ class Answer:
         verdict: `effects`; `none` when no effect earns its place; `unknown` when the gap is real
             and nothing of the library explains it, or the recordings do not allow to tell.
         selected: Most probable first; empty unless the verdict is `effects`.
-        ranking: What is named with its probability, the most probable first; else `none` or `unknown`.
-        gap: Its size, and the remainder, joint by joint too.
+        ranking: What is named, `none` or `unknown`, and the rivals; the most probable first.
+        gap: Its size, and the remainder.
+        where: Where it lies.
         rivals: Errors of simple rivals on the windows of the gap, by name.
         gates: Conditions of the verdict.
+        next_experiment: `None` where nothing is left to tell apart.
         reason: One sentence in words.
         more: Further plain JSON: `sanity`, `evidence`, `unseen`
     """
@@ -87,8 +123,10 @@ class Answer:
     selected: tuple[Selected, ...]
     ranking: tuple[Ranked, ...]
     gap: Gap | None
+    where: Where = field(default_factory=Where)
     rivals: Mapping[str, RivalError] = field(default_factory=dict)
     gates: tuple[Gate, ...] = ()
+    next_experiment: NextExperiment | None = None
     reason: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
 

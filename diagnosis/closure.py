@@ -7,7 +7,7 @@ their unit.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
@@ -53,25 +53,6 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class JointError:
-    """Error of one joint over free runs, in rad or m, and its part of the gap.
-
-    Attributes:
-        before: Of the simulator as it was.
-        after: With the selected effects.
-        floor: Of the unchanged machine under the field's motion.
-        share: `1 - after / before`.
-        part: Part of the gap of all joints: of their squared errors beyond the floor, over their travel.
-    """
-
-    before: float
-    after: float
-    floor: float
-    share: float
-    part: float = 0.0
-
-
-@dataclass(frozen=True)
 class Gap:
     """Error of all joints over free runs on parts of the field that no effect was fitted to.
 
@@ -86,7 +67,6 @@ class Gap:
         unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
             over their travel.
         floor_of: `reference` or `field`.
-        joints: The same joint by joint.
         reduced: `(before - after) / before`.
     """
 
@@ -96,7 +76,6 @@ class Gap:
     closed: Estimate | None
     unit: str = "rad"
     floor_of: str = "reference"
-    joints: Mapping[str, JointError] = field(default_factory=dict)
     reduced: Estimate | None = None
 
     @model_serializer(mode="wrap")

@@ -1,4 +1,4 @@
-"""Errors of all joints together, shares of a gap that effects close, and errors joint by joint.
+"""Errors of all joints together, and shares of a gap that effects close.
 
 Axes: `J` joints.
 """
@@ -13,10 +13,6 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.machine import Machine
-from diagnosis.closure import JointError
-
-TINY = np.finfo(float).tiny
-"""Smallest divisor: a sum of squares may be 0."""
 
 
 def choose_unit(machine: Machine) -> str:
@@ -45,20 +41,4 @@ def compute_shapley(
             chance = factorial(size) * factorial(count - size - 1) / factorial(count)
             for rest in combinations([n for n in names if n != name], size):
                 found[name] += chance * (value[frozenset(rest) | {name}] - value[frozenset(rest)])
-    return found
-
-
-def describe_joints(
-    machine: Machine, before: np.ndarray, after: np.ndarray, floor: np.ndarray
-) -> dict[str, JointError]:
-    """Return errors `(J,)` before, after and at the floor, joint by joint; their parts of the gap add up to 1."""
-    excess = np.maximum(np.square(before) - np.square(floor), 0.0)
-    if not excess.any():
-        excess = np.square(before)
-    parts = excess / np.square(machine.upper - machine.lower)
-    parts = parts / max(float(parts.sum()), TINY)
-    found = {}
-    for name, *row in zip(machine.joint_names, before, after, floor, parts, strict=True):
-        error, left, least, part = map(float, row)
-        found[name] = JointError(error, left, least, 1.0 - left / max(error, 1e-12), part)
     return found

@@ -19,8 +19,8 @@ def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
     """Draw measured and simulated positions of the joints with the largest gaps."""
     before = outcome.before
     error = np.sqrt(np.nanmean(before.error**2, 1))  # (W, J)
-    joints = outcome.answer.gap.joints if outcome.answer.gap else {}
-    foremost = [-joints[name].part if name in joints else 0.0 for name in machine.joint_names]
+    joints = outcome.answer.where.joints
+    foremost = [-joints[name]["share"] if joints else 0.0 for name in machine.joint_names]
     rows = {}
     for joint in np.argsort(foremost, kind="stable")[:MAX_JOINTS].tolist():
         worst = np.argsort(-np.nan_to_num(error[:, joint]))

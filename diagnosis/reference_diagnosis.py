@@ -23,7 +23,7 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import gates, geometry, sensors
-from diagnosis.answer import Answer, Outcome, Ranked, Selected, Verdict
+from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, Verdict, Where
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.effect_library import DetectedEffect, EffectType
@@ -31,6 +31,7 @@ from diagnosis.engine.decide import Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import SIGMAS, describe_numbers
 from diagnosis.repair_proof import EngineProof, RepairProof
+from diagnosis.where import locate_gap
 
 SizesByName = Mapping[str, Mapping[str, Estimate]]
 """Sizes by number and joint, or `machine`."""
@@ -51,6 +52,8 @@ UNNAMED_PROBABILITY = 0.8
 NATS_OF_HALF = 20.0
 NATS_OF_SURE = 15.0
 """An effect of so many nats is there in half of the cases, and how fast that grows."""
+MAX_RIVALS = 4
+"""Most rivals of a ranking."""
 
 
 @dataclass(frozen=True)
@@ -128,24 +131,32 @@ class Diagnosis(ABC):
         elif failed or verdict != "none":
             verdict = "unknown"
         after = proof.view(proof.after) if selected else None
-        ranking = [Ranked(one.effect, one.joints, one.probability) for one in selected]
-        if verdict != "effects":
-            ranking.append(Ranked(verdict, (), UNNAMED_PROBABILITY))
-        weighed = {"rivals": describe_rivals(found.rivals, machine), "unit": "log likelihood"}
         answer = Answer(
             verdict=verdict,
             selected=tuple(selected),
-            ranking=tuple(ranking),
+            ranking=rank_effects(selected, found.rivals, verdict, machine),
             gap=proof.measure_gap(bool(selected)),
+            where=self._locate(proof, selected),
             rivals=proof.rivals,
             gates=tuple(told),
+            next_experiment=propose_measurement(selected),
             reason=reason,
             more={
                 "sanity": [remark.plain() for remark in remarks],
-                "evidence": {**weighed, **found.evidence},
+                "evidence": {"rivals": describe_rivals(found.rivals, machine), **found.evidence},
             },
         )
         return Outcome(answer, proof.view(proof.before), after)
+
+    def _locate(self, proof: RepairProof, selected: Sequence[Selected]) -> Where:
+        """Return where the gap lies."""
+        after = np.sqrt(proof.measure_squares(proof.after)[0])
+        floor = np.sqrt(proof.floor_squares[0])
+        where = locate_gap(proof.view(proof.before), after, floor, self.case.machine)
+        if not selected:
+            return where
+        (kind,) = [kind for kind in self.kinds if kind.name == selected[0].effect]
+        return replace(where, stage=kind.stage)
 
     @cached_property
     def detected(self) -> list[DetectedEffect]:
@@ -361,6 +372,33 @@ def name_joints(joints: Sequence[int], machine: Machine) -> tuple[str, ...]:
     return tuple(machine.joint_names[j] for j in joints)
 
 
+def rank_effects(
+    selected: Sequence[Selected],
+    rivals: Sequence[EffectFinding],
+    verdict: Verdict,
+    machine: Machine,
+) -> tuple[Ranked, ...]:
+    """Return what is named, `none` or `unknown`, and the rivals, which share what the first leaves; most probable first."""
+    found = [Ranked(one.effect, one.joints, one.probability) for one in selected]
+    if verdict != "effects":
+        found.append(Ranked(verdict, (), UNNAMED_PROBABILITY))
+    names = {one.effect for one in found}
+    others = [one for one in rivals if one.name not in names and one.nats > 0.0][:MAX_RIVALS]
+    left = 1.0 - max(one.probability for one in found)
+    odds = np.exp([(one.nats - others[0].nats) / NATS_OF_SURE for one in others])
+    for one, chance in zip(others, left * odds / odds.sum(), strict=True):
+        found.append(Ranked(one.name, name_joints(one.joints, machine), float(chance)))
+    return tuple(sorted(found, key=lambda one: -one.probability))
+
+
+def propose_measurement(selected: Sequence[Selected]) -> NextExperiment | None:
+    """Return the measurement that would tell apart what these recordings cannot."""
+    for one in selected:
+        if one.same_as and one.decided_by:
+            return NextExperiment(one.decided_by, (one.effect, *one.same_as))
+    return None
+
+
 def describe_rivals(rivals: Sequence[EffectFinding], machine: Machine) -> list[dict[str, Any]]:
     """Return what each effect earns, plain JSON data."""
     rows = []
@@ -388,7 +426,6 @@ def _describe_evidence(decision: Decision) -> dict[str, Any]:
     """Return what each effect earns beside the first, and each cause outside the library, plain JSON data."""
     outside = decision.outside
     return {
-        "second": [{"effect": one.name, "score": one.nats} for one in decision.seconds[:5]],
         "outside": None if outside is None else {"cause": outside.effect, "score": outside.nats},
         "generic": {"group": decision.generic[0], "score": decision.generic[1]},
     }

@@ -27,7 +27,7 @@ from diagnosis.engine.rows import Row
 from diagnosis.engine.side import choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
 from diagnosis.free_runs import WindowedRuns
-from diagnosis.gap import choose_unit, combine_joints, compute_shapley, describe_joints
+from diagnosis.gap import choose_unit, combine_joints, compute_shapley
 from diagnosis.rivals import measure_rivals
 
 NOISE_FACTOR = 3.0
@@ -122,12 +122,6 @@ class RepairProof(ABC):
         before, after = self.measure_errors(self.before), self.measure_errors(self.after)
         floor = combine_joints(self.floor_squares, self.machine)
         closed = summarise_draws(self._share(before - after)) if is_named else None
-        joints = describe_joints(
-            self.machine,
-            np.sqrt(self.measure_squares(self.before)[0]),
-            np.sqrt(self.measure_squares(self.after)[0]),
-            np.sqrt(self.floor_squares[0]),
-        )
         return Gap(
             before=float(before[0]),
             after=float(after[0]),
@@ -135,7 +129,6 @@ class RepairProof(ABC):
             closed=closed,
             unit=choose_unit(self.machine),
             floor_of=self.floor_of,
-            joints=joints,
             reduced=summarise_draws((before - after) / np.maximum(before, 1e-12)),
         )
 

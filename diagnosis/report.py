@@ -12,6 +12,7 @@ from brokk_rl.session import write_text
 from diagnosis import plots
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 from diagnosis.closure import MIN_RESTORED
+from diagnosis.where import REGIMES
 
 REPORT_FILE = "report.html"
 TEMPLATE = Path(__file__).with_name("diagnosis.html.jinja")
@@ -125,10 +126,15 @@ def format_estimate(
 
 
 def _describe_place(answer: Answer) -> str:
-    if answer.gap is None or not answer.gap.joints:
+    where = answer.where
+    if not where.joints:
         return ""
-    joint, gap = max(answer.gap.joints.items(), key=lambda pair: pair[1].part)
-    return f"; {100 * gap.part:.0f} % of it lies in {joint}"
+    joint, told = max(where.joints.items(), key=lambda pair: pair[1]["share"])
+    place = f"; {100 * told['share']:.0f} % of it lies in {joint}"
+    if where.regimes:
+        first = where.regimes[0]
+        place += f", most of all {first.regime} of {first.joint}"
+    return place
 
 
 def _format_share(value: Estimate, of: str = "") -> str:
@@ -155,6 +161,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "pictures": _draw_pictures(outcome, machine),
         "horizon_s": choose_horizon_s(machine),
         "units": {joint.name: joint.unit for joint in machine.joints},
+        "regimes": list(REGIMES),
         "rivals": RIVALS,
         "severities": SEVERITIES,
         "max_listed": MAX_LISTED,

@@ -24,7 +24,6 @@ from brokk_rl import record
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import effect_library
-from diagnosis.answer import ANSWER_FILE, Answer, read_answer
 from diagnosis.case import estimate_running_s
 from diagnosis.effects_file import EFFECTS_FILE
 from diagnosis.simulator_runs import EffectSimulator, cut_simulator_runs
@@ -38,9 +37,6 @@ MIN_GAP_RATIO = 1.05
 """Error over floor from which there is a gap to close. Chosen by hand; not searched."""
 NUM_DRAWS = 200
 """Bootstrap draws over windows."""
-MAX_DIFFERENCE = 0.2
-"""Difference between the share that an answer states and the examiner's from which, if both lie
-outside of the other's interval, they disagree. Chosen by hand: twice the width of usual intervals."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +49,6 @@ class Examination:
         floor: The same without effects, on the unchanged machine.
         closed: Share of the gap that the effects close; `None` where there is none.
         ci95: Its interval.
-        said: Share that the answer states, `None` without one.
-        differs: Whether answer and examiner disagree.
     """
 
     before: float
@@ -62,8 +56,6 @@ class Examination:
     floor: float
     closed: float | None
     ci95: tuple[float, float] | None
-    said: float | None
-    differs: bool
 
 
 class ExaminerSimulator:
@@ -95,8 +87,8 @@ class ExaminerSimulator:
         self._before = self._squares(self._runs, {})
         self._floor = self._squares(cut_simulator_runs(self._actuator, unchanged, *about), {})
 
-    def examine(self, effects: Mapping[str, Any], said: Answer | None) -> Examination:
-        """Return the errors with these effects, specs by name, beside what the answer says."""
+    def examine(self, effects: Mapping[str, Any]) -> Examination:
+        """Return the errors with these effects, specs by name."""
         after = self._squares(self._runs, effects) if effects else self._before
         draws = np.random.default_rng(0).multinomial(
             len(after), np.full(len(after), 1.0 / len(after)), NUM_DRAWS
@@ -104,22 +96,12 @@ class ExaminerSimulator:
         weights = np.concatenate([np.ones((1, len(after))), draws]) / len(after)
         errors = [np.sqrt(weights @ squares) for squares in (self._before, after, self._floor)]
         closed, interval = compute_closed(*errors)
-        stated = said.gap.closed if said and said.gap else None
-        differs = False
-        if closed is not None and interval is not None and stated is not None:
-            apart = abs(closed - stated.mean) > MAX_DIFFERENCE
-            low, high = stated.ci95
-            differs = apart and not (
-                interval[0] <= stated.mean <= interval[1] or low <= closed <= high
-            )
         return Examination(
             before=float(errors[0][0]),
             after=float(errors[1][0]),
             floor=float(errors[2][0]),
             closed=closed,
             ci95=interval,
-            said=None if stated is None else stated.mean,
-            differs=differs,
         )
 
     def _squares(self, runs: EffectSimulator, effects: Mapping[str, Any]) -> np.ndarray:
@@ -184,14 +166,12 @@ def examine_case(
     found = []
     for place in answers:
         error, effects = None, {}
-        said = read_answer(place / ANSWER_FILE) if (place / ANSWER_FILE).is_file() else None
         try:
-            names_effects = said is not None and said.verdict == "effects"
             # a baseline writes no file: it repairs nothing
-            if names_effects and (place / EFFECTS_FILE).is_file():
+            if (place / EFFECTS_FILE).is_file():
                 effects = read_effects(place / EFFECTS_FILE, machine)
-            result = simulator.examine(effects, said)
+            result = simulator.examine(effects)
         except BrokkError as failure:
-            error, result = str(failure), simulator.examine({}, said)
+            error, result = str(failure), simulator.examine({})
         found.append({**vars(result), "error": error})
     return found

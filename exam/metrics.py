@@ -8,7 +8,6 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from brokk_rl.statistics import CONFIDENCE, compute_wilson_interval
 from exam.case_distribution import KINDS
@@ -49,21 +48,6 @@ def drop_none(value: Any) -> list[Any]:
     return [] if value is None else [value]
 
 
-def compute_ratio(rows: np.ndarray) -> float | None:
-    """Return the sum of the first column over that of the second."""
-    total = rows[:, 1].sum()
-    return float(rows[:, 0].sum() / total) if total else None
-
-
-def compute_auroc(rows: np.ndarray) -> float | None:
-    """Return the AUROC of the probability (first column) of cases with the property (second); ties count half."""
-    positive = rows[:, 1] > 0
-    inside, outside = rows[positive, 0], rows[~positive, 0]
-    if not len(inside) or not len(outside):
-        return None
-    return float(stats.mannwhitneyu(inside, outside).statistic / (len(inside) * len(outside)))
-
-
 def compute_ece(rows: np.ndarray) -> float:
     """Return the expected calibration error of probabilities (first column) of statements (second: 1 if true).
 
@@ -84,8 +68,6 @@ ROWS: dict[str, tuple[Any, ...]] = {
     "exactly_one_equivalent": ("… nothing but equivalents", ONE, lambda s: [s.exact_equivalent]),
     "exact_set": ("several effects: exact set", SEVERAL, lambda s: [s.exact]),
     "exact_set_equivalent": ("… or equivalents", SEVERAL, lambda s: [s.exact_equivalent]),
-    "set_f1": ("several effects: F1", SEVERAL, lambda s: [s.count_names(s.named)], compute_ratio),
-    "set_f1_equivalent": ("… with equivalents", SEVERAL, lambda s: [s.count_names(s.stands_for)], compute_ratio),
     "joints": ("joints right", KNOWN, lambda s: s.joints_right),
     "false_alarms_none": ("unchanged machines: an effect or `unknown`", ("none",), lambda s: [s.alarm]),
     "false_alarms_other_hand": ("… of these, field by another hand", ("none",), lambda s: [s.alarm] if s.other_hand else []),
@@ -93,13 +75,11 @@ ROWS: dict[str, tuple[Any, ...]] = {
     "unknown_recall": ("outside causes: said unknown", ("outside",), lambda s: [s.verdict == "unknown"]),
     "unknown_wrongly": ("effects called unknown", KNOWN, lambda s: [s.verdict == "unknown"]),
     "missed": ("effects called none", KNOWN, lambda s: [s.verdict == "none"]),
-    "unknown_auroc": ("AUROC of `unknown`", KINDS, lambda s: [(s.unknown, s.kind == "outside")], compute_auroc),
     "ece": ("calibration error", KINDS, lambda s: s.claims, compute_ece),
     "parameter_error": ("size: median error", KINDS, lambda s: [one.error for one in s.numbers], np.median),
     "cover_90": ("size: inside 90 %", KINDS, lambda s: [one.in_90 for one in s.numbers]),
     "cover_95": ("size: inside 95 %", KINDS, lambda s: [one.in_95 for one in s.numbers]),
     "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: drop_none(s.examined), np.median),
-    "closed_differs": ("stated closing contradicted", KNOWN, lambda s: drop_none(s.differs)),
     "closed_missing": ("named without closing", KINDS, lambda s: [s.closed is None] if s.named else []),
 }  # fmt: skip
 METRICS = {key: MetricDefinition(*row) for key, row in ROWS.items()}

@@ -53,13 +53,11 @@ class CaseScore:
         verdict: `effects`, `none`, `unknown`, or `failed` where there is no answer.
         joints_right: Whether a name that stands for an effect has exactly its joints, for each effect
             that joints can have.
-        unknown: Probability that the cause lies outside the library.
         claims: Statements whose truth the label knows.
         numbers: Parameters of strictly right names.
         closed: Share of the gap closed, by the answer's own account.
         examined: Share of the gap closed on withheld recordings, by the examiner's simulation of
             `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
-        differs: Whether the examiner's share and the answer's own disagree; `None` without both.
         seconds: Time the answer took.
         outside: Name of the fault outside the library.
         other_hand: Whether another hand drives the field than the reference.
@@ -72,12 +70,10 @@ class CaseScore:
     stands_for: tuple[str, ...]
     verdict: str
     joints_right: tuple[bool, ...]
-    unknown: float
     claims: tuple[Claim, ...]
     numbers: tuple[ParameterScore, ...]
     closed: float | None
     examined: float | None
-    differs: bool | None
     seconds: float | None
     outside: str | None
     other_hand: bool
@@ -106,10 +102,6 @@ class CaseScore:
     def alarm(self) -> bool:
         """True if a false effect is named, or the cause called unknown."""
         return self.verdict == "unknown" or not all(self.stands_for)
-
-    def count_names(self, names: Sequence[str]) -> tuple[int, int]:
-        """Return twice the right ones among names, and names and effects in all: the parts of F1."""
-        return 2 * len({*names} & {*self.truth}), len(names) + len(self.truth)
 
 
 def score_answer(
@@ -152,11 +144,7 @@ def score_answer(
         claims.append(Claim(read_probability(answer, verdict), kind == "outside"))
     gap = answer.gap if answer else None
     closed = gap.closed.mean if gap and gap.closed else None
-    examined, differs = None, None
-    if examination is not None:
-        examined = examination["closed"]
-        if examined is not None and closed is not None:
-            differs = bool(examination["differs"])
+    examined = examination["closed"] if examination is not None else None
     return CaseScore(
         case=label["case"],
         kind=kind,
@@ -165,12 +153,10 @@ def score_answer(
         stands_for=tuple(stands_for),
         verdict=verdict,
         joints_right=tuple(joints_right),
-        unknown=read_probability(answer, "unknown"),
         claims=tuple(claims),
         numbers=tuple(numbers),
         closed=closed,
         examined=examined,
-        differs=differs,
         seconds=seconds,
         outside=outside["ailment"] if outside else None,
         other_hand=label.get("other_hand", False),

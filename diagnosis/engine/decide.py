@@ -91,7 +91,6 @@ class Decision:
         verdict: `effects`, `none` or `unknown`.
         named: The named effects, the best first.
         rivals: All effects in the first table, the best first.
-        seconds: The same beside the first named effect.
         outside: Best row outside the library.
         generic: Best group of flexible columns, and what it earns, nats.
     """
@@ -99,7 +98,6 @@ class Decision:
     verdict: Literal["effects", "none", "unknown"]
     named: tuple[EffectFinding, ...]
     rivals: tuple[EffectFinding, ...]
-    seconds: tuple[EffectFinding, ...]
     outside: EffectFinding | None
     generic: tuple[str, float]
 
@@ -155,7 +153,6 @@ class Decider:
         is_unknown = is_odd and not coarse
         needed = HELD_NATS if best.effect in HELD else LEAST_NATS
         further = library if best.nats >= needed and not is_unknown else []
-        seconds: list[EffectFinding] = []
         while further:
             one = further[0]
             # A dead time beside a late clock is not told: an unchanged joint of a practice machine
@@ -176,7 +173,6 @@ class Decider:
             names = {other.name for other in named}
             known = [other for other in found if other.effect not in self.outside]
             further = [other for other in known if other.name not in names]
-            seconds = seconds or further
         verdict = "none"
         if is_unknown:
             verdict = "unknown"
@@ -184,12 +180,7 @@ class Decider:
         elif named:
             verdict = "effects"
         return Decision(
-            verdict,
-            tuple(named),
-            tuple(library),
-            tuple(seconds),
-            outside[0] if outside else None,
-            strongest,
+            verdict, tuple(named), tuple(library), outside[0] if outside else None, strongest
         )
 
     def _describe_clock(self) -> EffectFinding:

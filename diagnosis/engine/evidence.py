@@ -225,20 +225,15 @@ class RowEvidence:
             gains = np.full(len(self.every), -99.0)
             gains[places] = joint.score([self.every[place] for place in places])
             tables.append(gains)
-        return self._weigh_shared(places, joints, tables, np.array(0.0))
+        return self._weigh_shared(places, joints, tables)
 
     def _weigh_shared(
-        self,
-        places: np.ndarray,
-        joints: Sequence[FieldJoint],
-        tables: Sequence[np.ndarray],
-        least: np.ndarray | None = None,
+        self, places: np.ndarray, joints: Sequence[FieldJoint], tables: Sequence[np.ndarray]
     ) -> dict[int, JointRow]:
         """Return the rows of an effect that has about one size on all joints; its price is on the first."""
         total = np.sum([np.maximum(gains[places], LOSS_LIMIT) for gains in tables], 0)
         seconds = joints[0].count * joints[0].measure.interval * self.field.period_s
-        floor = -5.0 / seconds if least is None else least
-        parts = [np.maximum(self.parts[j.joint][:, places], floor) for j in joints]
+        parts = [np.maximum(self.parts[j.joint][:, places], -5.0 / seconds) for j in joints]
         prices = np.maximum(np.sum(parts, 0).max(0) * seconds, 0.0)
         best = int(np.argmax(total - prices))
         row = self.every[places[best]]

@@ -7,13 +7,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
-from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected
-from diagnosis.gap import describe_joints
+from diagnosis.answer import (
+    Answer,
+    Estimate,
+    Gap,
+    NextExperiment,
+    Ranked,
+    RegimeGap,
+    Selected,
+    Where,
+)
+from diagnosis.engine.decide import EffectFinding
+from diagnosis.reference_diagnosis import propose_measurement, rank_effects
 
 
 def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) -> None:
@@ -22,6 +33,9 @@ def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) ->
     (tmp_path / "field").mkdir()
     with pytest.raises(RecordingError, match=r"no reference/.*diagnosis.field"):
         case.load_case(tmp_path, machine)
+
+
+PLACE = {"rmse_rad": 0.03, "floor_rad": 0.002, "after_rad": 0.004, "share": 1.0}
 
 
 def said() -> Answer:
@@ -34,6 +48,8 @@ def said() -> Answer:
     return Answer(
         verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),),
         gap=Gap(0.03, 0.004, 0.002, Estimate(0.93, (0.88, 0.96))),
+        where=Where({"q3": PLACE}, (RegimeGap("q3", "after a reversal", 0.8),), "actuation"),
+        next_experiment=NextExperiment("a dial gauge", ("backlash", "lag")),
         reason="play", more={"sanity": [{"a": 1}]},
     )  # fmt: skip
 
@@ -48,10 +64,35 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
         "ci95": [0.028, 0.034],
     }
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
+    assert found["where"] == {
+        "joints": {"q3": PLACE},
+        "regimes": [{"joint": "q3", "regime": "after a reversal", "share": 0.8}],
+        "stage": "actuation",
+    }
+    experiment = {"excitation": "a dial gauge", "separates": ["backlash", "lag"]}
+    assert found["next_experiment"] == experiment
+    assert found["ranking"] == [{"effect": "backlash", "joints": ["q3"], "probability": 0.97}]
     assert answer.read_answer(path) == said()
     path.write_text(json.dumps(found | {"schema": 2}))
     with pytest.raises(RecordingError, match="schema 2"):
         answer.read_answer(path)
+
+
+def test_rivals_share_what_the_first_name_leaves(machine: Machine) -> None:
+    rivals = [EffectFinding("backlash", (2,), 90.0)]
+    for name, nats in (("lag", 60.0), ("stiction", 45.0), ("creep", -1.0)):
+        rivals.append(EffectFinding(name, (2,), nats))
+    found = rank_effects(said().selected, rivals, "effects", machine)
+    # Of 0.03, as e to 1, since 15 nats lie between them.
+    shares = {"backlash": 0.97, "lag": 0.03 / (1 + np.exp(-1)), "stiction": 0.03 / (1 + np.e)}
+    assert {one.effect: one.probability for one in found} == pytest.approx(shares)
+    assert [one.effect for one in found] == list(shares)
+    assert [one.effect for one in rank_effects((), (), "none", machine)] == ["none"]
+
+
+def test_what_would_decide_is_the_next_experiment() -> None:
+    assert propose_measurement(said().selected) == said().next_experiment
+    assert propose_measurement(()) is None
 
 
 def test_training_takes_the_found_effects_as_they_are(
@@ -62,15 +103,3 @@ def test_training_takes_the_found_effects_as_they_are(
     done = brokk("mode=train", f"effect=@{path}", "--cfg", "job")
     text = done.out[done.out.index("backlash:") :]
     assert "q3: 0.031" in text and "other: 0.0" in text
-
-
-def test_parts_of_the_gap_are_those_of_the_squares_beyond_the_floor(machine: Machine) -> None:
-    percent = 0.01 * (machine.upper - machine.lower)
-    before, floor = percent * [0.0, 5.0, 2.0, 3.0, 0.0], percent * [0.0, 3.0, 2.0, 4.0, 0.0]
-    plain = describe_joints(machine, before, before, 0.0 * floor)
-    parts = [one.part for one in plain.values()]
-    assert parts == pytest.approx([0.0, 25 / 38, 4 / 38, 9 / 38, 0.0])
-    found = describe_joints(machine, before, before, floor)
-    assert [one.part for one in found.values()] == pytest.approx([0.0, 1.0, 0.0, 0.0, 0.0])
-    below = describe_joints(machine, before, before, 9.0 * before)
-    assert [one.part for one in below.values()] == pytest.approx(parts)

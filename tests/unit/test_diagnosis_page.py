@@ -14,6 +14,7 @@ from brokk_rl.machine import Machine
 from diagnosis import plots, report
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected
 from diagnosis.free_runs import WindowedRuns
+from diagnosis.where import locate_gap
 
 GAIN = Selected(
     effect="flow_gain", joints=("q4",), probability=0.97, parameters={"gain": {"q4": Estimate(0.81, (0.78, 0.84))}},
@@ -48,6 +49,7 @@ def seen(machine: Machine) -> Outcome:
     answer = Answer(
         verdict="effects", selected=(GAIN,), ranking=(),
         gap=Gap(0.03, 0.006, 0.004, Estimate(0.93, (0.88, 0.96))),
+        where=locate_gap(before, np.full(5, 0.006), np.full(5, 0.004), machine),
         more={"evidence": {"rivals": rivals, "threshold": 5.0}},
     )  # fmt: skip
     return Outcome(answer, before, after)
@@ -82,6 +84,7 @@ def test_an_answer_without_effects_has_a_report(
     page = (tmp_path / "report.html").read_text()
     assert "12.0 mrad before; the floor is 10.0 mrad" in page
     assert f"{30 - report.MAX_LISTED} more" in page
+    assert "lies in q4" in report.write_headline(replace(bare, verdict="unknown"))[0]
 
 
 def test_an_answer_that_cannot_tell_says_why(machine: Machine, seen: Outcome) -> None:
