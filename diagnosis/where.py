@@ -72,5 +72,15 @@ def label_regimes(runs: WindowedRuns, machine: Machine) -> np.ndarray:
     moves = np.abs(speed) > MOVING * np.abs(speed).max((0, 1))
     now = np.where(moves, np.sign(speed), 0.0)
     earlier = np.concatenate([np.repeat(now[:, :1], num_steps, 1), now], 1)[:, : now.shape[1]]
-    conditions = [(now == 0.0) & (earlier == 0.0), now == 0.0, earlier == 0.0, now != earlier]
-    return np.select(conditions, range(len(conditions)), len(conditions))
+    # A joint that rested in between turns too.
+    turned = now * _hold_direction(earlier) < 0.0
+    conditions = [(now == 0.0) & (earlier == 0.0), now == 0.0, turned, earlier == 0.0]
+    names = ("at rest", "after a stop", "after a reversal", "after a start")
+    return np.select(conditions, [REGIMES.index(name) for name in names], len(names))
+
+
+def _hold_direction(direction: np.ndarray) -> np.ndarray:
+    """Return the newest direction of motion until each step, `(W, K, J)`; 0 before the first motion."""
+    step = np.arange(direction.shape[1])[:, None]
+    newest = np.maximum.accumulate(np.where(direction != 0.0, step, 0), 1)
+    return np.take_along_axis(direction, newest, 1)

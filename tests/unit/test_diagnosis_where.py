@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from motion import make_recording
@@ -38,6 +40,18 @@ def test_an_error_lies_where_it_arises(machine: Machine, regime: str) -> None:
     assert [(one.joint, one.regime) for one in found.regimes] == [("q3", regime)]
     assert found.regimes[0].share == pytest.approx(1.0)
     assert found.joints["q3"]["rmse_rad"] == pytest.approx(np.sqrt(np.mean(error[0, :, Q3] ** 2)))
+
+
+def test_a_joint_that_rested_in_between_turns_too(machine: Machine) -> None:
+    runs = run_freely(machine, np.zeros((1, 100, 5)))
+    out = runs.simulated.copy()
+    held = np.concatenate([out[:, :50], np.repeat(out[:, 49:50], 20, 1), out[:, 50:80]], 1)
+    regimes = label_regimes(replace(runs, simulated=held), machine)[0, :, Q3]
+    assert [REGIMES[regimes[step]] for step in (30, 65, 75)] == [
+        "after a start",
+        "at rest",
+        "after a reversal",
+    ]
 
 
 def test_two_causes_share_the_square_of_their_sum(machine: Machine) -> None:
