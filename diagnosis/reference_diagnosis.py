@@ -403,8 +403,8 @@ def describe_rivals(rivals: Sequence[EffectFinding], machine: Machine) -> list[d
     """Return what each effect earns, plain JSON data."""
     rows = []
     for one in rivals:
-        told = {"name": one.name, "effect": one.name, "score": one.nats}
-        rows.append(told | {"joints": list(name_joints(one.joints, machine))})
+        joints = list(name_joints(one.joints, machine))
+        rows.append({"effect": one.name, "joints": joints, "score": one.nats})
     return rows
 
 

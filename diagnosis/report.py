@@ -169,6 +169,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "describe_class": describe_class,
         "describe_edit": describe_edit,
         "name_effect": name_effect,
+        "list_on_joints": list_on_joints,
         "join_words": join_words,
         "format_error": format_error,
         "format_estimate": format_estimate,

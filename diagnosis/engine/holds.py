@@ -11,7 +11,7 @@ Axes: `T` samples, `K` delays, `M` models of the course.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -288,10 +288,10 @@ def _weigh_samples(side: Side) -> np.ndarray:
     return squares / max(float(squares.sum()), 1e-12)
 
 
-def _price_course(delays: np.ndarray, law: np.ndarray, parts: int) -> np.ndarray:
-    """Return the log prior of each step of a course, against no delay at all, `(T,)`."""
+def _price_course(delays: np.ndarray, law: np.ndarray, parts: int) -> float:
+    """Return the log prior of a course, against no delay at all."""
     states = np.rint(delays * parts).astype(int)
-    return np.append(law[states[:-1], states[1:]] - law[0, 0], 0.0)
+    return float((law[states[:-1], states[1:]] - law[0, 0]).sum())
 
 
 class HeldCommands:
@@ -336,21 +336,19 @@ class HeldCommands:
     ) -> Iterator[tuple[Course, float, np.ndarray, np.ndarray]]:
         """Yield courses with their gain in all, their delays and the gain at each sample."""
         side = joints[0].side
-
-        def judge(delays: np.ndarray) -> np.ndarray:
+        numbers = [joint.numbers for joint in joints]
+        for course, delays, law in _search_courses(side, self._evidence.bases, numbers):
+            if not delays.any():
+                continue
             held = hold_commands(side, delays)
-            total = np.zeros(side.num_samples)
+            gains = np.zeros(side.num_samples)
             for joint in joints:
                 path = held.simulate(joint.joint, joint.numbers)[0]
                 left = joint.residual - (joint.measure(path).astype(float) - joint.increments)
-                gains = _share_gain(joint.projection, joint.residual, left, joint.count)
-                total[: len(gains)] += gains
-            return total
-
-        numbers = [joint.numbers for joint in joints]
-        for course, delays, law in _search_courses(side, self._evidence.bases, numbers):
-            if delays.any():
-                yield course, *_drop_worthless(side, delays, law, course.parts, judge)
+                own = _share_gain(joint.projection, joint.residual, left, joint.count)
+                gains[: len(own)] += own
+            prior = _price_course(delays, law, course.parts)
+            yield course, float(gains.sum()) + prior, delays, gains
 
 
 def _share_gain(
@@ -378,44 +376,3 @@ def _find_rising(side: Side, joints: Sequence[FieldJoint]) -> np.ndarray:
     later = np.concatenate([speed[ahead:], np.zeros(ahead)])
     earlier = np.concatenate([np.zeros(behind), speed[:-behind]])
     return later > earlier
-
-
-def _drop_worthless(
-    side: Side,
-    delays: np.ndarray,
-    law: np.ndarray,
-    parts: int,
-    judge: Callable[[np.ndarray], np.ndarray],
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return gain, course and gain of each sample without the episodes that do not earn their prior."""
-
-    def add_up(tried: np.ndarray, gains: np.ndarray) -> float:
-        return float(gains.sum() + _price_course(tried, law, parts).sum())
-
-    gains = judge(delays)
-    best = (add_up(delays, gains), delays, gains)
-    for _ in range(3):
-        prior = _price_course(delays, law, parts)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], delays > 0, [0]]).astype(int)))
-        begin, end = edges[::2], edges[1::2]
-        if not len(begin):
-            break
-        last = side.num_samples
-        earned = np.concatenate([[0.0], np.cumsum(gains)])
-        priced = np.concatenate([[0.0], np.cumsum(prior)])
-        following = np.minimum(np.append(begin[1:] + side.count(0.4), last), last)
-        until = np.minimum(end + side.count(1.75), following)
-        until = np.maximum(until, np.minimum(end, last))
-        since = np.minimum(begin + side.count(0.2), last)
-        net = earned[until] - earned[since]
-        net += priced[np.minimum(end + 1, last)] - priced[np.maximum(begin - 1, 0)]
-        if (net >= 0.0).all():
-            break
-        delays = delays.copy()
-        for first, behind in zip(begin[net < 0.0], end[net < 0.0], strict=True):
-            delays[first:behind] = 0
-        gains = judge(delays)
-        total = add_up(delays, gains)
-        if total > best[0]:
-            best = (total, delays, gains)
-    return best

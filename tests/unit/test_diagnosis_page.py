@@ -43,8 +43,8 @@ def runs(machine: Machine, count: int, seed: int, factor: float) -> WindowedRuns
 def seen(machine: Machine) -> Outcome:
     before, after = runs(machine, 3, 0, 1.25), runs(machine, 3, 0, 1.01)
     rivals = [
-        {"name": "flow gain q4", "score": 40.0, "selected": True},
-        {"name": "backlash q3", "score": -1.0},
+        {"effect": "flow_gain", "joints": ["q4"], "score": 40.0},
+        {"effect": "backlash", "joints": ["q3"], "score": -1.0},
     ]
     answer = Answer(
         verdict="effects", selected=(GAIN,), ranking=(),
