@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import hydra
 import pytest
 import torch
 import training as runs
 from composed import option
-from hydra.utils import instantiate
 
 from actuators.person import HumanFollower
 from brokk_rl.checks import check_task
+from brokk_rl.extensions import load_mode
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.observation import ObservationEncoder, list_pose_parts
 from brokk_rl.rl.loop import ControlLoop
@@ -39,10 +38,8 @@ def person(**changes: Any) -> HumanFollower:
 
 def task(name: str = "borehole_insertion", **changes: Any) -> Any:
     """Returns the task as `follower=person` makes it."""
-    words = ["mode=evaluate", f"task={name}", "follower=person"]
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=words)
-    return replace(instantiate(cfg.task, _convert_="all"), **changes)
+    words = ("mode=evaluate", f"task={name}", "follower=person", "session.out=unused")
+    return replace(load_mode(*words).task, **changes)
 
 
 @pytest.mark.parametrize(

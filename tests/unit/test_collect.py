@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 import torch
 from composed import option
-from hydra import compose, initialize_config_module
-from hydra.utils import instantiate
 
 from actuators.effects.composition import ActuatorWithEffects
 from actuators.excite.player import NominalLink
 from actuators.modes.collect import Collect
 from brokk_rl import record
 from brokk_rl.errors import LinkError
+from brokk_rl.extensions import load_mode
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -44,16 +43,8 @@ def made(folder: Path, machine: Machine) -> dict[str, Recording]:
 
 
 def mode(out: Path, *overrides: str) -> Collect:
-    with initialize_config_module("conf", version_base="1.3"):
-        cfg = compose(
-            "config", overrides=["mode=collect", f"session.out={out}", "session.seed=0", *overrides]
-        )
     out.mkdir(exist_ok=True)
-    parts = {
-        name: instantiate(cfg[name], _convert_="all")
-        for name in ("session", "machine", "link", "excitation", "collect")
-    }
-    return Collect(**parts)
+    return load_mode("mode=collect", f"session.out={out}", "session.seed=0", *overrides)
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
-from hydra import compose, initialize_config_module
-from hydra.utils import instantiate
 
 from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
@@ -24,6 +22,7 @@ from actuators.excite.player import (
 from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import LinkError
+from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
@@ -33,8 +32,7 @@ OPEN = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
 
 @pytest.fixture(scope="module")
 def approach() -> Approach:
-    with initialize_config_module("conf", version_base="1.3"):
-        return instantiate(compose("config", overrides=["mode=collect"]).collect.approach)
+    return load_mode("mode=collect", "session.out=unused").collect.approach
 
 
 def constant(joints: dict[int, float], seconds: float, start: np.ndarray, **fields: Any) -> Segment:
@@ -70,15 +68,11 @@ def anywhere(machine: Machine, seed: int) -> np.ndarray:
 
 
 def with_speed(machine: Machine, scale: float) -> Machine:
-    speed = [
-        replace(joint.max_speed, value=joint.max_speed.value * scale) for joint in machine.joints
-    ]
-    return replace(
-        machine,
-        joints=tuple(
-            replace(joint, max_speed=s) for joint, s in zip(machine.joints, speed, strict=True)
-        ),
-    )
+    joints = []
+    for joint in machine.joints:
+        speed = replace(joint.max_speed, value=joint.max_speed.value * scale)
+        joints.append(replace(joint, max_speed=speed))
+    return replace(machine, joints=tuple(joints))
 
 
 def test_a_program_is_played_unchanged_from_its_start_pose(

@@ -16,6 +16,13 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.rl.logger import TensorBoardTracking, WandbTracking, _find_sweep
 
 
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder in which wandb keeps its own files."""
+    for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+
+
 def test_a_run_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
     for process, (first, last) in enumerate([(0, 8), (5, 10)]):
         tracker = TensorBoardTracking().open(tmp_path, {}, first)
@@ -28,11 +35,7 @@ def test_a_run_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
-        monkeypatch.setenv(name, str(tmp_path / "home"))
+def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(tmp_path: Path) -> None:
     tracking = WandbTracking(project="tests", group=None, tags=("a", "b"), mode="offline")
     folders = [tmp_path / name for name in ("job_0", "job_1")]
     for folder in folders:
@@ -53,8 +56,6 @@ def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
 def test_an_environment_that_wandb_refuses_is_explained(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
-        monkeypatch.setenv(name, str(tmp_path / "home"))
     wandb.teardown()  # it reads the environment once a process
     monkeypatch.setenv("WANDB_MODE", mode)
     tracking = WandbTracking(project="tests", group=None, tags=(), mode="disabled")
@@ -73,10 +74,8 @@ SMALL = (
 
 
 @pytest.fixture
-def run(brokk: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+def run(brokk: Callable[..., Any], tmp_path: Path) -> Callable:
     def train(*words: str) -> Path:
-        for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
-            monkeypatch.setenv(name, str(tmp_path / "home"))
         done = brokk("mode=train", "effect=[backlash]", *SMALL, *words)
         assert done.code == 0, done.err
         return tmp_path / "run"
