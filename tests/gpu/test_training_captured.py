@@ -16,7 +16,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import Teacher
-from brokk_rl.sim.simulator import WarpSimulator
 
 pytestmark = [
     pytest.mark.gpu,
@@ -28,10 +27,7 @@ pytestmark = [
 
 CUDA = torch.device("cuda")
 NUM = 64
-WARP: Any = WarpSimulator(
-    num_worlds=NUM, substeps=5, num_contacts=16, num_constraints=40, iterations=12,
-    linesearch_iterations=8, tolerance=1e-6, parity_worlds=0,
-)  # fmt: skip
+WARP: Any = replace(option("sim", "warp"), num_worlds=NUM, parity_worlds=0)
 WILD = 5
 """The world that diverges."""
 

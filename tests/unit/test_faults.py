@@ -19,10 +19,7 @@ from tasks.term_task import RewardTerm
 from tasks.terms import StepState
 
 NATIVE = NativeSimulator(num_worlds=4, substeps=5, num_threads=1)
-FUSED = WarpSimulator(
-    num_worlds=4, substeps=5, num_contacts=16, num_constraints=40, iterations=12,
-    linesearch_iterations=8, tolerance=1e-6, parity_worlds=0,
-)  # fmt: skip
+FUSED: WarpSimulator = replace(option("sim", "warp"), num_worlds=4, parity_worlds=0)
 WILD = 2
 """The world that diverges."""
 

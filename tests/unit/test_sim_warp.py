@@ -1,24 +1,18 @@
 """The Warp world on a CPU against the native world; kernels compile for half a minute at first use."""
 
+from dataclasses import replace
+
 import mujoco_warp
 import pytest
 import torch
+from composed import option
 
 from brokk_rl.errors import DeviceError
 from brokk_rl.sim.native_world import NativeWorld
-from brokk_rl.sim.simulator import AutoSimulator, NativeSimulator, WarpSimulator
+from brokk_rl.sim.simulator import AutoSimulator, NativeSimulator
 
 NUM_WORLDS = 8
-WARP = WarpSimulator(
-    num_worlds=NUM_WORLDS,
-    substeps=5,
-    num_contacts=16,
-    num_constraints=40,
-    iterations=12,
-    linesearch_iterations=8,
-    tolerance=1e-6,
-    parity_worlds=0,
-)
+WARP = replace(option("sim", "warp"), num_worlds=NUM_WORLDS, parity_worlds=0)
 NATIVE = NativeSimulator(num_worlds=NUM_WORLDS, substeps=5, num_threads=2)
 
 
