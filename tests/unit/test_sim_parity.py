@@ -30,7 +30,6 @@ CHANGES: dict[str, tuple[str, str]] = {
     "adhesion": (TOOL, '<geom adhesion="9000" name="chisel" class="chisel_contact"'),
     "surface velocity": (TOOL, '<geom surfacevel="0.9 0.4 0" name="chisel" class="chisel_contact"'),
     "torsional friction": (TOOL, '<geom condim="4" name="chisel" class="chisel_contact"'),
-    "no friction": (TOOL, '<geom condim="1" priority="1" name="chisel" class="chisel_contact"'),
     "soft contact": (
         TOOL,
         '<geom solref="0.2 1" priority="1" name="chisel" class="chisel_contact"',
@@ -39,7 +38,6 @@ CHANGES: dict[str, tuple[str, str]] = {
     "no actuation": (OPTIONS, f'{OPTIONS}<option><flag actuation="disable"/></option>'),
     "no contact": (OPTIONS, f'{OPTIONS}<option><flag contact="disable"/></option>'),
     "no limits": (OPTIONS, f'{OPTIONS}<option><flag limit="disable"/></option>'),
-    "no sensors": (OPTIONS, f'{OPTIONS}<option><flag sensor="disable"/></option>'),
     "water": (OPTIONS, f'{OPTIONS}<option density="9000" viscosity="90"/>'),
     "friction cone": (OPTIONS, f'{OPTIONS}<option impratio="20"/>'),
     "fixed length": (
@@ -52,8 +50,6 @@ CHANGES: dict[str, tuple[str, str]] = {
     ),
 }
 """Parts that an MJCF may have: the text of the shipped one, and what stands there instead."""
-WITHOUT_EFFECT_HERE = {"no friction"}
-"""Those that need not move the joints differently within a few control periods."""
 
 
 def change_mjcf(machine: Machine, folder, change: tuple[str, str]) -> Machine:
@@ -72,7 +68,7 @@ def make_warp(machine: Machine):
     return simulator.build(machine, "cpu", NUM_WORLDS)
 
 
-@pytest.mark.parametrize("name", [name for name in CHANGES if name != "no sensors"])
+@pytest.mark.parametrize("name", CHANGES)
 def test_each_part_matters_so_that_leaving_it_out_would_be_seen(machine, tmp_path, name):
     """MuJoCo C with the part in place of the simulator, and without it as the reference."""
     changed = change_mjcf(machine, tmp_path, CHANGES[name])
@@ -81,8 +77,7 @@ def test_each_part_matters_so_that_leaving_it_out_would_be_seen(machine, tmp_pat
     except ConfigError:
         return
     result = measure_parity(world, machine, SUBSTEPS)
-    if name not in WITHOUT_EFFECT_HERE:
-        assert not result.is_alike, result.describe()
+    assert not result.is_alike, result.describe()
 
 
 @pytest.mark.slow
