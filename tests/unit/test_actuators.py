@@ -204,32 +204,6 @@ def test_half_the_time_step_gives_the_same_path(machine: Machine) -> None:
     assert (coarse - fine).abs().max() < 0.01
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_a_run_repeats_and_environments_do_not_touch(name: str, machine: Machine) -> None:
-    u = torch.rand(40, 3, 5, generator=torch.Generator().manual_seed(1)) * 2.0 - 1.0
-    together = roll(option("actuator", name), machine, u)
-    torch.testing.assert_close(together, roll(option("actuator", name), machine, u), rtol=0, atol=0)
-    alone = roll(option("actuator", name), machine, u[:, 1:2])
-    torch.testing.assert_close(together[:, 1:2], alone, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_reset_reaches_the_masked_environments_only(name: str, machine: Machine) -> None:
-    model = option("actuator", name).build(machine, 3, CPU)
-    history = rest(machine, num=3)
-    fresh = {key: value.clone() for key, value in model.state.items()}
-    for _ in range(20):
-        history.push_u(torch.ones(3, 5))
-        history.push_q(model.step(history))
-    used = {key: value.clone() for key, value in model.state.items()}
-    addresses = {key: value.data_ptr() for key, value in model.state.items()}
-    model.reset(torch.tensor([False, True, False]))
-    for key, value in model.state.items():
-        torch.testing.assert_close(value[1], fresh[key][1])
-        torch.testing.assert_close(value[[0, 2]], used[key][[0, 2]])
-        assert value.data_ptr() == addresses[key]
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

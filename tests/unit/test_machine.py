@@ -5,8 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from actuators.models.lag import FirstOrderLag
-from brokk_rl.checks import check_actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Gravity, Kinematics
 from brokk_rl.machine import Machine
@@ -24,14 +22,6 @@ def unseen(machine: Machine) -> Machine:
         tool_m=None,
         joints=tuple(replace(j, body=None) for j in machine.joints),
     )
-
-
-def test_its_actuators_can_be_modelled(unseen: Machine) -> None:
-    lag = FirstOrderLag(
-        dead_time_s=None, dead_band_extend=0.1, dead_band_retract=0.1, gain=1.0, time_constant_s=0.1
-    )
-    check_actuator(lag, unseen)
-    assert not unseen.has_bodies
 
 
 @pytest.mark.parametrize(

@@ -70,17 +70,6 @@ def test_starts_lie_within_the_limits_and_in_the_open(name: str, machine: Machin
     assert (tip[:, 2] > top + task.arms.clearance_m).all() and (tip[:, 2] > task.arms.floor_m).all()
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_the_same_seed_gives_the_same_starts_and_another_others(
-    name: str, machine: Machine
-) -> None:
-    process = option("task", name).build(machine, 1, CPU)
-    first, again, other = process.starts(32, 3), process.starts(32, 3), process.starts(32, 4)
-    assert all(torch.equal(first[key], again[key]) for key in first)
-    assert not torch.equal(first["q"], other["q"])
-    assert not torch.equal(first["target_m"], other["target_m"])
-
-
 def test_starts_are_the_same_for_every_controller(machine: Machine) -> None:
     task = option("task", "borehole_insertion")
     other = replace(task.classical, gain_1_s=0.1, margin_rad=0.3, straight=False, damping=1.0)
