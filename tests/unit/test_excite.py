@@ -26,15 +26,6 @@ def moved(segment: Segment) -> set[int]:
     return set(np.flatnonzero(np.abs(segment.u).max(0)).tolist())
 
 
-def by_joints_only(machine: Machine) -> Machine:
-    return replace(
-        machine,
-        joints=tuple(replace(joint, body=None) for joint in machine.joints),
-        tool_m=None,
-        mjcf=None,
-    )
-
-
 def test_start_poses_load_each_joint_from_both_sides_where_gravity_can(machine: Machine) -> None:
     generator = np.random.default_rng(0)
     anywhere = np.sign(
@@ -49,8 +40,9 @@ def test_start_poses_load_each_joint_from_both_sides_where_gravity_can(machine: 
             )
 
 
-def test_a_machine_without_bodies_starts_anywhere_within_its_margins(machine: Machine) -> None:
-    bare = by_joints_only(machine)
+def test_a_machine_without_bodies_starts_anywhere_within_its_margins() -> None:
+    bare = option("machine", "mini_excavator")
+    assert not bare.has_bodies
     for name in ("levels", "holds", "ramps", "work"):
         for segment in segments(name, bare, 300.0):
             margin = segment.stop_margin * (bare.upper - bare.lower)
