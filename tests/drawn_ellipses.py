@@ -56,9 +56,7 @@ def fill(canvas: np.ndarray, row: tuple[float, ...], level: float) -> None:
     x, y, a, b, theta = row
     place = np.rint(((np.array([x, y]) + 0.5) * FINE - 0.5) * 16).astype(int).tolist()
     axes = (round(a * FINE * 16), round(b * FINE * 16))
-    cv2.ellipse(
-        canvas, place, axes, float(np.degrees(theta)), 0, 360, level, -1, cv2.LINE_AA, 4
-    )  # fmt: skip
+    cv2.ellipse(canvas, place, axes, float(np.degrees(theta)), 0, 360, level, -1, cv2.LINE_AA, 4)
 
 
 def overlap(one: np.ndarray, other: np.ndarray) -> float:

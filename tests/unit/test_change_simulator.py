@@ -51,9 +51,7 @@ def name_effects() -> Answer:
     return replace(NOTHING, verdict="effects", selected=tuple(selected), reason="test")
 
 
-NOTHING = Answer(
-    verdict="none", selected=(), ranking=(), gap=None
-)  # fmt: skip
+NOTHING = Answer(verdict="none", selected=(), ranking=(), gap=None)
 
 
 def build_mode(folder: Path, answer: Answer) -> ChangeSimulator:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -259,8 +258,6 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path, carriage: Machine) -> 
     check(recording)
 
 
-def test_a_folder_of_something_else_is_refused(
-    tmp_path: Path, brokk: Callable[..., object]
-) -> None:
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="expected a folder with the CSV files"):
         open_log(tmp_path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
@@ -17,7 +16,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
-from conftest import Done
 from log_import import import_log, try_draft, write_messages
 
 from actuators.recordings.advice import ADVICE
@@ -272,9 +270,7 @@ def test_rows_that_are_lost_by_chance_do_not_cut_a_log_into_pieces() -> None:
 @pytest.mark.parametrize(
     ("kind", "modulus"), [("angle", 2 * np.pi), ("counter", 4096.0), ("position", 2 * np.pi)]
 )
-def test_wraps_are_taken_out_and_said(
-    brokk: Callable[..., Done], kind: str, modulus: float
-) -> None:
+def test_wraps_are_taken_out_and_said(kind: str, modulus: float) -> None:
     rows = make_rows()
     scale = 4096.0 / (2 * np.pi) if kind == "counter" else 1.0
     begin = 0.0 if kind == "counter" else np.pi
@@ -324,7 +320,7 @@ def test_what_is_given_is_weighed_like_a_guess() -> None:
     assert "No guess is unsure" not in done.out
 
 
-def test_a_drive_that_is_off_is_said_with_its_times(brokk: Callable[..., Done]) -> None:
+def test_a_drive_that_is_off_is_said_with_its_times() -> None:
     rows = make_rows()
     rows[300:450, 4] = rows[300, 4]
     enable = np.ones(len(rows))
@@ -524,9 +520,7 @@ ADVISED = {
 
 
 @pytest.mark.parametrize("case", ADVISED)
-def test_advice_that_is_followed_to_the_letter_reads_the_log(
-    brokk: Callable[..., Done], case: str
-) -> None:
+def test_advice_that_is_followed_to_the_letter_reads_the_log(case: str) -> None:
     options = write_advised(case)
     key = ADVISED[case]
     first = try_draft(*options)

@@ -41,9 +41,7 @@ RATES = {
 def make_result(tmp_path: Path, after: float | None, verdict: str = "nothing") -> WhyResult:
     """A doctor's verdict, and an effect with which the policy succeeds in a share `after`."""
     lag = Selected(effect="lag", joints=("q3",), probability=0.9, parameters={}, gap_closed=None)
-    found = Answer(
-        verdict="effects", selected=(lag,), ranking=(), gap=None,
-    )  # fmt: skip
+    found = Answer(verdict="effects", selected=(lag,), ranking=(), gap=None)
     success = {} if after is None else {BEFORE: RATES[1.0], ALL_EFFECTS: RATES[after]}
     return WhyResult(tmp_path, DOCTOR | {"verdict": verdict}, found, success, "runs/policy", "mlp")
 
@@ -101,9 +99,7 @@ def test_a_diagnosis_without_an_answer_asks_for_recordings(tmp_path: Path) -> No
 def test_inputs_are_refused_before_the_first_stage(
     brokk: Callable[..., Any], changed: list[str], expected: str
 ) -> None:
-    command = {
-        "log": "log=nowhere/*.parquet", "policy": "policy=tasks:policies/borehole_insertion"
-    }  # fmt: skip
+    command = {"log": "log=nowhere/*.parquet", "policy": "policy=tasks:policies/borehole_insertion"}
     command |= {word.partition("=")[0]: word for word in changed}
     done = brokk("mode=why", *command.values(), "session.out=out")
     assert done.code == 2
