@@ -64,6 +64,8 @@ def generate_c_header(
         "REMOTE_MS": f"{round(1e3 * remote_s)}u",
         "COMMAND_MS": f"{round(1e3 * command_s)}u",
     }
+    for name, value in description.identity.items():
+        constants[_convert_to_upper_snake(name)] = f"0x{value:06X}u"
     for trust in ChannelTrust:
         constants[f"TRUST_{trust.name}"] = f"{trust.value}u"
     for number, fault in enumerate(MessageFault, start=1):

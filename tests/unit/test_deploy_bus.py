@@ -254,7 +254,11 @@ def test_the_header_decides_about_messages_as_the_python_side_does(
 
 def test_the_header_for_a_gateway_says_what_the_description_says(bus: BusDescription) -> None:
     text = generate_c_header(bus, *HEADER_TIMES)
+    # Without them no gateway could say that it goes by this description, and nothing would ever move.
+    own = bus.identity
     for line in (
+        f"BROKK_DESCRIPTION_HASH 0x{own['DescriptionHash']:06X}u",
+        f"BROKK_MACHINE_HASH 0x{own['MachineHash']:06X}u",
         "BROKK_VALVE_CMD_ID 0xD001027u",
         "BROKK_VALVE_CMD_DATA_ID 0x1031u",
         "BROKK_VALVE_CMD_STAMP_WRAP_MS 1024u",
