@@ -372,6 +372,10 @@ def test_the_shipped_file_is_that_of_the_machine() -> None:
         {"thresholds": None}, {"thresholds": {"share": 0.5}}, {"model": []}, {"sources": []},
         {"thresholds": {"share": math.nan, "window_s": 1.0, "slack_s": [0.1] * 5}},
         {"thresholds": {"share": 0.5, "window_s": 1.0, "slack_s": [0.1] * 3}},
+        {"thresholds": {"share": 0.5, "window_s": 1.0, "slack_s": [0.1] * 4 + [-0.1]}},
+        {"thresholds": {"share": 0.5, "window_s": 1.0, "slack_s": [0.1] * 4 + [2.0]}},
+        {"thresholds": {"share": 1.5, "window_s": 1.0, "slack_s": [0.1] * 5}},
+        {"thresholds": {"share": 0.5, "window_s": 1e6, "slack_s": [0.1] * 5}},
     ],
 )  # fmt: skip
 def test_a_file_by_which_no_motion_can_be_judged_is_refused(
