@@ -234,6 +234,8 @@ def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
         ({"observation": {}}, "."),
         ({"command": []}, "."),
         ({"task": [1]}, "."),
+        ({"stop": None}, "."),
+        ({"stop": {"success": {"largest_lateral_m": -1.0, "largest_roll_rad": 0.1}}}, "roll"),
     ],
     ids=str,
 )
