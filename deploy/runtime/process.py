@@ -113,7 +113,9 @@ def enter_child() -> None:
     signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
     writer = logging.StreamHandler()
     writer.setFormatter(logging.Formatter(f"{name}: %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[DetachedHandler([writer])])
+    # The message alone: the writer puts the name of the process before it.
+    detached = DetachedHandler([writer])
+    logging.basicConfig(level=logging.INFO, format="%(message)s", handlers=[detached])
     if realtime is not None:
         # before the imports: on a busy computer they would take ten times as long
         ask_for_priority(realtime)
