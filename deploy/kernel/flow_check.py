@@ -17,6 +17,8 @@ from deploy.kernel.limits import FlowLimits, Numbers
 T = TypeVar("T")
 NOBODY, LEVERS, FROM_PC = 0, 1, 2
 """Values of `FlowSource`."""
+MOST_NOTED = 1000
+"""Commands, and positions of levers, that are kept where no feedback comes: seconds of each. By hand."""
 
 
 class FlowCheck:
@@ -36,8 +38,8 @@ class FlowCheck:
     def __init__(self, limits: FlowLimits, num_joints: int, round_trip_s: float) -> None:
         self._limits, self._round_trip_s = limits, round_trip_s
         nothing = (0.0,) * num_joints
-        self._commands: deque[tuple[float, Numbers]] = deque([(0.0, nothing)])
-        self._levers: deque[tuple[float, Numbers]] = deque([(0.0, nothing)])
+        self._commands = deque[tuple[float, Numbers]]([(0.0, nothing)], MOST_NOTED)
+        self._levers = deque[tuple[float, Numbers]]([(0.0, nothing)], MOST_NOTED)
         self._sources: deque[tuple[float, int]] = deque([(0.0, NOBODY)])
         self._wrong = [0] * num_joints
         self._estop_s: float | None = None

@@ -62,7 +62,9 @@ def is_same_origin(origin: str | None, host: str | None, mine: frozenset[str]) -
 
 def compare_tokens(given: object, token: str) -> bool:
     """Compare tokens in a time that does not depend on where they differ."""
-    return isinstance(given, str) and hmac.compare_digest(given.encode(), token.encode())
+    return isinstance(given, str) and hmac.compare_digest(
+        given.encode(errors="replace"), token.encode()
+    )
 
 
 def parse_request(text: str | bytes) -> OperatorRequest | None:

@@ -142,6 +142,11 @@ def test_what_is_long_ago_is_forgotten() -> None:
         valves.report(STILL, NOBODY, 1)
     for noted in (valves.check._commands, valves.check._levers, valves.check._sources):
         assert len(noted) < 12
+    # Feedback that never comes must not fill the memory of a day.
+    for _ in range(5000):
+        valves.check.note_command(valves.now_s, STILL)
+        valves.check.note_levers(valves.now_s, STILL)
+    assert len(valves.check._commands) + len(valves.check._levers) <= 2000
 
 
 def build_check(ground_m: float | None = 0.0) -> TargetCheck:

@@ -82,7 +82,7 @@ def test_only_the_whole_token_fits() -> None:
     assert access.compare_tokens(TOKEN, TOKEN)
     assert not any(
         access.compare_tokens(given, TOKEN)
-        for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ")
+        for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ", "\ud800")
     )
 
 
