@@ -46,6 +46,10 @@ TOGETHER = (
     ("Command_", "CommandMode"), ("Flow_",), ("Lever_", "ButtonRight", "DeadMan", "RemoteOn"), ("EStop", "ExclusiveSelected"),
 )  # fmt: skip
 """Beginnings of the signals that mean something at one moment alone: each group is one message."""
+SWITCHES = (
+    "CommandMode", "FlowSource", "ButtonRight", "DeadMan", "RemoteOn", "EStop", "ExclusiveSelected",
+)  # fmt: skip
+"""Further signals that every bus has."""
 HASH_BYTES = 3
 """Of the hash of description and machine; both fit into one message with counter and CRC."""
 PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
@@ -130,16 +134,7 @@ class BusDescription:
         for kind in ("Command", "Position", "Valid", "Flow"):
             required += [f"{kind}_{joint}" for joint in machine.joint_names]
         required += [f"Lever_{axis}" for axis in LEVER_AXES]
-        required += [
-            "CommandMode",
-            "FlowSource",
-            "ButtonRight",
-            "DeadMan",
-            "RemoteOn",
-            "EStop",
-            "ExclusiveSelected",
-        ]
-        self._required = required
+        self._required = required = [*required, *SWITCHES]
         for signal in required:
             if signal not in self._home:
                 raise ConfigError(
@@ -313,11 +308,9 @@ def _build_layout(message: Message, dbc: str) -> MessageLayout:
             raise ConfigError(
                 f"bus: message {message.name} of {dbc} has E2EDataId; it needs {COUNTER}, and {CRC} of one whole byte"
             )
-        data_id, crc_byte, modulus = (
-            int(attribute.value),
-            crc.start // CRC_BITS,
-            1 << counter.length,
-        )
+        data_id = int(attribute.value)
+        crc_byte = crc.start // CRC_BITS
+        modulus = 1 << counter.length
     stamp = signals.get(STAMP)
     step_s = 0.0 if stamp is None else float(stamp.scale)
     return MessageLayout(

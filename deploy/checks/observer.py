@@ -79,10 +79,8 @@ class Observer:
         self.window_s = float(thresholds["window_s"])
         self._predictor = ValvePredictor(content["model"], machine)
         length = round(self.window_s / machine.period_s)
-        self._measured, self._predicted = (
-            deque[np.ndarray]([], length),
-            deque[np.ndarray]([], length),
-        )
+        self._measured = deque[np.ndarray]([], length)
+        self._predicted = deque[np.ndarray]([], length)
         # By how much each step may be missed.
         self._borne = deque[np.ndarray]([], length)
         self._slack = np.array(thresholds["slack_s"], float) * machine.max_speed

@@ -103,11 +103,8 @@ class ActiveFaults:
                 q, hole_m = list(map(float, place["q"])), list(map(float, place["hole_in_base_m"]))
                 self._place = q, hole_m
                 return
-            fault, message, seconds = (
-                asked["fault"],
-                asked.get("message", ""),
-                float(asked.get("seconds", FOREVER_S)),
-            )
+            fault, message = asked["fault"], asked.get("message", "")
+            seconds = float(asked.get("seconds", FOREVER_S))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
                 f"fault: expected JSON with 'fault', got {text[:80]!r} ({error})"

@@ -155,10 +155,8 @@ def run_person(
         fails: Check that the person fails; `None`: none.
         memory: Tells that the loop has heard positions.
     """
-    remote, person = (
-        RadioRemote(BusDescription(dbc, machine), machine),
-        ScriptedPerson(machine, fails),
-    )
+    remote = RadioRemote(BusDescription(dbc, machine), machine)
+    person = ScriptedPerson(machine, fails)
     begun_s, pressed, spoiled = np.inf, False, False
     with wire.open(remote.frame_ids) as bus:
         for now_s in remote.iterate_cycles(stop, bus):

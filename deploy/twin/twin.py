@@ -147,10 +147,8 @@ class RunningTwin:
         self._twin, self._machine, self._link = twin, machine, link
         self._bus, self._port = bus, port
         self._description = BusDescription(twin.dbc, machine)
-        self._gateway, self._remote = (
-            Gateway(self._description, machine),
-            RadioRemote(self._description, machine),
-        )
+        self._gateway = Gateway(self._description, machine)
+        self._remote = RadioRemote(self._description, machine)
         self._second, self._second_due_s = RadioRemote(self._description, machine), -np.inf
         self._second.deadman = True
         self._faults, self._timer = ActiveFaults(), CycleTimer(CYCLE_S)
