@@ -154,22 +154,23 @@ class Check:
         """Return starts of the task, `None` where it has none for this machine."""
         if not machine.has_bodies:
             return None
-        seed, count = self.session.stream("check"), self.subject.num_starts
+        count = self.subject.num_starts
+        seed = self.session.stream("check")
         try:
             process = self.task.build(machine, 1, torch.device("cpu"))
             if "count_starts" in process.offers:
                 found.starts = process.count_starts(count, seed)
-            drawn = process.starts(count, seed)
+            return process.starts(count, seed)
         except BrokkError as error:
             found.unfit.append(str(error))
             return None
-        return drawn
 
     def _try_simulation(
         self, machine: Machine, found: MachineCheck, drawn: dict[str, torch.Tensor] | None
     ) -> None:
         """Simulate a second of full commands from drawn starts, and say which joint diverges."""
-        num, cpu = self.subject.num_starts, torch.device("cpu")
+        num = self.subject.num_starts
+        cpu = torch.device("cpu")
         actuator: ActuatorModel | None = None
         try:
             with torch.random.fork_rng([]):
@@ -219,13 +220,12 @@ def check_machine(machine: Machine, num_poses: int, generator: np.random.Generat
                 "beyond the weight, so this is allowed; look at masses (kg) and force limits"
             )
     for j, joint in enumerate(machine.joints):
-        travel, speed = joint.upper.value - joint.lower.value, joint.max_speed.value
         found.joints[joint.name] = {
             "lower": joint.lower.value,
             "upper": joint.upper.value,
             "home": joint.home,
-            "max_speed": speed,
-            "travel_s": travel / speed,
+            "max_speed": joint.max_speed.value,
+            "travel_s": (joint.upper.value - joint.lower.value) / joint.max_speed.value,
             "largest_weight": None if load is None else float(load[j]),
             "yield_force": joint.body.yield_force.value if joint.body else None,
         }
@@ -272,13 +272,13 @@ def try_machine(
     if drawn is None:
         lower, upper = (torch.tensor(end) for end in (machine.lower, machine.upper))
         share = torch.rand(num_worlds, machine.num_joints, generator=generator)
-        q, scene = (lower + (upper - lower) * share).float(), make_empty_scenes(num_worlds)
+        q = (lower + (upper - lower) * share).float()
+        scene = make_empty_scenes(num_worlds)
     else:
-        q, scene = drawn["q"], drawn["scene"]
-    history = History(
-        q=torch.zeros(num_worlds, machine.num_history, machine.num_joints),
-        u=torch.zeros(num_worlds, machine.num_history, machine.num_joints),
-    )
+        q = drawn["q"]
+        scene = drawn["scene"]
+    zeros = torch.zeros(num_worlds, machine.num_history, machine.num_joints)
+    history = History(q=zeros, u=zeros.clone())
     world.reset(everywhere, q, scene)
     history.reset(everywhere, q)
     if actuator is not None:
@@ -304,10 +304,10 @@ def try_machine(
             history.push_q(world.q)
     if not cause:
         return None, True
-    num_faults, is_inside = int(world.faults.sum()), is_touching[world.faults]
+    num_faults = int(world.faults.sum())
     is_endured = num_faults <= MOST_FAULTS * num_worlds * math.ceil(TRIAL_S / machine.period_s)
     said = f"{num_faults} of {num_worlds} worlds diverged in a simulated second: {cause}. "
-    if is_inside[0]:
+    if is_touching[world.faults][0]:
         said += (
             "It began in contact with the block, the ground or itself: let the task draw other starts, "
             "or take block and ground away (scene: brokk_rl.sim.scene.make_empty_scenes)"
