@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from composed import option
 
 from brokk_rl.machine import Machine, mask_exclusive_joints
-from tasks.control import ClassicalController
 from tasks.settings import ActionMapping, CommandBase, PhaseSwitch
 
 
@@ -105,39 +103,3 @@ def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
     np.testing.assert_allclose(direct[0], [0.2, 0.0, -0.2, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(residual[0], [0.7, 0.0, 0.3, 1.0, -0.25], atol=1e-6)
     np.testing.assert_allclose(unmasked[0], [0.7, 0.7, 0.3, 1.0, -0.25], atol=1e-6)
-
-
-def guided(machine: Machine, q: torch.Tensor, target_m: torch.Tensor) -> Any:
-    task = option("task", "borehole_insertion")
-    controller = ClassicalController(task.classical, machine, torch.device("cpu"))
-    history = q[:, None].repeat(1, machine.num_history, 1)
-    return controller.guide(
-        history, torch.zeros_like(history), target_m, torch.full((len(q),), 1.57), (1.7, 2.4)
-    )
-
-
-def test_the_planar_rule_does_not_depend_on_where_q1_points(machine: Machine) -> None:
-    torch.manual_seed(0)
-    lower, upper = (torch.tensor(v, dtype=torch.float32) for v in (machine.lower, machine.upper))
-    q = lower + (upper - lower) * torch.rand(32, 5)
-    turned = q.clone()
-    turned[:, 0] = 1.2
-    target = torch.tensor([[2.8, 0.3, 0.7]]).repeat(32, 1)
-    here, there = (
-        switch("planar").positioning(guided(machine, rows, target)) for rows in (q, turned)
-    )
-    assert torch.equal(here, there) and here.any() and not here.all()
-
-
-def test_in_space_q2_alone_cannot_bring_a_target_behind_the_shoulder_into_range(
-    machine: Machine,
-) -> None:
-    """Why there is a planar rule: with q1 1.5 rad away, no q2 ends the positioning of text and equation."""
-    q = torch.tensor(machine.home, dtype=torch.float32).repeat(100, 1)
-    q[:, 0] = 1.5
-    q[:, 1] = torch.linspace(float(machine.lower[1]), float(machine.upper[1]), 100)
-    found = guided(machine, q, torch.tensor([[3.0, 0.0, 0.7]]).repeat(100, 1))
-    high = found.tip_z_m >= 0.2
-    assert switch("text").positioning(found)[high].all()
-    assert switch("equation").positioning(found).all()
-    assert not switch("planar").positioning(found).all()
