@@ -10,7 +10,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import (
     TARGET_DISTANCE,
     ObservationEncoder,
-    ObservationPart,
     TargetScaling,
     list_pose_parts,
     measure_ranges,
@@ -90,14 +89,6 @@ def test_the_contract_tells_size_order_and_scale_and_gives_the_encoder_back(
     assert paper["q"]["mean"][1] == pytest.approx(-0.675)
     assert paper["q"]["std"][1] == pytest.approx(0.3625)
     assert restore_encoder(machine, pitch).describe() == pitch
-
-
-def test_parts_of_another_task_are_told_one_by_one_and_give_the_encoder_back(
-    machine: Machine,
-) -> None:
-    described = ObservationEncoder([ObservationPart("speed", (2, 3), 0.5, 2.0)]).describe()
-    assert described["size"] == 6 and described["order"] == ["speed (2 x 3)"]
-    assert restore_encoder(machine, described).describe() == described
 
 
 def test_ranges_are_those_of_the_values_in_their_units(machine: Machine) -> None:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
-import training as runs
 from composed import option
 from kinematic import Kinematic, KinematicWorld
 
@@ -21,12 +19,8 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.observation import restore_encoder
 from brokk_rl.policy_folder import describe_task
-from brokk_rl.rl.policy import ClassicalPolicy
-from brokk_rl.rl.settings import Evaluation
-from brokk_rl.session import Session
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import find_site
@@ -224,7 +218,9 @@ def test_exclusive_joints_move_alone_where_their_command_is_the_largest(machine:
     assert free[1].tolist() == pytest.approx([0.1, 0.2, 0.0, 0.0, -1.0])
 
 
-def test_the_contract_names_each_part_and_gives_the_vector_back(machine: Machine) -> None:
+def test_the_contract_names_each_part_and_gives_the_vector_back(
+    machine: Machine, asked: float
+) -> None:
     stage = Stage(machine)
     described = json.loads(json.dumps(stage.process.describe()))
     assert described["order"] == ["joints (3 x 5)", "error (1 x 1)"] and described["size"] == 16
@@ -233,6 +229,7 @@ def test_the_contract_names_each_part_and_gives_the_vector_back(machine: Machine
     vector = stage.first.numpy()
     samples = encoder.decode(vector)
     assert samples["joints"].shape == (1, 3, 5) and samples["error"].shape == (1, 1, 1)
+    assert samples["error"].item() == pytest.approx(-asked), "in its own unit"
     np.testing.assert_allclose(encoder.encode(samples), vector, atol=1e-6)
 
 
@@ -254,24 +251,6 @@ def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     with pytest.raises(CheckpointError, match=r"asks for joints \(3 x 5\), error \(1 x 1\)"):
         PolicyBundle(str(tmp_path), machine)
-
-
-def test_a_task_without_a_classical_controller_is_evaluated_in_its_own_words(
-    machine: Machine, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    class Resting:
-        def build(self, loop: Any, seed: int) -> Any:
-            return SimpleNamespace(act=lambda groups: torch.zeros(loop.num_envs, 5))
-
-    session = Session(out=str(tmp_path), seed=0, device="cpu")
-    how = Evaluation(episodes=4, seed=3, num_recorded=1, video=False)
-    policies: Any = {"resting": Resting(), "classical": ClassicalPolicy(task=None)}
-    found = evaluate_policies(runs.plant(machine, make()), how, session, policies)
-    assert list(found["policies"]) == list(found["tasks"]) == ["resting"]
-    assert found["terminations"] == {"fault": 0, "time_limit": 4}
-    assert {one["title"] for one in found["figures"].values()} == {"turned", "turning"}
-    told = capsys.readouterr().out
-    assert "turned" in told and "paper" not in told and "valve" not in told
 
 
 def test_a_geom_of_the_scene_gives_that_of_the_machine_its_shape(machine: Machine) -> None:
