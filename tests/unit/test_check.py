@@ -128,6 +128,7 @@ def test_our_own_mjcf_gives_our_own_machine(machine: Machine) -> None:
     for q in (machine.home, machine.lower, machine.upper):
         tips = [compute_tool_kinematics(one, q).tip_in_base_m for one in (machine, made)]
         assert tips[0] == pytest.approx(tips[1], abs=1e-5)
+    assert made.lower == pytest.approx(machine.lower) and made.upper == pytest.approx(machine.upper)
     masses = [[body.mass_kg.value for body in one.bodies] for one in (machine, made)]
     assert masses[1] == pytest.approx(masses[0])
 

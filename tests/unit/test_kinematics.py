@@ -111,6 +111,7 @@ def test_arrays_have_the_jacobians_of_differences_behind_slides_too(machine):
     chain = _chain(machine, "shs", [(0, 0, 1), (0, 1, 0), (1, 0, 0)])
     q, step = np.array([0.2, 0.3, -0.1]), 1e-6
     tool = compute_tool_kinematics(chain, q)
+    assert np.linalg.norm(tool.axis_in_base) == pytest.approx(1.0)
     for j, shift in enumerate(step * np.eye(3)):
         ahead, behind = (compute_tool_kinematics(chain, q + sign * shift) for sign in (1, -1))
         tip = (ahead.tip_in_base_m - behind.tip_in_base_m) / (2 * step)

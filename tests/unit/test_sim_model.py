@@ -9,8 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.kinematics import compute_tool_kinematics
-from brokk_rl.sim.model import ASSETS, compile_model
+from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.scene import ScenePlacement, build_collision_geoms, make_nominal_scenes
 
 
@@ -105,15 +104,3 @@ def test_bounding_volumes_hold_every_block(machine):
     size, _ = placement.geoms(scene)
     assert (size.norm(dim=-1) <= torch.tensor(model.geom_rbound)[placement.geom_ids] + 1e-9).all()
     assert (size <= torch.tensor(model.geom_aabb[:, 3:])[placement.geom_ids] + 1e-9).all()
-
-
-def test_mujoco_alone_shows_the_arm_of_the_machine(machine):
-    model = mujoco.MjModel.from_xml_path(str(ASSETS / machine.mjcf))
-    data = mujoco.MjData(model)
-    lower, upper = np.asarray(machine.lower), np.asarray(machine.upper)
-    for share in (0.0, 0.3, 1.0):
-        data.qpos[:] = lower + share * (upper - lower)
-        mujoco.mj_kinematics(model, data)
-        tip = compute_tool_kinematics(machine, data.qpos).tip_in_base_m
-        assert data.site("tip").xpos == pytest.approx(tip, abs=1e-9)
-    assert model.jnt_range == pytest.approx(np.stack((lower, upper), 1))
