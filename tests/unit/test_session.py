@@ -135,7 +135,3 @@ def test_a_broken_record_is_named(tmp_path: Path) -> None:
     (tmp_path / "session.json").write_text("{")
     with pytest.raises(StorageError, match=r"session\.json"):
         read_record(tmp_path)
-
-
-def test_a_bug_of_ours_keeps_its_traceback() -> None:
-    assert explain(RuntimeError("bug")) is None
