@@ -155,10 +155,6 @@ def test_a_trained_policy_is_read_back_as_it_was_written(bundle: Bundle) -> None
         assert torch.equal(again.act(groups), NetworkPolicy(bundle.actor, bundle.loop).act(groups))
 
 
-def corrupt(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
-
-
 def cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
 
@@ -172,16 +168,14 @@ def spoil(path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "damage", "told"),
     [
-        ("policy.safetensors", lambda path: corrupt(path, b""), r"or corrupt: .*mode=export"),
-        ("policy.safetensors", lambda path: corrupt(path, b"{"), r"or corrupt: .*mode=export"),
         ("policy.safetensors", cut_off, r"or corrupt: .*mode=export"),
         ("policy.safetensors", spoil, r"NaN or infinite weights in mlp\.0\.weight"),
-        ("policy.json", lambda path: corrupt(path, b"{"), r"or corrupt: .*mode=export"),
+        ("policy.json", lambda path: path.write_bytes(b"{"), r"or corrupt: .*mode=export"),
         ("policy.safetensors", Path.unlink, r"or corrupt: No such file"),
     ],
 )
 def test_a_damaged_file_is_named_with_the_way_out(
-    file: str, damage: Callable[[Path], None], told: str, copied: Path
+    file: str, damage: Callable[[Path], Any], told: str, copied: Path
 ) -> None:
     damage(copied / file)
     with pytest.raises(CheckpointError, match=told):

@@ -113,16 +113,6 @@ def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
     read_checkpoint(tmp_path / "model_1.pt", "cpu")
 
 
-def test_a_folder_that_cannot_be_written_is_a_storage_error(
-    machine: Machine, tmp_path: Path
-) -> None:
-    runner = runs.make(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
-    (tmp_path / "run").rmdir()
-    (tmp_path / "run").touch()
-    with pytest.raises(StorageError, match=r"cannot write .*model_0\.pt"):
-        runner.checkpoint()
-
-
 @pytest.fixture
 def checkpoint(machine: Machine, tmp_path: Path) -> Path:
     runs.train(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
@@ -164,16 +154,13 @@ def test_a_checkpoint_cannot_run_code(checkpoint: Path, machine: Machine) -> Non
     assert not checkpoint.with_name("trapped").exists()
 
 
-@pytest.mark.parametrize("number", [float("nan"), float("inf")])
 def test_weights_that_are_no_numbers_are_refused_by_name(
-    number: float, checkpoint: Path, machine: Machine
+    checkpoint: Path, machine: Machine
 ) -> None:
     def spoil(content: dict[str, Any]) -> None:
-        next(
-            value for name, value in content["actor_state_dict"].items() if name.endswith("weight")
-        )[0, 0] = number
+        content["actor_state_dict"]["mlp.0.weight"][0, 0] = torch.inf
 
-    with pytest.raises(CheckpointError, match=r"NaN or infinite weights in .*weight"):
+    with pytest.raises(CheckpointError, match=r"NaN or infinite weights in mlp\.0\.weight"):
         loading(machine, changed(checkpoint, spoil))
 
 
@@ -236,11 +223,9 @@ def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: 
         runner.run()
 
 
-@pytest.mark.parametrize(
-    ("number", "term"), [(float("inf"), "value"), (float("nan"), "value"), (1e30, "value")]
-)
+@pytest.mark.parametrize("number", [float("inf"), float("nan"), 1e30])
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(
-    number: float, term: str, machine: Machine, tmp_path: Path
+    number: float, machine: Machine, tmp_path: Path
 ) -> None:
     runner = runs.make(machine, tmp_path, runs.small(max_env_steps=3 * ITERATION))
     step, calls = runner.env.step, [0]
@@ -252,7 +237,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(
         return groups, reward + number if is_spoiled else reward, *rest
 
     runner.env.step = spoils  # type: ignore[method-assign]
-    with pytest.raises(TrainingError, match=rf"iteration 2: .* for {term}.*model_2\.pt"):
+    with pytest.raises(TrainingError, match=r"iteration 2: .* for value.*model_2\.pt"):
         runner.run()
     assert [path.name for path in list_checkpoints(tmp_path)] == ["model_1.pt", "model_2.pt"]
     assert len(runs.progress(tmp_path)) == 2
