@@ -133,24 +133,6 @@ def test_a_function_for_one_state_is_that_for_many(
     np.testing.assert_allclose(runs[0][0, -1], expected, atol=1e-12)
 
 
-def test_a_pendulum_written_by_hand_explains_its_own_delay(pendulum: str) -> None:
-    machine = make_machine("hinge")
-    simulator = api._load_simulator(pendulum)
-    simulator.load(machine)
-    step = sys.modules["my_pendulum"].step
-    targets = draw_targets(np.random.default_rng(2), 800, 1)
-    state, q = np.zeros(2), np.zeros((800, 1))
-    for k in range(800):
-        q[k] = state[0]
-        state = step(state, targets[max(0, k - 2)])
-    t_s = np.arange(800) * machine.period_s
-    recording = make_motion(machine, "run", t_s, (targets / 1.5).astype(np.float32), q)
-    late = {"dead_time": {"dead_time_s": np.full((1, 1), 0.04)}}
-    before = measure_errors(simulator, machine, recording, {})[0]
-    after = measure_errors(simulator, machine, recording, late)[0]
-    assert after < 0.05 * before
-
-
 def test_function_and_file_of_the_tutorial_are_the_same_pendulum(
     pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
