@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 import torch
 from composed import option
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from actuators.effects.composition import ActuatorWithEffects
 from brokk_rl.history import History
@@ -22,8 +20,6 @@ from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")
 FULL = 0.02
-LEVELS = st.lists(st.floats(-1.0, 1.0, width=32), min_size=1, max_size=30)
-few = settings(max_examples=25, deadline=None)
 
 
 class Probe:
@@ -196,16 +192,6 @@ def test_effects_without_memory_hold_for_the_whole_history(machine: Machine) -> 
     torch.testing.assert_close(model.inner.history.u, history.u.clamp(-0.5, 0.5))
 
 
-@given(levels=LEVELS, stroke_s=st.floats(0.01, 2.0))
-@few
-def test_rate_limit_never_exceeds_its_slope_nor_the_command(
-    machine: Machine, levels: list[float], stroke_s: float
-) -> None:
-    got = seen("rate_limit", machine, levels, stroke_s=stroke_s)
-    assert np.abs(np.diff([0.0, *got])).max() <= 0.05 / stroke_s + 1e-5
-    assert np.abs(got).max() <= np.abs(levels).max() + 1e-6
-
-
 def test_a_gain_does_not_compound_in_a_model_that_goes_on_from_increments(machine: Machine) -> None:
     got = steps(wrapped("flow_gain", machine, inner=Glide(machine), gain=0.8), machine, [1.0] * 20)
     plain = steps(Glide(machine), machine, [1.0] * 20)
@@ -225,18 +211,6 @@ def test_backlash_of_a_moving_joint_is_closed(machine: Machine) -> None:
         q=0.01 * torch.arange(13.0)[None, :, None].expand(1, 13, 5), u=torch.ones(1, 13, 5)
     )
     assert (model.step(history) - history.q[:, -1])[0, 0].item() == pytest.approx(FULL, abs=1e-6)
-
-
-@given(levels=LEVELS, gap=st.floats(0.0, 0.15))
-@few
-def test_backlash_keeps_within_its_gap_and_never_moves_against_the_drive(
-    machine: Machine, levels: list[float], gap: float
-) -> None:
-    path = roll(wrapped("backlash", machine, gap_rad=gap), machine, levels)[:, 0, 0].numpy()
-    driven = FULL * np.cumsum([0.0, *levels])
-    inside = np.abs(driven) < 1.5  # the stops are at 1.6
-    assert (np.abs(path - driven)[inside] <= 0.5 * gap + 1e-5).all()
-    assert (np.diff(path) * np.array(levels) >= -1e-7).all()
 
 
 def test_compliance_rings_as_an_oscillator_does(machine: Machine) -> None:
