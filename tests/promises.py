@@ -22,6 +22,7 @@ from brokk_rl.errors import BrokkError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.signals import Command
 
+CPU = torch.device("cpu")
 NUM_PROPOSALS = 60
 """Control periods of a follower's check."""
 DURATION_S = 300.0
@@ -99,34 +100,24 @@ def check_link(link: Link, machine: Machine, num_runs: int = 1) -> None:
         assert not np.asarray(sent).any(), text
 
 
-def check_follower(
-    follower: Follower, machine: Machine, device: torch.device | str = "cpu"
-) -> None:
+@isolate_randomness()
+def check_follower(follower: Follower, machine: Machine) -> None:
     """Check the model of `Follower.build` against `FollowerModel`."""
-    place = torch.device(device)
-    with isolate_randomness():
-        _check_follower_model(follower.build(machine, NUM_ENVS, place), machine, place)
-
-
-def _check_follower_model(model: FollowerModel, machine: Machine, device: torch.device) -> None:
-    first = check_memory(
-        model, machine, device, lambda alter: _follow(model, machine, device, alter)
-    )
+    model = follower.build(machine, NUM_ENVS, CPU)
+    first = check_memory(model, machine, CPU, lambda alter: _follow(model, machine, alter))
     assert (first.abs() <= 1.0).all(), "step: commands leave [-1, 1]"
-    exclusive = torch.as_tensor(machine.is_exclusive, device=device)
+    exclusive = torch.as_tensor(machine.is_exclusive)
     both = (first[..., exclusive] != 0).any(-1) & (first[..., ~exclusive] != 0).any(-1)
     assert not both.any(), "step: an exclusive joint moves together with others"
     assert (first != 0).any(), "step: nothing is ever given"
-    model.reset(torch.ones(NUM_ENVS, dtype=torch.bool, device=device))
-    still = torch.zeros(NUM_ENVS, machine.num_joints, device=device)
+    model.reset(torch.ones(NUM_ENVS, dtype=torch.bool))
+    still = torch.zeros(NUM_ENVS, machine.num_joints)
     for _ in range(NUM_PROPOSALS):
         given = model.step(still)
         assert not given.any(), "reset: a new person gives a command that nobody has proposed"
 
 
-def _follow(
-    model: FollowerModel, machine: Machine, device: torch.device, alter_first: bool
-) -> torch.Tensor:
+def _follow(model: FollowerModel, machine: Machine, alter_first: bool) -> torch.Tensor:
     """Return the given commands, `(T, N, J)`, for held, full, random and zero proposals."""
     generator = torch.Generator().manual_seed(0)
     exclusive = torch.as_tensor(machine.is_exclusive)
@@ -141,7 +132,6 @@ def _follow(
         proposed = u.clone()
         if alter_first:
             proposed[0] = -proposed[0].roll(1)
-        proposed = proposed.to(device)
         kept = proposed.clone()
         found.append(model.step(proposed).clone())
         assert is_same(proposed, kept), "step: changed the proposal"
