@@ -13,7 +13,6 @@ from arm import make_machine, run_servo
 from composed import option
 from scipy.integrate import solve_ivp
 
-from actuators.effects.drives import TorqueLimit
 from actuators.models.servo import Servo
 from brokk_rl.commands import read_targets
 from brokk_rl.errors import ConfigError
@@ -197,7 +196,6 @@ def test_only_joints_commanded_by_position_have_it(machine: Machine, arm: Machin
         option("effect", "torque_limit").wrap(option("actuator", "lag").build(machine, 1, CPU), machine, 1, CPU)  # fmt: skip
     with pytest.raises(ConfigError, match="limit_rad: expected more than 0"):
         make_servo(limit_rad=0.0).build(arm, 1, CPU)
-    assert TorqueLimit.numbers["shortage"].none == 0.0
 
 
 def record_limited(arm: Machine, seed: int, limit_n_m: float, seconds: float) -> Recording:
