@@ -54,7 +54,7 @@ CORE = {
 """Modules that decide what reaches the valves, and the tests of each."""
 SCIENCE = {
     "brokk_rl.kinematics": ["test_kinematics.py"],
-    "brokk_rl.observation": ["test_observation.py"],
+    "brokk_rl.observation": ["test_observation.py", "test_term_task.py"],
     "brokk_rl.statistics": ["test_compare.py"],
     "tasks.control": ["test_classical.py", "test_task_masks.py", "test_advice.py"],
     "tasks.terms": ["test_reward.py", "test_term_task.py", "test_termination.py"],
