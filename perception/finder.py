@@ -207,6 +207,13 @@ class StagedFinder:
             judged = self._doubt_scale(frame, judged, ms)
         return self._conclude(judged, masks, frame, ms)
 
+    def find_ellipses(self, frame: Frame) -> tuple[FrameDetections, tuple[()]]:
+        """Return the ellipses of the whole picture, of any size, without depth; no hole is tracked."""
+        ms: dict[str, float] = {}
+        with _time_stage(ms, "ellipse"):
+            ellipses = self._detector.detect(convert_to_gray(frame), None, None)
+        return FrameDetections([], [], ellipses, None, ms), ()
+
     def _doubt_scale(self, frame: Frame, judged: _Judged, ms: dict[str, float]) -> _Judged:
         """Return that a rim of another size is surer than all holes, in place of those."""
         s = self.settings

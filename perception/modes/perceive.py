@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,12 +27,13 @@ from brokk_rl.contracts.vision import (
     TrackedHole,
     TrackerSpec,
 )
-from brokk_rl.errors import FrameError
+from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, spec
 from perception.contracts import SteeredFinder
+from perception.finder import StagedFinder
 from perception.overlay import OverlayDrawing
 from perception.tracking.steered_search import SteeredSearch
 
@@ -45,11 +46,13 @@ class PerceiveOptions:
 
     Attributes:
         input: Folder of frames.
+        until: `holes`, or `ellipses` of the whole picture, which need no depth.
         frames: Number of frames; `null` for all, which a live camera has no end of.
         pictures: Write an overlay for each frame.
     """
 
     input: str | None
+    until: Literal["holes", "ellipses"]
     frames: Count | None
     pictures: bool
 
@@ -80,6 +83,7 @@ class FrameEntry:
         }
         plain["holes"] = [_describe_hole(one) for one in self.found.holes]
         plain["rejected"] = [_describe_rejection(one) for one in self.found.rejected]
+        plain["ellipses"] = [_describe_ellipse(one) for one in self.found.ellipses]
         plain["target"] = None
         if self.target is not None:
             hole, age_s = self.target
@@ -148,12 +152,19 @@ class Perceive:
     ) -> Iterator[tuple[FrameEntry, Frame | None]]:
         """Yield the result of each frame of the source."""
         search = SteeredSearch(finder, tracker)
+        look = search.update
+        if self.perceive.until == "ellipses":
+            if not isinstance(finder, StagedFinder):
+                raise ConfigError(
+                    f"perceive.until=ellipses: expected perception=plane_conic, got {type(finder).__name__}"
+                )
+            look = finder.find_ellipses
         for name, frame, refused in self._read_frames():
             if frame is None:
                 yield FrameEntry(name, None, None, refused), None
                 continue
             try:
-                found, tracked = search.update(frame)
+                found, tracked = look(frame)
             except FrameError as error:
                 log.warning("%s", error)
                 yield FrameEntry(name, None, None, str(error)), frame
@@ -197,13 +208,11 @@ class Perceive:
 
     def _show(self, entries: list[FrameEntry]) -> None:
         """Print a table of counts, refusals, the target and the durations."""
-        used = []
-        for entry in entries:
-            if entry.found:
-                used.append(entry.found)
+        used = [entry.found for entry in entries if entry.found]
         rows = [("frames", f"{len(used)} used, {len(entries) - len(used)} refused")]
         num_holes = sum(len(one.holes) for one in used)
         rows.append(("holes", f"{num_holes} in {sum(bool(one.holes) for one in used)} frames"))
+        rows.append(("ellipses", str(sum(len(one.ellipses) for one in used))))
         counts: Counter[str] = Counter()
         for one in used:
             counts.update(f"{rejection.stage}: {rejection.reason}" for rejection in one.rejected)

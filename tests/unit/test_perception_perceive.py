@@ -47,6 +47,20 @@ def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) 
     assert "1 hole" in Path("out/explain.txt").read_text()
 
 
+def test_ellipses_of_a_picture_need_no_depth(folder: Path, brokk: Callable) -> None:
+    for path in folder.glob("*.depth.npy"):
+        path.unlink()
+    command = ("mode=perceive", f"perceive.input={folder}", "perceive.until=ellipses")
+    done = brokk(*command, "source.needs=camera", "session.out=out")
+    assert done.code == 0, done.err
+    frame = json.loads(Path("out/holes.json").read_text())["frames"][0]
+    x, y, z = K @ CENTER
+    away_px = [np.hypot(one["x"] - x / z, one["y"] - y / z) for one in frame["ellipses"]]
+    assert min(away_px) < 2.0 and frame["holes"] == []
+    refused = brokk(*command, "perception=truth", "session.out=no")
+    assert refused.code == 2 and "expected perception=plane_conic" in refused.err
+
+
 def test_a_finder_that_only_finds_holes_is_enough(folder: Path, brokk: Callable) -> None:
     done = brokk("mode=perceive", f"perceive.input={folder}", "perception=truth", "session.out=out")
     assert done.code == 0, done.err
