@@ -54,23 +54,18 @@ def load_extrinsics(given: CameraPlacement, where: str) -> CameraExtrinsics:
     if not isinstance(given, str):
         return CameraExtrinsics(validation.check_pose(given, where), None)
     content, where = read_calibration(Path(given), where), f"{where}={given}"
-    cov = np.asarray(content.get("covariance", np.zeros((6, 6))), float)
-    is_covariance = (
-        cov.shape == (6, 6)
-        and np.isfinite(cov).all()
-        and np.linalg.eigvalsh((cov + cov.T) / 2).min() >= MIN_EIGENVALUE
-    )
-    if not is_covariance:
-        raise FrameError(
-            f"{where}: covariance: expected a covariance of six numbers, (6, 6); calibrate again"
-        )
+    told = content.get("covariance", np.zeros((6, 6)))
+    cov = validation.parse_numbers(told, (6, 6), f"{where}: covariance")
+    cov = (cov + cov.T) / 2
+    if np.linalg.eigvalsh(cov).min() < MIN_EIGENVALUE:
+        raise FrameError(f"{where}: covariance: expected one of six numbers; calibrate again")
     place = validation.check_pose(content["T_base_cam"], where)
     disparity = content.get("disparity")
     if disparity is None:
-        return CameraExtrinsics(place, (cov + cov.T) / 2)
-    error_px = validation.check_disparity_error(disparity["error_px"], where)
-    std_px = validation.check_number(disparity["std_px"], where, "disparity_std_px")
-    return CameraExtrinsics(place, (cov + cov.T) / 2, error_px, std_px)
+        return CameraExtrinsics(place, cov)
+    error_px = validation.check_disparity_error(disparity.get("error_px"), where)
+    std_px = validation.check_number(disparity.get("std_px"), where, "disparity_std_px")
+    return CameraExtrinsics(place, cov, error_px, std_px)
 
 
 def read_calibration(path: Path, where: str) -> dict[str, Any]:
@@ -86,10 +81,10 @@ def read_calibration(path: Path, where: str) -> dict[str, Any]:
             f"{where}: {path} cannot be read ({error}); expected calibration.yaml of "
             "`brokk mode=calibrate`"
         ) from error
-    if (
-        not isinstance(content, dict)
-        or content.get("schema") != SCHEMA
-        or "T_base_cam" not in content
+    is_known = isinstance(content, dict) and content.get("schema") == SCHEMA
+    is_known = is_known and "T_base_cam" in content
+    if not is_known or not all(
+        isinstance(content.get(part), dict | None) for part in ("verdict", "disparity")
     ):
         raise FrameError(
             f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` "
@@ -163,10 +158,7 @@ def build_calibration(
         distance_m: Working distance, at which the uncertainty of a point is stated.
         more: Entries of this kind alone.
     """
-    used = []
-    for one in residuals:
-        if one.left_out is None:
-            used.append(one)
+    used = [one for one in residuals if one.left_out is None]
     return {
         "schema": SCHEMA,
         "kind": "board",
@@ -193,8 +185,5 @@ def build_calibration(
 
 
 def _compute_rms(values: Sequence[float | None]) -> float | None:
-    known = []
-    for value in values:
-        if value is not None:
-            known.append(value)
+    known = [value for value in values if value is not None]
     return round(float(np.sqrt(np.mean(np.square(known)))), 6) if known else None

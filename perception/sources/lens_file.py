@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from brokk_rl.errors import FrameError
+from perception.calibrate.transforms import make_transform
 from perception.sources import validation
 
 ZED_SIZES = {
@@ -25,6 +26,8 @@ ZED_SIZES = {
     (672, 376): "VGA",
 }
 """Names of picture sizes in the sections of a factory file."""
+CALIBRATION = ("K1", "D1", "K2", "D2", "R", "T")
+"""What a stereo calibration holds."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +84,7 @@ def read_pair_lens(
     if content is None:
         cameras, turn, shift_m = _read_factory_file(path, size_px)
     else:
-        told = validation.parse_size(content.get("size_px"), str(path))
-        validation.check_size(told, size_px[1], size_px[0], str(path), "the pictures")
-        cameras = []
-        for number in (1, 2):
-            matrix = validation.check_matrix(content[f"K{number}"], str(path))
-            cameras.append((matrix, np.asarray(content[f"D{number}"], float).ravel()))
-        turn = np.asarray(content["R"], float).reshape(3, 3)
-        shift_m = np.asarray(content["T"], float).ravel()
+        cameras, turn, shift_m = _read_stereo_calibration(str(path), content, size_px)
     for matrix, _ in cameras:
         validation.check_matrix_fits(matrix, size_px[1], size_px[0], str(path))
     validation.check_number(float(np.linalg.norm(shift_m)), str(path), "baseline_m")
@@ -107,6 +103,30 @@ def read_pair_lens(
     if baseline_m <= 0:
         raise FrameError(f"{path}: the second camera lies left of the first; swap them")
     return PairLens(np.asarray(project)[:, :3], np.zeros(0), baseline_m, size_px, maps)
+
+
+def _read_stereo_calibration(
+    where: str, content: dict[str, Any], size_px: tuple[int, int]
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray]:
+    """Return the same as `_read_factory_file`, of what `stereoCalibrate` gives."""
+    if missing := [name for name in CALIBRATION if name not in content]:
+        raise FrameError(
+            f"{where}: expected {' '.join(CALIBRATION)}, as OpenCV's stereoCalibrate gives them, got no "
+            f"{', '.join(missing)}; lens=board writes such a file"
+        )
+    told = validation.parse_size(content.get("size_px"), where)
+    validation.check_size(told, size_px[1], size_px[0], where, "the pictures")
+    cameras = []
+    for number in (1, 2):
+        camera = f"{where}: camera {number}"
+        bent = validation.check_distortion(content[f"D{number}"], camera)
+        matrix = validation.check_matrix(content[f"K{number}"], camera)
+        cameras.append((matrix, np.zeros(0) if bent is None else bent))
+    turn = validation.parse_numbers(content["R"], (3, 3), f"{where}: R")
+    shift_m = validation.parse_numbers(content["T"], None, f"{where}: T").ravel()
+    shift_m = validation.parse_numbers(shift_m, (3,), f"{where}: T")
+    validation.check_pose(make_transform(turn, shift_m), where, "R with T")
+    return cameras, turn, shift_m
 
 
 def _read_factory_file(

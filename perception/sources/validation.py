@@ -44,7 +44,7 @@ NUMBERS = {
 
 def check_matrix(value: Any, where: str) -> np.ndarray:
     """Return a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
-    found = _parse_numbers(value, (3, 3), f"{where}: K")
+    found = parse_numbers(value, (3, 3), f"{where}: K")
     if found[0, 0] <= 0 or found[1, 1] <= 0:
         raise FrameError(
             f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected more than 0"
@@ -95,7 +95,7 @@ def parse_size(value: Any, where: str) -> tuple[int, int] | None:
     """Return columns and rows of the pictures of a camera, `None` where they are not told."""
     if value is None:
         return None
-    found = _parse_numbers(value, (2,), f"{where}: size_px")
+    found = parse_numbers(value, (2,), f"{where}: size_px")
     if (found < 1).any() or (found != np.rint(found)).any():
         raise FrameError(f"{where}: size_px is {value}, expected [columns, rows] of the pictures")
     return int(found[0]), int(found[1])
@@ -119,7 +119,7 @@ def check_size(
 def check_distortion(value: Any, where: str) -> np.ndarray | None:
     """Return distortion coefficients, `None` where all of them are 0."""
     found = np.asarray(
-        _parse_numbers([] if value is None else value, None, f"{where}: dist")
+        parse_numbers([] if value is None else value, None, f"{where}: dist")
     ).reshape(-1)
     if len(found) not in _NUM_DISTORTION:
         raise FrameError(
@@ -130,9 +130,9 @@ def check_distortion(value: Any, where: str) -> np.ndarray | None:
     return found if np.any(found) else None
 
 
-def check_pose(value: Any, where: str) -> np.ndarray:
+def check_pose(value: Any, where: str, name: str = "T_base_cam") -> np.ndarray:
     """Return a pose, `(4, 4)`, or raises a `FrameError` where it is none."""
-    found = _parse_numbers(value, (4, 4), f"{where}: T_base_cam")
+    found = parse_numbers(value, (4, 4), f"{where}: {name}")
     turn = found[:3, :3]
     if (
         np.abs(found[3] - [0, 0, 0, 1]).max() > 1e-9
@@ -140,7 +140,7 @@ def check_pose(value: Any, where: str) -> np.ndarray:
         or np.linalg.det(turn) < 0
     ):
         raise FrameError(
-            f"{where}: T_base_cam is no rigid transform: expected a rotation, a shift in m and the row 0 0 0 1"
+            f"{where}: {name} is no rigid transform: expected a rotation, a shift in m and the row 0 0 0 1"
         )
     return found
 
@@ -171,7 +171,7 @@ def check_upright(base_from_camera: np.ndarray, where: str) -> None:
 
 def check_number(value: Any, where: str, name: str) -> float:
     """Return a number of a camera (`NUMBERS`), or raises a `FrameError` where it is none."""
-    found = float(_parse_numbers(value, (), f"{where}: {name}"))
+    found = float(parse_numbers(value, (), f"{where}: {name}"))
     least, largest, expected = NUMBERS[name]
     if not least <= found <= largest:
         raise FrameError(f"{where}: {name} is {found:g}, expected {expected}")
@@ -180,7 +180,7 @@ def check_number(value: Any, where: str, name: str) -> float:
 
 def check_disparity_error(value: Any, where: str) -> tuple[float, float, float]:
     """Return constant and slopes of a disparity's error, px, or raises a `FrameError`."""
-    found = _parse_numbers(value, (3,), f"{where}: disparity.error_px")
+    found = parse_numbers(value, (3,), f"{where}: disparity.error_px")
     if np.abs(found).max() > _LARGEST_OFFSET_PX:
         raise FrameError(
             f"{where}: disparity.error_px is {found.tolist()}, expected up to "
@@ -253,7 +253,8 @@ def check_same_size(one: np.ndarray, other: np.ndarray, where: str, what: str) -
         )
 
 
-def _parse_numbers(value: Any, shape: tuple[int, ...] | None, where: str) -> np.ndarray:
+def parse_numbers(value: Any, shape: tuple[int, ...] | None, where: str) -> np.ndarray:
+    """Return finite numbers of a shape, any where that is `None`, or raises a `FrameError`."""
     try:
         found = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

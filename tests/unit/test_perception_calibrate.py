@@ -36,13 +36,8 @@ def off(found: np.ndarray) -> tuple[float, float]:
 def opencv(views: Any) -> np.ndarray:
     """Returns the camera as OpenCV finds it (Park and Martin): the same equations, all poses alike."""
     back, seen = transforms.invert(views.base_from_link), views.camera_from_board[:, 0]
-    turn, shift = cv2.calibrateHandEye(
-        list(back[:, :3, :3]),
-        list(back[:, :3, 3]),
-        list(seen[:, :3, :3]),
-        list(seen[:, :3, 3]),
-        method=cv2.CALIB_HAND_EYE_PARK,
-    )
+    parts = (back[:, :3, :3], back[:, :3, 3], seen[:, :3, :3], seen[:, :3, 3])
+    turn, shift = cv2.calibrateHandEye(*map(list, parts), method=cv2.CALIB_HAND_EYE_PARK)
     return transforms.make_transform(turn, shift[:, 0])
 
 
@@ -301,3 +296,8 @@ def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
     content["verdict"] = {"status": "cannot tell", "reasons": ["few"]}
     Path("open.yaml").write_text(yaml.safe_dump(content))
     assert load_extrinsics("open.yaml", "here").base_from_camera is not None
+    rows = [("covariance", [[1, 2], [3]]), ("disparity", {}), ("disparity", 3), ("verdict", "good")]
+    for part, wrong in rows:
+        Path("damaged.yaml").write_text(yaml.safe_dump(content | {"verdict": {}, part: wrong}))
+        with pytest.raises(FrameError, match=r"damaged\.yaml"):
+            load_extrinsics("damaged.yaml", "here")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
 from brokk_rl.errors import FrameError
 from perception.calibrate.pair_lens import BoardPair, calibrate_pair
+from perception.sources.lens_file import read_pair_lens
 
 SIZE_PX = (1280, 720)
 BOARD_M = np.array([[0.1 * x, 0.1 * y, 0.0] for y in range(5) for x in range(7)], np.float32)
@@ -59,3 +63,22 @@ def test_views_that_determine_no_lens_are_refused_by_what_they_lack(
 ) -> None:
     with pytest.raises(FrameError, match=lack):
         calibrate_pair(pairs, SIZE_PX)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("D2", None, "got no D2"), ("R", 2 * np.eye(3), "no rigid transform"), ("R", np.eye(2), r"R has shape \(2, 2\)"),
+        ("T", [-0.12, 0.0], r"T has shape \(2,\)"), ("D1", [np.nan] * 5, "camera 1: dist"), ("T", [-120.0, 0.0, 0.0], "mm"),
+    ],
+)  # fmt: skip
+def test_a_lens_file_without_a_number_or_with_impossible_ones_is_refused(
+    name: str, value: Any, told: str
+) -> None:
+    content = {"K1": LEFT, "D1": BENT, "K2": RIGHT, "D2": BENT, "R": np.eye(3), "T": [[-0.12], [0], [0]]}  # fmt: skip
+    assert read_pair_lens(Path("lens.yaml"), content, SIZE_PX).baseline_m == pytest.approx(0.12)
+    wrong = content | {name: value}
+    if value is None:
+        del wrong[name]
+    with pytest.raises(FrameError, match=told):
+        read_pair_lens(Path("lens.yaml"), wrong, SIZE_PX)

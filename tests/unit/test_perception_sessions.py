@@ -150,8 +150,21 @@ def test_a_session_is_scored_by_holes_measured_in_the_frame_of_the_board(tmp_pat
         assert score(tmp_path, kind, kind, found_m) == pytest.approx(error_m)
         row = json.loads((tmp_path / kind / "score.json").read_text())
         assert (row["kind"], row["inside_3_sigma"]) == (kind, inside)
-    (tmp_path / "wrong.yaml").write_text("holes: [{center_m: [1, 2]}]\nstd_m: 0.1\n")
-    with pytest.raises(ConfigError, match=r"hole 1.*expected YAML such as"):
+
+
+@pytest.mark.parametrize(
+    ("hole", "told"),
+    [
+        ("center_m: [1, 2]", "center_m"), ("center_m: [.nan, 0, 0]", "center_m"), ("center_m: [1120, 310, 6]", "mm"),
+        ("center_m: [1, 0, 0], axis: [0, 0, 0]", "axis"), ("center_m: [1, 0, 0], radius_m: 50", "mm"),
+        ("center_m: [1, 0, 0], radius_m: -0.05", "radius_m"),
+    ],
+)  # fmt: skip
+def test_a_hole_that_nobody_can_have_measured_is_refused(
+    tmp_path: Path, hole: str, told: str
+) -> None:
+    (tmp_path / "wrong.yaml").write_text(f"holes: [{{{hole}}}]\nstd_m: 0.1\n")
+    with pytest.raises(ConfigError, match=f"hole 1.*{told}.*expected YAML such as"):
         read_measured(tmp_path / "wrong.yaml", "score.truth")
 
 
