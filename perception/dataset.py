@@ -194,12 +194,9 @@ def write_frame(
     Raises:
         StorageError: a file could not be written.
     """
-    for ending, picture in (
-        (COLOR, color[..., ::-1]),
-        (RIGHT, None if right is None else right[..., ::-1]),
-    ):
-        if picture is not None:
-            write_picture(_build_path(stem, ending), picture)
+    write_picture(_build_path(stem, COLOR), color[..., ::-1])
+    if right is not None:
+        write_picture(_build_path(stem, RIGHT), right[..., ::-1])
     if depth_m is not None:
         content = io.BytesIO()
         np.save(content, depth_m.astype(np.float32))

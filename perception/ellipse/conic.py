@@ -128,12 +128,9 @@ def _convert_coefficients(
         flat = mean - apart
         # The difference cancels for flat ellipses; there the product of both eigenvalues is used.
         flat = np.where(flat < 0.5 * mean, det / level**2 / (mean + apart), flat)
-        result[:, 0], result[:, 1], result[:, 2], result[:, 3] = (
-            x,
-            y,
-            1.0 / np.sqrt(flat),
-            1.0 / np.sqrt(mean + apart),
-        )
+        result[:, 0], result[:, 1] = x, y
+        result[:, 2] = 1.0 / np.sqrt(flat)
+        result[:, 3] = 1.0 / np.sqrt(mean + apart)
         result[:, 4] = np.arctan2(-skew, -half) / 2 % np.pi
         largest = np.maximum(np.maximum(np.abs(a), np.abs(c)), np.abs(b))
         known = (det > 1e-15 * np.maximum(largest, 1e-300) ** 2) & np.isfinite(result).all(1)

@@ -316,11 +316,9 @@ def _follow_edges(
         # One stride ahead, then to the nearest edge there.
         onto = place + STRIDE_PX * along
         number = edges.at(onto)
-        came, place, bright = (
-            ((edges.points[number] - place) * along).sum(1),
-            edges.points[number],
-            edges.directions[number],
-        )
+        came = ((edges.points[number] - place) * along).sum(1)
+        place = edges.points[number]
+        bright = edges.directions[number]
         along = np.column_stack([bright[:, 1], -bright[:, 0]]) * hand[:, None]
         needed = step * STRIDE_PX < reach_px
         near = (np.linalg.norm(place - onto, axis=1) < NEAR_PX) & (came > LEAST_PX)

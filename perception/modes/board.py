@@ -59,13 +59,9 @@ class PrintBoard:
             figure.savefig(path, metadata={"CreationDate": None})
         except OSError as error:
             raise StorageError(f"{path} could not be written: {error.strerror or error}") from error
-        width_m, height_m = (side * METRES_PER_INCH for side in figure.get_size_inches())
-        log.info(
-            "%s: %.0f x %.0f mm; print it at 100 %% and measure the ruler of 100 mm",
-            path,
-            1000 * width_m,
-            1000 * height_m,
-        )
+        size_mm = (1000 * METRES_PER_INCH * figure.get_size_inches()).tolist()
+        text = "%s: %.0f x %.0f mm; print it at 100 %% and measure the ruler of 100 mm"
+        log.info(text, path, *size_mm)
 
 
 def draw_board(board: Charuco, margin_m: float) -> Figure:

@@ -194,14 +194,6 @@ def _show(row: dict[str, Any]) -> None:
         errors.append(None if row[key] is None else f"{1000 * row[key]:.1f} mm")
     found = f"{row['found']} of {row['holes']}"
     inside = f"{row['inside_3_sigma']} of {row['found']}"
-    cells = (
-        row["kind"],
-        row["name"],
-        str(row["frames"]),
-        found,
-        str(row["false"]),
-        *errors,
-        inside,
-    )
+    counts = (str(row["frames"]), found, str(row["false"]))
     head = ("kind", "session", "frames", "found", "no hole", "median", "95 %", "inside 3 σ")
-    print_table(head, [cells])
+    print_table(head, [(row["kind"], row["name"], *counts, *errors, inside)])

@@ -314,10 +314,8 @@ def take_picture(
     if exposure.blur_px > 0:
         light = cv2.GaussianBlur(light, (0, 0), exposure.blur_px)
     if exposure.vignetting > 0:
-        x, y = (
-            np.linspace(-1, 1, width, dtype=np.float32),
-            np.linspace(-1, 1, height, dtype=np.float32),
-        )
+        x = np.linspace(-1, 1, width, dtype=np.float32)
+        y = np.linspace(-1, 1, height, dtype=np.float32)
         lost = np.float32(exposure.vignetting / 2) * (x[None] ** 2 + y[:, None] ** 2)
         light = light * (1.0 - lost)[..., None]
     return camera.develop(light, exposure, generator)

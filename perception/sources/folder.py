@@ -185,24 +185,20 @@ class FolderSource:
         return self._read(stem, number / self._settings.rate_hz)
 
     def _read(self, stem: Path, t_s: float) -> Frame:
-        paths = {}
-        for ending in (dataset.COLOR, dataset.RIGHT):
-            paths[ending] = stem.with_name(stem.name + ending)
-        picture = read_picture(paths[dataset.COLOR])
-        color = validation.convert_color(picture, str(paths[dataset.COLOR]))
+        left_path = stem.with_name(stem.name + dataset.COLOR)
+        right_path = stem.with_name(stem.name + dataset.RIGHT)
+        color = validation.convert_color(read_picture(left_path), str(left_path))
         height, width = color.shape[:2]
         camera = self._camera
         if camera is None:
             raise FrameError(f"{self._place}: not open; use it in a `with` block")
         where = str(self._place / dataset.CAMERA)
-        validation.check_size(camera.size_px, height, width, where, str(paths[dataset.COLOR]))
+        validation.check_size(camera.size_px, height, width, where, str(left_path))
         validation.check_matrix_fits(camera.matrix, height, width, where)
         right = None
-        if paths[dataset.RIGHT].exists():
-            right = validation.convert_color(
-                read_picture(paths[dataset.RIGHT]), str(paths[dataset.RIGHT])
-            )
-            validation.check_same_size(color, right, str(paths[dataset.RIGHT]), "the right picture")
+        if right_path.exists():
+            right = validation.convert_color(read_picture(right_path), str(right_path))
+            validation.check_same_size(color, right, str(right_path), "the right picture")
         depth, shrink = self._depth(stem, color, right, camera)
         error_px, baseline_m = camera.disparity_error_px, camera.baseline_m
         if any(error_px) and baseline_m is not None:
@@ -223,11 +219,10 @@ class FolderSource:
         least = self._settings.least_known
         if stored.exists() or millimetres.exists():
             where = stored if stored.exists() else millimetres
-            values = (
-                _load_array(stored)
-                if stored.exists()
-                else validation.convert_png_depth(read_picture(millimetres), str(millimetres))
-            )
+            if stored.exists():
+                values = _load_array(stored)
+            else:
+                values = validation.convert_png_depth(read_picture(where), str(where))
             found = validation.check_depth(values, str(where), least)
             validation.check_same_size(color, found, str(where), "depth")
             return found, 1

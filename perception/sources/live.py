@@ -130,12 +130,10 @@ class LiveSource:
                     return self._frame(capture, self._lens)
                 oldest_s = max(age_s, oldest_s or 0.0)
             left = until - time.monotonic()
-        stale = (
-            ""
-            if oldest_s is None
-            else f"; the frames that came were up to {oldest_s:.2f} s old, "
-            f"{self._fresh.max_age_s:g} allowed"
-        )
+        stale = ""
+        if oldest_s is not None:
+            allowed = f"{self._fresh.max_age_s:g} allowed"
+            stale = f"; the frames that came were up to {oldest_s:.2f} s old, {allowed}"
         raise FrameError(
             f"{self._name}: no new frame for {self._fresh.timeout_s:g} s{stale}. Is it plugged in?"
         )

@@ -93,9 +93,8 @@ class RealSenseDevice:
     def capture(self, timeout_s: float) -> RawCapture | None:
         """Return the next capture, `None` when there is none in time."""
         try:
-            frames = self._align.process(
-                self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s)))
-            )
+            taken = self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s)))
+            frames = self._align.process(taken)
         except RuntimeError:  # the library's way to say that time is up
             return None
         depth, color = frames.get_depth_frame(), frames.get_color_frame()

@@ -103,10 +103,8 @@ class SimulatedSource:
             chain_in_base_m: The arm as points in the base frame, `(P, 3)`: its joints in order,
                 then the tip of the tool (`brokk_rl.kinematics`); empty for none.
         """
-        self._scene, self._chain = (
-            tuple(float(value) for value in task_scene),
-            np.asarray(chain_in_base_m, float).reshape(-1, 3),
-        )
+        self._scene = tuple(float(value) for value in task_scene)
+        self._chain = np.asarray(chain_in_base_m, float).reshape(-1, 3)
 
     def read_latest(self) -> Frame | None:
         """Return a frame of the present scene, `None` after `num_frames`.

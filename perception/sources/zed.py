@@ -94,10 +94,8 @@ class ZedDevice:
         init.depth_mode = _look_up(sl.DEPTH_MODE, settings.depth_mode, "source.depth_mode")
         init.coordinate_units = sl.UNIT.METER
         init.coordinate_system = sl.COORDINATE_SYSTEM.IMAGE  # x right, y down, z forward
-        init.depth_minimum_distance, init.depth_maximum_distance = (
-            settings.nearest_m,
-            settings.farthest_m,
-        )
+        init.depth_minimum_distance = settings.nearest_m
+        init.depth_maximum_distance = settings.farthest_m
         if settings.serial is not None:
             init.set_from_serial_number(settings.serial)
         if settings.recording is not None:

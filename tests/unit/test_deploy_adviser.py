@@ -64,11 +64,9 @@ class Desk:
     """An adviser, the memory around it, and a clock."""
 
     def __init__(self, commands: bool = True) -> None:
-        self.memory, self.bundle, self.now_s = (
-            LoopMemory.new(NUM_JOINTS, commands),
-            Bundle(),
-            1000.0,
-        )
+        self.memory = LoopMemory.new(NUM_JOINTS, commands)
+        self.bundle = Bundle()
+        self.now_s = 1000.0
         self.adviser = PolicyAdviser(CONFIG, self.bundle, self.memory)  # type: ignore[arg-type]
         self.number = 0
 
@@ -81,10 +79,8 @@ class Desk:
 
     def aim(self, t_s: float | None = None) -> None:
         target = self.memory.target.new()
-        target["t_s"], target["center_in_base_m"] = (
-            self.now_s if t_s is None else t_s,
-            (2.6, 0.1, 0.75),
-        )
+        target["t_s"] = self.now_s if t_s is None else t_s
+        target["center_in_base_m"] = (2.6, 0.1, 0.75)
         self.memory.target.write(target)
 
     def go(self, periods: int = 1, missed: int = 0, **changes: Any) -> AdviceStatus:

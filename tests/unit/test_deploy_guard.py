@@ -514,11 +514,9 @@ def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any
         for j, (value, last) in enumerate(zip(decision.u, before, strict=True)):
             grown = abs(value) - (abs(last) if value * last > 0 else 0.0)
             assert grown <= LIMITS.max_rate_1_s * dt + 1e-9
-            at, lower, upper = (
-                cycle["q"][j],
-                BODY.lower[j] + LIMITS.stop_margin,
-                BODY.upper[j] - LIMITS.stop_margin,
-            )
+            at = cycle["q"][j]
+            lower = BODY.lower[j] + LIMITS.stop_margin
+            upper = BODY.upper[j] - LIMITS.stop_margin
             assert not (value > 0 and at >= upper) and not (value < 0 and at <= lower)
         if any(moved):
             assert decision.state is GuardState.ACTIVE and state is GuardState.ACTIVE

@@ -22,11 +22,9 @@ class Listener:
     """A channel with a clock: its sender is on time, and stamps each message when it sends it."""
 
     def __init__(self, period_s: float = PERIOD_S, wrap_s: float = WRAP_S) -> None:
-        self.channel, self.now_s, self.period_s = (
-            ProtectedChannel(16, period_s, wrap_s),
-            100.0,
-            period_s,
-        )
+        self.channel = ProtectedChannel(16, period_s, wrap_s)
+        self.now_s = 100.0
+        self.period_s = period_s
 
     def hear(self, counters: Iterable[int | None]) -> list[MessageFault | None]:
         """Hear messages one period apart; `None`: one with a wrong CRC."""
@@ -115,19 +113,9 @@ def test_a_channel_that_recovered_bears_as_much_as_a_new_one() -> None:
     assert other.trust is VALID, "one error"
 
 
+@pytest.mark.parametrize("every", [1, 5, 10, 20])
 @pytest.mark.parametrize("offset", range(16))
-def test_two_senders_of_one_message_are_found_whatever_their_counters(offset: int) -> None:
-    one = Listener()
-    one.hear(range(40))
-    for number in range(40, 44):
-        one.hear([number])
-        one.channel.take((number + offset) % 16, one.now_s % WRAP_S, one.now_s)
-    assert one.trust is INVALID
-
-
-@pytest.mark.parametrize("every", [5, 10, 20])
-@pytest.mark.parametrize("offset", range(16))
-def test_a_second_sender_who_speaks_seldom_is_found_at_the_latest_with_its_third_message(
+def test_a_second_sender_is_found_whatever_its_counter_with_its_third_message(
     every: int, offset: int
 ) -> None:
     one = Listener()

@@ -103,10 +103,8 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     m, row = AXIS / (AXIS @ CENTER), pose_row(ellipse)
     pull_px = K[0, 0] * 0.12
     left, right = both_views(m, pull_px, generator)
-    color, partner = (
-        as_color(120 + 60 * left),
-        as_color(0.9 * np.clip(120 + 60 * right, 0, 255) + 8),
-    )
+    color = as_color(120 + 60 * left)
+    partner = as_color(0.9 * np.clip(120 + 60 * right, 0, 255) + 8)
     off = 0.1 / pull_px  # a tenth of a pixel
     depth = (1.0 / (RAYS @ m + off + generator.normal(0, 0.3, (480, 640)) / pull_px)).astype(
         np.float32
@@ -232,11 +230,9 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(
     depth_m = (1.0 / (RAYS @ m)).astype(np.float32)
     if arm:  # from 5 px beside it on, 0.5 m away: 127 px of disparity where the face has 53
         edge = int(ellipse.x + ellipse.a + 5)
-        (
-            left[:, edge : edge + 90],
-            right[:, edge - 127 : edge - 37],
-            depth_m[:, edge : edge + 90],
-        ) = 60, 60, 0.5
+        left[:, edge : edge + 90] = 60
+        right[:, edge - 127 : edge - 37] = 60
+        depth_m[:, edge : edge + 90] = 0.5
         depth_m[:, edge - 74 : edge] = np.nan
     frame = replace(
         frame, color=as_color(left), right=as_color(right), baseline_m=0.12, depth_m=depth_m

@@ -179,10 +179,8 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Stereo
         NOON,
         (0, 0, 0),
     )
-    exposure, chance = (
-        CameraExposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0),
-        np.random.default_rng(0),
-    )
+    exposure = CameraExposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0)
+    chance = np.random.default_rng(0)
     views = [tracer.view(camera) for camera in (full.left, full.right)]
     left, right = (
         take_picture(

@@ -46,20 +46,9 @@ def frames(tmp_path: Path) -> Path:
 
 
 def folder(path: Path, **changes: Any) -> FrameFolder:
-    return FrameFolder(
-        folder=str(path),
-        **(
-            {
-                "rate_hz": 10.0,
-                "least_known": 0.01,
-                "needs": "depth",
-                "base_from_camera": None,
-                "stereo": load_part("stereo"),
-                "pair": load_part("pair_check"),
-            }
-            | changes
-        ),
-    )
+    usual = {"rate_hz": 10.0, "least_known": 0.01, "needs": "depth", "base_from_camera": None}
+    usual |= {"stereo": load_part("stereo"), "pair": load_part("pair_check")}
+    return FrameFolder(folder=str(path), **(usual | changes))
 
 
 def read(path: Path, **changes: Any) -> list[Frame]:
@@ -384,15 +373,11 @@ def pyzed(monkeypatch: pytest.MonkeyPatch) -> None:
         enable_fill_mode=True, set_from_svo_file=lambda path: None
     )
     sl.ERROR_CODE = SimpleNamespace(SUCCESS="SUCCESS", END_OF_SVOFILE_REACHED="END")
-    sl.RESOLUTION, sl.DEPTH_MODE = (
-        SimpleNamespace(HD1080="HD1080"),
-        SimpleNamespace(NEURAL="NEURAL"),
-    )
+    sl.RESOLUTION = SimpleNamespace(HD1080="HD1080")
+    sl.DEPTH_MODE = SimpleNamespace(NEURAL="NEURAL")
     sl.UNIT, sl.COORDINATE_SYSTEM = SimpleNamespace(METER="metre"), SimpleNamespace(IMAGE="image")
-    sl.VIEW, sl.MEASURE = (
-        SimpleNamespace(LEFT="left", RIGHT="right"),
-        SimpleNamespace(DEPTH="depth"),
-    )
+    sl.VIEW = SimpleNamespace(LEFT="left", RIGHT="right")
+    sl.MEASURE = SimpleNamespace(DEPTH="depth")
     sl.TIME_REFERENCE = SimpleNamespace(IMAGE="image", CURRENT="current")
     monkeypatch.setitem(sys.modules, "pyzed", ModuleType("pyzed"))
     monkeypatch.setitem(sys.modules, "pyzed.sl", sl)
@@ -440,10 +425,8 @@ def test_a_lens_whose_inverse_is_told_bends_as_opencv_says() -> None:
 def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     rs: Any = ModuleType("pyrealsense2")
     streams: list[Any] = []
-    rs.stream, rs.format = (
-        SimpleNamespace(depth="depth", color="color"),
-        SimpleNamespace(z16="z16", rgb8="rgb8"),
-    )
+    rs.stream = SimpleNamespace(depth="depth", color="color")
+    rs.format = SimpleNamespace(z16="z16", rgb8="rgb8")
     rs.config = lambda: SimpleNamespace(enable_stream=lambda *stream: streams.append(stream))
     rs.distortion = SimpleNamespace(inverse_brown_conrady="inverse")
     rs.timestamp_domain = SimpleNamespace(hardware_clock="own")

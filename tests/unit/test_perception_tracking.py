@@ -58,9 +58,11 @@ def test_a_direction_that_is_measured_badly_stays_the_worst() -> None:
 def test_a_base_that_moved_is_noticed_within_a_few_detections() -> None:
     tracker = FUSION.build()
     for number in range(200):
-        tracker.update([detect((2.6, 0, 0.75))], 0.1 * number)
+        (hole,) = tracker.update([detect((2.6, 0, 0.75), 0.002)], 0.1 * number)
+    # As sure as its memory and the newest detection make it, and no surer.
+    assert np.diag(hole.pose.cov_m2) == pytest.approx(0.002**2 / (FUSION.memory + 1))
     for number in range(30):
-        (hole,) = tracker.update([detect((2.65, 0, 0.75))], 20.0 + 0.1 * number)
+        (hole,) = tracker.update([detect((2.65, 0, 0.75), 0.002)], 20.0 + 0.1 * number)
     assert hole.pose.center_m[0] > 2.645
 
 
