@@ -109,7 +109,7 @@ def _read_stereo_calibration(
     where: str, content: dict[str, Any], size_px: tuple[int, int]
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], np.ndarray, np.ndarray]:
     """Return the same as `_read_factory_file`, of what `stereoCalibrate` gives."""
-    if missing := [name for name in CALIBRATION if name not in content]:
+    if missing := [name for name in CALIBRATION if content.get(name) is None]:
         raise FrameError(
             f"{where}: expected {' '.join(CALIBRATION)}, as OpenCV's stereoCalibrate gives them, got no "
             f"{', '.join(missing)}; lens=board writes such a file"

@@ -221,11 +221,8 @@ def test_the_header_decides_about_messages_as_the_python_side_does(
     for k in range(10_000):
         calm = (k // 200) % 2
         flood = k % 400 > 370
-        now_ms += (
-            0
-            if flood
-            else chance.choice([20] * 20 if calm else [20] * 12 + [0, 1, 7, 40, 90, 700, 5000])
-        )
+        steps_ms = [20] * 20 if calm else [20] * 12 + [0, 1, 7, 40, 90, 700, 5000]
+        now_ms += 0 if flood else chance.choice(steps_ms)
         counter += chance.choice([1] * 30 if calm else [1] * 12 + [0, 2, 4, 5, 9])
         late_ms = 0 if calm or chance.random() < 0.9 else chance.choice([30, 200, 600])
         stamp_ms = max(0, now_ms - late_ms) % wrap_ms
@@ -255,10 +252,9 @@ def test_the_header_decides_about_messages_as_the_python_side_does(
 def test_the_header_for_a_gateway_says_what_the_description_says(bus: BusDescription) -> None:
     text = generate_c_header(bus, *HEADER_TIMES)
     # Without them no gateway could say that it goes by this description, and nothing would ever move.
-    own = bus.identity
     for line in (
-        f"BROKK_DESCRIPTION_HASH 0x{own['DescriptionHash']:06X}u",
-        f"BROKK_MACHINE_HASH 0x{own['MachineHash']:06X}u",
+        f"BROKK_DESCRIPTION_HASH 0x{bus.identity['DescriptionHash']:06X}u",
+        f"BROKK_MACHINE_HASH 0x{bus.identity['MachineHash']:06X}u",
         "BROKK_VALVE_CMD_ID 0xD001027u",
         "BROKK_VALVE_CMD_DATA_ID 0x1031u",
         "BROKK_VALVE_CMD_STAMP_WRAP_MS 1024u",

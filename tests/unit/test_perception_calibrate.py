@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 import yaml
 from composed import option
+from motion import make_recording
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import FrameError
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
+from brokk_rl.record import write_recording
 from perception import dataset
 from perception.calibrate import arm, clock_offset, hand_eye, transforms, verdict
 from perception.calibrate.extrinsics import compute_point_std_m, load_extrinsics
@@ -125,12 +127,9 @@ def test_an_arm_that_rests_tells_nothing_about_clocks(machine: Machine) -> None:
         0.4,
     )
     assert found is None or found.correlation < 0.4
-    assert (
-        clock_offset.estimate_clock_offset(
-            frame_s[:9], turns[:9], t_s, turns[:1].repeat(len(t_s), 0), 1.0, 0.4
-        )
-        is None
-    )
+    still = turns[:1].repeat(len(t_s), 0)
+    few = clock_offset.estimate_clock_offset(frame_s[:9], turns[:9], t_s, still, 1.0, 0.4)
+    assert few is None
 
 
 def test_uncertainty_at_a_distance_is_that_worked_by_hand() -> None:
@@ -189,22 +188,17 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     assert frame.camera_cov is not None
     np.testing.assert_allclose(frame.camera_cov, np.array(told["covariance"]), atol=1e-12)
     Path("other.yaml").write_text("schema: 7\n")
-    lost = brokk(
-        "mode=perceive",
-        f"perceive.input={footage}",
-        "source.base_from_camera=other.yaml",
-        "session.out=look",
-    )
+    look = ("mode=perceive", f"perceive.input={footage}", "session.out=look")
+    lost = brokk(*look, "source.base_from_camera=other.yaml")
     assert lost.code == 2 and "no calibration of schema 1" in lost.err
 
 
 def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
     brokk: Callable[..., Any], footage: Path
 ) -> None:
-    same = {
-        f"{number:03d}": (board.MIDDLE + 0.02 * number * np.eye(5)[4]).tolist()
-        for number in range(16)
-    }
+    same = {}
+    for number in range(16):
+        same[f"{number:03d}"] = (board.MIDDLE + 0.02 * number * np.eye(5)[4]).tolist()
     Path("same.yaml").write_text(yaml.safe_dump(same))
     command = ("mode=calibrate", f"calibration.source.folder={footage}", "session.out=run")
     done = brokk(*command, "calibration.joints=same.yaml")
@@ -220,6 +214,32 @@ def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
     Path("degrees.yaml").write_text(yaml.safe_dump({"000": [0.0, -43.0, 34.0, 28.0, 28.0]}))
     done = brokk(*command, "calibration.joints=degrees.yaml")
     assert done.code == 2 and "are these degrees?" in done.err
+
+
+@pytest.mark.slow
+def test_a_board_filmed_while_the_arm_moves_is_enough(
+    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
+) -> None:
+    poses, t_s = board.posed(machine, 12, 1), np.arange(0.0, 14.0, 0.05)
+    # Of each second, 0.6 s on the way to the next pose.
+    eased = np.floor(t_s) + np.clip((t_s % 1.0 - 0.2) / 0.6, 0.0, 1.0)
+    q = np.stack([np.interp(eased, np.arange(12.0), column) for column in poses.q.T], 1)
+    write_recording(make_recording(machine, np.zeros_like(q), q), tmp_path / "run.parquet")
+    frame_s, late_s, chance = np.arange(0.5, 11.5, 0.4), 0.12, np.random.default_rng(0)
+    dataset.write_camera(tmp_path, board.MATRIX, (1280, 720), None, None)
+    there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)
+    for number, link in enumerate(arm.compute_link_poses(machine, there).base_from_link):
+        seen = transforms.invert(board.CAMERA) @ link @ poses.link_from_board
+        dataset.write_picture(tmp_path / f"{number:03d}.color.png", board.picture(seen, chance))
+    source = (f"calibration.source.folder={tmp_path}", "calibration.source.rate_hz=2.5")
+    joints = f"calibration.joints={tmp_path / 'run.parquet'}"
+    done = brokk("mode=calibrate", *source, joints, "session.out=run")
+    assert done.code == 0, done.err
+    told = yaml.safe_load(Path("run/calibration.yaml").read_text())
+    # The folder's first frame is at 0 s, the recording's clock says 0.5 + 0.12 s then.
+    assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(0.62, abs=0.01)
+    mm, degrees = off(np.array(told["T_base_cam"]))
+    assert mm < 4.0 and degrees < 0.1
 
 
 def judged(machine: Machine, poses: board.Posed, q: np.ndarray, seed: int) -> verdict.Verdict:
@@ -279,9 +299,8 @@ def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
     brokk: Callable[..., Any], footage: Path
 ) -> None:
     told = yaml.safe_load((footage / "joints.yaml").read_text())
-    Path("wrong.yaml").write_text(
-        yaml.safe_dump({name: [*q[:2], 1.1 * q[2], *q[3:]] for name, q in told.items()})
-    )
+    wrong = {name: [*q[:2], 1.1 * q[2], *q[3:]] for name, q in told.items()}
+    Path("wrong.yaml").write_text(yaml.safe_dump(wrong))
     done = brokk(
         "mode=calibrate", f"calibration.source.folder={footage}", "calibration.joints=wrong.yaml",
         "session.out=run",
@@ -296,7 +315,7 @@ def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
     Path("open.yaml").write_text(yaml.safe_dump(content))
     assert load_extrinsics("open.yaml", "here").base_from_camera is not None
     rows = [("covariance", [[1, 2], [3]]), ("disparity", {}), ("disparity", 3), ("verdict", "good")]
-    for part, wrong in rows:
-        Path("damaged.yaml").write_text(yaml.safe_dump(content | {"verdict": {}, part: wrong}))
+    for part, value in rows:
+        Path("damaged.yaml").write_text(yaml.safe_dump(content | {"verdict": {}, part: value}))
         with pytest.raises(FrameError, match=r"damaged\.yaml"):
             load_extrinsics("damaged.yaml", "here")

@@ -160,9 +160,7 @@ def test_a_session_is_scored_by_holes_measured_in_the_frame_of_the_board(tmp_pat
         ("center_m: [1, 0, 0], radius_m: -0.05", "radius_m"),
     ],
 )  # fmt: skip
-def test_a_hole_that_nobody_can_have_measured_is_refused(
-    tmp_path: Path, hole: str, told: str
-) -> None:
+def test_a_hole_that_nobody_measured_is_refused(tmp_path: Path, hole: str, told: str) -> None:
     (tmp_path / "wrong.yaml").write_text(f"holes: [{{{hole}}}]\nstd_m: 0.1\n")
     with pytest.raises(ConfigError, match=f"hole 1.*{told}.*expected YAML such as"):
         read_measured(tmp_path / "wrong.yaml", "score.truth")
