@@ -38,8 +38,8 @@ def off(found: np.ndarray) -> tuple[float, float]:
 def opencv(views: Any) -> np.ndarray:
     """Returns the camera as OpenCV finds it (Park and Martin): the same equations, all poses alike."""
     back, seen = transforms.invert(views.base_from_link), views.camera_from_board[:, 0]
-    parts = (back[:, :3, :3], back[:, :3, 3], seen[:, :3, :3], seen[:, :3, 3])
-    turn, shift = cv2.calibrateHandEye(*map(list, parts), method=cv2.CALIB_HAND_EYE_PARK)
+    parts: Any = (back[:, :3, :3], back[:, :3, 3], seen[:, :3, :3], seen[:, :3, 3])
+    turn, shift = cv2.calibrateHandEye(*parts, method=cv2.CALIB_HAND_EYE_PARK)
     return transforms.make_transform(turn, shift[:, 0])
 
 
@@ -183,7 +183,7 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     )  # fmt: skip
     with folder.build() as source:
         frame = source.read_latest()
-    assert frame is not None
+    assert frame is not None and frame.base_from_camera is not None
     np.testing.assert_allclose(frame.base_from_camera, np.array(told["T_base_cam"]))
     assert frame.camera_cov is not None
     np.testing.assert_allclose(frame.camera_cov, np.array(told["covariance"]), atol=1e-12)
