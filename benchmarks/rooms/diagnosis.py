@@ -53,13 +53,13 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "48 simulated cranes, answered once. A person drives 27 fields. Six open cases were seen before.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 48, "diagnosis", "valve",
+        "36 simulated cranes, answered once. A person drives 12 fields. An earlier engine had 10 of 17, 4 of 10 and 2 of 7 of other 48.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 36, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "100 simulated arms. An earlier engine had 33 of 35 single effects.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 100, "servo_diagnosis", "servo",
+        "48 simulated arms, answered once. An earlier engine had 31 of 35, 11 of 20 and 0 of 15 of other 100.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 48, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
