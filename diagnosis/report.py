@@ -158,7 +158,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "tone": tone,
         "said": answer,
         "more": more,
-        "pictures": _draw_pictures(outcome, machine),
+        "picture_of_paths": embed_picture(plots.draw_paths(outcome, machine)),
         "horizon_s": choose_horizon_s(machine),
         "units": {joint.name: joint.unit for joint in machine.joints},
         "regimes": list(REGIMES),
@@ -175,8 +175,3 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "format_estimate": format_estimate,
     }
     write_text(folder / REPORT_FILE, render_page(TEMPLATE, values))
-
-
-def _draw_pictures(outcome: Outcome, machine: Machine) -> dict[str, str]:
-    """Return the pictures as addresses that hold their data."""
-    return {"paths": embed_picture(plots.draw_paths(outcome, machine))}

@@ -16,7 +16,8 @@ from diagnosis.answer import RegimeGap, Where
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.measured_changes import MOVING
 
-REGIMES = ("at rest", "after a stop", "after a start", "after a reversal", "in steady motion")
+REGIMES = ("at rest", "after a stop", "after a reversal", "after a start", "in steady motion")
+"""A step has the first that fits."""
 TRANSIENT_S = 0.6
 """Time between the two directions of motion that make a regime, on the reference of `actuators.scales`: lag, play
 and ringing of a hydraulic joint are over after it."""
@@ -33,19 +34,19 @@ def locate_gap(runs: WindowedRuns, after: np.ndarray, floor: np.ndarray, machine
         floor: The same of the unchanged machine under the field's motion.
         machine: The machine.
     """
-    squares = np.square(runs.error)
-    before = np.sqrt(squares.mean((0, 1)))
+    before = np.sqrt(np.square(runs.error).mean((0, 1)))
     excess = np.maximum(np.square(before) - np.square(floor), 0.0)
     if not excess.any():
         excess = np.square(before)
     shares = excess / np.square(machine.upper - machine.lower)
     shares = shares / max(float(shares.sum()), TINY)
     parts = shares * split_by_regime(runs, machine)
-    joints, regimes = {}, []
+    joints = {}
+    regimes = []
     for j, joint in enumerate(machine.joints):
-        told = {"rmse": before[j], "floor": floor[j], "after": after[j]}
-        errors = {f"{name}_{joint.unit}": float(value) for name, value in told.items()}
-        joints[joint.name] = {**errors, "share": float(shares[j])}
+        errors = {"rmse": before[j], "floor": floor[j], "after": after[j]}
+        told = {f"{name}_{joint.unit}": float(value) for name, value in errors.items()}
+        joints[joint.name] = told | {"share": float(shares[j])}
         for regime, part in zip(REGIMES, parts[:, j].tolist(), strict=True):
             if part > 0.0:
                 regimes.append(RegimeGap(joint.name, regime, part))
@@ -72,15 +73,9 @@ def label_regimes(runs: WindowedRuns, machine: Machine) -> np.ndarray:
     moves = np.abs(speed) > MOVING * np.abs(speed).max((0, 1))
     now = np.where(moves, np.sign(speed), 0.0)
     earlier = np.concatenate([np.repeat(now[:, :1], num_steps, 1), now], 1)[:, : now.shape[1]]
-    # A joint that rested in between turns too.
-    turned = now * _hold_direction(earlier) < 0.0
+    # A joint that rested in between turns too: its newest direction until then counts.
+    step = np.arange(earlier.shape[1])[:, None]
+    newest = np.maximum.accumulate(np.where(earlier != 0.0, step, 0), 1)
+    turned = now * np.take_along_axis(earlier, newest, 1) < 0.0
     conditions = [(now == 0.0) & (earlier == 0.0), now == 0.0, turned, earlier == 0.0]
-    names = ("at rest", "after a stop", "after a reversal", "after a start")
-    return np.select(conditions, [REGIMES.index(name) for name in names], len(names))
-
-
-def _hold_direction(direction: np.ndarray) -> np.ndarray:
-    """Return the newest direction of motion until each step, `(W, K, J)`; 0 before the first motion."""
-    step = np.arange(direction.shape[1])[:, None]
-    newest = np.maximum.accumulate(np.where(direction != 0.0, step, 0), 1)
-    return np.take_along_axis(direction, newest, 1)
+    return np.select(conditions, range(len(conditions)), len(conditions))

@@ -43,11 +43,6 @@ class MetricDefinition:
     compute: Callable[[np.ndarray], float | None] | None = None
 
 
-def drop_none(value: Any) -> list[Any]:
-    """Return the value as a list, empty for `None`."""
-    return [] if value is None else [value]
-
-
 def compute_ece(rows: np.ndarray) -> float:
     """Return the expected calibration error of probabilities (first column) of statements (second: 1 if true).
 
@@ -78,8 +73,7 @@ ROWS: dict[str, tuple[Any, ...]] = {
     "ece": ("calibration error", KINDS, lambda s: s.claims, compute_ece),
     "parameter_error": ("size: median error", KINDS, lambda s: [one.error for one in s.numbers], np.median),
     "cover_90": ("size: inside 90 %", KINDS, lambda s: [one.in_90 for one in s.numbers]),
-    "cover_95": ("size: inside 95 %", KINDS, lambda s: [one.in_95 for one in s.numbers]),
-    "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: drop_none(s.examined), np.median),
+    "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: [] if s.examined is None else [s.examined], np.median),
     "closed_missing": ("named without closing", KINDS, lambda s: [s.closed is None] if s.named else []),
 }  # fmt: skip
 METRICS = {key: MetricDefinition(*row) for key, row in ROWS.items()}

@@ -23,13 +23,11 @@ class ParameterScore:
 
     Attributes:
         error: Absolute error over the true distance from the value that changes nothing.
-        in_95: Whether the 95 % interval holds the truth.
-        in_90: The same for the 90 % interval, which is the 95 % interval drawn together as for a
+        in_90: Whether the 90 % interval holds the truth: the 95 % interval drawn together as for a
             normal distribution.
     """
 
     error: float
-    in_95: bool
     in_90: bool
 
 
@@ -203,5 +201,5 @@ def score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterSc
             short = estimate.mean + CI90_OVER_CI95 * (low - estimate.mean)
             long = estimate.mean + CI90_OVER_CI95 * (high - estimate.mean)
             error = abs(estimate.mean - value) / max(abs(value - true["nothing"][name]), 1e-9)
-            found.append(ParameterScore(error, low <= value <= high, short <= value <= long))
+            found.append(ParameterScore(error, short <= value <= long))
     return found
