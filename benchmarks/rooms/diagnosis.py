@@ -53,12 +53,12 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "36 simulated cranes, answered once. A person drives 12 fields. An earlier engine had 10 of 17, 4 of 10 and 2 of 7 of other 48. Of these 36 answers one changed since: a zero of an encoder is found.",
+        "36 simulated cranes, answered once. A person drives 12 fields. An earlier engine had 10 of 17, 4 of 10 and 2 of 7 of other 48. One answer has become right since.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 36, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "48 simulated arms, answered once. An earlier engine had 31 of 35, 11 of 20 and 0 of 15 of other 100. The change of geometry since changes no answer.",
+        "48 simulated arms, answered once. An earlier engine had 31 of 35, 11 of 20 and 0 of 15 of other 100. No answer has changed since.",
         "machine=so101 exam_plants=servos exam_mix=servos", 48, "servo_diagnosis", "servo",
     ),
     Measurement(
