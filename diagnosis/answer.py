@@ -116,7 +116,7 @@ class Answer:
         gates: Conditions of the verdict.
         next_experiment: `None` where nothing is left to tell apart.
         reason: One sentence in words.
-        more: Further plain JSON: `sanity`, `evidence`, `unseen`
+        more: Further plain JSON: `sanity`, `evidence`, `changes`.
     """
 
     verdict: Verdict

@@ -155,10 +155,8 @@ class Diagnosis(ABC):
         after = np.sqrt(proof.measure_squares(proof.after)[0])
         floor = np.sqrt(proof.floor_squares[0])
         where = locate_gap(proof.view(proof.before), after, floor, self.case.machine)
-        if not selected:
-            return where
-        (kind,) = [kind for kind in self.kinds if kind.name == selected[0].effect]
-        return replace(where, stage=kind.stage)
+        stages = {kind.name: kind.stage for kind in self.kinds}
+        return replace(where, stage=stages[selected[0].effect] if selected else None)
 
     @cached_property
     def detected(self) -> list[DetectedEffect]:

@@ -56,7 +56,8 @@ def locate_gap(runs: WindowedRuns, after: np.ndarray, floor: np.ndarray, machine
 
 def split_by_regime(runs: WindowedRuns, machine: Machine) -> np.ndarray:
     """Return the part of each regime in the squared error of each joint, `(C, J)`, none below 0 and of sum 1."""
-    error, regime = runs.error, label_regimes(runs, machine)
+    error = runs.error
+    regime = label_regimes(runs, machine)
     added = np.diff(error, axis=1, prepend=0.0)
     parts = np.zeros((len(REGIMES), error.shape[2]))
     for number in range(len(REGIMES)):

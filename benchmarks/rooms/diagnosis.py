@@ -41,7 +41,7 @@ def describe_exam(
         ),
         code=(*CODE, "exam"),
         read=read_marks,
-        where=f"two cores, {4 * num_cases} min",
+        where=f"two cores, {num_cases} min",
     )
 
 
@@ -58,7 +58,7 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "48 simulated arms, answered once. An earlier engine had 31 of 35, 11 of 20 and 0 of 15 of other 100. No answer has changed since.",
+        "48 simulated arms, answered once. An earlier engine had 31 of 35, 11 of 20 and 0 of 15 of other 100. No name has changed since.",
         "machine=so101 exam_plants=servos exam_mix=servos", 48, "servo_diagnosis", "servo",
     ),
     Measurement(

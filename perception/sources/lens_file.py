@@ -27,7 +27,7 @@ ZED_SIZES = {
 }
 """Names of picture sizes in the sections of a factory file."""
 CALIBRATION = ("K1", "D1", "K2", "D2", "R", "T")
-"""What a stereo calibration holds."""
+"""Matrices of the file of a stereo calibration."""
 
 
 @dataclass(frozen=True)
