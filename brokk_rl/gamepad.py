@@ -26,6 +26,7 @@ class Gamepad:
     Args:
         path: Device, such as `/dev/input/js0`.
         option: Option that names the device, for the error.
+        instead: What a person without a gamepad does, likewise.
 
     Attributes:
         connected: Whether it is still there.
@@ -34,7 +35,7 @@ class Gamepad:
         ConfigError: The device cannot be opened.
     """
 
-    def __init__(self, path: Path, option: str) -> None:
+    def __init__(self, path: Path, option: str, instead: str) -> None:
         self._axes: dict[int, float] = {}
         self._buttons: dict[int, bool] = {}
         self._rest = b""
@@ -44,7 +45,7 @@ class Gamepad:
         except OSError as error:
             raise ConfigError(
                 f"{option}={path}: {error.strerror}. Plug the gamepad into this computer and "
-                f"give its device (ls /dev/input/js*), or leave {option} out."
+                f"give its device (ls /dev/input/js*), or {instead}"
             ) from error
 
     def poll(self) -> bool:

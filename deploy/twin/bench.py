@@ -1,8 +1,6 @@
-"""A desk instead of a machine: the twin, and at its remote a simulated operator or a gamepad."""
+"""A desk instead of a machine: the twin, and who is at its remote: a simulated operator, a gamepad."""
 
 from __future__ import annotations
-
-from typing import Any
 
 from brokk_rl.contracts.actuator import Follower
 from brokk_rl.contracts.link import Connection
@@ -11,40 +9,51 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.runtime.supervisor import CompanionProcess
-from deploy.twin.remote import GamepadRemote
+from deploy.twin.remote import GamepadRemote, Person, SimulatedOperator
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 
-def list_companions(
-    twin: Twin,
-    plant: Connection,
-    machine: Machine,
-    session: Session,
-    target: str = "",
-    *arguments: Any,
-) -> list[CompanionProcess]:
-    """Return the process of a twin, and of who plays its remote, where `target` names that."""
-    own = (twin, machine, plant, session)
-    found = [CompanionProcess("twin", "deploy.twin.twin:run", own, TWIN_PRIORITY)]
-    if target:
-        others = (twin.wire, twin.dbc, machine, *arguments)
-        found.append(CompanionProcess("operator", target, others, TWIN_PRIORITY))
-    return found
-
-
 @spec
-class TwinBench:
-    """Twin and operator in place of a machine.
+class Bench:
+    """Twin in place of a machine, and a person at its remote.
 
     Attributes:
         twin: The twin.
         plant: The simulated machine behind it.
-        operator: Simulated person who moves the levers as they are shown; `null`: none, the levers
-            stay in neutral.
     """
 
     twin: Twin
     plant: Connection
+
+    def find_person(self, machine: Machine, session: Session) -> Person | None:
+        """Return who holds the remote; `None` where the twin plays it, levers in neutral."""
+        raise NotImplementedError
+
+    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
+        """Return the processes to run beside the loop.
+
+        Raises:
+            ConfigError: the gamepad cannot be opened.
+        """
+        twin, person = self.twin, self.find_person(machine, session)
+        own = (twin, machine, self.plant, session)
+        found = [CompanionProcess("twin", "deploy.twin.twin:run", own, TWIN_PRIORITY)]
+        if person is not None:
+            others = (twin.wire, twin.dbc, machine, person)
+            target = "deploy.twin.remote:run_remote"
+            found.append(CompanionProcess("operator", target, others, TWIN_PRIORITY))
+        return found
+
+
+@spec
+class TwinBench(Bench):
+    """Twin and operator in place of a machine.
+
+    Attributes (and those of `Bench`):
+        operator: Simulated person who moves the levers as they are shown; `null`: none, the levers
+            stay in neutral.
+    """
+
     operator: Follower | None
 
     def check(self) -> None:
@@ -53,27 +62,21 @@ class TwinBench:
                 "bench: the remote is played by the twin (twin.remote=true) or by an operator, not by both or neither"
             )
 
-    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
-        """Return the processes to run beside the loop."""
+    def find_person(self, machine: Machine, session: Session) -> Person | None:
+        """See `Bench`."""
         if self.operator is None:
-            return list_companions(self.twin, self.plant, machine, session)
-        arguments = (self.operator, session.stream("operator"))
-        target = "deploy.twin.remote:run_operator"
-        return list_companions(self.twin, self.plant, machine, session, target, *arguments)
+            return None
+        return SimulatedOperator(self.operator, session.stream("operator"))
 
 
 @spec
-class GamepadBench:
+class GamepadBench(Bench):
     """Twin in place of a machine, and a gamepad in the hands of a person.
 
-    Attributes:
-        twin: The twin.
-        plant: The simulated machine behind it.
+    Attributes (and those of `Bench`):
         gamepad: The gamepad.
     """
 
-    twin: Twin
-    plant: Connection
     gamepad: GamepadRemote
 
     def check(self) -> None:
@@ -82,13 +85,8 @@ class GamepadBench:
                 "bench=gamepad: expected twin.remote=false, since the gamepad is the remote"
             )
 
-    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
-        """Return the processes to run beside the loop.
-
-        Raises:
-            ConfigError: the gamepad cannot be opened.
-        """
+    def find_person(self, machine: Machine, session: Session) -> Person:
+        """See `Bench`."""
         # Before anything starts: a person who has forgotten to plug it in is told so at once.
         self.gamepad.open_device().close()
-        target = "deploy.twin.remote:run_gamepad"
-        return list_companions(self.twin, self.plant, machine, session, target, self.gamepad)
+        return self.gamepad

@@ -7,23 +7,18 @@ emergency stop, one joint after the other, each both ways. They can fail one cho
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 
 import numpy as np
 
-from brokk_rl.contracts.link import Connection
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import Positive, spec
-from deploy.bus.can_bus import CanBus
-from deploy.bus.description import BusDescription
-from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.supervisor import CompanionProcess
-from deploy.twin.bench import list_companions
+from deploy.twin.bench import Bench
 from deploy.twin.faults import request_fault
 from deploy.twin.remote import RadioRemote
-from deploy.twin.twin import Twin
 
 CHECKS = ("bus", "positions", "dead-man", "e-stop", "joints", "shadow")
 """Checks that can be failed."""
@@ -48,18 +43,16 @@ SPOILED_S = 1.0
 
 
 @spec
-class RehearsalBench:
+class RehearsalBench(Bench):
     """Twin and scripted person in place of a machine and its operator.
 
-    Attributes:
-        twin: The twin; needs a fault port, for the emergency stop.
-        plant: The simulated machine behind it.
+    The twin needs a fault port, for the emergency stop.
+
+    Attributes (and those of `Bench`):
         rest_s: Time after the first positions for which the person leaves the machine at rest.
         fails: Check that the person fails, or fault of a sensor (`SENSORS`); `null`: none.
     """
 
-    twin: Twin
-    plant: Connection
     rest_s: Positive
     fails: str | None
 
@@ -75,11 +68,10 @@ class RehearsalBench:
                 f"bench.fails: there is no check '{self.fails}'; {list_choices(self.fails, known)}"
             )
 
-    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
-        """Return the processes to run beside the checklist."""
-        arguments = (self.twin.fault_port, self.rest_s, self.fails)
-        target = "deploy.twin.rehearsal:run_person"
-        return list_companions(self.twin, self.plant, machine, session, target, *arguments)
+    def find_person(self, machine: Machine, session: Session) -> ScriptedPerson:
+        """See `Bench`."""
+        assert self.twin.fault_port is not None
+        return ScriptedPerson(machine, self.fails, self.rest_s, self.twin.fault_port)
 
 
 class ScriptedPerson:
@@ -88,13 +80,15 @@ class ScriptedPerson:
     Args:
         machine: Its levers and joints.
         fails: Check that the person fails; `None`: none.
+        rest_s: Time after the first positions for which the machine is left at rest.
+        port: Of the twin's faults.
 
     Attributes:
         round_s: Length of a round.
     """
 
-    def __init__(self, machine: Machine, fails: str | None) -> None:
-        self._machine, self._fails = machine, fails
+    def __init__(self, machine: Machine, fails: str | None, rest_s: float, port: int) -> None:
+        self._machine, self._fails, self._rest_s, self._port = machine, fails, rest_s, port
         self.round_s = JOINTS_S + machine.num_joints * PART_S
 
     def holds(self, switch: str, t_s: float) -> bool:
@@ -120,57 +114,33 @@ class ScriptedPerson:
         remote.move_levers(self.command(t_s))
         remote.deadman = self.holds("dead-man", t_s)
 
-    def spoil(self, t_s: float, rest_s: float) -> dict[str, object] | None:
+    def spoil(self, t_s: float) -> dict[str, object] | None:
         """Return the fault that the person asks the twin for at `t_s`, if any."""
         if self._fails == "bus":
             return {"fault": "corrupt", "message": "MachineStatus", "seconds": SPOILED_S}
         if self._fails == "positions":
-            return {"fault": "drift", "seconds": rest_s}
+            return {"fault": "drift", "seconds": self._rest_s}
         if self._fails in SENSORS:
             return {"fault": SENSORS[self._fails]}
         if self._fails == "shadow" and t_s > SOUND_ROUNDS * self.round_s:
             return {"fault": "invalid"}
         return None
 
-
-def run_person(
-    stop: Stop,
-    wire: CanBus,
-    dbc: str,
-    machine: Machine,
-    port: int,
-    rest_s: float,
-    fails: str | None,
-    memory: LoopMemory,
-) -> None:
-    """Run the person: at rest until the loop has listened, then round by round.
-
-    Args:
-        stop: Returns whether to stop.
-        wire: The bus.
-        dbc: Its description.
-        machine: The machine.
-        port: Of the twin's faults.
-        rest_s: Time after the first positions for which the machine is left at rest.
-        fails: Check that the person fails; `None`: none.
-        memory: Tells that the loop has heard positions.
-    """
-    remote = RadioRemote(BusDescription(dbc, machine), machine)
-    person = ScriptedPerson(machine, fails)
-    begun_s, pressed, spoiled = np.inf, False, False
-    with wire.open(remote.frame_ids) as bus:
-        for now_s in remote.iterate_cycles(stop, bus):
+    def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
+        """See `Person`; at rest until the loop has listened, then round by round."""
+        begun_s, pressed, spoiled = np.inf, False, False
+        for now_s in cycles:
             state = memory.state.read()
             if state is not None and state.q_t_s > 0 and begun_s == np.inf:
-                begun_s = now_s + rest_s
+                begun_s = now_s + self._rest_s
             t_s = now_s - begun_s
-            person.move(remote, t_s)
+            self.move(remote, t_s)
             # A busy twin may not answer in time: then the person tries again.
             with contextlib.suppress(TimeoutError):
-                if person.holds("e-stop", t_s) and not pressed:
+                if self.holds("e-stop", t_s) and not pressed:
                     begin_s, end_s = PRESSES_S["e-stop"]
-                    request_fault(port, {"fault": "estop", "seconds": end_s - begin_s})
-                pressed = person.holds("e-stop", t_s)
-                if begun_s < np.inf and not spoiled and (fault := person.spoil(t_s, rest_s)):
-                    request_fault(port, fault)
+                    request_fault(self._port, {"fault": "estop", "seconds": end_s - begin_s})
+                pressed = self.holds("e-stop", t_s)
+                if begun_s < np.inf and not spoiled and (fault := self.spoil(t_s)):
+                    request_fault(self._port, fault)
                     spoiled = True

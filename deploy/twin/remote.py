@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -32,8 +34,11 @@ class RadioRemote:
 
     Args:
         description: The bus.
+        machine: The machine.
 
     Attributes:
+        machine: The machine.
+        map: Its mapping of levers to commands.
         levers: Deflections of the four axes, of full.
         button_right: Whether the right button is held.
         deadman: Whether the dead-man is held.
@@ -43,7 +48,8 @@ class RadioRemote:
     """
 
     def __init__(self, description: BusDescription, machine: Machine) -> None:
-        self._map, self._full_rad = LeverMap(machine), find_full_angles_rad(machine)
+        self.machine, self.map = machine, LeverMap(machine)
+        self._full_rad = find_full_angles_rad(machine)
         self._description = description
         self._layout = description.layouts[description.message_of("DeadMan")]
         self.period_s = self._layout.period_s
@@ -61,7 +67,7 @@ class RadioRemote:
 
     def move_levers(self, u: np.ndarray) -> None:
         """Move the levers to where they stand for commands, `(J,)`; press the button with them."""
-        angles_rad, self.button_right = self._map.levers(u)
+        angles_rad, self.button_right = self.map.levers(u)
         self.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
 
     def hear(self, frame: CanFrame) -> None:
@@ -101,40 +107,60 @@ class RadioRemote:
         )
 
 
-def run_operator(
-    stop: Stop,
-    wire: CanBus,
-    dbc: str,
-    machine: Machine,
-    follower: Follower,
-    seed: int,
-    memory: LoopMemory,
-) -> None:
-    """Run a simulated operator, who moves the remote's levers as `follower` follows the advice.
+class Person(Protocol):
+    """Who holds the remote."""
 
-    The operator lets go of the levers where the advice is stale or there is none.
+    def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
+        """Move levers, button and dead-man as long as there are cycles.
+
+        Args:
+            remote: The remote.
+            cycles: Time of each cycle; what the remote is like after it is sent.
+            memory: Shows what the loop shows and knows.
+        """
+
+
+def run_remote(
+    stop: Stop, wire: CanBus, dbc: str, machine: Machine, person: Person, memory: LoopMemory
+) -> None:
+    """Run the remote in the hands of a person.
 
     Args:
         stop: Returns whether to stop.
         wire: The bus.
         dbc: Its description.
         machine: The machine.
+        person: Who holds the remote.
+        memory: Of the loop.
+    """
+    remote = RadioRemote(BusDescription(dbc, machine), machine)
+    with wire.open(remote.frame_ids) as bus:
+        person.hold_remote(remote, remote.iterate_cycles(stop, bus), memory)
+
+
+@dataclass(frozen=True)
+class SimulatedOperator:
+    """Moves the levers as `follower` follows the advice; lets go where it is stale or there is none.
+
+    Attributes:
         follower: The operator.
         seed: Of the operator.
-        memory: Source of the advice.
     """
-    import torch  # only here: the machine's computer has none
 
-    torch.manual_seed(seed)
-    remote = RadioRemote(BusDescription(dbc, machine), machine)
-    hands = follower.build(machine, 1, torch.device("cpu"))
-    cycles_a_period = round(machine.period_s / remote.period_s)
-    levers = LeverMap(machine)
-    remote.deadman = True
-    with wire.open(remote.frame_ids) as bus:
-        for cycle, _ in enumerate(remote.iterate_cycles(stop, bus)):
+    follower: Follower
+    seed: int
+
+    def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
+        """See `Person`."""
+        import torch  # only here: the machine's computer has none
+
+        torch.manual_seed(self.seed)
+        hands = self.follower.build(remote.machine, 1, torch.device("cpu"))
+        cycles_a_period = round(remote.machine.period_s / remote.period_s)
+        remote.deadman = True
+        for cycle, _ in enumerate(cycles):
             if cycle % cycles_a_period == 0:
-                displayed = _read_displayed_command(memory, levers)
+                displayed = _read_displayed_command(memory, remote.map)
                 proposed = torch.as_tensor(displayed, dtype=torch.float32)[None]
                 with torch.inference_mode():
                     given = hands.step(proposed)[0].numpy().astype(float)
@@ -179,41 +205,17 @@ class GamepadRemote:
         Raises:
             ConfigError: it cannot be opened.
         """
-        return Gamepad(Path(self.device), "bench.gamepad.device")
+        return Gamepad(Path(self.device), "bench.gamepad.device", "take bench=twin or bench=guided")
 
-    def move(self, remote: RadioRemote, gamepad: Gamepad) -> None:
-        """Hold the remote as the gamepad is held now."""
-        gamepad.poll()
-        remote.levers = gamepad.read_axes(self.axes)
-        remote.deadman = gamepad.is_pressed(self.deadman)
-        remote.button_right = gamepad.is_pressed(self.button_right)
-
-
-def run_gamepad(
-    stop: Stop,
-    wire: CanBus,
-    dbc: str,
-    machine: Machine,
-    settings: GamepadRemote,
-    memory: LoopMemory | None = None,
-) -> None:
-    """Run the remote as a person holds the gamepad.
-
-    A gamepad that is unplugged is a remote out of range: nothing more is sent.
-
-    Args:
-        stop: Returns whether to stop.
-        wire: The bus.
-        dbc: Its description.
-        machine: The machine.
-        settings: Of the gamepad.
-        memory: Not needed: the person looks at the page.
-    """
-    remote, gamepad = RadioRemote(BusDescription(dbc, machine), machine), settings.open_device()
-    with wire.open(remote.frame_ids) as bus:
-        for _ in remote.iterate_cycles(stop, bus):
-            settings.move(remote, gamepad)
+    def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
+        """See `Person`; a gamepad that is unplugged is a remote out of range: nothing more is sent."""
+        gamepad = self.open_device()
+        for _ in cycles:
+            gamepad.poll()
+            remote.levers = gamepad.read_axes(self.axes)
+            remote.deadman = gamepad.is_pressed(self.deadman)
+            remote.button_right = gamepad.is_pressed(self.button_right)
             if not gamepad.connected:
-                log.warning("the gamepad %s is gone: the remote is silent", settings.device)
+                log.warning("the gamepad %s is gone: the remote is silent", self.device)
                 break
-    gamepad.close()
+        gamepad.close()

@@ -151,7 +151,7 @@ def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
 
 def sample_person(fails: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A round of the scripted person: commands, dead-man and emergency stop every 20 ms."""
-    person = ScriptedPerson(option("machine", "brokk170"), fails)
+    person = ScriptedPerson(option("machine", "brokk170"), fails, 1.0, 43210)
     times = np.arange(0.0, person.round_s, 0.02)
     held = [[person.holds(name, t_s) for t_s in times] for name in ("dead-man", "e-stop")]
     return np.array([person.command(t_s) for t_s in times]), *map(np.array, held)
@@ -171,7 +171,7 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     for begin in begins:
         assert not moves[begin - 50 : begin].any()
     machine = option("machine", "brokk170")
-    person = ScriptedPerson(machine, None)
+    person = ScriptedPerson(machine, None, 1.0, 43210)
     assert not person.command(-1.0).any() and not person.holds("dead-man", -person.round_s + 0.5)
     remote = RadioRemote(BusDescription(DBC, machine), machine)
     person.move(remote, 2.2 + 1.2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import struct
 import time
 import tty
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from composed import option
+from composed import names, option
 from desk import DBC, build_twin
 
 from brokk_rl.errors import ConfigError
@@ -22,7 +23,7 @@ from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
 from deploy.twin.bench import GamepadBench
-from deploy.twin.remote import GamepadRemote, run_gamepad
+from deploy.twin.remote import GamepadRemote, run_remote
 
 REMOTE = GamepadRemote(device="", axes=(-1, 0, -4, 3), deadman=4, button_right=5)
 AXIS, BUTTON = 0x02, 0x01
@@ -74,7 +75,7 @@ def test_sticks_are_levers_shoulders_are_dead_man_and_button_and_unplugged_is_si
     wire = Wire(machine, acts)
     end_s = time.monotonic() + 10.0
     settings = replace(REMOTE, device=os.ttyname(device))
-    run_gamepad(lambda: time.monotonic() > end_s, wire, DBC, machine, settings)  # type: ignore[arg-type]
+    run_remote(lambda: time.monotonic() > end_s, wire, DBC, machine, settings, None)  # type: ignore[arg-type]
     os.close(device)
     assert time.monotonic() < end_s, "an unplugged gamepad ends the remote"
     names = [f"Lever_{side}" for side in ("left_theta", "left_psi", "right_theta", "right_psi")]
@@ -95,8 +96,13 @@ def test_a_gamepad_that_is_not_there_is_refused_before_anything_starts(
     twin = build_twin(option("bus", "udp"), remote=False)
     pad = replace(REMOTE, device=str(tmp_path / "js9"))
     bench = GamepadBench(twin=twin, plant=option("link", "nominal"), gamepad=pad)
-    with pytest.raises(ConfigError, match=r"bench.gamepad.device=.*js9: No such file.*ls /dev/inp"):
+    with pytest.raises(
+        ConfigError, match=r"bench.gamepad.device=.*js9: No such file.*ls /dev/inp"
+    ) as told:
         bench.companions(machine, None)  # type: ignore[arg-type]
+    # Without its device there is no such bench: the way out is another one, and each is shipped.
+    others = re.findall(r"bench=(\w+)", str(told.value))
+    assert others and set(others) <= set(names("bench")) and "leave" not in str(told.value)
     with pytest.raises(ConfigError, match=r"twin\.remote=false"):
         replace(bench, twin=replace(twin, remote=True))
     with pytest.raises(ConfigError, match="two buttons"):
