@@ -33,7 +33,7 @@ from deploy.kernel.guard import GuardTrip
 from deploy.recorder.capture import MCAP, CaptureConfig
 from deploy.recorder.capture_reader import read_capture
 from deploy.runtime.operator_state import AdviceStatus, OperatorState
-from deploy.runtime.process_group import BusAndPolicySettings, ProcessGroup
+from deploy.runtime.process_group import POLL_S, BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.supervisor import CompanionProcess
 from deploy.runtime.target import TargetSelector
@@ -41,8 +41,6 @@ from deploy.runtime.target import TargetSelector
 log = logging.getLogger(__name__)
 
 REPORT = "bringup.json"
-POLL_S = 0.01
-"""Between looks at the state: the cycle of the bus process."""
 WATCH_S = 1.0
 """Piece of motion between two evaluations of the joints. Chosen by hand."""
 
@@ -116,7 +114,7 @@ class BringupChecklist(BusAndPolicySettings):
                 f"bringup.pose: expected {machine.num_joints} positions, got {len(self.pose)}; "
                 f"give those of {', '.join(machine.joint_names)}"
             )
-        memory = LoopMemory.new(machine.num_joints, commands=False)
+        memory = LoopMemory(machine.num_joints, commands=False)
         # The bring-up never commands: without `commands` there is no request slot at all.
         group = ProcessGroup(memory, self.realtime)
         try:
@@ -348,11 +346,5 @@ class _StateChecks:
 
     def _wait_until(self, holds: Callable[[OperatorState], bool]) -> float | None:
         """Return when the state first `holds`; `None` if it does not in all of the time."""
-        end_s = time.monotonic() + self._checklist.patience_s
-        while time.monotonic() < end_s:
-            self._group.check()
-            state = self._memory.state.read()
-            if state is not None and holds(state):
-                return time.monotonic()
-            time.sleep(POLL_S)
-        return None
+        state = self._group.wait_for_state(holds, self._checklist.patience_s)
+        return None if state is None else state.t_s

@@ -26,8 +26,8 @@ from deploy.kernel.bus_process import BusProcessConfig
 from deploy.kernel.guard import GuardState
 from deploy.kernel.limits import GuardLimits
 from deploy.runtime.operator_state import OperatorControls, OperatorState, RequestedCommand
-from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_priority
-from deploy.runtime.process_group import BUS_PRIORITY, PATIENCE_S
+from deploy.runtime.process import ask_for_priority, give_up_priority
+from deploy.runtime.process_group import BUS_PRIORITY, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 
 log = logging.getLogger(__name__)
@@ -84,8 +84,7 @@ class CanLink:
 
     def __init__(self, can: CanConnection, machine: Machine) -> None:
         self._can, self._machine = can, machine
-        self._memory: LoopMemory | None = None
-        self._child: ChildProcess | None = None
+        self._group: ProcessGroup | None = None
         # The last command in force, from which the guard lets the next one grow.
         self._reached = np.zeros(machine.num_joints)
         self._was_active = False
@@ -138,27 +137,17 @@ class CanLink:
 
     def __enter__(self) -> Self:
         can, machine = self._can, self._machine
-        self._memory = LoopMemory.new(machine.num_joints, commands=True)
+        self._group = group = ProcessGroup(LoopMemory(machine.num_joints, True), can.realtime)
         # Recordings are made before there is a model of this machine: no observer yet.
         # Nobody watches a page, and the operator stands at the machine.
         limits = replace(can.limits, observer=None, vigilance_s=None)
         config = BusProcessConfig(can.wire, can.dbc, machine, limits, needs_page=False)
-        arguments, files = (config, self._memory), self._memory.files
-        priority = BUS_PRIORITY if can.realtime else None
-        target = "deploy.kernel.bus_process:run"
-        self._child = ChildProcess("bus", target, arguments, files, priority)
-        until_s = time.monotonic() + can.patience_s
         try:
-            while (state := self._memory.state.read()) is None or state.q_t_s == 0.0:
-                if self._child.code is not None:
-                    raise LinkError(
-                        f"link: the bus process has died (exit code {self._child.code})"
-                    )
-                if time.monotonic() > until_s:
-                    raise LinkError(
-                        f"link: no joint positions on {can.source} within {can.patience_s:g} s; is the machine on?"
-                    )
-                time.sleep(WAIT_S)
+            group.start("bus", "deploy.kernel.bus_process:run", (config,), BUS_PRIORITY)
+            if group.wait_for_state(lambda state: state.q_t_s > 0, can.patience_s) is None:
+                raise LinkError(
+                    f"link: no joint positions on {can.source} within {can.patience_s:g} s; is the machine on?"
+                )
         # Also for an interruption: a started bus process must not be left behind.
         except BaseException:
             self.__exit__()
@@ -172,12 +161,11 @@ class CanLink:
     def __exit__(self, *exc: Any) -> None:
         if self._can.realtime:
             give_up_priority()
-        if self._child is not None:
-            self._child.end(PATIENCE_S)  # sends zero before it goes
-        if self._memory is not None:
-            self._memory.close()
+        if self._group is not None:
+            self._group.end()  # the bus process sends zero before it goes
+            self._group.memory.close()
         # Closing twice is harmless.
-        self._child = self._memory = None
+        self._group = None
 
     def _ask(self, u: np.ndarray) -> float:
         memory, now_s = self._opened(), time.monotonic()
@@ -237,6 +225,6 @@ class CanLink:
         return state
 
     def _opened(self) -> LoopMemory:
-        if self._memory is None:
+        if self._group is None:
             raise LinkError("link: it is not open; use it in a `with` block")
-        return self._memory
+        return self._group.memory

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
+
+from brokk_rl.signals import Frame
 
 
 def encode_jpeg(color: np.ndarray, quality: int) -> bytes:
@@ -27,10 +31,20 @@ def decode_jpeg(data: bytes) -> np.ndarray:
     return cv2.cvtColor(found, cv2.COLOR_BGR2RGB)
 
 
-def shrink_picture(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return a picture, `(h, w)` or `(h, w, 3)`, shrunk to `width` times `height` px.
+def shrink_frame(frame: Frame, width: int) -> Frame:
+    """Return a frame shrunk to `width` px, and its camera with it; a narrower one as it is.
 
     Colours are averaged; depths are picked, since a mean over an edge is no depth.
     """
-    interpolation = cv2.INTER_AREA if picture.ndim == 3 else cv2.INTER_NEAREST
-    return cv2.resize(picture, (width, height), interpolation=interpolation)
+    full_height, full_width = frame.color.shape[:2]
+    if width >= full_width:
+        return frame
+    size = width, full_height * width // full_width
+    # The half pixel that the grid moves by is a millimetre at 4 m.
+    part = width / full_width
+    return replace(
+        frame,
+        color=cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA),
+        depth_m=cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST),
+        camera_matrix=frame.camera_matrix * np.array([[part], [part], [1.0]]),
+    )

@@ -154,7 +154,7 @@ class TwinDesk:
         # A plant that cannot be placed has no such fields; `link=site` has.
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
         self._link = placed.build(machine, 1, session)
-        self._memory = LoopMemory.new(machine.num_joints, commands=False)
+        self._memory = LoopMemory(machine.num_joints, commands=False)
         target = self._memory.target.new()
         target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
         self._memory.target.write(target)

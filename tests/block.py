@@ -24,6 +24,15 @@ FARTHEST_M = 12.0
 """Depth beyond which the ground is not measured."""
 
 
+def seen_at(frame: Frame, center_m: np.ndarray) -> tuple[float, float]:
+    """Returns where in the picture a point of the base frame is, as parts of width and height."""
+    assert frame.base_from_camera is not None
+    from_base = np.linalg.inv(frame.base_from_camera)
+    u, v, w = frame.camera_matrix @ (from_base[:3, :3] @ center_m + from_base[:3, 3])
+    height, width = frame.depth_m.shape
+    return (u / w + 0.5) / width, (v / w + 0.5) / height
+
+
 def take_frame(size_px: tuple[int, int], number: int, t_s: float) -> Frame:
     """Returns the `number`-th frame, taken at `t_s`; the scene stands still, the noise does not."""
     matrix, way = sight(POSE, size_px, FOCAL * size_px[0])

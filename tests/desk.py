@@ -114,7 +114,7 @@ class Desk:
         kind: str = "udp",
     ) -> None:
         self.machine, self.wire, self.port = machine, wire(kind), free_port()
-        self.memory = LoopMemory.new(machine.num_joints, commands)
+        self.memory = LoopMemory(machine.num_joints, commands)
         self._description = BusDescription(DBC, machine)
         # The observer's file is of the hydraulic plant, not of the nominal machine of this desk.
         limits = replace(limits, observer=None)

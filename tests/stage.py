@@ -267,7 +267,7 @@ class Stage:
         twin_dbc: str = DBC,
     ) -> None:
         self.machine, self.mode, self.ms = machine, mode, 0
-        self.memory = LoopMemory.new(machine.num_joints, commands=mode != "listen")
+        self.memory = LoopMemory(machine.num_joints, commands=mode != "listen")
         self.air, self.request_s, self.wanted = Air(self), 0.05, WANTED
         self.bridge, self.supervised = Bridge(self), True
         self.stopped_ms: int | None = None

@@ -201,14 +201,6 @@ class BusDescription:
             )
         return self._home[signal]
 
-    def signals(self, message: str) -> list[str]:
-        """Return the names of the signals of `message`, without counter and CRC."""
-        names = []
-        for signal in self._messages[message].signals:
-            if signal.name not in (COUNTER, CRC):
-                names.append(signal.name)
-        return names
-
     def units(self, message: str) -> dict[str, str]:
         """Return the unit of each signal of `message`, counter and CRC among them; '' for none."""
         return {signal.name: signal.unit or "" for signal in self._messages[message].signals}

@@ -17,7 +17,7 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
-from deploy.picture import encode_jpeg, shrink_picture
+from deploy.picture import encode_jpeg, shrink_frame
 
 LENGTH = struct.Struct("<I")
 M_PER_UNIT = 0.001
@@ -43,20 +43,15 @@ def encode_frame(frame: Frame, width: int, quality: int) -> bytes:
         raise FrameError(
             f"depth is {frame.depth_m.shape}, colour {frame.color.shape}: expected one size"
         )
-    full_height, full_width = frame.depth_m.shape
-    part = min(1.0, width / full_width)
-    size = round(part * full_width), round(part * full_height)
-    color, depth_m = frame.color, frame.depth_m
-    if part < 1.0:
-        color, depth_m = shrink_picture(color, *size), shrink_picture(depth_m, *size)
-    matrix = frame.camera_matrix.astype(float).copy()
-    matrix[:2] *= part  # the half pixel that the grid moves by is a millimetre at 4 m
+    frame = shrink_frame(frame, width)
+    height, width = frame.depth_m.shape
+    matrix = frame.camera_matrix
     pose = np.eye(4) if frame.base_from_camera is None else frame.base_from_camera
-    depth = zlib.compress(encode_depth_planes(depth_m).tobytes(), LEVEL)
+    depth = zlib.compress(encode_depth_planes(frame.depth_m).tobytes(), LEVEL)
     header = {
         "t_s": frame.t_s,
-        "width": size[0],
-        "height": size[1],
+        "width": width,
+        "height": height,
         "m_per_unit": M_PER_UNIT,
         "depth_bytes": len(depth),
         "focal_px": [matrix[0, 0], matrix[1, 1]],
@@ -65,7 +60,7 @@ def encode_frame(frame: Frame, width: int, quality: int) -> bytes:
         "placed": frame.base_from_camera is not None,
     }
     text = json.dumps(header).encode()
-    return b"".join((LENGTH.pack(len(text)), text, depth, encode_jpeg(color, quality)))
+    return b"".join((LENGTH.pack(len(text)), text, depth, encode_jpeg(frame.color, quality)))
 
 
 def encode_depth_planes(depth_m: np.ndarray) -> np.ndarray:

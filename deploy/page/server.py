@@ -45,19 +45,19 @@ from deploy.page.connections import (
     SendWindow,
 )
 from deploy.page.files import FILES, SECURITY, load_files
-from deploy.page.protocol import PageFeed, PageState
+from deploy.page.protocol import PageFeed
 from deploy.page.settings import LINK, PageSettings
 
 log = logging.getLogger(__name__)
 
 POLL_S = 0.004
 """Between looks for a new advice. Chosen by hand: a quarter of a screen's frame."""
+HEARTBEAT_S = 0.1
+"""Longest time between two states, whatever the rate: a third of the silence that greys a page."""
 FRAME_POLL_S = 0.02
 """Between looks for a frame of the camera."""
 STOP_POLL_S = 0.05
 """Between looks whether to stop."""
-HEARTBEAT_S = 0.1
-"""Between messages when nothing changes, so that a page knows that it is connected."""
 EARLY = 0.9
 """Part of a camera's period from which the next frame is on time: the period is not exact."""
 UNDRAWN_STATES, UNDRAWN_FRAMES = 4, 2
@@ -244,25 +244,19 @@ class PageServer:
                 task.cancel()
 
     async def _watch(self) -> None:
-        """Watch the feed: a new advice goes out at once, other changes no faster than the rate."""
-        sent_s = looked_s = 0.0
-        before = advised = None
+        """Send states at the page's rate; one with a new advice goes out at once."""
+        looked_s, advised = 0.0, None
+        period_s = min(1.0 / self._page.rate_hz, HEARTBEAT_S)
         while True:
             now_s, number = time.monotonic(), self._feed.read_advice_number()
-            # A page that hears nothing for long cannot tell a calm machine from a dead
-            # connection.
-            silent = now_s - sent_s >= HEARTBEAT_S
-            is_due = now_s - looked_s >= 1.0 / self._page.rate_hz
-            if number != advised or silent or is_due:
+            # Also where nothing changes: a page that hears nothing cannot tell a calm machine from
+            # a dead connection.
+            if number != advised or now_s - looked_s >= period_s:
                 looked_s, advised, state = now_s, number, self._feed.read_state()
-                facts = _list_facts(state)
-                if silent or facts != before:
-                    sent_s, before = now_s, facts
-                    alarms = [asdict(one) for one in list_alarms(state)]
-                    shown = state.to_plain() | {"alarms": alarms}
-                    message = {"number": self._state.number + 1, "shown": shown}
-                    text = json.dumps(message, separators=(",", ":"))
-                    await self._state.put(text)
+                alarms = [asdict(one) for one in list_alarms(state)]
+                shown = state.to_plain() | {"alarms": alarms}
+                message = {"number": self._state.number + 1, "shown": shown}
+                await self._state.put(json.dumps(message, separators=(",", ":")))
             await asyncio.sleep(POLL_S)
 
     async def _watch_frames(self) -> None:
@@ -409,23 +403,6 @@ class PageServer:
                 return False
             await asyncio.sleep(CONFIRM_POLL_S)
         return True
-
-
-def _list_facts(state: PageState) -> tuple[object, ...]:
-    """Return the parts of a state whose change is worth a message; ages change all the time."""
-    return (
-        state.advice,
-        state.own,
-        state.q,
-        state.safety,
-        state.alive,
-        state.guiding,
-        state.recording.on,
-        state.recording.failed,
-        list_alarms(state),
-        state.targets,
-        state.replay,
-    )
 
 
 async def _run_both(

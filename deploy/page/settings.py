@@ -34,7 +34,7 @@ class PageSettings:
         token: Secret that a browser must show with a request; `null`: a new one each time, in the
             link that is shown at the start.
         language: `auto`: the browser's.
-        rate_hz: Fastest rate of levers and state; changes are sent at once up to that.
+        rate_hz: Rate of levers and state; a new advice is sent at once.
         frames_hz: Fastest rate of camera pictures and point clouds.
         picture_px: Width to which they are shrunk.
         jpeg_quality: Of the picture, 1 to 100.

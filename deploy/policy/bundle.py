@@ -96,6 +96,10 @@ class PolicyBundle:
                 f"in {ONNX}; history or joints differ"
             )
         self._check_golden(_read(place / GOLDEN, folder), folder)
+        for name, bound in (self.contract.get("stop", {}).get("success") or {}).items():
+            # No comparison with NaN holds: the machine would go on at the end of the episodes.
+            if not math.isfinite(bound):
+                raise ValueError(f"expected a finite bound {name} in stop.success, got {bound}")
         # An end that cannot be measured would show only once the machine moves.
         self.is_done(machine.home, np.array(observation["target"]["mean_m"]), None)
 

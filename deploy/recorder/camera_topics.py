@@ -19,8 +19,6 @@ from foxglove_schemas_protobuf import (
     Quaternion_pb2,
     Vector3_pb2,
 )
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.message import Message
 
 from brokk_rl.signals import Frame
 from deploy.picture import decode_jpeg, encode_jpeg
@@ -60,26 +58,7 @@ def encode_frame(frame: Frame) -> Iterator[tuple[str, Any]]:
     )
     if frame.base_from_camera is not None:
         yield CAMERA_POSE, _build_transform(frame.base_from_camera)
-    yield CLOUD, _build_cloud(*list_points(frame, MOST_POINTS))
-
-
-def list_points(frame: Frame, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points `(K, 3)` of a frame in the camera's, in m, and colours `(K, 4)` in [0, 1].
-
-    Every second pixel of a row and column is taken, or third, …, until `most` is kept.
-    """
-    height, width = frame.depth_m.shape
-    step = max(1, math.ceil(math.sqrt(height * width / most)))
-    rows, columns = np.mgrid[0:height:step, 0:width:step]
-    depth_m = frame.depth_m[::step, ::step]
-    known = np.isfinite(depth_m)
-    z = depth_m[known].astype(float)
-    matrix = frame.camera_matrix
-    x = (columns[known] - matrix[0, 2]) / matrix[0, 0] * z
-    y = (rows[known] - matrix[1, 2]) / matrix[1, 1] * z
-    color = np.ones((len(z), 4))
-    color[:, :3] = frame.color[::step, ::step][known] / 255.0
-    return np.stack([x, y, z], 1), color
+    yield CLOUD, _build_cloud(frame)
 
 
 def decode_frame(
@@ -111,29 +90,23 @@ def decode_frame(
     return Frame(color, depth_m, matrix, placed, t_s)
 
 
-def describe_schema(message: Message) -> bytes:
-    """Return the schema of a message and of all that it needs."""
-    found, seen = FileDescriptorSet(), set[str]()
+def _build_cloud(frame: Frame) -> PointCloud_pb2.PointCloud:
+    """Return points in the camera's frame with their colours.
 
-    def add(file: Any) -> None:
-        if file.name in seen:
-            return
-        seen.add(file.name)
-        for needed in file.dependencies:
-            add(needed)
-        file.CopyToProto(found.file.add())
-
-    add(message.DESCRIPTOR.file)
-    return found.SerializeToString()
-
-
-def _build_cloud(points_m: np.ndarray, color: np.ndarray) -> PointCloud_pb2.PointCloud:
-    """Return points `(K, 3)` in the camera's frame with their colours, `(K, 4)`."""
-    data = np.empty(len(points_m), CLOUD_TYPE)
-    for index, name in enumerate("xyz"):
-        data[name] = points_m[:, index]
-    for index, name in enumerate(SHADES):
-        data[name] = np.round(255.0 * color[:, index])
+    Every second pixel of a row and column is taken, or third, …, until `MOST_POINTS` is kept.
+    """
+    height, width = frame.depth_m.shape
+    step = max(1, math.ceil(math.sqrt(height * width / MOST_POINTS)))
+    rows, columns = np.mgrid[0:height:step, 0:width:step]
+    depth_m = frame.depth_m[::step, ::step]
+    known = np.isfinite(depth_m)
+    z, matrix = depth_m[known].astype(float), frame.camera_matrix
+    data = np.full(len(z), 255, CLOUD_TYPE)
+    data["x"] = (columns[known] - matrix[0, 2]) / matrix[0, 0] * z
+    data["y"] = (rows[known] - matrix[1, 2]) / matrix[1, 1] * z
+    data["z"] = z
+    color = frame.color[::step, ::step][known]
+    data["red"], data["green"], data["blue"] = color.T
     cloud = PointCloud_pb2.PointCloud(
         frame_id=CAMERA_FRAME, point_stride=CLOUD_TYPE.itemsize, data=data.tobytes()
     )

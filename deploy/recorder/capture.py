@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
@@ -27,7 +28,7 @@ from brokk_rl.signals import Frame
 from deploy.bus.description import BusDescription, MessageLayout
 from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.kernel.protection import MessageFault
-from deploy.recorder.camera_topics import describe_schema, encode_frame
+from deploy.recorder.camera_topics import encode_frame
 from deploy.recorder.topics import TIME, TOPICS, TopicSchema, describe_bus_fields
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
@@ -140,7 +141,8 @@ class CaptureWriter:
         for topic, message in encode_frame(frame):
             message.timestamp.FromNanoseconds(int(frame.t_s * 1e9) + self._offset_ns)
             name, data = message.DESCRIPTOR.full_name, message.SerializeToString()
-            self._write_message(topic, frame.t_s, name, describe_schema(message), data)
+            schema = build_file_descriptor_set(message).SerializeToString()
+            self._write_message(topic, frame.t_s, name, schema, data)
 
     def flush_when_due(self) -> None:
         """Flush where it is time to."""

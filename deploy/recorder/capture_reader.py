@@ -19,12 +19,13 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, MessageIndex, Metadata, Schema, Statistics
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
+from mcap_protobuf.decoder import DecoderFactory
 
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.plain_files import parse_json
 from deploy.recorder.capture import FACTS
-from deploy.recorder.topics import PACKAGE, TIME, decode_message, load_message_class
+from deploy.recorder.topics import PACKAGE, TIME, decode_message
 
 log = logging.getLogger(__name__)
 
@@ -179,16 +180,15 @@ class _Decoder:
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self._classes: dict[int, Any] = {}
+        self._factory = DecoderFactory()
 
     def decode(self, message: Message) -> dict[str, Any] | None:
         """Return its values; `None` for a message that is meant for viewers."""
         schema = self.schemas[self.channels[message.channel_id].schema_id]
-        if not schema.name.startswith(f"{PACKAGE}."):
+        decode = self._factory.decoder_for("protobuf", schema)
+        if decode is None or not schema.name.startswith(f"{PACKAGE}."):
             return None
-        if schema.id not in self._classes:
-            self._classes[schema.id] = load_message_class(schema.name, schema.data)
-        return decode_message(self._classes[schema.id].FromString(message.data))
+        return decode_message(decode(message.data))
 
 
 def is_whole(path: Path) -> bool:

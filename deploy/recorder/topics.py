@@ -182,18 +182,6 @@ def decode_message(message: Message) -> dict[str, Any]:
     return found
 
 
-def load_message_class(schema_name: str, data: bytes) -> type[Message]:
-    """Return the class of the messages of a schema that stands in a file.
-
-    Raises:
-        KeyError: the schema is not among its files.
-    """
-    pool = descriptor_pool.DescriptorPool()
-    for file in descriptor_pb2.FileDescriptorSet.FromString(data).file:
-        pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema_name))
-
-
 def _describe_message(
     file: descriptor_pb2.FileDescriptorProto,
     message: descriptor_pb2.DescriptorProto,

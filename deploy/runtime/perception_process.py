@@ -31,7 +31,7 @@ from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
 from deploy.kernel.bus_process import TEXT
-from deploy.picture import shrink_picture
+from deploy.picture import shrink_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import HOLE, MOST_HOLES, LoopMemory
@@ -67,6 +67,20 @@ class CameraConfig:
     num_px: Annotated[int, Ge(SMALLEST_PICTURE_PX)]
     stale_s: Positive
     record_hz: NonNegative
+
+    def check_frames(self) -> None:
+        """Check before any process starts that stored frames are there; a live camera may come later.
+
+        Raises:
+            FrameError: there are none.
+        """
+        try:
+            _ = self.source.build().num_frames
+        except FrameError as error:
+            raise FrameError(
+                f"deploy.camera.source: expected frames, got none ({error}); give a folder that holds "
+                "some by source.folder=<folder>"
+            ) from error
 
 
 def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
@@ -158,18 +172,15 @@ def _list_holes(slot: Slot) -> list[dict[str, Any]]:
 
 def _publish_frame(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
     """Publish a frame, shrunk to the room that there is."""
+    full_height, full_width = frame.color.shape[:2]
+    frame = shrink_frame(frame, math.isqrt(num_px * full_width // full_height))
     height, width = frame.color.shape[:2]
-    scale = min(1.0, math.sqrt(num_px / (width * height)))
-    size = int(scale * width), int(scale * height)
-    color, depth_m = frame.color, frame.depth_m
-    if scale < 1.0:
-        color, depth_m = shrink_picture(color, *size), shrink_picture(depth_m, *size)
-    count = size[0] * size[1]
+    count = width * height
     record = slot.new()
-    record["t_s"], record["width"], record["height"] = t_s, *size
-    record["color"][:count] = color.reshape(count, 3)
-    record["depth_m"][:count] = depth_m.reshape(count)
-    record["camera_matrix"] = frame.camera_matrix * np.array([[scale], [scale], [1.0]])
+    record["t_s"], record["width"], record["height"] = t_s, width, height
+    record["color"][:count] = frame.color.reshape(count, 3)
+    record["depth_m"][:count] = frame.depth_m.reshape(count)
+    record["camera_matrix"] = frame.camera_matrix
     pose = frame.base_from_camera
     record["base_from_camera"] = math.nan if pose is None else pose
     slot.write(record)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +19,7 @@ from deploy.kernel.bus_process import BusProcessConfig
 from deploy.kernel.limits import GuardLimits
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyProcessConfig
+from deploy.runtime.operator_state import OperatorState
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import TargetSpec
@@ -38,6 +41,8 @@ END_ORDER = {"policy": 0, "bus": 1, "log": 3}
 """Order in which processes are asked to end; 2 for others. The bus ends after the policy, so that
 it can send zero, and the log last, when all has been written."""
 OTHERS_END = 2
+POLL_S = 0.01
+"""Between looks at the state: the cycle of the bus process."""
 
 
 @dataclass
@@ -82,6 +87,23 @@ class ProcessGroup:
                 )
             loss = OPTIONAL[child.name]
             log.error("ALARM: the %s has ended (exit code %s); %s", child.name, child.code, loss)
+
+    def wait_for_state(
+        self, holds: Callable[[OperatorState], bool], patience_s: float
+    ) -> OperatorState | None:
+        """Return the first state of which `holds` is true; `None` where none comes in time.
+
+        Raises:
+            LinkError: a process has died.
+        """
+        end_s = time.monotonic() + patience_s
+        while time.monotonic() < end_s:
+            self.check()
+            state = self.memory.state.read()
+            if state is not None and holds(state):
+                return state
+            time.sleep(POLL_S)
+        return None
 
     def end(self) -> None:
         """End them all, one after the other."""

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -67,9 +66,13 @@ def build_frame_fields(num_px: int) -> np.dtype:
     )
 
 
-@dataclass
 class LoopMemory:
-    """All memory that the processes share; each process gets the same object.
+    """All memory that the processes of a run share; each process gets the same object.
+
+    Args:
+        num_joints: Of the machine.
+        commands: Without, there is no way from any process to the valves.
+        frame_px: Pixels of a camera's frame; 0: no camera.
 
     Attributes:
         state: From the bus process.
@@ -89,49 +92,22 @@ class LoopMemory:
         reports: On each process's timing, one after the other, written when it ends.
     """
 
-    state: RecordSlot[OperatorState]
-    advice: RecordSlot[PolicyAdvice]
-    request: RecordSlot[RequestedCommand] | None
-    target: Slot
-    controls: RecordSlot[OperatorControls]
-    page: RecordSlot[PageSignal]
-    frame: Slot | None
-    holes: Slot
-    view: RecordSlot[CameraView]
-    bus_log: Pipe
-    policy_log: Pipe
-    page_log: Pipe
-    vision_log: Pipe
-    requests: Pipe
-    reports: Pipe
-
-    @classmethod
-    def new(cls, num_joints: int, commands: bool, frame_px: int = 0) -> LoopMemory:
-        """Allocate the memory of one run.
-
-        Args:
-            num_joints: Of the machine.
-            commands: Without, there is no way from any process to the valves.
-            frame_px: Pixels of a camera's frame; 0: no camera.
-        """
-        request = RecordSlot("request", RequestedCommand, num_joints) if commands else None
-        return cls(
-            state=RecordSlot("state", OperatorState, num_joints),
-            advice=RecordSlot("advice", PolicyAdvice, num_joints),
-            request=request,
-            target=Slot("target", TARGET),
-            controls=RecordSlot("controls", OperatorControls, num_joints),
-            page=RecordSlot("page", PageSignal, num_joints),
-            frame=Slot("frame", build_frame_fields(frame_px)) if frame_px else None,
-            holes=Slot("holes", HOLES),
-            view=RecordSlot("view", CameraView, num_joints),
-            bus_log=Pipe("bus_log", LOG_BYTES),
-            policy_log=Pipe("policy_log", LOG_BYTES),
-            page_log=Pipe("page_log", LOG_BYTES),
-            vision_log=Pipe("vision_log", VISION_LOG_BYTES),
-            requests=Pipe("requests", REQUEST_BYTES),
-            reports=Pipe("reports", REPORT_BYTES),
-        )
+    def __init__(self, num_joints: int, commands: bool, frame_px: int = 0) -> None:
+        self.state = RecordSlot("state", OperatorState, num_joints)
+        self.advice = RecordSlot("advice", PolicyAdvice, num_joints)
+        self.request = RecordSlot("request", RequestedCommand, num_joints) if commands else None
+        self.target = Slot("target", TARGET)
+        self.controls = RecordSlot("controls", OperatorControls, num_joints)
+        self.page = RecordSlot("page", PageSignal, num_joints)
+        self.frame = Slot("frame", build_frame_fields(frame_px)) if frame_px else None
+        self.holes = Slot("holes", HOLES)
+        self.view = RecordSlot("view", CameraView, num_joints)
+        self.bus_log = Pipe("bus_log", LOG_BYTES)
+        self.policy_log = Pipe("policy_log", LOG_BYTES)
+        self.page_log = Pipe("page_log", LOG_BYTES)
+        self.vision_log = Pipe("vision_log", VISION_LOG_BYTES)
+        self.requests = Pipe("requests", REQUEST_BYTES)
+        self.reports = Pipe("reports", REPORT_BYTES)
 
     @property
     def logs(self) -> tuple[Pipe, ...]:

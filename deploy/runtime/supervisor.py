@@ -31,7 +31,7 @@ from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_prior
 from deploy.runtime.process_group import PATIENCE_S, BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import DetectedTarget, TargetSelector
-from deploy.video.settings import VideoProcessConfig, VideoSettings
+from deploy.video.settings import VideoSettings
 
 log = logging.getLogger(__name__)
 
@@ -100,6 +100,7 @@ class DeploymentLoop(BusAndPolicySettings):
         Raises:
             CheckpointError: the policy cannot be used on this machine.
             ConfigError: bus description, levers or the observer's file do not fit the machine.
+            FrameError: the camera's folder holds no frames.
             LinkError: bus or policy process died.
         """
         self.check_machine(machine)
@@ -109,6 +110,8 @@ class DeploymentLoop(BusAndPolicySettings):
             build_envelope(self.limits, machine, commands=True)
         if self.video is not None:
             self.video.require_packages()
+        if self.camera is not None:
+            self.camera.check_frames()
         with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:
             self._run(machine, session, companions, sockets)
 
@@ -120,7 +123,7 @@ class DeploymentLoop(BusAndPolicySettings):
         sockets: str,
     ) -> None:
         frame_px = self.camera.num_px if self.camera else 0
-        memory = LoopMemory.new(machine.num_joints, self.commands, frame_px)
+        memory = LoopMemory(machine.num_joints, self.commands, frame_px)
         group = ProcessGroup(memory, self.realtime)
         recorder = self._build_recorder(memory, machine, session.folder)
         try:
@@ -155,8 +158,7 @@ class DeploymentLoop(BusAndPolicySettings):
             config = self.build_page_config(self.page, machine, session)
             if self.video is not None:
                 config = replace(config, video_folder=sockets)
-                video = VideoProcessConfig(self.video, sockets)
-                group.start("video", "deploy.video.video_process:run", (video,))
+                group.start("video", "deploy.video.video_process:run", (self.video, sockets))
             group.start("page", "deploy.page.loop_feed:run", (config,))
         if self.camera is not None:
             group.start("camera", "deploy.runtime.perception_process:run", (self.camera,))

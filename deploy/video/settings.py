@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib.util import find_spec
 
 from brokk_rl.errors import ConfigError
@@ -37,16 +36,3 @@ class VideoSettings:
         """
         if find_spec("aiortc") is None:
             raise ModuleNotFoundError("video needs aiortc", name="aiortc")
-
-
-@dataclass(frozen=True)
-class VideoProcessConfig:
-    """Settings of a video process.
-
-    Attributes:
-        video: The cameras.
-        folder: Holds the socket; only its owner may enter.
-    """
-
-    video: VideoSettings
-    folder: str

@@ -24,7 +24,7 @@ from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCSes
 
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.video.settings import SOCKET, VideoProcessConfig, VideoSettings
+from deploy.video.settings import SOCKET, VideoSettings
 from deploy.video.sources import CameraReader
 
 log = logging.getLogger(__name__)
@@ -122,11 +122,18 @@ def hide_local_names(offer: str) -> str:
     return "".join(one for one in lines if not (one.startswith("a=candidate") and ".local " in one))
 
 
-def run(stop: Stop, config: VideoProcessConfig, memory: LoopMemory | None = None) -> None:
-    """Send pictures until asked to stop."""
+def run(stop: Stop, video: VideoSettings, folder: str, memory: LoopMemory | None = None) -> None:
+    """Send pictures until asked to stop.
+
+    Args:
+        stop: Returns whether to stop.
+        video: The cameras.
+        folder: For the socket; only its owner may enter.
+        memory: Of the loop; not needed.
+    """
     os.nice(NICENESS)
     logging.getLogger("aioice").setLevel(logging.WARNING)
-    asyncio.run(_serve(stop, config.video, Path(config.folder) / SOCKET))
+    asyncio.run(_serve(stop, video, Path(folder) / SOCKET))
 
 
 def _tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

@@ -83,7 +83,7 @@ def test_the_camera_process_publishes_its_holes(name: str, finder_spec: Any) -> 
         record_hz=0.0,
     )
     num_joints = option("machine", "brokk170").num_joints
-    memory = LoopMemory.new(num_joints, commands=False, frame_px=frame.depth_m.size)
+    memory = LoopMemory(num_joints, commands=False, frame_px=frame.depth_m.size)
     try:
         perception_process.run(lambda: False, camera, memory)
         (hole,) = read_holes(memory.holes)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from block import TARGETS, take_frame
+from block import TARGETS, seen_at, take_frame
 from desk import free_port
 from PIL import Image
 from websockets.asyncio.client import connect
@@ -93,13 +93,6 @@ def _photograph(folder: Path) -> None:
     np.save(folder / "0.depth.npy", FRAME.depth_m)
     camera = {"K": FRAME.camera_matrix.tolist(), "T_base_cam": FRAME.base_from_camera.tolist()}
     (folder / "camera.yaml").write_text(json.dumps(camera))
-
-
-def seen_at(frame: Any, center_m: np.ndarray) -> tuple[float, float]:
-    """Returns where in the picture a point of the base frame is, as parts of width and height."""
-    from_base = np.linalg.inv(frame.base_from_camera)
-    u, v, w = frame.camera_matrix @ (from_base[:3, :3] @ center_m + from_base[:3, 3])
-    return (u / w + 0.5) / frame.color.shape[1], (v / w + 0.5) / frame.color.shape[0]
 
 
 async def _shown(state: Any, claim: Any) -> dict[str, Any]:

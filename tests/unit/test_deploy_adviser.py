@@ -64,7 +64,7 @@ class Desk:
     """An adviser, the memory around it, and a clock."""
 
     def __init__(self, commands: bool = True) -> None:
-        self.memory = LoopMemory.new(NUM_JOINTS, commands)
+        self.memory = LoopMemory(NUM_JOINTS, commands)
         self.bundle = Bundle()
         self.now_s = 1000.0
         self.adviser = PolicyAdviser(CONFIG, self.bundle, self.memory)  # type: ignore[arg-type]
@@ -332,7 +332,7 @@ def test_a_history_that_was_emptied_has_heard_of_no_silence() -> None:
 def test_the_process_runs_until_it_is_asked_to_stop_and_reports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    memory, turns = LoopMemory.new(NUM_JOINTS, commands=True), iter([False, False, True])
+    memory, turns = LoopMemory(NUM_JOINTS, commands=True), iter([False, False, True])
     monkeypatch.setattr(policy_process, "PolicyBundle", lambda folder, machine: Bundle())
     begun_s = time.monotonic()
     policy_process.run(lambda: next(turns), CONFIG, memory)

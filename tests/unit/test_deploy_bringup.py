@@ -185,10 +185,8 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
 def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:
     twin = build_twin(wire("udp"), remote=False, fault_port=43210)
     bench = RehearsalBench(twin=twin, plant=NominalMachine(), rest_s=1.0, fails=None)  # type: ignore[arg-type]
-    assert [one.name for one in bench.companions(option("machine", "brokk170"), None)] == [
-        "twin",
-        "operator",
-    ]  # type: ignore[arg-type]
+    found = bench.companions(option("machine", "brokk170"), None)  # type: ignore[arg-type]
+    assert [one.name for one in found] == ["twin", "operator"]
     for change in ({"twin": replace(twin, remote=True)}, {"twin": replace(twin, fault_port=None)}):
         with pytest.raises(ConfigError, match=r"twin\.remote=false and a twin\.fault_port"):
             replace(bench, **change)

@@ -116,7 +116,7 @@ class Rig:
 
     def __init__(self, commands: bool = True) -> None:
         self.clock = Clock()
-        self.memory = LoopMemory.new(MACHINE.num_joints, commands)
+        self.memory = LoopMemory(MACHINE.num_joints, commands)
         self.wire = Wire(self.clock)
         limits = replace(LIMITS, observer=None)
         config = BusProcessConfig(self.wire, DBC, MACHINE, limits, needs_page=True)  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from block import TARGETS, take_frame
+from block import TARGETS, seen_at, take_frame
 from composed import option
 
 from brokk_rl.contracts.vision import CameraView, FrameDetections, HolePose
@@ -51,18 +51,9 @@ def pose(x: float, y: float, std_m: float = 0.004, score: float = 0.9) -> HolePo
     )
 
 
-def seen_at(frame: Frame, center_m: Any) -> tuple[float, float]:
-    """Returns where in the picture a point of the base frame is, as parts of width and height."""
-    assert frame.base_from_camera is not None
-    from_base = np.linalg.inv(frame.base_from_camera)
-    u, v, w = frame.camera_matrix @ (from_base[:3, :3] @ center_m + from_base[:3, 3])
-    height, width = frame.depth_m.shape
-    return (u / w + 0.5) / width, (v / w + 0.5) / height
-
-
 @pytest.fixture
 def exchange() -> Iterator[LoopMemory]:
-    found = LoopMemory.new(MACHINE.num_joints, commands=False, frame_px=PIXELS)
+    found = LoopMemory(MACHINE.num_joints, commands=False, frame_px=PIXELS)
     yield found
     found.close()
 

@@ -206,7 +206,7 @@ def test_a_wall_clock_that_is_moved_by_an_hour_changes_nothing(
 def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    memory = LoopMemory.new(machine.num_joints, commands=False)
+    memory = LoopMemory(machine.num_joints, commands=False)
     capture = CaptureConfig(tmp_path, DBC, machine, {"source": "test"}, 0.0)
     sync, flush, count = os.fsync, CaptureWriter.flush, [0]
 

@@ -236,6 +236,11 @@ def test_a_bundle_for_another_machine_joint_order_history_or_rate_is_refused(
         ({"task": [1]}, "."),
         ({"stop": None}, "."),
         ({"stop": {"success": {"largest_lateral_m": -1.0, "largest_roll_rad": 0.1}}}, "roll"),
+        (
+            {"stop": {"success": {"largest_lateral_m": math.nan}}},
+            "a finite bound.*lateral.*got nan",
+        ),
+        ({"stop": {"success": {"least_depth_below_target_m": -math.inf}}}, "a finite bound.*-inf"),
     ],
     ids=str,
 )
@@ -437,3 +442,13 @@ def test_a_bench_is_built_whole_before_its_policy_is_read(
 ) -> None:
     done = brokk("preset=bench", f"bench={bench}", "deploy.policy=nowhere", "session.out=run")
     assert done.code == 2 and "policy nowhere: policy.json is missing" in done.err
+
+
+def test_a_camera_without_frames_is_refused_before_any_process_starts(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    words = ("camera=pictures", "perception/source@source=folder", "source.folder=nowhere")
+    done = brokk("preset=bench", *words, "session.out=run")
+    assert done.code == 2 and not (tmp_path / "run/processes.json").exists()
+    assert "expected frames" in done.err and "nowhere: no such folder" in done.err
+    assert "source.folder=" in done.err

@@ -30,7 +30,7 @@ FULL_RAD = 0.35
 
 @pytest.fixture
 def memory() -> Iterator[LoopMemory]:
-    found = LoopMemory.new(MACHINE.num_joints, commands=True)
+    found = LoopMemory(MACHINE.num_joints, commands=True)
     yield found
     found.close()
 
@@ -108,23 +108,16 @@ def test_old_things_are_old(memory: LoopMemory, feed: LoopFeed) -> None:
     target = memory.target.new()
     target["t_s"], target["center_in_base_m"] = now_s - 700.0, [2.6, 0.0, 0.75]
     memory.target.write(target)
-    assert {stream.name for stream in feed.read_state().streams if stream.stale} == {
-        "positions",
-        "levers",
-        "advice",
-        "borehole",
-    }
+    stale = {stream.name for stream in feed.read_state().streams if stream.stale}
+    assert stale == {"positions", "levers", "advice", "borehole"}
     assert not feed.read_state().deadman, "a dead-man of which nothing was heard is not held"
 
 
 def test_the_borehole_and_the_way_to_it(memory: LoopMemory, feed: LoopFeed) -> None:
     say(memory)
     target = memory.target.new()
-    target["t_s"], target["center_in_base_m"], target["std_m"] = (
-        time.monotonic(),
-        [2.6, 0.0, 0.75],
-        0.003,
-    )
+    target["t_s"], target["std_m"] = time.monotonic(), 0.003
+    target["center_in_base_m"] = [2.6, 0.0, 0.75]
     memory.target.write(target)
     shown = feed.read_state()
     assert shown.targets[0].center_in_base_m == (2.6, 0.0, 0.75) and shown.targets[0].std_m == 0.003
@@ -228,7 +221,7 @@ def test_a_start_that_was_asked_for_before_a_stop_does_not_undo_it(
 
 
 def test_a_loop_that_sends_nothing_has_nothing_to_confirm(tmp_path: Path) -> None:
-    memory = LoopMemory.new(MACHINE.num_joints, commands=False)
+    memory = LoopMemory(MACHINE.num_joints, commands=False)
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     config = PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0)
     feed = LoopFeed(config, memory)

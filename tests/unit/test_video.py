@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed
 
 from deploy.page.video_relay import VideoRelay
 from deploy.runtime.process import ChildProcess
-from deploy.video.settings import SOCKET, VideoProcessConfig
+from deploy.video.settings import SOCKET
 
 READ_CODE = """name => {
     const camera = window.measured.video.cameras.find(one => one.name === name), { video } = camera;
@@ -100,11 +100,11 @@ def test_pictures_come_with_their_age_and_a_dead_process_is_an_alarm(
     page: Any, tmp_path: Path
 ) -> None:
     pytest.importorskip("aiortc", reason="the extra video is not installed")
-    config = VideoProcessConfig(option("video", "pattern"), str(tmp_path))
-    child = ChildProcess("video", "deploy.video.video_process:run", (config,), ())
+    video = option("video", "pattern")
+    child = ChildProcess("video", "deploy.video.video_process:run", (video, str(tmp_path)), ())
     try:
         eventually(lambda: page.evaluate(SHOWS) == 2)
-        for index, name in enumerate(config.video.cameras):
+        for index, name in enumerate(video.cameras):
             now_s, width, red = page.evaluate(READ_CODE, name)
             taken_s = read_time_code(np.reshape(red, (-1, width)))
             late_s = (now_s - taken_s) % (1e-3 * (1 << CODE_BITS))
