@@ -9,7 +9,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.runtime.supervisor import CompanionProcess
-from deploy.twin.remote import GamepadRemote, Person, SimulatedOperator
+from deploy.twin.remote import GamepadRemote, RemoteHolder, SimulatedOperator
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 
@@ -25,7 +25,7 @@ class Bench:
     twin: Twin
     plant: Connection
 
-    def find_person(self, machine: Machine, session: Session) -> Person | None:
+    def find_person(self, machine: Machine, session: Session) -> RemoteHolder | None:
         """Return who holds the remote; `None` where the twin plays it, levers in neutral."""
         raise NotImplementedError
 
@@ -62,7 +62,7 @@ class TwinBench(Bench):
                 "bench: the remote is played by the twin (twin.remote=true) or by an operator, not by both or neither"
             )
 
-    def find_person(self, machine: Machine, session: Session) -> Person | None:
+    def find_person(self, machine: Machine, session: Session) -> RemoteHolder | None:
         """See `Bench`."""
         if self.operator is None:
             return None
@@ -85,7 +85,7 @@ class GamepadBench(Bench):
                 "bench=gamepad: expected twin.remote=false, since the gamepad is the remote"
             )
 
-    def find_person(self, machine: Machine, session: Session) -> Person:
+    def find_person(self, machine: Machine, session: Session) -> RemoteHolder:
         """See `Bench`."""
         # Before anything starts: a person who has forgotten to plug it in is told so at once.
         self.gamepad.open_device().close()

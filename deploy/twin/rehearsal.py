@@ -127,7 +127,7 @@ class ScriptedPerson:
         return None
 
     def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
-        """See `Person`; at rest until the loop has listened, then round by round."""
+        """See `RemoteHolder`; at rest until the loop has listened, then round by round."""
         begun_s, pressed, spoiled = np.inf, False, False
         for now_s in cycles:
             state = memory.state.read()

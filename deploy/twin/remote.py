@@ -107,7 +107,7 @@ class RadioRemote:
         )
 
 
-class Person(Protocol):
+class RemoteHolder(Protocol):
     """Who holds the remote."""
 
     def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
@@ -121,7 +121,7 @@ class Person(Protocol):
 
 
 def run_remote(
-    stop: Stop, wire: CanBus, dbc: str, machine: Machine, person: Person, memory: LoopMemory
+    stop: Stop, wire: CanBus, dbc: str, machine: Machine, person: RemoteHolder, memory: LoopMemory
 ) -> None:
     """Run the remote in the hands of a person.
 
@@ -151,7 +151,7 @@ class SimulatedOperator:
     seed: int
 
     def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
-        """See `Person`."""
+        """See `RemoteHolder`."""
         import torch  # only here: the machine's computer has none
 
         torch.manual_seed(self.seed)
@@ -208,7 +208,7 @@ class GamepadRemote:
         return Gamepad(Path(self.device), "bench.gamepad.device", "take bench=twin or bench=guided")
 
     def hold_remote(self, remote: RadioRemote, cycles: Iterator[float], memory: LoopMemory) -> None:
-        """See `Person`; a gamepad that is unplugged is a remote out of range: nothing more is sent."""
+        """See `RemoteHolder`; a gamepad that is unplugged is a remote out of range: nothing more is sent."""
         gamepad = self.open_device()
         for _ in cycles:
             gamepad.poll()
