@@ -9,20 +9,19 @@ from typing import Any
 import numpy as np
 
 from actuators.identify import dead_time
-from actuators.recordings import inspection_picture
+from actuators.motion_panels import draw_joint_track
 from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
 from actuators.recordings.recording_checks import (
     REMARK_HEAD,
     REMARKS,
     examine_recordings,
-    find_targets,
     tabulate_remarks,
 )
 from brokk_rl import record
-from brokk_rl.commands import view_recordings
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.plot import make_figure, save_figure
 from brokk_rl.progress import track_items
 from brokk_rl.record import Breach, Recording
 from brokk_rl.report import embed_picture, render_page
@@ -42,6 +41,11 @@ OVERALL = {
     "step": np.median,
 }
 """Figure over all recordings of those that are no means."""
+FINDING, BREACH = "#e69f00", "#b00020"
+THINNEST = 0.002
+"""A finding is drawn at least this wide, as a part of the picture, so that a single row can be
+seen."""
+
 FILES = ["file", "minutes", "rate", "jitter", "breaches", "findings"]
 
 
@@ -140,9 +144,7 @@ class Inspect:
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
             if one.recording and one.inspection:
                 path = folder / f"{one.path.stem}.png"
-                inspection_picture.draw_recording(
-                    path, one.recording, self.machine, one.inspection, one.breaches
-                )
+                draw_recording(path, one.recording, self.machine, one.inspection, one.breaches)
                 pictures[one.path.name] = embed_picture(path)
         values = {
             "title": f"Recordings of {self.machine.name}",
@@ -163,9 +165,7 @@ class Inspect:
         recording, breaches = record.examine_recording(path, self.machine)
         if recording is None or recording.num_samples < 2:
             return InspectedFile(path, None, breaches, None)
-        (viewed,) = view_recordings([recording], self.machine)
-        targets = find_targets(recording, self.machine)
-        found = inspect_recording(viewed, self.machine, self.thresholds, targets)
+        found = inspect_recording(recording, self.machine, self.thresholds)
         return InspectedFile(path, recording, breaches, found)
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -244,3 +244,36 @@ def _format_number(value: float | None, digits: int = 3) -> str:
 
 def _format_percent(value: float | None) -> str:
     return "–" if value is None else f"{100.0 * value:.1f} %"
+
+
+def draw_recording(
+    path: Path,
+    recording: Recording,
+    machine: Machine,
+    inspection: Inspection,
+    breaches: Sequence[Breach],
+) -> None:
+    """Draw commands, positions, findings (shaded) and breaches (lines) as PNG."""
+    count = machine.num_joints
+    figure = make_figure(14, 1.1 + 1.7 * count)
+    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    t_s = recording.t_s
+    begin_s, span_s = float(np.nanmin(t_s)), max(float(np.nanmax(t_s) - np.nanmin(t_s)), 1e-9)
+    for j, (joint, axis) in enumerate(zip(machine.joints, axes, strict=True)):
+        draw_joint_track(axis, t_s, recording.q[:, j], recording.u[:, j], machine, j)
+        for finding in inspection.findings:
+            if finding.joint in (joint.name, None):
+                width_s = max(finding.duration_s, THINNEST * span_s)
+                axis.axvspan(
+                    finding.t_s, finding.t_s + width_s, color=FINDING, alpha=0.35, linewidth=0
+                )
+        own = {f"u_{joint.name}", f"q_{joint.name}_{joint.unit}", "t_s"}
+        for breach in breaches:
+            if breach.row is not None and breach.column in own and np.isfinite(t_s[breach.row]):
+                axis.axvline(t_s[breach.row], color=BREACH, linewidth=1.0)
+    axes[-1].set_xlabel("time [s]")
+    axes[-1].set_xlim(begin_s, begin_s + span_s)
+    name = recording.path.name if recording.path else "recording"
+    title = "measured position (black), command (filled), findings (shaded), breaches (lines)"
+    figure.suptitle(f"{name}: {title}", fontsize=11)
+    save_figure(figure, path)

@@ -12,6 +12,7 @@ import numpy as np
 from annotated_types import Ge
 
 from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
+from brokk_rl.commands import read_targets, view_recordings
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
@@ -89,7 +90,7 @@ class RecordingFinding:
     """A stretch of a recording that needs an explanation.
 
     Attributes:
-        kind: A key of `FINDINGS`.
+        kind: A key of `recording_checks.REMARKS`.
         joint: Joint concerned, `None` where it is all of them.
         row: First row.
         num_rows: Rows on end.
@@ -123,22 +124,12 @@ class Inspection:
 
 
 def inspect_recording(
-    recording: Recording,
-    machine: Machine,
-    thresholds: InspectionThresholds,
-    targets: np.ndarray | None = None,
+    recording: Recording, machine: Machine, thresholds: InspectionThresholds
 ) -> Inspection:
-    """Return the contents of a recording of `machine`.
-
-    Args:
-        recording: The recording, its commands as speeds.
-        machine: The machine.
-        thresholds: From which on a stretch is reported.
-        targets: Targets of joints that are commanded by position, `(T, J)`, rad or m; `None` for others.
-    """
+    """Return the contents of a recording of `machine`."""
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
-        scan = _RecordingScan(recording, machine, thresholds, targets)
+        scan = _RecordingScan(recording, machine, thresholds)
         findings = sorted(scan.find_all(), key=lambda finding: finding.row)
         return Inspection(scan.timing(), scan.joints(), findings)
 
@@ -147,18 +138,16 @@ class _RecordingScan:
     """Scan of one recording: the quantities that all findings use."""
 
     def __init__(
-        self,
-        recording: Recording,
-        machine: Machine,
-        thresholds: InspectionThresholds,
-        targets: np.ndarray | None,
+        self, recording: Recording, machine: Machine, thresholds: InspectionThresholds
     ) -> None:
-        self._machine, self._limits, self._targets = machine, thresholds, targets
-        self._t_s, self._u, self._q = (
-            recording.t_s,
-            recording.u.astype(np.float64),
-            recording.q.astype(np.float64),
-        )
+        self._machine, self._limits = machine, thresholds
+        (viewed,) = view_recordings([recording], machine)
+        self._t_s, self._u = viewed.t_s, viewed.u.astype(np.float64)
+        self._q = viewed.q.astype(np.float64)
+        # of joints that are commanded by position, `(T, J)`, rad or m
+        self._targets: np.ndarray | None = None
+        if machine.interface == "position":
+            self._targets = read_targets(recording.u.astype(float), machine)
         self._period_s = 1.0 / recording.rate_hz
         self._travel = machine.upper - machine.lower
         self._reach = max(1, round(0.15 / self._period_s))

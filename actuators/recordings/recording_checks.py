@@ -9,18 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from actuators.recordings.finding_kinds import FINDINGS, FindingKind, Severity
 from actuators.recordings.inspection import (
     InspectionThresholds,
     RecordingFinding,
     inspect_recording,
 )
 from actuators.scales import choose_horizon_s
-from brokk_rl.commands import read_targets, view_recordings
+from brokk_rl.commands import view_recordings
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -32,46 +31,81 @@ MIN_AGREEMENT = 0.9
 """A lock holds in at least this share of the ignored rows, and in at most the rest of the obeyed ones; chosen by hand."""
 NUM_POSITIONS = 15
 """Positions of a joint that are tried as the edge of a lock; chosen by hand."""
+Severity = Literal["note", "warn", "bad"]
 ORDER: tuple[Severity, ...] = ("bad", "warn", "note")
 
 
 @dataclass(frozen=True)
-class RecordingRemark:
-    """A finding that limits the conclusions from a recording.
+class FindingKind:
+    """Severity, meaning and remedy of a kind of finding.
 
     Attributes:
-        name: Kind of the finding.
-        severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`:
-            good to know.
-        joint: Joint concerned, `None` where it is all of them.
-        recording: Its file's stem or run.
-        from_s: Begin of the first stretch.
-        to_s: End of the last one.
-        count: Number of stretches.
-        amount: How much, with its unit.
+        severity: `bad`: conclusions about this joint are likely wrong; `warn`: they may be; `note`: good to know.
         meaning: Possible causes.
         advice: The remedy.
-        share: Its time over that of the recording.
     """
 
-    name: str
     severity: Severity
-    joint: str | None
-    recording: str
-    from_s: float
-    to_s: float
-    count: int
-    amount: str
     meaning: str
     advice: str
-    share: float = 0.0
-
-    def plain(self) -> dict[str, Any]:
-        """Return it as plain JSON data."""
-        return asdict(self)
 
 
-REMARKS = FINDINGS | {
+REMARKS = {
+    "command without motion": FindingKind(
+        "warn",
+        "a dead band wider than expected, an interlock or dead-man that is not logged, or a load too heavy",
+        "log the interlocks; leave these stretches out if the machine was not allowed to move",
+    ),
+    "does not obey": FindingKind(
+        "bad",
+        "the joint stays away from its target: its drive is off or blocked, or too weak for the load",
+        "leave these stretches out, or log the enable signal and use the parts in which the drive is on",
+    ),
+    "jumps": FindingKind(
+        "bad",
+        "the position steps by more than a machine moves: an angle or a counter that wraps, a sign bit, a reset, or two sources",
+        "import again with log.wraps, or leave the other source out; no model can follow these steps",
+    ),
+    "motion without command": FindingKind(
+        "warn",
+        "the load sinks (a leak), or the joint was moved by something that is not logged",
+        "log every input; a slow sinking towards the load is the effect 'creep'",
+    ),
+    "unlogged input": FindingKind(
+        "bad",
+        "the joint moves at a working speed without command: something moves it that is not logged",
+        "log every input that moves the machine: levers, a second operator, automatic functions",
+    ),
+    "frozen sensor": FindingKind(
+        "warn",
+        "equal samples, then a jump, or equal samples of a sensor with noise: it did not measure",
+        "check sensor and cable; the motion is real",
+    ),
+    "lost frames": FindingKind(
+        "note",
+        "all joints repeat the row before while one of them moves: positions were lost on their way",
+        "record frame counters; small rates are the effect 'frame_loss' or a slow sensor",
+    ),
+    "beyond limit": FindingKind(
+        "warn",
+        "measured beyond the limits of the machine's file",
+        "measure the end stops; correct the machine's file",
+    ),
+    "exclusive joint": FindingKind(
+        "bad",
+        "an exclusive joint is commanded together with others, which the machine forbids: one of both is not carried out",
+        "record what was really sent",
+    ),
+    "irregular clock": FindingKind(
+        "warn",
+        "rows are not equally spaced in time",
+        "stamp rows where they are measured, not where they are written",
+    ),
+    "saturated sensor": FindingKind(
+        "bad",
+        "the sensor stays at one end of its range, away from the joint's stops: it cannot say more, or a stop is nearer than known",
+        "check the sensor's range and the machine's limits",
+    ),
     "interlock": FindingKind(
         "bad",
         "the joint ignores its command whenever that condition holds: a lock that is not logged",
@@ -83,7 +117,43 @@ REMARKS = FINDINGS | {
         "record runs that move it",
     ),
 }
-"""All remarks: findings in single recordings, and what only several of them show."""
+"""All remarks: findings in single recordings, and the last two, which only several of them show."""
+
+
+@dataclass(frozen=True)
+class RecordingRemark:
+    """A finding that limits the conclusions from a recording.
+
+    Attributes:
+        name: Kind of the finding, a key of `REMARKS`.
+        joint: Joint concerned, `None` where it is all of them.
+        recording: Its file's stem or run.
+        from_s: Begin of the first stretch.
+        to_s: End of the last one.
+        count: Number of stretches.
+        amount: How much, with its unit.
+        share: Its time over that of the recording.
+    """
+
+    name: str
+    joint: str | None
+    recording: str
+    from_s: float
+    to_s: float
+    count: int
+    amount: str
+    share: float = 0.0
+
+    @property
+    def kind(self) -> FindingKind:
+        """Its severity, meaning and remedy."""
+        return REMARKS[self.name]
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as plain JSON data."""
+        return asdict(self) | asdict(self.kind)
+
+
 MOST_ROWS = 40
 """Rows of the table of remarks; a page of a terminal."""
 REMARK_HEAD = ["remark", "joint", "run", "when", "what"]
@@ -96,8 +166,7 @@ def examine_recordings(
     """Return all remarks about recordings of `machine`, the most severe first."""
     inspected = []
     for one, seen in zip(recordings, view_recordings(recordings, machine), strict=True):
-        targets = find_targets(one, machine)
-        inspected.append((seen, inspect_recording(seen, machine, thresholds, targets).findings))
+        inspected.append((seen, inspect_recording(one, machine, thresholds).findings))
     locks = {}
     for j, name in enumerate(machine.joint_names):
         if text := _find_lock(inspected, machine, j, thresholds):
@@ -108,7 +177,7 @@ def examine_recordings(
     remarks += _check_excitation([seen for seen, _ in inspected], machine, thresholds)
     return sorted(
         remarks,
-        key=lambda one: (ORDER.index(one.severity), one.name, one.joint or "", one.recording),
+        key=lambda one: (ORDER.index(one.kind.severity), one.name, one.joint or "", one.recording),
     )
 
 
@@ -116,37 +185,15 @@ def tabulate_remarks(remarks: Sequence[RecordingRemark]) -> list[list[str]]:
     """Return the cells of a table below `REMARK_HEAD`: the most severe remarks, without notes."""
     rows = []
     for one in remarks[:MOST_ROWS]:
-        if one.severity != "note":
+        if one.kind.severity != "note":
             span = f"{one.from_s:.2f} to {one.to_s:.2f} s"
             rows.append([one.name, one.joint or "all", one.recording, span, one.amount])
     return rows
 
 
-def find_targets(recording: Recording, machine: Machine) -> np.ndarray | None:
-    """Return the targets of joints that are commanded by position, `(T, J)`, rad or m; `None` for others."""
-    if machine.interface != "position":
-        return None
-    return read_targets(recording.u.astype(float), machine)
-
-
 def name_recording(recording: Recording) -> str:
     """Return how a recording is called in a report: by its file, else by its run."""
     return recording.path.stem if recording.path else recording.run
-
-
-def _make_remark(
-    name: str,
-    joint: str | None,
-    where: str,
-    span_s: tuple[float, float],
-    count: int,
-    amount: str,
-    share: float = 0.0,
-) -> RecordingRemark:
-    kind = REMARKS[name]
-    return RecordingRemark(
-        name, kind.severity, joint, where, *span_s, count, amount, kind.meaning, kind.advice, share
-    )
 
 
 def _group_findings(
@@ -171,7 +218,7 @@ def _group_findings(
             name, text = "interlock", locks[joint]
         span_s = some[0].t_s, some[-1].t_s + some[-1].duration_s
         where = name_recording(recording)
-        yield _make_remark(name, joint or None, where, span_s, len(some), text, part)
+        yield RecordingRemark(name, joint or None, where, *span_s, len(some), text, part)
 
 
 def _find_lock(
@@ -251,4 +298,4 @@ def _check_excitation(
         if seconds < MIN_COMMANDED_RUNS * choose_horizon_s(machine):
             total_s = sum(recording.duration_s for recording in recordings)
             text = f"commanded for {seconds:.1f} s of {total_s:.0f} s"
-            yield _make_remark("joint at rest", name, "all recordings", (0.0, total_s), 1, text)
+            yield RecordingRemark("joint at rest", name, "all recordings", 0.0, total_s, 1, text)

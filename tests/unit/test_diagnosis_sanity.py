@@ -21,7 +21,7 @@ def test_a_sound_recording_says_only_which_joint_rested(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     (remark,) = examine_recordings([recording(machine)], machine, thresholds)
-    assert (remark.name, remark.joint, remark.severity) == ("joint at rest", "q2", "note")
+    assert (remark.name, remark.joint, remark.kind.severity) == ("joint at rest", "q2", "note")
 
 
 def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
@@ -32,7 +32,7 @@ def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
         examine_recordings([recording(machine, np.abs(sound.u[:, 3]) > 0)], machine, thresholds)
     )["interlock"]
     assert found.joint == "q3"
-    assert found.severity == "bad"
+    assert found.kind.severity == "bad"
     assert found.recording == "planted"
     assert found.count >= 5
     assert "q3 ignores its command when q4 is commanded" in found.amount
@@ -87,7 +87,7 @@ def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_no
     found = named(examine_recordings([replace(sound, q=q)], machine, thresholds))[
         "saturated sensor"
     ]
-    assert found.joint == "q3" and found.severity == "bad"
+    assert found.joint == "q3" and found.kind.severity == "bad"
     shifted = q + np.where(np.arange(5) == 2, machine.upper[2] - q[:, 2].max(), 0.0).astype(
         np.float32
     )
@@ -118,8 +118,8 @@ def test_the_gravest_comes_first_and_all_of_it_is_plain(
         machine,
         thresholds,
     )
-    assert [remark.severity for remark in remarks] == sorted(
-        (r.severity for r in remarks), key=["bad", "warn", "note"].index
+    assert [remark.kind.severity for remark in remarks] == sorted(
+        (r.kind.severity for r in remarks), key=["bad", "warn", "note"].index
     )
     for remark in remarks:
         assert remark.plain()["name"] in REMARKS

@@ -22,6 +22,7 @@ from actuators.recordings.inspection import (
     inspect_recording,
 )
 from brokk_rl import record
+from brokk_rl.commands import scale_targets
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -158,9 +159,9 @@ def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_
     arm = option("machine", "so101")
     t_s = arm.period_s * np.arange(1000)
     q = np.tile(arm.home, (len(t_s), 1))
-    u = np.zeros_like(q)
     # a hundredth of full speed for ten seconds, then a hold
-    u[:500, 2], q[:, 2] = 0.01, q[:, 2] + 0.01 * arm.max_speed[2] * np.minimum(t_s, 10.0)
+    q[:, 2] += 0.01 * arm.max_speed[2] * np.minimum(t_s, 10.0)
+    u = scale_targets(q, arm)
     q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
     follows = make_recording(arm, u, q)
     assert found(follows, arm, thresholds) == []
@@ -186,9 +187,8 @@ def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
     q = targets.copy()
     targets[:, 2], q[:, 2] = arm.home[2] + travel * wave, arm.home[2] + travel * (late - 0.15)
     q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
-    log = make_recording(arm, np.zeros_like(q), q, rate_hz=1.0 / period_s, t_s=t_s)
-    findings = inspect_recording(log, arm, thresholds, targets).findings
-    named = [one for one in findings if one.kind == "does not obey"]
+    log = make_recording(arm, scale_targets(targets, arm), q, rate_hz=1.0 / period_s, t_s=t_s)
+    named = [one for one in found(log, arm, thresholds) if one.kind == "does not obey"]
     assert bool(named) == is_found
     assert all(one.joint == "elbow" and one.row >= 495 for one in named)
 
