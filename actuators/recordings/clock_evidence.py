@@ -21,13 +21,7 @@ from actuators.recordings.clocks import (
 )
 from actuators.recordings.guess import Evidence, GivenColumns, Guess
 from actuators.recordings.log_tables import LogRun, Table, index_columns
-from actuators.recordings.name_evidence import (
-    COUNT_WORDS,
-    TIME_UNITS,
-    TIME_WORDS,
-    read_words,
-    split_unit,
-)
+from actuators.recordings.name_evidence import TIME_UNITS, WORDS, read_words, split_unit
 from brokk_rl.errors import RecordingError, list_choices
 
 RATES_HZ = (0.1, 5000.0)
@@ -179,10 +173,10 @@ class _ClockJudge:
         self._text, self._values, self._table, self._given = text, values, table, given
         self._words = set(read_words(text))
         is_pair = text not in table.columns  # chosen by its two units
-        is_time = not self._words.isdisjoint(TIME_WORDS | TIME_UNITS.keys())
+        is_time = not self._words.isdisjoint(WORDS["time"] | TIME_UNITS.keys())
         self._is_named = is_pair or given.time is not None or is_time
         self._is_count = (
-            not is_pair and given.time is None and not self._words.isdisjoint(COUNT_WORDS)
+            not is_pair and given.time is None and not self._words.isdisjoint(WORDS["count"])
         )
         named = [split_unit(text)[1] or "", *reversed(read_words(text))]
         units = [TIME_UNITS[one] for one in named if one in TIME_UNITS]

@@ -28,13 +28,7 @@ from actuators.recordings.guess import GivenColumns
 from actuators.recordings.joint_evidence import ColumnEntry, JointGuess, JointJudge
 from actuators.recordings.log_signals import RunSignals
 from actuators.recordings.log_tables import LogRun, index_columns
-from actuators.recordings.name_evidence import (
-    COUNT_WORDS,
-    ENABLE_WORDS,
-    name_joint,
-    read_column_name,
-    read_words,
-)
+from actuators.recordings.name_evidence import WORDS, name_joint, read_column_name, read_words
 from actuators.recordings.signal_checks import Wrap, find_wrap
 from brokk_rl.errors import RecordingError
 
@@ -163,7 +157,7 @@ class _PairFinder:
             clocks = list_time_columns(self._times[table].time)
             is_time = any(column == one or column in re.findall(r"\w+", one) for one in clocks)
             is_time |= column.endswith("stamp") or column == self._run.tables[table].clock
-            if not is_time and (COUNT_WORDS | ENABLE_WORDS).isdisjoint(read_words(column)):
+            if not is_time and (WORDS["count"] | WORDS["enable"]).isdisjoint(read_words(column)):
                 try:
                     entries.append(self._read_entry(full_name))
                 except RecordingError:
@@ -268,8 +262,10 @@ class _PairFinder:
         """Add the evidence of a drive that is off by a column that says so, and remark it."""
         for full_name, (_, column) in self._places.items():
             words = read_words(column)
-            left = [one for one in words if one not in ENABLE_WORDS | {"torque", "drive", "motor"}]
-            if ENABLE_WORDS.isdisjoint(words) or "".join(left) not in ("", joint.q.name.key):
+            left = [
+                one for one in words if one not in WORDS["enable"] | {"torque", "drive", "motor"}
+            ]
+            if WORDS["enable"].isdisjoint(words) or "".join(left) not in ("", joint.q.name.key):
                 continue
             signal = self.signals.read(full_name)
             off = signal.values == 0.0

@@ -5,57 +5,21 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
+
+import yaml
 
 Role = Literal["command", "measured"]
 Quantity = Literal["position", "velocity", "effort", "unknown"]
 
 
-def _split(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
-TIME_WORDS = _split("""
-    t time timestamp stamp clock sec secs seconds nanosec nanosecs nsec epoch ts tout
-    datetime date zeit zeitstempel uhrzeit datum temps tiempo tempo ipoc elapsed millis micros
-""")
-COUNT_WORDS = _split("""
-    index idx row frame sample seq sequence step counter id no nr episode
-""")
-"""Words of numbers that count rows."""
-COMMAND_WORDS = _split("""
-    u cmd cmds command commands commanded control ctrl action actions target targets tgt
-    goal set setpoint setpoints sp desired des ref reference demand request valve flow pwm duty
-    soll sollwert sollwinkel sollposition stellwert vorgabe consigne consigna comando aspos input
-    joystick lever trajectory
-""")
-MEASURED_WORDS = _split("""
-    q state states actual act meas measured ms feedback fb obs observation encoder enc
-    present status sensor ist istwert istwinkel istposition aipos mesure output
-""")
-TARGET_WORDS = _split("""
-    target targets tgt goal setpoint setpoints sp desired des ref reference soll sollwert
-    consigne consigna aspos
-""")
-"""Words for commands that are positions unless another word says velocity or effort."""
-QUANTITY_WORDS: dict[Quantity, frozenset[str]] = {
-    "position": _split("""
-        q pos position positions angle angles length stroke ms ticks counts winkel weg hub
-        lage sollwinkel istwinkel sollposition istposition aspos aipos posizione posicion
-    """),
-    "velocity": _split("""
-        qd dq vel vels velocity velocities speed speeds rate geschwindigkeit drehzahl
-        vitesse velocidad
-    """),
-    "effort": _split("""
-        tau torque torques effort efforts load loads current force pressure temp moment
-        temperature voltage kp kd stiffness damping drehmoment kraft strom druck temperatur
-    """),
-}
-ENABLE_WORDS = _split("""
-    enable enabled enabling freigabe deadman active armed servo_on powered
-""")
-"""Words of columns that say whether a drive is on."""
+WORDS: dict[str, frozenset[str]] = {}
+"""Words of names by what they say; see `words.yaml`."""
+for _kind, _text in yaml.safe_load(Path(__file__).with_name("words.yaml").read_text()).items():
+    WORDS[_kind] = frozenset(_text.split())
+QUANTITIES: tuple[Quantity, ...] = ("effort", "velocity", "position")
+"""The first one with a word in a name is its quantity."""
 DEG = math.pi / 180.0
 UNITS = {
     **dict.fromkeys(("rad", "rads", "radians"), ("rad", 1.0)),
@@ -77,20 +41,10 @@ TIME_UNITS = {
     "min": 60.0,
 }
 """Seconds for one of a unit."""
-OTHER_UNITS = _split("""
-    % - 1 nm n a ma v mv bar pa kpa mpa hz rpm 1/min °c k w counts count ticks inc raw bool
-    l/min m/s^2 m/s² kg kn
-""")
-"""Units that say neither a position nor a time."""
-SI_NAMES = (_split("q"), _split("qpos"), _split("dof"), _split("joint states"))
+SI_NAMES = ({"q"}, {"qpos"}, {"dof"}, {"joint", "states"})
 """Words of programs whose positions are in rad or m: libfranka, MuJoCo, Isaac, ROS."""
-EFFORT_UNITS = _split("nm n a v bar")
-FILLER_WORDS = _split("""
-    joint joints motor motors data value values raw real header robot main percent pct norm
-    controller controllers dof forward servo servos axis
-""")
-"""Words that name no joint."""
-ROLE_WORDS = COMMAND_WORDS | MEASURED_WORDS | frozenset().union(*QUANTITY_WORDS.values())
+EFFORT_UNITS = ("nm", "n", "a", "v", "bar")
+ROLE_WORDS = frozenset().union(*(WORDS[kind] for kind in ("command", "measured", *QUANTITIES)))
 """Words of role and quantity."""
 UNIT_SUFFIX = re.compile(r"^(.*?)\s*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
 """A name with a unit in brackets behind it."""
@@ -136,7 +90,7 @@ def is_unit(text: str) -> bool:
     plain = text.strip("[](){}<> ").lower()
     numerator, _, rest = plain.partition("/")
     is_rate = numerator in UNITS and rest in ("s", "s^2", "s²", "min")
-    return is_rate or plain in UNITS or plain in TIME_UNITS or plain in OTHER_UNITS
+    return is_rate or plain in UNITS or plain in TIME_UNITS or plain in WORDS["other_units"]
 
 
 def split_unit(column: str) -> tuple[str, str | None]:
@@ -196,7 +150,7 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     elif quantity == "unknown" and stated in EFFORT_UNITS:
         quantity = "effort"
     is_si = any(name <= {*words, *outer} for name in SI_NAMES)
-    known = ROLE_WORDS | FILLER_WORDS | UNITS.keys() | ({"d"} if "q" in words else set())
+    known = ROLE_WORDS | WORDS["filler"] | UNITS.keys() | ({"d"} if "q" in words else set())
     joint, source = ("_".join(one for one in each if one not in known) for each in (words, outer))
     return ColumnName(
         table, column, _find_role(words) or _find_role(outer), quantity, stated if stated in UNITS else None,
@@ -233,18 +187,19 @@ def _split_numbers(words: list[str]) -> list[str]:
 def _find_role(words: list[str]) -> Role | None:
     """Return the role; a word for commands counts more: `target q` and libfranka's `q_d` are commands, `enc_u` is none."""
     is_desired = "d" in words and not {"q", "dq", "tau"}.isdisjoint(words)
-    is_measured = not (MEASURED_WORDS - {"q"}).isdisjoint(words)
-    commands = COMMAND_WORDS - {"u"} if is_measured else COMMAND_WORDS
+    measured = WORDS["measured"]
+    is_measured = not (measured - {"q"}).isdisjoint(words)
+    commands = WORDS["command"] - {"u"} if is_measured else WORDS["command"]
     if is_desired or not commands.isdisjoint(words):
         return "command"
-    return None if MEASURED_WORDS.isdisjoint(words) else "measured"
+    return None if measured.isdisjoint(words) else "measured"
 
 
 def _find_quantity(words: list[str]) -> Quantity:
-    for quantity in ("effort", "velocity", "position"):
-        if not QUANTITY_WORDS[quantity].isdisjoint(words):
+    for quantity in QUANTITIES:
+        if not WORDS[quantity].isdisjoint(words):
             return quantity
-    return "unknown" if TARGET_WORDS.isdisjoint(words) else "position"
+    return "unknown" if WORDS["target"].isdisjoint(words) else "position"
 
 
 def name_joint(text: str) -> str:

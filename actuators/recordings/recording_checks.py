@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 
 from actuators.recordings.inspection import (
     InspectionThresholds,
@@ -50,74 +52,10 @@ class FindingKind:
     advice: str
 
 
-REMARKS = {
-    "command without motion": FindingKind(
-        "warn",
-        "a dead band wider than expected, an interlock or dead-man that is not logged, or a load too heavy",
-        "log the interlocks; leave these stretches out if the machine was not allowed to move",
-    ),
-    "does not obey": FindingKind(
-        "bad",
-        "the joint stays away from its target: its drive is off or blocked, or too weak for the load",
-        "leave these stretches out, or log the enable signal and use the parts in which the drive is on",
-    ),
-    "jumps": FindingKind(
-        "bad",
-        "the position steps by more than a machine moves: an angle or a counter that wraps, a sign bit, a reset, or two sources",
-        "import again with log.wraps, or leave the other source out; no model can follow these steps",
-    ),
-    "motion without command": FindingKind(
-        "warn",
-        "the load sinks (a leak), or the joint was moved by something that is not logged",
-        "log every input; a slow sinking towards the load is the effect 'creep'",
-    ),
-    "unlogged input": FindingKind(
-        "bad",
-        "the joint moves at a working speed without command: something moves it that is not logged",
-        "log every input that moves the machine: levers, a second operator, automatic functions",
-    ),
-    "frozen sensor": FindingKind(
-        "warn",
-        "equal samples, then a jump, or equal samples of a sensor with noise: it did not measure",
-        "check sensor and cable; the motion is real",
-    ),
-    "lost frames": FindingKind(
-        "note",
-        "all joints repeat the row before while one of them moves: positions were lost on their way",
-        "record frame counters; small rates are the effect 'frame_loss' or a slow sensor",
-    ),
-    "beyond limit": FindingKind(
-        "warn",
-        "measured beyond the limits of the machine's file",
-        "measure the end stops; correct the machine's file",
-    ),
-    "exclusive joint": FindingKind(
-        "bad",
-        "an exclusive joint is commanded together with others, which the machine forbids: one of both is not carried out",
-        "record what was really sent",
-    ),
-    "irregular clock": FindingKind(
-        "warn",
-        "rows are not equally spaced in time",
-        "stamp rows where they are measured, not where they are written",
-    ),
-    "saturated sensor": FindingKind(
-        "bad",
-        "the sensor stays at one end of its range, away from the joint's stops: it cannot say more, or a stop is nearer than known",
-        "check the sensor's range and the machine's limits",
-    ),
-    "interlock": FindingKind(
-        "bad",
-        "the joint ignores its command whenever that condition holds: a lock that is not logged",
-        "log the lock as a command of 0, or leave these stretches out",
-    ),
-    "joint at rest": FindingKind(
-        "note",
-        "hardly commanded here: nothing can be said about this joint",
-        "record runs that move it",
-    ),
-}
-"""All remarks: findings in single recordings, and the last two, which only several of them show."""
+REMARKS: dict[str, FindingKind] = {}
+"""All kinds by name: findings in single recordings, and what only several of them show."""
+for _name, _facts in yaml.safe_load(Path(__file__).with_name("remarks.yaml").read_text()).items():
+    REMARKS[_name] = FindingKind(**_facts)
 
 
 @dataclass(frozen=True)

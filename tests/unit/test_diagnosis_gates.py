@@ -22,7 +22,7 @@ def by_name(found: list[Gate]) -> dict[str, Gate]:
 
 
 def remark(name: str, joint: str, share: float) -> RecordingRemark:
-    return RecordingRemark(name, "bad", joint, "planted", 0.0, 1.0, 1, "", "", "", share)
+    return RecordingRemark(name, joint, "planted", 0.0, 1.0, 1, "", share)
 
 
 @pytest.mark.parametrize(("name", "limit"), gates.MAX_REMARK_SHARES.items())

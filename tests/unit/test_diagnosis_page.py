@@ -77,7 +77,7 @@ def test_an_answer_without_effects_has_a_report(
         gap=Gap(0.012, 0.012, 0.01, None),
         reason="Few data.",
     )
-    remark = RecordingRemark("jumps", "bad", "q4", "run", 0.0, 1.0, 1, "one", "a wrap", "unwrap it")
+    remark = RecordingRemark("jumps", "q4", "run", 0.0, 1.0, 1, "one")
     bare = replace(answer, more={"sanity": [remark.plain()] * 30})
     assert report.write_headline(bare)[1] == ("good" if verdict == "none" else "warn")
     report.write_report(Outcome(bare, seen.before, None), tmp_path, machine)
