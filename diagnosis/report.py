@@ -5,11 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from matplotlib.figure import Figure
+
+from actuators.motion_panels import MotionWindow, draw_motion_panels
+from actuators.recordings.recording_checks import name_recording
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
+from brokk_rl.plot import BLUE, RED
 from brokk_rl.report import Tone, embed_picture, render_page
 from brokk_rl.session import write_text
-from diagnosis import plots
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 from diagnosis.closure import MIN_RESTORED
 from diagnosis.where import REGIMES
@@ -158,7 +163,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "tone": tone,
         "said": answer,
         "more": more,
-        "picture_of_paths": embed_picture(plots.draw_paths(outcome, machine)),
+        "picture_of_paths": embed_picture(draw_paths(outcome, machine)),
         "horizon_s": choose_horizon_s(machine),
         "units": {joint.name: joint.unit for joint in machine.joints},
         "regimes": list(REGIMES),
@@ -175,3 +180,56 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
         "format_estimate": format_estimate,
     }
     write_text(folder / REPORT_FILE, render_page(TEMPLATE, values))
+
+
+MAX_JOINTS = 3
+"""Joints whose paths are drawn."""
+
+
+def draw_paths(outcome: Outcome, machine: Machine) -> Figure:
+    """Draw measured and simulated positions of the joints with the largest gaps."""
+    before = outcome.before
+    error = np.sqrt(np.nanmean(before.error**2, 1))  # (W, J)
+    joints = outcome.answer.where.joints
+    foremost = [-joints[name]["share"] if joints else 0.0 for name in machine.joint_names]
+    rows = {}
+    for joint in np.argsort(foremost, kind="stable")[:MAX_JOINTS].tolist():
+        worst = np.argsort(-np.nan_to_num(error[:, joint]))
+        whole = np.flatnonzero(before.source == before.source[worst[0]])
+        rows[joint] = [
+            _show_windows(outcome, joint, "a whole recording", whole),
+            _show_windows(outcome, joint, "worst window", worst[:1]),
+        ]
+    return draw_motion_panels(rows, machine, (1.9, 1.0))
+
+
+def _show_windows(outcome: Outcome, joint: int, title: str, windows: np.ndarray) -> MotionWindow:
+    """Return some windows of one recording on one time axis."""
+    before = outcome.before
+    recording = before.recordings[int(before.source[windows[0]])]
+    steps, count = before.simulated.shape[1], recording.num_samples
+    first = int(before.row[windows].min())
+    last = min(int(before.row[windows].max()) + steps, count)
+    paths = []
+    for runs, colour, label in (
+        (before, RED, "simulated before"),
+        (outcome.after, BLUE, "simulated after"),
+    ):
+        if runs is None:
+            continue
+        for number, window in enumerate(windows):
+            begin = int(before.row[window])
+            end = min(begin + steps, count)
+            style = {"color": colour, "lw": 1.3, "label": None if number else label}
+            paths.append(
+                (recording.t_s[begin:end], runs.simulated[window, : end - begin, joint], style)
+            )
+    shown = slice(first, last)
+    return MotionWindow(
+        title=f"{title}: {name_recording(recording)}",
+        t_s=recording.t_s[shown],
+        measured=recording.q[shown, joint],
+        u=recording.u[shown, joint],
+        paths=paths,
+        foremost=np.concatenate([path for _, path, _ in paths]),
+    )

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from actuators import open_loop
-from actuators.identify import dead_time, pictures
+from actuators.identify import dead_time
 from actuators.identify.scores import FreeRunScores, average_joints
 from actuators.identify.stages import FitStage, list_recordings
 from actuators.identify.training_data import list_sources
 from actuators.recordings.split import measure_commanded_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 HORIZONS_S = (1.0, 2.0, 5.0, 10.0)
 """Horizons of `identification.json`."""
@@ -158,8 +154,8 @@ def build_results(
     horizons_s: Sequence[float],
     resampling: np.random.Generator,
     delaying: np.random.Generator,
-) -> tuple[dict[str, Any], list[VerdictSentence], Figure]:
-    """Return `identification.json`, the verdict, and the picture of the predictions.
+) -> tuple[dict[str, Any], list[VerdictSentence], FreeRunScores]:
+    """Return `identification.json`, the verdict, and the errors behind them.
 
     Args:
         machine: The machine.
@@ -198,7 +194,7 @@ def build_results(
     result["data"] = _describe_data(stages, fitted_to, judged, scores)
     findings = write_verdict(result, machine)
     result["verdict"] = [{"tone": finding.tone, "text": finding.text} for finding in findings]
-    return result, findings, pictures.draw_prediction(scores, model)
+    return result, findings, scores
 
 
 def _tabulate_errors(

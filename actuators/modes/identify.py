@@ -97,14 +97,14 @@ class Identify:
                     stage.fitted[name] = fit_or_restore(
                         stage, name, models[name], folder, self.machine, device
                     )
-        result, findings, prediction = build_results(
+        result, findings, scores = build_results(
             self.machine, self.fit.name, stages, horizons_s,
             self.session.generator("resample"), self.session.generator("delay"),
         )  # fmt: skip
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
         folder = self.session.folder
         write_json(folder / "identification.json", result)
-        page.write_page(folder, result, prediction, self.machine)
+        page.write_page(folder, result, scores)
         _print_results(result, findings, folder)
         return result["overall"][self.fit.name][f"{horizons_s[-1]:g}"]["percent"]
 

@@ -18,14 +18,16 @@ from scipy.optimize import linear_sum_assignment
 from actuators.recordings.advice import advise, format_joints
 from actuators.recordings.clock_evidence import TimeGuess, guess_times
 from actuators.recordings.clocks import list_time_columns, unwrap
-from actuators.recordings.correlations import (
+from actuators.recordings.guess import GivenColumns
+from actuators.recordings.joint_evidence import (
     CLEAR_CORRELATION,
     MARGIN,
+    ColumnEntry,
     Correlations,
+    JointGuess,
+    JointJudge,
     weigh_correlation,
 )
-from actuators.recordings.guess import GivenColumns
-from actuators.recordings.joint_evidence import ColumnEntry, JointGuess, JointJudge
 from actuators.recordings.log_signals import RunSignals
 from actuators.recordings.log_tables import LogRun, index_columns
 from actuators.recordings.name_evidence import WORDS, name_joint, read_column_name, read_words

@@ -16,7 +16,6 @@ that an editor shows.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,26 +23,17 @@ from typing import Literal
 
 import numpy as np
 
-from actuators.recordings.clocks import (
-    AlignedTime,
-    Column,
-    RowTime,
-    TimeColumn,
-    list_time_columns,
-    put_near,
-)
+from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn, put_near
 from actuators.recordings.guess import Damaged
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import (
-    Places,
     RunSignals,
     Signal,
     describe_source,
-    list_names,
     list_ticks,
     locate,
+    open_signals,
 )
-from actuators.recordings.log_tables import index_columns
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -202,8 +192,14 @@ class ColumnMap:
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
         self._check_interface(machine)
+        texts = [column.column for column in self.optional.values()]
+        for joint in self.joints.values():
+            texts += [joint.command.column, joint.position.column]
+        signs = (self.delimiter, self.decimal)
+        opened = open_log(path, signs, self.dbc, self.damaged, self.channel)
+        find_time = partial(self.find_time, where=path)
         found = []
-        for signals in self.open_runs(path):
+        for signals in open_signals(opened, texts, find_time, self.longest_gap_s):
             found += self._read_run(signals, machine)
         if not found:
             raise RecordingError(
@@ -211,18 +207,6 @@ class ColumnMap:
                 "mend longest_gap_s or the scale of time in the column map"
             )
         return found
-
-    def open_runs(self, path: Path) -> Iterator[RunSignals]:
-        """Yield the signals of each run of the log at `path`."""
-        opened = open_log(
-            path, (self.delimiter, self.decimal), self.dbc, self.damaged, self.channel
-        )
-        places = index_columns(opened.list_tables())
-        wanted = self._list_wanted(places, path)
-        for run in opened.read_runs(wanted, None):
-            find_time = partial(self.find_time, where=run.where)
-            skip = self.damaged == "skip"
-            yield RunSignals(run, places, find_time, skip, self.longest_gap_s)
 
     def _check_interface(self, machine: Machine) -> None:
         """Raise a `ConfigError` where targets are read as another quantity than the machine's command."""
@@ -250,22 +234,6 @@ class ColumnMap:
                 f"{where}: the map has no time for table '{table}'; {list_choices(table, self.time)}"
             )
         return self.time[table]
-
-    def _list_wanted(self, places: Places, where: Path) -> dict[str, list[str]]:
-        """Return the columns to read by table, those of the clocks too."""
-        texts = [column.column for column in self.optional.values()]
-        for joint in self.joints.values():
-            texts += [joint.command.column, joint.position.column]
-        wanted: dict[str, dict[str, None]] = {}
-        for text in texts:
-            for name in list_names(text, places, where):
-                table, column = places[name]
-                wanted.setdefault(table, {})[column] = None
-        for table, columns in wanted.items():
-            inside = {column: (table, column) for one, column in places.values() if one == table}
-            for text in list_time_columns(self.find_time(table, where)):
-                columns |= dict.fromkeys(list_names(text, inside, where))
-        return {table: [*columns] for table, columns in wanted.items()}
 
     def _read_run(self, signals: RunSignals, machine: Machine) -> list[Recording]:
         """Return the pieces of a run, resampled to the rate of the machine."""

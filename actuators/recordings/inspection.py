@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Ge
 
-from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
+from actuators.recordings.signal_checks import LONGEST_LAG_S, find_jumps, find_spikes, find_wrap
 from brokk_rl.commands import read_targets, view_recordings
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -42,8 +42,6 @@ JUMP_TRAVEL = 0.01
 """Part of the travel from which on a step is told; smaller ones hide in noise and coarse sensors."""
 LEAST_ROWS = 5
 """Least number of rows of a stretch: a slow log has one in seconds."""
-LONGEST_LAG_S = 1.5
-"""Time within which a joint answers its target: more than twice the 0.55 s of the slowest machine known."""
 MAX_IRREGULAR_SHARE = 0.05
 """Share of periods further than 10 % from the median from which a clock is irregular; chosen by hand."""
 MIN_SATURATED_ROWS = 10
@@ -272,7 +270,7 @@ class _RecordingScan:
         wrap = find_wrap(q)
         if wrap is None:
             cause = np.zeros(len(q)) if self._targets is None else self._targets[:, j]
-            jumps = find_jumps(self._t_s, q, cause, LONGEST_LAG_S)
+            jumps = find_jumps(self._t_s, q, cause)
             rows = np.union1d(jumps, find_spikes(q) - 1).astype(int)
         else:
             rows = wrap.rows

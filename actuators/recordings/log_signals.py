@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from actuators.recordings.advice import advise
-from actuators.recordings.clocks import TimeColumn, read_clock, unwrap
+from actuators.recordings.clocks import TimeColumn, list_time_columns, read_clock, unwrap
 from actuators.recordings.expression import parse_expression
-from actuators.recordings.log_tables import LogRun
+from actuators.recordings.log_tables import LogFile, LogRun, index_columns
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -160,6 +160,34 @@ class RunSignals:
                 f"{self.run.where}: column '{name}' has {len(rows)} values with a time; a log has at least 2"
             )
         return Signal(table, t_s[rows], values[rows], rows, name)
+
+
+def open_signals(
+    opened: LogFile, texts: Sequence[str], find_time: Callable[[str], TimeColumn], gap_s: float
+) -> Iterator[RunSignals]:
+    """Yield the signals of each run of a log, of which only some columns and their clocks are read.
+
+    Args:
+        opened: The log.
+        texts: The columns, or arithmetic over them.
+        find_time: Returns the clock of a table by its name.
+        gap_s: Time at which a log is split.
+
+    Raises:
+        RecordingError: A column is missing, or the log is damaged.
+    """
+    places = index_columns(opened.list_tables())
+    wanted: dict[str, dict[str, None]] = {}
+    for text in texts:
+        for name in list_names(text, places, opened.path):
+            table, column = places[name]
+            wanted.setdefault(table, {})[column] = None
+    for table, columns in wanted.items():
+        inside = {column: (table, column) for one, column in places.values() if one == table}
+        for text in list_time_columns(find_time(table)):
+            columns |= dict.fromkeys(list_names(text, inside, opened.path))
+    for run in opened.read_runs(wanted, None):
+        yield RunSignals(run, places, find_time, opened.keep_whole, gap_s)
 
 
 def list_names(text: str, places: Places, where: object) -> tuple[str, ...]:

@@ -32,6 +32,8 @@ SPIKE_RATIO = 8.0
 """A spike is so many times the usual change over two samples, which noise and motion have too."""
 JUMP_SHARE = 0.1
 """Least size of a jump, as a part of the range."""
+LONGEST_LAG_S = 1.5
+"""Time within which a joint answers its target: more than twice the 0.55 s of the slowest machine known."""
 CAUSE_SHARE = 0.3
 """Least step of a target that causes a step of the position, as a part of the latter."""
 JUMP_RATIO = 10.0
@@ -120,16 +122,13 @@ def find_spikes(values: np.ndarray) -> np.ndarray:
     return np.flatnonzero(is_spike) + 1
 
 
-def find_jumps(
-    t_s: np.ndarray, q: np.ndarray, cause: np.ndarray, longest_lag_s: float
-) -> np.ndarray:
+def find_jumps(t_s: np.ndarray, q: np.ndarray, cause: np.ndarray) -> np.ndarray:
     """Return the rows, `(K,)`, before steps of a position that its command does not cause.
 
     Args:
         t_s: Times, `(T,)` s.
         q: Positions, `(T,)`.
         cause: Its target in the same unit, `(T,)`; zeros for a command of another kind.
-        longest_lag_s: A step of the target causes one of the position within this time.
     """
     if len(q) < 20:
         return np.empty(0, dtype=int)
@@ -141,7 +140,7 @@ def find_jumps(
     least = max(JUMP_RATIO * float(np.quantile(size, 0.95)), JUMP_SHARE * span)
     found = []
     for row in np.flatnonzero(size > least):
-        begin = int(np.searchsorted(t_s, t_s[row] - longest_lag_s))
+        begin = int(np.searchsorted(t_s, t_s[row] - LONGEST_LAG_S))
         # only a step causes a step; a target that moves slowly does not
         largest = np.abs(np.diff(cause[begin : row + 2])).max(initial=0.0)
         if begin == 0 and cause.any():  # a target may have stepped before the log began

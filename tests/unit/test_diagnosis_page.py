@@ -11,7 +11,7 @@ from motion import make_recording
 
 from actuators.recordings.recording_checks import RecordingRemark
 from brokk_rl.machine import Machine
-from diagnosis import plots, report
+from diagnosis import report
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.where import locate_gap
@@ -93,4 +93,4 @@ def test_an_answer_that_cannot_tell_says_why(machine: Machine, seen: Outcome) ->
         reason="cannot tell, because nothing moves",
     )  # fmt: skip
     assert "nothing moves" in report.write_headline(bare)[0]
-    assert plots.draw_paths(Outcome(bare, seen.before, None), machine).axes
+    assert report.draw_paths(Outcome(bare, seen.before, None), machine).axes

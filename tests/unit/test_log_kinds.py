@@ -304,9 +304,9 @@ def test_steps_that_no_machine_makes_are_found() -> None:
     assert not len(find_spikes(q))
     reset = q + 200.0 * (np.arange(1000) >= 500)
     for cause in (np.zeros(1000), 300.0 * np.sin(0.5 * t_s + 0.1)):
-        assert find_jumps(t_s, reset, cause, 1.5).tolist() == [499]
+        assert find_jumps(t_s, reset, cause).tolist() == [499]
     step = np.where(t_s > 5.0, 1.0, 0.0)
-    assert not len(find_jumps(t_s, delay(step), step, 1.5))
+    assert not len(find_jumps(t_s, delay(step), step))
 
 
 def test_what_is_given_is_weighed_like_a_guess() -> None:
