@@ -11,22 +11,26 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
+from brokk_rl.contracts.actuator import Actuator, Effect
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.session import write_json
 from diagnosis.deployment import distortions
 from diagnosis.deployment.contract import LoadedPolicy, PolicyContract
 from diagnosis.deployment.distortions import MAX_DELAY, Distortion
 from diagnosis.deployment.fault_search import (
+    NUM_RANKED,
     FittedDistortion,
     ReplayStage,
     StageResult,
     judge_stage,
 )
-from diagnosis.deployment.motion_check import MotionEvidence
+from diagnosis.deployment.motion_check import MotionEvidence, check_motion
 from diagnosis.deployment.orders import match_order
 from diagnosis.deployment.replay import SPREAD_FACTOR, TOLERANCE, VECTOR_TOLERANCE, PolicyReplay
 from diagnosis.deployment.run_log import RunLog, read_run_log
@@ -35,11 +39,11 @@ from diagnosis.deployment.training_range import RangeEvidence, compare_with_trai
 DoctorVerdict = Literal["code", "actuator", "task", "nothing", "cannot_tell"]
 UNLISTED = "unlisted"
 """Kind of a departure that no distortion explains."""
+SCHEMA = 1
+ANSWER_FILE = "doctor.json"
 GOLDEN = "golden.json"
 RATE_TOLERANCE = 0.02
 """Relative difference of rates that is a clock's; chosen by hand."""
-NUM_RANKED = 5
-"""Mistakes of the ranking that are told."""
 
 
 @dataclass(frozen=True)
@@ -92,47 +96,160 @@ class RunExamination:
         """True if at least the way from observation to command could be replayed."""
         return any(one.stage.name in ("policy", "network") for one in self.stages)
 
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain JSON data, as `doctor.json` holds it."""
+        path = self.log.recording.path
+        return {
+            "path": str(path) if path else None,
+            "findings": [vars(finding) for finding in self.findings],
+            "code": [stage.to_json(self.log.t_s) for stage in self.stages],
+            "task": {
+                "blamed": self.task.blamed,
+                "outside": [vars(one) for one in self.task.outside],
+                "cannot_tell": self.task.cannot_tell or None,
+            },
+            "cannot_tell": self.cannot_tell,
+            "notes": self.notes,
+        }
 
-def examine_run(
-    policy: LoadedPolicy,
-    recording: Recording,
-    machine: Machine,
-    others: Mapping[str, LoadedPolicy],
-    target_m: tuple[float, ...] | None,
-    is_sent: bool,
-    generator: np.random.Generator,
-) -> RunExamination:
-    """Examine one log.
 
-    Args:
+@dataclass(frozen=True)
+class DoctorAnswer:
+    """Answer of the deployment doctor.
+
+    Attributes:
+        verdict: `code`, `actuator`, `task`, `nothing` or `cannot_tell`.
+        reason: The verdict in a sentence or two.
+        runs: Result of each log.
+        motion: Motion of all logs against the simulator.
+    """
+
+    verdict: DoctorVerdict
+    reason: str
+    runs: tuple[RunExamination, ...]
+    motion: MotionEvidence
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Mistakes of all logs."""
+        return tuple(finding for run in self.runs for finding in run.findings)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the answer as plain JSON data, as `doctor.json` holds it."""
+        return {
+            "schema": SCHEMA,
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "named": bool(self.findings) and all(one.kind != UNLISTED for one in self.findings),
+            "logs": [run.to_json() for run in self.runs],
+            "actuator": {
+                "horizon_s": self.motion.horizon_s,
+                "cannot_tell": self.motion.cannot_tell or None,
+                "joints": {one.joint: one.to_json() for one in self.motion.joints},
+            },
+        }  # fmt: skip
+
+    def write(self, folder: Path) -> None:
+        """Write `doctor.json` into a folder."""
+        write_json(folder / ANSWER_FILE, self.to_json())
+
+
+@dataclass(frozen=True)
+class Deployment:
+    """A policy that was deployed on a machine.
+
+    Attributes:
         policy: The policy that should have run.
-        recording: The log.
         machine: The machine.
         others: Further policies that may have run instead, by name.
-        target_m: Target where the log does not hold it.
+        target_m: Target where the logs do not hold it.
         is_sent: The commands in force are those that the policy's loop sent: nobody at levers.
-        generator: Draws the log's rounding.
     """
-    contract = policy.contract
-    log = read_run_log(recording, contract, target_m)
-    is_sent = is_sent and not log.is_measured
-    notes, stages = list[str](), list[StageResult]()
-    findings = _check_without_replay(policy, log)
-    is_other = any(finding.kind == "network" for finding in findings)
-    for stage in () if is_other else _list_stages(policy, log, others, is_sent, generator):
-        result = judge_stage(stage)
-        stages.append(result)
-        rests = log.rests_at_start(machine.dead_time_s, machine.upper - machine.lower)
-        if result.only_start and not result.named and not rests:
-            notes.append(
-                "the log begins while the machine moves: its first "
-                f"{contract.num_samples / contract.rate_hz:.2g} s cannot be judged"
-            )
-        elif result.departs:
-            findings += _describe_findings(result, log)
-    task = compare_with_training(log, contract)
-    lacking = tuple(_list_lacking(log, is_sent))
-    return RunExamination(log, tuple(stages), tuple(findings), task, lacking, tuple(notes))
+
+    policy: LoadedPolicy
+    machine: Machine
+    others: Mapping[str, LoadedPolicy] = dataclasses.field(default_factory=dict)
+    target_m: tuple[float, ...] | None = None
+    is_sent: bool = True
+
+    def examine(
+        self,
+        recordings: Sequence[Recording],
+        actuator: Actuator | None,
+        effects: Mapping[str, Effect],
+        seed: int,
+    ) -> DoctorAnswer:
+        """Return the doctor's answer.
+
+        Args:
+            recordings: Logs of its run or runs.
+            actuator: The simulator's actuator; `None`: motion is not judged.
+            effects: Effects that the training draws, by name.
+            seed: Of all draws.
+        """
+        generator = np.random.default_rng(seed)
+        runs = [self.examine_run(recording, generator) for recording in recordings]
+        if any(run.findings for run in runs):
+            motion = MotionEvidence((), 0.0, "the code is to be mended first")
+        else:
+            motion = check_motion(recordings, self.machine, actuator, effects, seed)
+        verdict, reason = decide_verdict(runs, motion)
+        return DoctorAnswer(verdict, reason, tuple(runs), motion)
+
+    def examine_run(self, recording: Recording, generator: np.random.Generator) -> RunExamination:
+        """Examine one log; the generator draws its rounding."""
+        contract, machine = self.policy.contract, self.machine
+        log = read_run_log(recording, contract, self.target_m)
+        is_sent = self.is_sent and not log.is_measured
+        notes, stages = list[str](), list[StageResult]()
+        findings = _check_without_replay(self.policy, log)
+        is_other = any(finding.kind == "network" for finding in findings)
+        for stage in () if is_other else self._list_stages(log, is_sent, generator):
+            result = judge_stage(stage)
+            stages.append(result)
+            rests = log.rests_at_start(machine.dead_time_s, machine.upper - machine.lower)
+            if result.only_start and not result.named and not rests:
+                notes.append(
+                    "the log begins while the machine moves: its first "
+                    f"{contract.num_samples / contract.rate_hz:.2g} s cannot be judged"
+                )
+            elif result.departs:
+                findings += _describe_findings(result, log)
+        task = compare_with_training(log, contract)
+        lacking = tuple(_list_lacking(log, is_sent))
+        return RunExamination(log, tuple(stages), tuple(findings), task, lacking, tuple(notes))
+
+    def _list_stages(
+        self, log: RunLog, is_sent: bool, generator: np.random.Generator
+    ) -> Iterator[ReplayStage]:
+        """Yield the parts of the way that the log lets one judge."""
+        policy, observed, in_force = self.policy, log.observed, log.in_force
+        contract = policy.contract
+        commanded = log.commanded
+        if commanded is None and is_sent:
+            commanded = in_force
+        replay = PolicyReplay(policy, log, generator)
+        after = distortions.list_command_distortions(policy)
+        networks = distortions.list_network_distortions(policy, self.others)
+        start, joints = contract.num_samples, contract.joints
+        if log.is_complete and observed is not None:
+            floor = VECTOR_TOLERANCE + SPREAD_FACTOR * replay.spread[0]
+            labels = tuple(name for term in contract.terms for name in term.list_numbers())
+            every = _list_inputs(policy, log, replay.encoded, observed, floor)
+            every += distortions.list_matched_orders(policy, log.signals, observed)
+            yield ReplayStage("observation", replay.encode, observed, floor, labels, every, start)
+        if commanded is not None and (observed is not None or log.is_complete):
+            name, floor, every = "network", np.full(commanded.shape, TOLERANCE), list[Distortion]()
+            if observed is None:
+                name, floor = "policy", floor + SPREAD_FACTOR * replay.spread[1]
+                every = _list_inputs(policy, log, replay.nominal, commanded, floor)
+            every += [*networks, *after, *_match_commands(contract, replay.nominal, commanded)]
+            start = 0 if observed is not None else start
+            yield ReplayStage(name, replay.command, commanded, floor, joints, every, start)
+        if log.commanded is not None and in_force is not None and is_sent:
+            floor = np.full(in_force.shape, TOLERANCE)
+            every = [*after, *_match_commands(contract, log.commanded, in_force)]
+            yield ReplayStage("delivery", replay.deliver, in_force, floor, joints, every, 0)
 
 
 def decide_verdict(
@@ -170,42 +287,6 @@ def decide_verdict(
         if not motion.cannot_tell
         else f"{code}Motion was not judged: {motion.cannot_tell}."
     )
-
-
-def _list_stages(
-    policy: LoadedPolicy,
-    log: RunLog,
-    others: Mapping[str, LoadedPolicy],
-    is_sent: bool,
-    generator: np.random.Generator,
-) -> Iterator[ReplayStage]:
-    """Yield the parts of the way that the log lets one judge."""
-    contract, observed, in_force = policy.contract, log.observed, log.in_force
-    commanded = log.commanded
-    if commanded is None and is_sent:
-        commanded = in_force
-    replay = PolicyReplay(policy, log, generator)
-    after = distortions.list_command_distortions(policy)
-    networks = distortions.list_network_distortions(policy, others)
-    start, joints = contract.num_samples, contract.joints
-    if log.is_complete and observed is not None:
-        floor = VECTOR_TOLERANCE + SPREAD_FACTOR * replay.spread[0]
-        labels = tuple(name for term in contract.terms for name in term.list_numbers())
-        every = _list_inputs(policy, log, replay.encoded, observed, floor)
-        every += distortions.list_matched_orders(policy, log.signals, observed)
-        yield ReplayStage("observation", replay.encode, observed, floor, labels, every, start)
-    if commanded is not None and (observed is not None or log.is_complete):
-        name, floor, every = "network", np.full(commanded.shape, TOLERANCE), list[Distortion]()
-        if observed is None:
-            name, floor = "policy", floor + SPREAD_FACTOR * replay.spread[1]
-            every = _list_inputs(policy, log, replay.nominal, commanded, floor)
-        every += [*networks, *after, *_match_commands(contract, replay.nominal, commanded)]
-        start = 0 if observed is not None else start
-        yield ReplayStage(name, replay.command, commanded, floor, joints, every, start)
-    if log.commanded is not None and in_force is not None and is_sent:
-        floor = np.full(in_force.shape, TOLERANCE)
-        every = [*after, *_match_commands(contract, log.commanded, in_force)]
-        yield ReplayStage("delivery", replay.deliver, in_force, floor, joints, every, 0)
 
 
 def _list_inputs(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -49,6 +50,8 @@ NUM_REFINED = 12
 NUM_FIRST, PAIR_GAIN = 2, 0.3
 """Limits of the search for two mistakes at once: how many are tried as the first, and the share of the
 loss that a first one removes at least. Chosen by hand."""
+NUM_RANKED = 5
+"""Mistakes and numbers of a ranking that are told."""
 TOLERANCE_REFINED = 1e-5
 """Relative tolerance of a refined number."""
 
@@ -147,6 +150,27 @@ class StageResult:
         shares = over.mean(0)
         order = np.argsort(-shares, kind="stable")
         return [(self.stage.labels[k], float(shares[k])) for k in order if shares[k]]
+
+    def to_json(self, t_s: np.ndarray) -> dict[str, Any]:
+        """Return it as plain JSON data, with times of the rows `(T,)`."""
+        ranking = []
+        for one in self.ranking[:NUM_RANKED]:
+            ranking.append(
+                {
+                    "kind": one.distortion.kind, "field": one.distortion.field,
+                    "value": one.value if one.distortion.parameter else None,
+                    "explained": one.explained, "removes": one.gain,
+                }
+            )  # fmt: skip
+        labels = self.rank_labels()[:NUM_RANKED]
+        return {
+            "stage": self.stage.name,
+            "rows": self.num_rows,
+            "departed": len(self.departed),
+            "since_s": float(t_s[self.departed[0]]) if len(self.departed) else None,
+            "where": [{"number": label, "share": share} for label, share in labels],
+            "ranking": ranking,
+        }
 
 
 def is_departure(num_departed: int, num_rows: int) -> bool:

@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from brokk_rl.plot import BLUE, ORANGE, RED, add_legend, make_figure, remove_frame
 from brokk_rl.report import Tone, embed_picture, render_page
 from brokk_rl.session import write_text
-from diagnosis.deployment.doctor import DoctorAnswer
-from diagnosis.deployment.examination import UNLISTED, DoctorVerdict, Finding
+from diagnosis.deployment.examination import UNLISTED, DoctorAnswer, DoctorVerdict, Finding
 from diagnosis.deployment.fault_search import StageResult
 
 PAGE_FILE = "doctor.html"

@@ -13,9 +13,9 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis.deployment import doctor, page
+from diagnosis.deployment import page
 from diagnosis.deployment.contract import load_policy
-from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
+from diagnosis.deployment.examination import ANSWER_FILE, Deployment, DoctorAnswer
 
 log = logging.getLogger(__name__)
 
@@ -76,22 +76,13 @@ class DoctorPolicy:
         """Return the answer; errors as in `run`."""
         asked = self.doctor
         policy = load_policy(asked.policy, self.machine)
-        names = name_policies(asked.others)
-        others = {
-            name: load_policy(folder, self.machine)
-            for name, folder in zip(names, asked.others, strict=True)
-        }
-        return examine_deployment(
-            policy,
-            record.read_recordings(asked.log, self.machine),
-            self.machine,
-            others=others,
-            target_m=asked.target_in_base_m,
-            is_sent=asked.sent,
-            actuator=self.actuator,
-            effects=self.effect,
-            seed=self.session.stream("doctor"),
-        )
+        others = {}
+        for name, folder in zip(name_policies(asked.others), asked.others, strict=True):
+            others[name] = load_policy(folder, self.machine)
+        deployment = Deployment(policy, self.machine, others, asked.target_in_base_m, asked.sent)
+        recordings = record.read_recordings(asked.log, self.machine)
+        seed = self.session.stream("doctor")
+        return deployment.examine(recordings, self.actuator, self.effect, seed)
 
 
 def name_policies(folders: Sequence[str]) -> list[str]:
@@ -120,4 +111,4 @@ def print_answer(found: DoctorAnswer, folder: Path) -> None:
     for run in found.runs:
         for line in (*run.cannot_tell, *run.notes):
             print_text(f"not judged: {line}")
-    print_text(f"page: {folder / page.PAGE_FILE}, answer: {folder / doctor.ANSWER_FILE}")
+    print_text(f"page: {folder / page.PAGE_FILE}, answer: {folder / ANSWER_FILE}")

@@ -20,7 +20,7 @@ from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, write_recording
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
-from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
+from diagnosis.deployment.examination import Deployment, DoctorAnswer
 from diagnosis.deployment.run_log import measure_resolution
 from diagnosis.deployment.training_range import measure_margin
 
@@ -124,9 +124,7 @@ def run_loop(
 
 
 def ask(policy: LoadedPolicy, recording: Recording, machine: Machine) -> DoctorAnswer:
-    return examine_deployment(
-        policy, [recording], machine, others={}, target_m=None, is_sent=True, actuator=None, effects={}, seed=0
-    )  # fmt: skip
+    return Deployment(policy, machine).examine([recording], None, {}, 0)
 
 
 def turn_joint(values: np.ndarray, _: int) -> np.ndarray:

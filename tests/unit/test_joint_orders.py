@@ -11,7 +11,7 @@ from arm import make_machine
 
 from brokk_rl.record import Recording
 from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm, PolicyContract
-from diagnosis.deployment.doctor import examine_deployment
+from diagnosis.deployment.examination import Deployment
 from diagnosis.deployment.orders import invert_order, list_orders, match_order
 
 LEGS, KINDS = ("FL", "FR", "RL", "RR"), ("hip", "thigh", "calf")
@@ -89,10 +89,7 @@ def test_an_order_of_twelve_joints_is_named(
 ) -> None:
     policy = make_policy()
     recording = run_loop(policy, inputs, outputs, observed)
-    answer = examine_deployment(
-        policy, [recording], make_machine(*BY_KIND), others={}, target_m=None, is_sent=True, actuator=None, effects={},
-        seed=0,
-    )  # fmt: skip
+    answer = Deployment(policy, make_machine(*BY_KIND)).examine([recording], None, {}, 0)
     assert answer.verdict == "code"
     assert text in answer.reason
 
