@@ -267,11 +267,7 @@ class CaseRecorder:
         # a faulty machine may be slow on its ways to start poses
         player = PlanPlayer(plan, machine, self.approach, guards, level=logging.DEBUG)
         with link as opened:
-            samples = list(drive(opened, player, machine, len(jobs), file_s))
-        track = PlanTrack(samples)
-        extra = {}
-        for name in samples[0].extra:
-            extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
+            track = PlanTrack(drive(opened, player, machine, len(jobs), file_s))
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)
         t_s = track.t_s - track.t_s[0]
         is_withheld = jobs[0].half == "withheld"
@@ -280,7 +276,8 @@ class CaseRecorder:
             motion = record.make_motion(machine, "", t_s, u[:, n], q[:, n])
             if unchanged is not None:
                 self._write_file(job, job.unchanged_path, replace(motion, q=unchanged[:, n]))
-            columns = {name: values[n] for name, values in extra.items() if job.question.tracked}
+            extra = track.extra if job.question.tracked else {}
+            columns = {name: values[n] for name, values in extra.items()}
             self._write_file(job, job.path, replace(motion, extra=columns))
 
     def _write_file(self, job: RecordingJob, path: Path, motion: record.Recording) -> None:

@@ -1,4 +1,4 @@
-"""Answers of a candidate to all cases: one process a case, which sees a copy of that case only."""
+"""Candidates, and their answers to all cases: one process a case, which sees a copy of that case only."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_bytes, write_json, write_text
-from brokk_rl.spec import spec
-from diagnosis.answer import ANSWER_FILE
+from brokk_rl.spec import Share, spec
+from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -179,3 +179,34 @@ def read_note(answer: Path) -> dict[str, Any]:
         return json.loads((answer / NOTE_FILE).read_text())
     except (OSError, ValueError):
         return {}
+
+
+@spec
+class ConstantAnswer:
+    """Give the same answer to every case: an effect on all joints, or no gap.
+
+    Attributes:
+        effect: The effect; `null` for none.
+        probability: With which it is stated.
+    """
+
+    effect: str | None
+    probability: Share
+
+    def answer(self, case: Path, out: Path, machine: Machine) -> None:
+        """Write it."""
+        out.mkdir(parents=True, exist_ok=True)
+        verdict: Verdict = "none"
+        joints: tuple[str, ...] = ()
+        selected: tuple[Selected, ...] = ()
+        if self.effect is not None:
+            verdict, joints = "effects", machine.joint_names
+            named = {"effect": self.effect, "joints": joints, "probability": self.probability}
+            selected = (Selected(**named, parameters={}, gap_closed=None),)
+        said = Answer(
+            verdict=verdict,
+            selected=selected,
+            ranking=(Ranked(self.effect or "none", joints, self.probability),),
+            gap=None,
+        )
+        said.write(out / ANSWER_FILE)

@@ -35,6 +35,7 @@ class PlanTrack:
         u: Commands, `(T, N, J)`.
         stage: `BEFORE`, `PLAYING`, `AWAY` or `AFTER`, `(T, N)`.
         segment: Number of the segment, `(T, N)`.
+        extra: Further measurements of the link, each `(N, T)`.
     """
 
     def __init__(self, samples: Iterable[Sample]) -> None:
@@ -44,6 +45,9 @@ class PlanTrack:
         self.u = np.stack([sample.u for sample in kept])
         self.stage = STAGE[np.stack([sample.phase for sample in kept])]
         self.segment = np.stack([sample.segment for sample in kept])
+        self.extra: dict[str, np.ndarray] = {}
+        for name in kept[0].extra:
+            self.extra[name] = np.stack([sample.extra[name] for sample in kept], 1)
 
     def list_actions(self, run: int) -> list[tuple[int, int]]:
         """Return first sample and end of each way and each program of a run, in order."""

@@ -6,8 +6,6 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-import numpy as np
-
 from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
 from actuators.excite.player import (
@@ -198,11 +196,7 @@ class Writer:
         self._written = time.monotonic()
         if len(self._samples) < 2:
             return
-        samples = self._samples
-        track, begin_s = PlanTrack(samples), samples[0].t_s
-        extra = {}
-        for name in samples[0].extra:
-            extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
+        track, begin_s = PlanTrack(self._samples), self._samples[0].t_s
         for n, name in enumerate(self._names):
             motion = record.make_motion(
                 self._machine,
@@ -214,7 +208,7 @@ class Writer:
             created = record.add_seconds(self._created, begin_s - self._begin_s)
             recording = replace(
                 motion,
-                extra={key: values[n] for key, values in extra.items()},
+                extra={key: values[n] for key, values in track.extra.items()},
                 metadata={**self._metadata, "created": created, **motion.metadata},
             )
             record.write_recording(recording, self._folder / f"{name}_{self._part:02d}.parquet")

@@ -20,7 +20,7 @@ from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
-from exam import dataset, ledger, report, run_cases
+from exam import dataset, report, run_cases
 from exam.answer_scoring import (
     RUN_FILE,
     build_table,
@@ -217,9 +217,9 @@ class Exam:
                 )
         if before["commit"] != run["commit"]:
             log.warning("answers of two commits: %s, then %s", before["commit"], run["commit"])
-        if not any(one.get("run") == run for one in ledger.read_ledger(self._folder)):
+        if not any(one.get("run") == run for one in dataset.read_ledger(self._folder)):
             entry = {"labels_sha256": facts["labels_sha256"], "run": run}
-            ledger.append_entry(self._folder, ledger.BEGUN, entry)
+            dataset.append_entry(self._folder, dataset.BEGUN, entry)
         write_json(out / RUN_FILE, run)
         failed = run_cases.answer_cases(
             settings.candidate, cases, out, self.machine, settings.workers
@@ -266,10 +266,10 @@ class Exam:
         facts["ledger"] = []
         for path in answers.values():
             run = read_run(path)
-            facts["ledger"].append(ledger.describe_registration(self._folder, path, run))
+            facts["ledger"].append(dataset.describe_registration(self._folder, path, run))
         if not is_published:
             hashes = {"labels_sha256": facts["labels_sha256"]}
-            ledger.append_entry(self._folder, ledger.OPENED, hashes)
+            dataset.append_entry(self._folder, dataset.OPENED, hashes)
         out = self.session.folder
         examine = partial(examine_case, self._folder, self.exam.fit, self.machine)
         examined = examine_answers(self._folder, labels, answers, examine, self.exam.workers)

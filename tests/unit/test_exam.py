@@ -25,9 +25,9 @@ from brokk_rl.machine import Machine
 from diagnosis.answer import ANSWER_FILE
 from exam import dataset, generate, run_cases
 from exam.case_distribution import CaseDesign, CaseDistribution
-from exam.constant_answer import ConstantAnswer
+from exam.dataset import BEGUN, read_ledger
 from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER, CaseRecorder
-from exam.ledger import BEGUN, read_ledger
+from exam.run_cases import ConstantAnswer
 
 SEALED = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234")
 
