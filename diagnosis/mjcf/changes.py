@@ -74,40 +74,37 @@ class _Editor:
         self.timestep_s = float(plant.model.opt.timestep)
         self.changes: list[MjcfChange] = []
 
-    def get(self, number: str) -> float:
+    def list_sizes(self, number: str) -> list[float]:
+        """Return a number of the finding and the ends of its interval, if it has one."""
         size = self.finding.sizes.get(number)
-        return 0.0 if size is None else size.mean
+        if size is None:
+            return [0.0]
+        return [size.mean, *(size.ci95 if size.has_interval else ())]
+
+    def put(self, element: str, attribute: str, index: int, values: Sequence[float]) -> None:
+        """Set an attribute to the first of some values; the others are those at the ends of the interval."""
+        owner = self.joint if element == "joint" else self.drive
+        held = np.array(getattr(owner, attribute), dtype=float)
+        row = np.atleast_1d(held.copy())
+        before, row[index] = float(row[index]), values[0]
+        setattr(owner, attribute, row if held.ndim else float(row[0]))
+        name = f"{attribute}[{index}]" if held.ndim else attribute
+        interval = (min(values[1:]), max(values[1:])) if len(values) > 1 else None
+        told = (self.finding.effect, self.finding.joint, element, name)
+        self.changes.append(MjcfChange(*told, before, float(values[0]), interval))
 
     def write(
         self,
         element: str,
         attribute: str,
-        index: int | None,
+        index: int,
         number: str,
         rule: Callable[[float, float], float],
     ) -> None:
         """Set an attribute to `rule(before, value)`, where the value is that of a number of the finding."""
         owner = self.joint if element == "joint" else self.drive
-        held = getattr(owner, attribute)
-        before = float(held if index is None else held[index])
-        after = rule(before, self.get(number))
-        size = self.finding.sizes.get(number)
-        interval = None
-        if size is not None and size.has_interval:
-            low, high = sorted(rule(before, end) for end in size.ci95)
-            interval = (low, high)
-        if index is None:
-            setattr(owner, attribute, after)
-        else:
-            row = np.array(held)
-            row[index] = after
-            setattr(owner, attribute, row)
-        name = attribute if index is None else f"{attribute}[{index}]"
-        self.changes.append(
-            MjcfChange(
-                self.finding.effect, self.finding.joint, element, name, before, after, interval
-            )  # pyright: ignore[reportArgumentType]
-        )
+        before = float(np.ravel(getattr(owner, attribute))[index])
+        self.put(element, attribute, index, [rule(before, one) for one in self.list_sizes(number)])
 
 
 def write_changed_mjcf(
@@ -127,8 +124,8 @@ def write_changed_mjcf(
         spec.texturedir = str((source.parent / (spec.texturedir or ".")).resolve())
     changes, left = [], {}
     for finding in findings:
-        rule = RULES.get((finding.effect, machine.interface))
-        if rule is None:
+        rule, interface = RULES.get(finding.effect), machine.interface
+        if rule is None or interface not in INTERFACES.get(finding.effect, (interface,)):
             left[finding.effect] = REASONS.get(finding.effect, NO_ELEMENT)
             continue
         editor = _Editor(spec, plant, machine, finding)
@@ -185,17 +182,14 @@ REASONS = {
 
 
 def _add_friction(to: _Editor) -> None:
-    to.write(
-        "joint", "frictionloss", None, "part", lambda old, new: old + new * to.unit["friction"]
-    )
+    unit = to.unit["friction"]
+    to.write("joint", "frictionloss", 0, "part", lambda old, new: old + new * unit)
 
 
 def _add_damping(to: _Editor) -> str | None:
-    index = 0 if np.ndim(to.joint.damping) else None
-    held = float(np.ravel(to.joint.damping)[0])
     unit = to.unit["damping"]
-    if held + to.get("part") * unit >= 0.0:
-        to.write("joint", "damping", index, "part", lambda old, new: old + new * unit)
+    if float(np.ravel(to.joint.damping)[0]) + to.list_sizes("part")[0] * unit >= 0.0:
+        to.write("joint", "damping", 0, "part", lambda old, new: old + new * unit)
         return None
     if to.machine.interface == "torque":
         return "less damping than the joint has in the file was found, and the drive has none"
@@ -206,36 +200,30 @@ def _add_damping(to: _Editor) -> str | None:
 
 
 def _add_armature(to: _Editor) -> None:
-    to.write("joint", "armature", None, "part", lambda old, new: old + new * to.unit["armature"])
+    unit = to.unit["armature"]
+    to.write("joint", "armature", 0, "part", lambda old, new: old + new * unit)
 
 
 def _scale_drive(to: _Editor) -> None:
-    to.write("actuator", "gainprm", 0, "gain", lambda old, new: old * new)
-    to.write("actuator", "biasprm", 1, "gain", lambda old, new: old * new)
+    places = [("gainprm", 0), ("biasprm", 1)]
     if to.machine.interface == "speed":
-        to.write("actuator", "biasprm", 2, "gain", lambda old, new: old * new)
+        places.append(("biasprm", 2))
+    for attribute, index in places:
+        to.write("actuator", attribute, index, "gain", lambda old, new: old * new)
 
 
 def _limit_force(to: _Editor) -> str | None:
-    shortage = to.get("shortage")
-    if shortage <= 0.0:
+    sizes = to.list_sizes("shortage")
+    if sizes[0] <= 0.0:
         return "no limit was found there"
-    limited = to.is_limited
-    if not limited:  # MJCF: a range of 0 is none
+    held = np.array(to.drive.forcerange) if to.is_limited else None
+    if held is None:  # MJCF: a range of 0 is none
         to.drive.forcerange = np.zeros(2)
-
-    def narrow(side: int) -> Callable[[float, float], float]:
-        def rule(old: float, new: float) -> float:
-            most = to.unit["limit"] / max(new, 1e-9)
-            held = (-np.inf, np.inf) if not limited else (old, old)
-            return float(limit_force_range(held, most)[side])
-
-        return rule
-
+    most = to.unit["limit"] / np.maximum(sizes, 1e-9)
+    ranges = np.stack([limit_force_range(held, float(one)) for one in most])
     for side in (0, 1):
-        held = float(to.drive.forcerange[side])
-        if not limited or narrow(side)(held, shortage) != held:
-            to.write("actuator", "forcerange", side, "shortage", narrow(side))
+        if held is None or ranges[0, side] != held[side]:
+            to.put("actuator", "forcerange", side, ranges[:, side].tolist())
     to.drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     return None
 
@@ -245,9 +233,9 @@ def _scale_command(to: _Editor) -> None:
 
 
 def _add_delay(to: _Editor) -> str | None:
-    if to.get("dead_time_s") < 0.0:
+    if to.list_sizes("dead_time_s")[0] < 0.0:
         return "the machine answers sooner than the file; lower its own delay"
-    to.write("actuator", "delay", None, "dead_time_s", lambda old, new: old + max(0.0, new))
+    to.write("actuator", "delay", 0, "dead_time_s", lambda old, new: old + max(0.0, new))
     to.drive.nsample = max(to.drive.nsample, math.ceil(to.drive.delay / to.timestep_s) + 2)
     to.drive.interp = 1  # a delay that is no multiple of the time step would be rounded up
     return None
@@ -260,13 +248,8 @@ def _add_lag(to: _Editor) -> str | None:
     to.drive.dynprm = np.zeros_like(to.drive.dynprm)
     # The effect holds each period's last value, half a period ahead of a continuous filter.
     ahead_s = 0.5 * to.machine.period_s
-    to.write(
-        "actuator",
-        "dynprm",
-        0,
-        "time_constant_s",
-        lambda old, new: max(new - ahead_s, to.timestep_s),
-    )
+    later = lambda old, new: max(new - ahead_s, to.timestep_s)  # noqa: E731
+    to.write("actuator", "dynprm", 0, "time_constant_s", later)
     return None
 
 
@@ -276,7 +259,7 @@ def _add_sag(to: _Editor) -> str | None:
     lower, upper = (limit[to.place] for limit in (to.machine.lower, to.machine.upper))
     stiffness = float(to.drive.gainprm[0])
     gear = float(to.drive.gear[0])
-    middle = 0.5 * (lower + upper) * gear * stiffness * to.get("sag_slope")
+    middle = 0.5 * (lower + upper) * gear * stiffness * to.list_sizes("sag_slope")[0]
     to.write(
         "actuator", "biasprm", 0, "sag_rad", lambda old, new: old + middle - stiffness * gear * new
     )
@@ -284,16 +267,17 @@ def _add_sag(to: _Editor) -> str | None:
     return None
 
 
-RULES: Mapping[tuple[str, str], Callable[[_Editor], str | None]] = {
-    ("flow_gain", "speed"): _scale_command,
-    ("lag", "position"): _add_lag,
-    ("lag", "torque"): _add_lag,
-    ("sag", "position"): _add_sag,
-    **{("joint_friction", kind): _add_friction for kind in ("speed", "position", "torque")},
-    **{("joint_damping", kind): _add_damping for kind in ("speed", "position", "torque")},
-    **{("joint_armature", kind): _add_armature for kind in ("speed", "position", "torque")},
-    **{("drive_gain", kind): _scale_drive for kind in ("speed", "position", "torque")},
-    **{("drive_limit", kind): _limit_force for kind in ("speed", "position", "torque")},
-    **{("dead_time", kind): _add_delay for kind in ("speed", "position", "torque")},
+RULES: Mapping[str, Callable[[_Editor], str | None]] = {
+    "flow_gain": _scale_command,
+    "lag": _add_lag,
+    "sag": _add_sag,
+    "joint_friction": _add_friction,
+    "joint_damping": _add_damping,
+    "joint_armature": _add_armature,
+    "drive_gain": _scale_drive,
+    "drive_limit": _limit_force,
+    "dead_time": _add_delay,
 }
-"""Change of the file for an effect on machines of an interface."""
+"""Change of the file for an effect."""
+INTERFACES = {"flow_gain": ("speed",), "lag": ("position", "torque"), "sag": ("position",)}
+"""Interfaces of machines on which an effect is a change of the file; all for the others."""
