@@ -1,4 +1,7 @@
-"""The report of a diagnosis: sentences, tables and figures in one HTML page."""
+"""The report of a diagnosis: sentences, tables and figures in one HTML page.
+
+In figures black is the measurement, red the simulator as it was, blue the one with the effects.
+"""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,9 +16,6 @@ from actuators.recordings.split import COMMANDED
 from brokk_rl import report
 from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, save_figure
 from brokk_rl.session import write_text
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 PAGE = "identification.html"
 TEMPLATE = Path(__file__).with_name("identification.html.jinja")

@@ -13,8 +13,7 @@ from scipy.signal import lfilter
 
 from actuators.contracts import FitTask
 from actuators.identify.dead_time import LONGEST_S, RESOLUTION_S, ServoLoops, discretise_loop
-from actuators.identify.option_file import write_numbers
-from actuators.identify.standard_errors import estimate_standard_errors
+from actuators.identify.option_file import estimate_standard_errors, write_numbers
 from actuators.models.servo import Servo
 from actuators.open_loop import WARM_UP_S
 from brokk_rl.commands import read_targets

@@ -32,8 +32,14 @@ from diagnosis.deployment.fault_search import (
 )
 from diagnosis.deployment.motion_check import MotionEvidence, check_motion
 from diagnosis.deployment.orders import match_order
-from diagnosis.deployment.replay import SPREAD_FACTOR, TOLERANCE, VECTOR_TOLERANCE, PolicyReplay
-from diagnosis.deployment.run_log import RunLog, read_run_log
+from diagnosis.deployment.replay import (
+    SPREAD_FACTOR,
+    TOLERANCE,
+    VECTOR_TOLERANCE,
+    PolicyReplay,
+    RunLog,
+    read_run_log,
+)
 from diagnosis.deployment.training_range import RangeEvidence, compare_with_training
 
 DoctorVerdict = Literal["code", "actuator", "task", "nothing", "cannot_tell"]

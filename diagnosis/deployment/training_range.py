@@ -13,7 +13,7 @@ from scipy.stats import norm
 
 from brokk_rl.observation import TARGET_DISTANCE, RangeTable
 from diagnosis.deployment.contract import PolicyContract
-from diagnosis.deployment.run_log import RunLog
+from diagnosis.deployment.replay import RunLog
 
 FALSE_ALARMS = 0.01
 """Share of runs of the training's own distribution that may lie outside in any value; chosen by hand."""

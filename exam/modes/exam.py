@@ -20,7 +20,7 @@ from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
-from exam import dataset, report, run_cases
+from exam import dataset, metrics, run_cases
 from exam.answer_scoring import (
     RUN_FILE,
     build_table,
@@ -284,8 +284,8 @@ class Exam:
             publish_answers(one, out / f"answers_{name}.jsonl")
         write_text(out / dataset.OPENED_FILE, text)
         write_json(out / "marks.json", {"exam": facts, "candidates": tables})
-        report.write_report(out, facts, tables)
-        print_table(["", *tables], report.build_rows(tables))
+        metrics.write_report(out, facts, tables)
+        print_table(["", *tables], metrics.build_rows(tables))
         for sentence in facts["ledger"]:
             print_text(sentence)
-        log.info("report: %s", out / report.REPORT_FILE)
+        log.info("report: %s", out / metrics.REPORT_FILE)

@@ -4,8 +4,7 @@ changes            table of effects as changes of numbers
 family             runs, a link to them, and a family of plants that draws them from seeds
 electronics        command frames on the bus, losses in bursts, encoders
 linkage            weight of an arm, tool point
-valve_parameters   numbers that only effects change, on machines with valves; effects as changes of them
-valve_causes       causes outside the library
+valve_faults       effects as changes of numbers, on machines with valves; causes outside the library
 valve_arm          bus, oil, stops, play and encoders around any hydraulics; the family with a load-sensing pump
 hydraulics         its pilot pressure, spool, notches, compensators, pump, cylinders on a linkage
 circuits           the family on the three circuits of `actuators.models.circuit`

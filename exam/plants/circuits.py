@@ -24,8 +24,7 @@ from exam.plants.family import DrawnPlants, PlantBatch, share
 from exam.plants.hydraulics import SPOOL_STEP
 from exam.plants.linkage import Arm
 from exam.plants.valve_arm import ValveArm
-from exam.plants.valve_causes import CAUSES, OutsideCauses
-from exam.plants.valve_parameters import CHANGES, NEUTRAL
+from exam.plants.valve_faults import CAUSES, CHANGES, NEUTRAL, OutsideCauses
 
 STEP_S = 0.005
 """Time step, s: the longest that the circuits allow, so that each of theirs is one."""

@@ -24,8 +24,7 @@ import numpy as np
 from brokk_rl.machine import Machine
 from exam.plants.changes import PlantParameters
 from exam.plants.linkage import Arm
-from exam.plants.valve_causes import OutsideCauses
-from exam.plants.valve_parameters import compute_notch_area
+from exam.plants.valve_faults import OutsideCauses, compute_notch_area
 
 STEP_S = 0.0025
 """Time step, s: a twentieth of a control period; the first mode of a joint lasts 50 of them."""

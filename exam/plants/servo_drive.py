@@ -148,4 +148,4 @@ class DryFriction:
 
 
 FRICTIONS = {"bristle": BristleFriction, "dry": DryFriction}
-"""By make; see `servo_parameters.MAKES`."""
+"""By make; see `servo_faults.MAKES`."""

@@ -18,12 +18,12 @@ from brokk_rl.machine import Dimension, Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from diagnosis.mjcf.plant import MjcfPlant
-from exam.plants import servo_parameters
+from exam.plants import servo_faults
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus
 from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
-from exam.plants.servo_causes import CAUSES, ServoCauses
 from exam.plants.servo_drive import FRICTIONS, STEP_S, PositionLoop, TargetFilter
+from exam.plants.servo_faults import CAUSES, ServoCauses
 
 ARM = Path(__file__).parent / "so101_arm.xml"
 WANDER_S = 8.0
@@ -144,9 +144,9 @@ class _RunChance:
 class ServoPlants(DrawnPlants):
     """Tabletop arms of position servos in two makes of friction, each arm unique."""
 
-    makes = servo_parameters.MAKES
+    makes = servo_faults.MAKES
     stream = "servos"
-    table = servo_parameters.FAULTS
+    table = servo_faults.FAULTS
     causes = CAUSES
 
     def complete(
@@ -163,7 +163,7 @@ class ServoPlants(DrawnPlants):
                 "position servos, e.g. machine=so101"
             )
         phase = chance.uniform(0.0, 2.0 * np.pi, machine.num_joints)
-        arm = servo_parameters.NEUTRAL | {
+        arm = servo_faults.NEUTRAL | {
             "supply_drop": drawn["supply_drop"][0],
             "transport_s": chance.uniform(*self.shared["transport_s"]),
             # time steps between two of the firmware's loop

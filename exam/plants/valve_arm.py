@@ -19,8 +19,7 @@ from exam.plants.electronics import CommandBus, RunChance, SteppedEncoders
 from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
 from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
-from exam.plants.valve_causes import CAUSES, OutsideCauses
-from exam.plants.valve_parameters import CHANGES, NEUTRAL
+from exam.plants.valve_faults import CAUSES, CHANGES, NEUTRAL, OutsideCauses
 
 VISCOSITY_RATIO = 6.0
 """Viscosity of cold over that of warm oil: ISO VG 46 at 10 and 50 degrees Celsius, ISO 3448."""

@@ -21,7 +21,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, write_recording
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
 from diagnosis.deployment.examination import Deployment, DoctorAnswer
-from diagnosis.deployment.run_log import measure_resolution
+from diagnosis.deployment.replay import measure_resolution
 from diagnosis.deployment.training_range import measure_margin
 
 NUM_ROWS, SAMPLES = 120, 4

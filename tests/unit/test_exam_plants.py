@@ -16,14 +16,14 @@ from brokk_rl.kinematics import Gravity, Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from diagnosis.effect_library import load_effects
-from exam.plants import servo_parameters
+from exam.plants import servo_faults
 from exam.plants.changes import PlantParameters, apply_changes
 from exam.plants.electronics import CommandBus, SteppedEncoders, draw_bursts
 from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, PlantRun, UnknownFault
 from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
 from exam.plants.valve_arm import ValveArm
-from exam.plants.valve_parameters import CHANGES, compute_notch_area
+from exam.plants.valve_faults import CHANGES, compute_notch_area
 
 Q1, Q3 = 0, 2
 RUN = PlantRun(seed=3, roughness="mild", chance=1, elapsed_s=900.0)
@@ -319,7 +319,7 @@ def test_a_circuit_that_nothing_changes_moves_as_the_library_has_it() -> None:
 def test_an_arm_sags_by_its_weight_over_the_stiffness(monkeypatch: pytest.MonkeyPatch) -> None:
     """Masses and levers by hand: forearm 0.104 kg, wrist 0.079 kg, gripper 0.099 kg."""
     arm, family = option("machine", "so101"), option("exam_plants", "servos")
-    monkeypatch.setitem(servo_parameters.NEUTRAL, "step_rad", 1e-9)
+    monkeypatch.setitem(servo_faults.NEUTRAL, "step_rad", 1e-9)
     tiny = (1e-6, 1e-6)
     plants = replace(
         family,
