@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -28,6 +28,9 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
+if TYPE_CHECKING:
+    from diagnosis.mjcf.plant import MjcfPlant  # MuJoCo is not in every installation
+
 MAX_KEPT = 20_000
 """Roll-outs that are kept: 60 MB at 250 samples of three joints."""
 SPEED_GAIN = 0.5
@@ -38,34 +41,6 @@ MIN_WARM_UP = 15
 """Samples before a run that give its speed; a simulator with a memory gets the whole warm-up."""
 TRIAL_TOLERANCE = 1e-9
 """Largest difference between a function called for two states at once and one by one, or twice."""
-
-
-class Plant(Protocol):
-    """Motion of all joints under commands; rows are independent."""
-
-    has_memory: bool
-    """True if a state holds more than positions and speeds."""
-
-    def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return states `(N, S)` at positions and speeds `(N, J)`."""
-        ...
-
-    def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return states moved to positions and speeds."""
-        ...
-
-    def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and speeds of states, each `(…, J)`."""
-        ...
-
-    def run(
-        self,
-        state: np.ndarray,
-        commands: np.ndarray,
-        changes: Mapping[str, np.ndarray] | None = None,
-    ) -> np.ndarray:
-        """Return the states after each period, `(N, T, S)`, of commands `(N, T, J)`."""
-        ...
 
 
 @spec
@@ -231,7 +206,9 @@ def read_commands(u: np.ndarray, machine: Machine) -> np.ndarray:
     return u * (machine.max_speed if machine.interface == "speed" else machine.max_force)
 
 
-def correct_state(plant: Plant, state: np.ndarray, q: np.ndarray, period_s: float) -> np.ndarray:
+def correct_state(
+    plant: FunctionPlant | MjcfPlant, state: np.ndarray, q: np.ndarray, period_s: float
+) -> np.ndarray:
     """Return states moved to measured positions `(N, J)`, their speeds corrected by a share of the way.
 
     The simulator is the model of an alpha-beta filter: it knows how fast a step of the command makes a
@@ -246,7 +223,7 @@ _ROLL_OUTS: WeakKeyDictionary[Any, dict[bytes, np.ndarray]] = WeakKeyDictionary(
 
 
 def _roll_out(
-    plant: Plant,
+    plant: FunctionPlant | MjcfPlant,
     known: np.ndarray,
     commands: np.ndarray,
     first: int,
@@ -284,7 +261,7 @@ def _roll_out(
 
 
 def _simulate(
-    plant: Plant,
+    plant: FunctionPlant | MjcfPlant,
     known: np.ndarray,
     commands: np.ndarray,
     first: int,
@@ -308,7 +285,10 @@ def _simulate(
 
 
 class FunctionPlant:
-    """A function `step(state, command) -> state` as a plant.
+    """A function `step(state, command) -> state` as a plant: motion of all joints under commands, rows independent.
+
+    Attributes:
+        has_memory: A state holds more than positions and speeds.
 
     Args:
         step: The function.
@@ -356,7 +336,7 @@ class FunctionPlant:
         self._is_vectorised = self._agrees_in_rows(state, command, one_by_one)
 
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """See `Plant`."""
+        """Return states `(N, S)` at positions and speeds `(N, J)`."""
         if self._start is None:
             return np.concatenate([q, speed], 1)
         found = []
@@ -377,13 +357,13 @@ class FunctionPlant:
         return np.stack(found)
 
     def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """See `Plant`."""
+        """Return states moved to positions and speeds."""
         state, joints = state.copy(), self._num_joints
         state[:, :joints], state[:, joints : 2 * joints] = q, speed
         return state
 
     def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Plant`."""
+        """Return positions and speeds of states, each `(…, J)`."""
         joints = self._num_joints
         return state[..., :joints], state[..., joints : 2 * joints]
 
@@ -393,7 +373,7 @@ class FunctionPlant:
         commands: np.ndarray,
         changes: Mapping[str, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """See `Plant`; a function has no numbers that could be changed."""
+        """Return the states after each period, `(N, T, S)`, of commands `(N, T, J)`; nothing in a function can be changed."""
         found = np.empty((*commands.shape[:2], state.shape[1]))
         for k in range(commands.shape[1]):
             command = commands[:, k]

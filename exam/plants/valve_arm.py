@@ -7,7 +7,7 @@ makes. Hydraulics of one's own turn commands into speeds.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,32 +21,15 @@ from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
 from exam.plants.valve_faults import CAUSES, CHANGES, NEUTRAL, OutsideCauses
 
+if TYPE_CHECKING:
+    from exam.plants.circuits import CircuitValves
+
 VISCOSITY_RATIO = 6.0
 """Viscosity of cold over that of warm oil: ISO VG 46 at 10 and 50 degrees Celsius, ISO 3448."""
 
 
 LATEST_STAMP_S = 0.6
 """Time by which a stamp is late at most; chosen by hand, far above any fault of a clock."""
-
-
-class Hydraulics(Protocol):
-    """Valves, cylinders and pump of `N` machines, advanced by time steps."""
-
-    def take_pose(self, q: np.ndarray, link: np.ndarray) -> None:
-        """Take the pose of cylinders and links, `(N, J)`, for the steps of a control period."""
-        ...
-
-    def open(self, u: np.ndarray) -> np.ndarray:
-        """Return which valves are open, `(N, J)`, a step after commands `u`."""
-        ...
-
-    def move(self, flow: np.ndarray) -> np.ndarray:
-        """Return the speeds after a step, rad/s or m/s, with this factor on the flows, both `(N, J)`."""
-        ...
-
-    def stop(self, where: np.ndarray, q: np.ndarray) -> None:
-        """Take the speed from joints at their stops `q`; both `(N, J)`, `where` bool."""
-        ...
 
 
 class ValveArm(PlantLink):
@@ -62,7 +45,7 @@ class ValveArm(PlantLink):
         self,
         batch: PlantBatch,
         step_s: float,
-        hydraulics: Callable[[PlantParameters, Machine, OutsideCauses], Hydraulics],
+        hydraulics: Callable[..., SensingValves | CircuitValves],
     ) -> None:
         chance = []
         for run, one in zip(batch.runs, batch.numbers, strict=True):
