@@ -5,19 +5,15 @@ A test follows each entry: with the key the same log is read, or refused for ano
 
 from __future__ import annotations
 
-ADVICE = {
-    "damaged": "log.damaged=skip, or damaged: skip in the column map, reads what is whole",
-    "rate": "log.rate_hz={rate_hz:g} takes the rows as equally spaced",
-    "time": "if it is the time, give 'log.time=[{columns}]'; two columns are seconds and nanoseconds",
-    "joints": "name the columns of each joint: 'log.joints={{{joints}}}'",
-    "channel": "choose one: log.channel={channel}",
-    "offset": "if they began together, give 'log.clock_offset_s={{{table}: {offset_s:.12g}}}'",
-    "dbc": "log.dbc=<file>, or a column map that names it",
-    "wraps": "log.wraps={modulus:g} unwraps it, a negative number reads that sign bit, log.wraps=0 takes it as it is",
-    "unit": "give it, log.position_unit=deg, mm or, for a count of an encoder, '0.00153 rad'",
-    "command": "give it, log.command=velocity, position or torque",
-}
+from pathlib import Path
+
+import yaml
+
+_TEXTS = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
+ADVICE: dict[str, str] = _TEXTS["advice"]
 """Texts by the key that they advise; numbers and names are filled in."""
+FOREIGN: dict[str, str] = _TEXTS["foreign"]
+"""Files that are no logs yet, and what makes logs of them, by their ending."""
 
 
 def advise(key: str, **values: object) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from actuators.recordings.advice import advise
-from actuators.recordings.array_log import FORMATS, ArrayLog, LeRobotLog, TableLog
+from actuators.recordings.advice import FOREIGN, advise
+from actuators.recordings.array_log import FORMATS
 from actuators.recordings.guess import Damaged
 from actuators.recordings.log_tables import LogFile, Table, Wanted
 from actuators.recordings.text_log import TextLog
@@ -15,8 +16,15 @@ from brokk_rl.errors import ConfigError, RecordingError
 
 TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".log", ".lvm")
 CAN_ENDINGS = (".blf", ".asc", ".trc")
-BAG_ENDINGS = (".db3", ".bag")
-ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *BAG_ENDINGS, *FORMATS, ".mcap", ".npz", ".mat")
+READERS: dict[str, str] = {
+    **dict.fromkeys(FORMATS, "array_log.TableLog"),
+    **dict.fromkeys((".npz", ".mat"), "array_log.ArrayLog"),
+    **dict.fromkeys((".db3", ".bag"), "message_log.BagLog"),
+    ".mcap": "message_log.McapLog",
+}
+"""Readers of files that need no more than their path, by their ending."""
+FOLDER_READERS = {"lerobot": "array_log.LeRobotLog", "bag": "message_log.BagLog"}
+ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *READERS)
 """Endings of the files that are logs."""
 SIGNATURES = {
     b"\x89MCAP0\r\n": (".mcap", "an MCAP file"),
@@ -28,19 +36,6 @@ SIGNATURES = {
     b"MATLAB 5.0": (".mat", "a MATLAB file"),
 }
 """First bytes of files, with the ending and the name of their kind."""
-FOREIGN = {
-    ".gz": "is compressed; unpack it, gunzip <file>",
-    ".zip": "is compressed; unpack it, unzip <file>",
-    ".xlsx": "is a workbook; save its sheet as CSV",
-    ".xls": "is a workbook; save its sheet as CSV",
-    ".mf4": "is an MDF file; asammdf exports it as CSV or Parquet",
-    ".mdf": "is an MDF file; asammdf exports it as CSV or Parquet",
-    ".h5": "is an HDF5 file; save its arrays by numpy.savez, or as CSV",
-    ".hdf5": "is an HDF5 file; save its arrays by numpy.savez, or as CSV",
-    ".json": "is one JSON document; write a record a line into a .jsonl file, jq -c '.[]' <file>",
-    ".pkl": "is a pickle, which can run code; save its arrays by numpy.savez",
-}
-"""Files that are no logs yet, and what makes logs of them, by their ending."""
 CANDUMP_LINE = re.compile(rb"^\s*\([-\d:. ]+\)\s+\S+\s+[0-9A-Fa-f]+(#|\s+\[\d+\])", re.MULTILINE)
 """A line of candump, as a file (`candump -l`) or as printed on a terminal (`candump -t a`)."""
 
@@ -93,13 +88,8 @@ def open_log(
 
 def _open_folder(path: Path) -> LogFile:
     kind = tell_folder(path)
-    if kind == "lerobot":
-        return LeRobotLog(path)
-    if kind == "bag":
-        # Imported here, since a desk without logs has no rosbags.
-        from actuators.recordings.message_log import BagLog
-
-        return BagLog(path)
+    if kind is not None:
+        return _load_reader(FOLDER_READERS[kind])(path)
     if len(_list_csv_files(path)) > 1:
         return CsvFolderLog(path)
     raise RecordingError(
@@ -117,25 +107,21 @@ def _open_file(
     if ending in FOREIGN:
         raise RecordingError(f"{path}: {FOREIGN[ending]}")
     _check_ending(path, ending)
-    if ending in FORMATS:
-        return TableLog(path)
-    if ending in (".npz", ".mat"):
-        return ArrayLog(path)
-    if ending == ".mcap" or ending in BAG_ENDINGS:
-        # Imported here, since a desk without logs has no mcap and no rosbags.
-        from actuators.recordings.message_log import BagLog, McapLog
-
-        return McapLog(path) if ending == ".mcap" else BagLog(path)
+    if ending in READERS:
+        return _load_reader(READERS[ending])(path)
     if ending in CAN_ENDINGS or (ending in (".log", ".txt") and is_candump(path)):
-        # Imported here, since a desk without CAN has no python-can.
-        from actuators.recordings.can_log import CanLog
-
         if dbc is None:
             raise ConfigError(
                 f"{path}: frames of a CAN bus mean nothing without their DBC file: {advise('dbc')}"
             )
-        return CanLog(path, dbc, channel)
+        return _load_reader("can_log.CanLog")(path, dbc, channel)
     return TextLog(path, signs)
+
+
+def _load_reader(name: str) -> Any:
+    """Return a class of a module beside this one; a desk without such logs lacks what it imports."""
+    module, _, reader = name.partition(".")
+    return getattr(importlib.import_module(f"actuators.recordings.{module}"), reader)
 
 
 def is_candump(path: Path) -> bool:
