@@ -34,15 +34,12 @@ from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.session import Session
 from diagnosis import report as diagnosis_report
 from diagnosis.answer import Outcome
 from diagnosis.case import GapCase
-from diagnosis.modes.diagnose import Diagnose, DiagnosisSubject
+from diagnosis.modes.diagnose import Diagnose
 from diagnosis.request import FITS
 
-REPEATABILITY = 0.01
-"""As `diagnosis.repeatability` in conf/mode/diagnose.yaml."""
 HELD_OUT = 4
 """One recording in so many stops a fit."""
 
@@ -168,7 +165,7 @@ def diagnose(
     reference: RecordingSet | None = None,
     fit: str | Path | ActuatorFit | None = None,
     effects: Sequence[str] | None = None,
-    repeatability: float = REPEATABILITY,
+    repeatability: float | None = None,
     seed: int = 0,
     workers: int = 1,
 ) -> Outcome:
@@ -183,7 +180,8 @@ def diagnose(
         fit: Option of `fit` that makes the simulator of joints commanded by torque from a reference;
             `None`: `force`.
         effects: Names to choose among; `None`: all that the machine may have.
-        repeatability: How much the machine repeats from day to day, standard deviation over the value.
+        repeatability: How much the machine repeats from day to day, standard deviation over the value;
+            `None`: as on the command line.
         seed: Of all random numbers.
         workers: Processes that share the work, on Linux.
 
@@ -193,9 +191,13 @@ def diagnose(
     """
     if not field.recordings:
         raise RecordingError("diagnose: expected a recording or more of the machine, got none")
-    asked = _build_mode(
-        field.machine, folder, simulator, fit, effects, seed, workers, repeatability
-    )
+    asked = _build_mode(field.machine, folder, seed)
+    names = None if effects is None else tuple(effects)
+    subject = replace(asked.diagnosis, effects=names, workers=workers)
+    if repeatability is not None:
+        subject = replace(subject, repeatability=repeatability)
+    chosen = _choose_fit(fit, field.machine)
+    asked = replace(asked, fit=chosen, actuator=_load_simulator(simulator), diagnosis=subject)
     asked.session.seed_all()
     before = () if reference is None else reference.recordings
     return asked.find_causes(GapCase(field.machine, before, field.recordings))
@@ -229,7 +231,7 @@ def report(outcome: Outcome, field: RecordingSet, folder: str | Path) -> Path:
     Raises:
         StorageError: A file could not be written.
     """
-    asked = _build_mode(field.machine, folder, None, None, None, 0, 1)
+    asked = _build_mode(field.machine, folder, 0)
     asked.session.folder.mkdir(parents=True, exist_ok=True)
     asked.write(outcome)
     return asked.session.folder / diagnosis_report.REPORT_FILE
@@ -266,30 +268,8 @@ def _choose_fit(fit: str | Path | ActuatorFit | None, machine: Machine) -> Actua
     return _load_option("fit", fit)
 
 
-def _build_mode(
-    machine: Machine,
-    folder: str | Path,
-    simulator: str | Path | Actuator | Callable[..., Any] | None,
-    fit: str | Path | ActuatorFit | None,
-    effects: Sequence[str] | None,
-    seed: int,
-    workers: int,
-    repeatability: float = REPEATABILITY,
-) -> Diagnose:
-    """Return the mode with the options that the command line would give it."""
-    return Diagnose(  # pyright: ignore[reportCallIssue]
-        session=Session(out=str(folder), seed=seed, device="cpu"),  # pyright: ignore[reportCallIssue]
-        machine=machine,
-        fit=_choose_fit(fit, machine),
-        actuator=_load_simulator(simulator),
-        simulator=None,
-        own=_load_option("actuator", "own"),
-        thresholds=extensions.load_part("thresholds"),
-        diagnosis=DiagnosisSubject(  # pyright: ignore[reportCallIssue]
-            case=None,
-            field="",  # recordings are given, none is read
-            effects=None if effects is None else tuple(effects),
-            repeatability=repeatability,
-            workers=workers,
-        ),
-    )
+def _build_mode(machine: Machine, folder: str | Path, seed: int) -> Diagnose:
+    """Return the mode as the command line would build it; recordings are given, none is read."""
+    mode = extensions.load_mode("mode=diagnose", "diagnosis.field=given", "session.device=cpu")
+    session = replace(mode.session, out=str(folder), seed=seed)
+    return replace(mode, machine=machine, session=session)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import yaml
 from matplotlib.figure import Figure
 
 from brokk_rl.plot import BLUE, ORANGE, RED, add_legend, make_figure, remove_frame
@@ -23,21 +24,7 @@ TITLES: dict[DoctorVerdict, tuple[str, Tone]] = {
     "nothing": ("Nothing found", "good"),
     "cannot_tell": ("The log does not suffice", "warn"),
 }
-REMEDIES = {
-    "order": "Compare the order of joints, terms and samples with `joints` and `observation` of policy.json.",
-    "sign": "Turn the sign where the signal enters the program, and check it with one joint moved by hand.",
-    "scale": "Compare units, `mean` and `std` of the field with policy.json.",
-    "frame": "Give the point in the base frame of the machine: x ahead, y to the left, z up.",
-    "rate": "Run the loop at `rate_hz`, take one sample of history a period, and send each command.",
-    "delay": "Take the newest sample when the policy decides; look for queues on the way.",
-    "stale": "Look for a signal that is not subscribed or has stopped, and refuse values that are too old.",
-    "clip": "Take the clip away, or train with it.",
-    "default_pose": "Check the zero of the joint, and the default pose or mean that is subtracted.",
-    "history": "Fill the history as `history` of policy.json says before the first command.",
-    "filter": "Take the filter away, or train with it.",
-    "network": "Compare policy.onnx on the machine with the one that was meant, and with golden.json.",
-    UNLISTED: "Log the observation vector too (obs_0, obs_1, …): then the doctor says which number departs first.",
-}
+REMEDIES: dict[str, str] = yaml.safe_load(Path(__file__).with_name("remedies.yaml").read_text())
 """Next step by kind of mistake."""
 SEEN_REMEDY = "Look where the numbers are made that depart first; the picture shows them."
 """Next step for a mistake without a name in an observation that was logged."""
