@@ -1,10 +1,12 @@
-"""Effects as changes of a plant's numbers: a table of rows, or a function where a row does not say it."""
+"""Effects as changes of a plant's numbers: rows of `faults.yaml`, or a function where a row does not say it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
+import yaml
 
 from brokk_rl.errors import ConfigError, list_choices
 
@@ -26,6 +28,26 @@ def replace_by(own: np.ndarray, size: np.ndarray) -> np.ndarray:
 def add_share(own: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Return an overlap beyond which a command of `size` more is needed before the land opens."""
     return own + size * (1.0 - own)
+
+
+COMBINE: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "add": np.add,
+    "multiply": np.multiply,
+    "minimum": np.minimum,
+    "maximum": np.maximum,
+    "replace": replace_by,
+    "add_share": add_share,
+}
+"""Ways in which a row of `faults.yaml` changes a number."""
+
+
+def read_faults(plant: str) -> tuple[dict[str, float], dict[str, Change]]:
+    """Return what only an effect changes, as a plant without effects has it, and the rows of each effect."""
+    told = yaml.safe_load(Path(__file__).with_name("faults.yaml").read_text())[plant]
+    changes: dict[str, Change] = {}
+    for effect, rows in told["effects"].items():
+        changes[effect] = tuple((own, COMBINE[how], size) for own, how, size in rows)
+    return told["neutral"], changes
 
 
 def apply_changes(

@@ -19,9 +19,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.changes import Change, FaultSizes, PlantParameters
+from exam.plants.changes import FaultSizes, PlantParameters, read_faults
 from exam.plants.servo_drive import STEP_S
-from exam.plants.valve_faults import CHANGES as VALVE_CHANGES
 
 MAKES = ("bristle", "dry")
 """Friction of a make: bristles that bend before they slip (LuGre), or dry friction of MuJoCo with a
@@ -29,14 +28,6 @@ Stribeck part."""
 
 COUNT_RAD = 2.0 * np.pi / 4096
 """Step of the servos' encoder: twelve bits over a turn."""
-NEUTRAL = dict.fromkeys(
-    (
-        "jitter_s", "loss", "filter_s", "stroke_s", "added_friction_n_m", "added_viscous", "added_armature", "pull_n_m",
-        "extra_noise_rad",
-    ),
-    0.0,
-) | {"step_rad": COUNT_RAD, "duty_cap": 1.0}  # fmt: skip
-"""Numbers that only a fault changes, as an arm without faults has them."""
 
 
 def _add_backlash(n: PlantParameters, size: FaultSizes) -> None:
@@ -66,24 +57,15 @@ def _add_torque_limit(n: PlantParameters, size: FaultSizes) -> None:
     n["duty_cap"] = np.minimum(n["duty_cap"], limit_n_m / n["stall_n_m"])
 
 
-LIKE_VALVES = ("dead_time", "delay_jitter", "frame_loss", "rate_limit", "sensor_noise")
-"""Effects that change the same parameters as on a valve: of the bus, of the slope of targets, of
-readings."""
-FAULTS: dict[str, Change] = {
-    **{name: VALVE_CHANGES[name] for name in LIKE_VALVES},
-    "lag": (("filter_s", np.add, "time_constant_s"),),
+NEUTRAL, FAULTS = read_faults("servos")
+NEUTRAL["step_rad"] = COUNT_RAD
+FAULTS |= {
     "backlash": _add_backlash,
     "sag": _add_sag,
-    "quantisation": (("step_rad", np.maximum, "step_rad"),),
     "torque_limit": _add_torque_limit,
     "joint_friction": _add_joint_friction,
     "joint_damping": _add_joint_damping,
-    "joint_armature": (("added_armature", np.add, "part"),),
-    "drive_gain": (("stiffness", np.multiply, "gain"),),
 }
-"""Change of the parameters by effect. The last four are effects on numbers of an MJCF file: only a
-candidate that diagnoses such a simulator can name them."""
-
 
 CAUSES = (
     "wind_up", "heat", "bad_tooth", "overload_trip", "weak_side", "cross_talk", "feed_forward", "warm_delay",

@@ -26,18 +26,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from brokk_rl.machine import Machine
-from exam.plants.changes import Change, FaultSizes, PlantParameters, add_share, replace_by
-
-NEUTRAL = dict.fromkeys(
-    (
-        "jitter_s", "loss", "stamp_s", "pilot_s", "stroke_s", "sink_rad_s", "breakaway", "bleed", "sensitivity",
-        "soft_s", "soft_damping", "gap_rad", "step_rad", "extra_noise_rad", "bias_rad", "extra_m", "roll_rad",
-        "pitch_rad", "drift",
-    ),
-    0.0,
-) | {"stop": 1.0, "flow": 1.0, "scale": 1.0, "drift_s": 700.0}  # fmt: skip
-"""Numbers that only an effect changes, as a machine without effects has them. `drift_s`: s, warm-up of a
-small tank."""
+from exam.plants.changes import FaultSizes, PlantParameters, read_faults
 
 
 def compute_notch_area(opening: np.ndarray, notch: np.ndarray) -> np.ndarray:
@@ -78,38 +67,8 @@ def _add_flow_sharing(n: PlantParameters, size: FaultSizes) -> None:
     n["demand"] = np.where(wanted > 0, np.maximum(n["demand"], share * wanted), n["demand"])
 
 
-CHANGES: dict[str, Change] = {
-    "dead_time": (("transport_s", np.add, "dead_time_s"),),
-    "delay_jitter": (("jitter_s", np.add, "jitter_s"),),
-    "frame_loss": (("loss", np.add, "probability"),),
-    "clock_offset": (("stamp_s", np.add, "offset_s"),),
-    "dead_band": (
-        ("overlap_extend", add_share, "extend"),
-        ("overlap_retract", add_share, "retract"),
-    ),
-    "saturation": (("stop", np.minimum, "level"),),
-    "rate_limit": (("stroke_s", np.add, "stroke_s"),),
-    "lag": (("pilot_s", np.add, "time_constant_s"),),
-    "stiction": _add_stiction,
-    "flow_gain": (("flow", np.multiply, "gain"),),
-    "asymmetry": (("extend", np.multiply, "extend_gain"), ("retract", np.multiply, "retract_gain")),
-    "load_dependence": (("sensitivity", np.add, "sensitivity"),),
-    "flow_sharing": _add_flow_sharing,
-    "creep": (("sink_rad_s", np.add, "sink_rad_s"),),
-    "thermal_drift": (("drift", np.add, "change"), ("drift_s", replace_by, "time_s")),
-    "backlash": (("gap_rad", np.add, "gap_rad"),),
-    "compliance": (("soft_s", np.add, "ringing_s"), ("soft_damping", replace_by, "damping")),
-    "quantisation": (("step_rad", np.add, "step_rad"),),
-    "sensor_noise": (("extra_noise_rad", np.add, "sigma_rad"),),
-    "encoder_bias": (("bias_rad", np.add, "bias_rad"),),
-    "encoder_scale": (("scale", np.multiply, "scale"),),
-    "link_length": (("extra_m", np.add, "extra_m"),),
-    "base_tilt": (("roll_rad", np.add, "roll_rad"), ("pitch_rad", np.add, "pitch_rad")),
-}
-"""Change of the parameters by effect, with sizes in the library's units. A machine may have some of an
-effect anyway (an overlap, a leak); the fault adds to it, as the library's effect does. `extrinsics` is not
-among them: a case has no estimates of boreholes to see it by."""
-
+NEUTRAL, CHANGES = read_faults("valves")
+CHANGES |= {"stiction": _add_stiction, "flow_sharing": _add_flow_sharing}
 
 CAUSES = (
     "silted_spool", "ajar_check", "supply_voltage", "moved_stop", "back_flow", "stale_readings", "coarse_driver",
