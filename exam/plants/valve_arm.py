@@ -7,7 +7,7 @@ makes. Hydraulics of one's own turn commands into speeds.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
 from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
 from exam.plants.valve_faults import CAUSES, CHANGES, NEUTRAL, OutsideCauses
-
-if TYPE_CHECKING:
-    from exam.plants.circuits import CircuitValves
 
 VISCOSITY_RATIO = 6.0
 """Viscosity of cold over that of warm oil: ISO VG 46 at 10 and 50 degrees Celsius, ISO 3448."""
@@ -38,14 +35,14 @@ class ValveArm(PlantLink):
     Args:
         batch: The runs and their machines.
         step_s: Time step of the hydraulics.
-        hydraulics: Builds them from numbers `(N, J)`, machine and causes.
+        hydraulics: Builds them from numbers `(N, J)`, machine and causes, with the methods of `SensingValves`.
     """
 
     def __init__(
         self,
         batch: PlantBatch,
         step_s: float,
-        hydraulics: Callable[..., SensingValves | CircuitValves],
+        hydraulics: Callable[[PlantParameters, Machine, OutsideCauses], Any],
     ) -> None:
         chance = []
         for run, one in zip(batch.runs, batch.numbers, strict=True):
