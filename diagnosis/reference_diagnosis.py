@@ -383,7 +383,12 @@ def rank_effects(
     if verdict != "effects":
         found.append(Ranked(verdict, (), UNNAMED_PROBABILITY))
     names = {one.effect for one in found}
-    others = [one for one in rivals if one.name not in names and one.nats > 0.0][:MAX_RIVALS]
+    others = []
+    for one in rivals:
+        if one.name not in names and one.nats > 0.0:
+            others.append(one)
+            names.add(one.name)
+    others = others[:MAX_RIVALS]
     left = 1.0 - max(one.probability for one in found)
     odds = np.exp([(one.nats - others[0].nats) / NATS_OF_SURE for one in others])
     for one, chance in zip(others, left * odds / odds.sum(), strict=True):
