@@ -57,26 +57,6 @@ class LeverGuidance:
     max_rate_rad_s: Positive
 
 
-def find_full_angles_rad(machine: Machine) -> np.ndarray:
-    """Return the angle at full deflection of each of the four `AXES`, `(4,)`; 1 without a joint."""
-    full_rad = np.ones(len(AXES))
-    for index, axis in enumerate(AXES):
-        angles_rad = []
-        for one in machine.levers:
-            if (one.side, one.axis) == axis:
-                angles_rad.append(one.max_angle_rad)
-        if angles_rad:
-            full_rad[index] = max(angles_rad)
-    return full_rad
-
-
-def convert_to_positions(
-    angles_rad: np.ndarray, full_rad: np.ndarray, button_right: bool
-) -> LeverPositions:
-    """Return angles of the four `AXES`, `(4,)`, as parts of those at full deflection."""
-    return LeverPositions(*(angles_rad / full_rad).tolist(), button_right=button_right)
-
-
 class LeverMap:
     """Mapping between commands and levers.
 
@@ -99,6 +79,10 @@ class LeverMap:
         )
         self.full_rad = np.array([by_joint[name].max_angle_rad for name in names])
         """Lever angle at full command, `(J,)`."""
+        self.axis_full_rad = np.ones(len(AXES))
+        """Lever angle at full deflection of each of the four `AXES`; 1 without a joint."""
+        for axis in set(self._axis.tolist()):
+            self.axis_full_rad[axis] = self.full_rad[self._axis == axis].max()
         self._exclusive = machine.is_exclusive
         shared = [int(axis) for axis in self._axis[~self._exclusive]]
         if len(set(shared)) != len(shared):
@@ -110,6 +94,10 @@ class LeverMap:
         for j in np.flatnonzero(self._exclusive == button):
             angles[self._axis[j]] = u[j] * self.full_rad[j]
         return angles, button
+
+    def read_positions(self, angles_rad: np.ndarray, button: bool) -> LeverPositions:
+        """Return angles of the four `AXES`, `(4,)`, as parts of those at full deflection."""
+        return LeverPositions(*(angles_rad / self.axis_full_rad).tolist(), button_right=button)
 
     def command(self, angles_rad: np.ndarray, button: bool) -> np.ndarray:
         """Return the commands, `(J,)` in [-1, 1], of levers at these angles."""

@@ -26,7 +26,7 @@ from deploy.kernel.limits import GuardLimits
 from deploy.kernel.target_check import SeenTarget
 from deploy.runtime.operator_state import PageSignal
 from deploy.runtime.process import CycleTimer, Stop, read_steady_s
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.shm_layout import LoopMemory, log_text
 from deploy.runtime.target import read_holes
 
 log = logging.getLogger(__name__)
@@ -38,8 +38,8 @@ FRAME = struct.Struct("<dIBB")
 """Header of a frame in the log's pipe.
 
 Time, identifier, 1 where it was sent from here, and the number of data bytes that follow."""
-FRAMES, TEXT = b"F", b"J"
-"""First byte of an entry in the log's pipe: frames, or a JSON text with topic and time."""
+FRAMES = b"F"
+"""First byte of an entry with frames in the log's pipe; others are texts (`log_text`)."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,12 @@ class BusProcess:
         fault, is_urgent = self._logic.take(frame, now_s, read_steady_s())
         self._log_frame(frame, now_s, sent=False)
         if fault is not None:
-            self._log_text("fault", now_s, {"frame_id": frame.frame_id, "fault": fault.value})
+            log_text(
+                self._memory.bus_log,
+                "fault",
+                now_s,
+                {"frame_id": frame.frame_id, "fault": fault.value},
+            )
         if is_urgent:
             self.run_cycle()
 
@@ -216,5 +221,4 @@ class BusProcess:
         self._log.append(header + frame.data)
 
     def _log_text(self, topic: str, now_s: float, values: Mapping[str, object]) -> None:
-        text = json.dumps({"topic": topic, "t_s": now_s, **values})
-        self._memory.bus_log.put(TEXT + text.encode())
+        log_text(self._memory.bus_log, topic, now_s, values)

@@ -23,7 +23,7 @@ from deploy.bus.description import (
     BusDescription,
     MessageLayout,
 )
-from deploy.guidance import LeverMap, find_full_angles_rad
+from deploy.guidance import LeverMap
 from deploy.kernel.clock import GatewayClock
 from deploy.kernel.flow_check import FROM_PC, FlowCheck
 from deploy.kernel.guard import NOTHING_OBSERVED, GuardDecision, GuardInput, GuardTrip, Observation
@@ -79,7 +79,6 @@ class BusReceiver:
         self.flow_check = FlowCheck(self.limits.flow, machine.num_joints, self.limits.round_trip_s)
         has_levers = {lever.joint for lever in machine.levers} >= set(machine.joint_names)
         self._lever_map = LeverMap(machine) if has_levers else None
-        self._lever_full_rad = find_full_angles_rad(machine)
         self.flow_source = 0
         # Whether the gateway goes by our description and machine; `None` until it says so.
         self.described: bool | None = None
@@ -341,7 +340,7 @@ class BusReceiver:
         num_joints = self.machine.num_joints
         asked = np.zeros(num_joints)
         if self.remote_on and self._lever_map is not None:
-            angles_rad = self.lever * self._lever_full_rad
+            angles_rad = self.lever * self._lever_map.axis_full_rad
             asked = self._lever_map.command(angles_rad, self.button_right)
         elif self.remote_on and self.lever.any():
             # Nobody knows which joint they move.

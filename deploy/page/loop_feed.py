@@ -23,8 +23,7 @@ import numpy as np
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.guidance import LeverGuidance, convert_to_positions, find_full_angles_rad
-from deploy.kernel.bus_process import TEXT
+from deploy.guidance import LeverGuidance, LeverMap
 from deploy.kernel.limits import GuardLimits
 from deploy.page.protocol import (
     BoreholeChoice,
@@ -41,9 +40,9 @@ from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
 from deploy.page.video_relay import VideoRelay
 from deploy.runtime.operator_state import LoopSnapshot, PageSignal, PolicyAdvice
-from deploy.runtime.perception_process import read_frame
+from deploy.runtime.perception_process import read_newer_frame
 from deploy.runtime.process import Stop
-from deploy.runtime.shm_layout import LOG_BYTES, LoopMemory
+from deploy.runtime.shm_layout import LOG_BYTES, LoopMemory, log_text
 from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, read_holes
 
 log = logging.getLogger(__name__)
@@ -131,9 +130,7 @@ class LoopFeed:
         self._config, self._memory, self._clock = config, memory, clock
         self._guiding, self._stopped_s, self._present_s = True, 0.0, 0.0
         self._turned_s, self._signalling = clock(), threading.Lock()
-        machine = config.machine
-        self._full_rad = find_full_angles_rad(machine)
-        self._exclusive = machine.is_exclusive
+        self._levers = LeverMap(config.machine)
 
     def read_advice_number(self) -> int | None:
         """See `PageFeed`; the server asks in each of its turns."""
@@ -192,13 +189,7 @@ class LoopFeed:
 
     def read_frame(self, after_s: float) -> Frame | None:
         """See `PageFeed`."""
-        # The time alone is read first: copying a picture that has not changed would cost
-        # milliseconds.
-        slot, taken_s = self._memory.frame, self._read_frame_t_s()
-        if slot is None or taken_s is None or taken_s <= after_s:
-            return None
-        record = slot.read()
-        return None if record is None else read_frame(record)
+        return read_newer_frame(self._memory.frame, after_s)
 
     def submit(self, request: OperatorRequest) -> bool:
         """See `PageFeed`."""
@@ -232,7 +223,7 @@ class LoopFeed:
         taken = self._memory.requests.put(json.dumps(values | facts).encode())
         # The time of the record is that of the request; the place was measured before.
         told = {"seen_s" if name == "t_s" else name: value for name, value in facts.items()}
-        self._log_text("wish", values | {"taken": taken} | told)
+        log_text(self._memory.page_log, "wish", self._clock(), values | {"taken": taken} | told)
         if request.kind in ("start", "stop"):
             # guiding stops on the page even where the supervisor has no room for the request
             self._guiding = request.kind == "start"
@@ -246,15 +237,11 @@ class LoopFeed:
             return True
         return state is not None and state.t_s > self._stopped_s and not state.guard.sends
 
-    def _log_text(self, topic: str, values: dict[str, Any]) -> None:
-        text = json.dumps({"topic": topic, "t_s": self._clock(), **values})
-        self._memory.page_log.put(TEXT + text.encode())
-
     def _convert_advice(self, advice: PolicyAdvice) -> ShownAdvice:
-        button = advice.button_right
-        levers = convert_to_positions(advice.lever_rad, self._full_rad, button)
+        button, exclusive = advice.button_right, self._config.machine.is_exclusive
+        levers = self._levers.read_positions(advice.lever_rad, button)
         due_s = 0.0 if button else None
-        if not button and advice.valid and advice.u[self._exclusive].any():
+        if not button and advice.valid and advice.u[exclusive].any():
             # the policy wants it already; the shown levers go through neutral first, as fast as a
             # hand can
             most_rad = float(np.abs(advice.lever_rad).max())
@@ -273,7 +260,7 @@ class LoopFeed:
             ("borehole", None if aim is None else float(aim["t_s"]), config.borehole_s),
         ]
         if config.camera_s is not None:
-            sources.append(("camera", self._read_frame_t_s(), config.camera_s))
+            sources.append(("camera", self._memory.frame.peek("t_s"), config.camera_s))
         ages = []
         for name, t_s, limit_s in sources:
             ages.append(SourceAge(name, None if t_s is None else now_s - t_s, limit_s))
@@ -299,9 +286,6 @@ class LoopFeed:
             log_behind=any(pipe.waiting > LOG_BEHIND_BYTES for pipe in memory.logs),
             supervisor_silent=silent,
         )
-
-    def _read_frame_t_s(self) -> float | None:
-        return self._memory.frame and self._memory.frame.peek("t_s")
 
     def _list_targets(self, aim: Any | None) -> tuple[BoreholeChoice, ...]:
         radius_m = self._config.page.borehole_radius_m

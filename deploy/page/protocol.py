@@ -8,7 +8,7 @@ greys them.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, Protocol, get_args
 
 from brokk_rl.contracts.vision import CameraView
@@ -249,22 +249,8 @@ class PageState:
 
     def to_plain(self) -> dict[str, Any]:
         """Return it as plain JSON data for the page; a number that is not finite is null."""
-        found = {
-            "t_s": self.t_s,
-            "alive": self.alive,
-            "guiding": self.guiding,
-            "advice": self.advice and asdict(self.advice),
-            "own": self.own and asdict(self.own),
-            "q": self.q,
-            "streams": [asdict(one) for one in self.streams],
-            "safety": self.safety,
-            "recording": asdict(self.recording),
-            "targets": [asdict(one) for one in self.targets],
-            "insertion": self.insertion and asdict(self.insertion),
-            "path_in_base_m": self.path_in_base_m,
-            "view": self.view and asdict(self.view),
-            "replay": self.replay and asdict(self.replay),
-        }
+        found = asdict(replace(self, state=None))
+        found |= {"own": self.own and asdict(self.own), "q": self.q, "safety": self.safety}
         return convert_to_plain(found)
 
 

@@ -7,11 +7,12 @@ perception and page.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
-from deploy.guidance import AXES, convert_to_positions, find_full_angles_rad
+from deploy.guidance import AXES, LeverMap
 from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.loop_feed import list_boreholes
 from deploy.page.protocol import (
@@ -36,7 +37,7 @@ from deploy.page.protocol import (
 )
 from deploy.page.scene import place_tool
 from deploy.recorder.camera_topics import decode_frame
-from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
+from deploy.recorder.capture_reader import CaptureContents, read_capture
 from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import ALIVE_S, AdviceStatus, OperatorState
 from deploy.runtime.shared_memory import RecordLayout
@@ -44,7 +45,15 @@ from deploy.runtime.shared_memory import RecordLayout
 VIEWS = (PICTURE, LENS, CLOUD, CAMERA_POSE)
 """Topics of the camera."""
 CLOCK_S = 1e-6
-"""Rounding of the times of pictures."""
+"""Rounding of the times of pictures, whole nanoseconds of the wall clock."""
+SWITCHES = {
+    "button_right": "ButtonRight",
+    "deadman": "DeadMan",
+    "remote_on": "RemoteOn",
+    "estop": "EStop",
+    "exclusive_selected": "ExclusiveSelected",
+}
+"""Switches of the state, and their signals."""
 MOST_MARKS = 200
 """Marks on the timeline; each state carries them. Chosen by hand."""
 RADIUS_M = 0.05
@@ -60,7 +69,6 @@ class CaptureReplay:
         bus_s: Age from which positions and levers are stale.
         advice_s: Age from which the advice is.
         borehole_s: Age from which the boreholes are.
-        delay_s: Delay of messages that is too long.
         camera_s: Age from which the camera's picture is stale.
     """
 
@@ -68,7 +76,6 @@ class CaptureReplay:
     bus_s: Positive
     advice_s: Positive
     borehole_s: Positive
-    delay_s: Positive
     camera_s: Positive
 
     def build(self, machine: Machine) -> ReplayFeed:
@@ -104,24 +111,25 @@ class ReplayFeed:
         clock: Callable[[], float],
     ) -> None:
         self._replay, self._machine, self._clock = replay, machine, clock
-        self._topics = {name: _Topic(rows) for name, rows in contents.messages.items()}
-        self._begin_s = float(min(topic.t_s[0] for topic in self._topics.values()))
-        end_s = float(max(topic.t_s[-1] for topic in self._topics.values()))
+        topics = {}
+        for name, messages in contents.messages.items():
+            topics[name] = _Series(messages.series("t_s"), messages)
+        self._begin_s = float(min(topic.t_s[0] for topic in topics.values()))
+        end_s = float(max(topic.t_s[-1] for topic in topics.values()))
         self._duration_s = end_s - self._begin_s
-        self._views = {name: _View(rows) for name, rows in contents.views.items()}
+        self._signals: dict[str, _Series] = {}
+        for topic in topics.values():
+            for signal in topic.rows.names:
+                self._signals.setdefault(signal, topic)
+        self._series = dict(topics)
+        for name, pictures in contents.views.items():
+            taken_s = np.array([t_s for t_s, _ in pictures])
+            self._series[name] = _Series(taken_s - CLOCK_S, pictures)
         self._picture = -1
-        self._sources = {}
-        for signal in (
-            *(f"Position_{name}" for name in machine.joint_names),
-            *(f"Lever_{side}_{axis}" for side, axis in AXES),
-            *("ButtonRight", "DeadMan", "RemoteOn", "EStop", "ExclusiveSelected"),
-        ):
-            found = [topic for topic in self._topics.values() if signal in topic.rows.names]
-            self._sources[signal] = found[0] if found else None
         self._blank = RecordLayout(OperatorState, machine.num_joints).new()
-        self._full_rad = find_full_angles_rad(machine)
-        self._marks = _list_marks(self._topics, self._begin_s)
-        guard = self._topics.get("guard")
+        self._levers = LeverMap(machine)
+        self._marks = _list_marks(topics, self._begin_s)
+        guard = topics.get("guard")
         # Without any other state, the loop could only listen.
         self._commands = guard is not None and any(
             values["state"] != GuardState.SILENT.name for _, values in guard.rows
@@ -137,59 +145,46 @@ class ReplayFeed:
     def read_advice_number(self) -> int | None:
         """See `PageFeed`."""
         found = self._find("advice", self._begin_s + self.position_s)
-        return None if found is None else found[0]
+        return None if found is None else found.number
 
     def read_state(self) -> PageState:
         """See `PageFeed`."""
         position_s = self.position_s
         at_s = self._begin_s + position_s
-        state, ages_s = self._build_state(at_s)
-        advice = self._find("advice", at_s)
-        targets = self._list_targets(at_s, None if advice is None else advice[2])
+        state, advice = self._build_state(at_s), self._find("advice", at_s)
+        targets = self._list_targets(at_s, advice)
         chosen = next((one for one in targets if one.chosen), None)
         path, insertion = place_tool(self._machine, state.q, chosen)
         view = self._find("view", at_s)
-        replay, heard_s = self._replay, min(ages_s["positions"], ages_s["levers"])
-        streams = [
-            SourceAge("positions", _drop_infinite(ages_s["positions"]), replay.bus_s),
-            SourceAge("levers", _drop_infinite(ages_s["levers"]), replay.bus_s),
-            SourceAge("advice", None if advice is None else at_s - advice[1], replay.advice_s),
-            SourceAge("borehole", self._measure_age("holes", at_s), replay.borehole_s),
-        ]
-        if PICTURE in self._views:
-            _, taken_s, picture = self._views[PICTURE].find(at_s)
-            age_s = None if picture is None else at_s - taken_s
-            streams.append(SourceAge("camera", age_s, replay.camera_s))
         return PageState(
             t_s=self._clock(),
-            alive=heard_s < ALIVE_S,
+            alive=state.bus_up,
             guiding=True,
-            advice=None if advice is None else self._convert_advice(advice[0], advice[2]),
+            advice=None if advice is None else self._convert_advice(advice),
             state=state,
             commands=self._commands,
-            streams=tuple(streams),
+            streams=self._measure_ages(at_s, state),
             recording=RecordingStatus(True, position_s, 0, failed=False),
-            health=LoopHealth(0.0, replay.delay_s, log_behind=False, supervisor_silent=False),
+            health=LoopHealth(0.0, math.inf, log_behind=False, supervisor_silent=False),
             targets=targets,
             insertion=insertion,
             path_in_base_m=path,
-            view=None if view is None else CameraView(**view[2]),
+            view=None if view is None else CameraView(**view.values),
             replay=ReplayTimeline(position_s, self._duration_s, self._speed, self._marks),
         )
 
     def read_frame(self, after_s: float) -> Frame | None:
         """See `PageFeed`; a jump back shows an earlier picture, at the time of the clock."""
-        if not {PICTURE, LENS, CLOUD} <= self._views.keys():
+        picture = self._find(PICTURE, self._begin_s + self.position_s)
+        if picture is None or (picture.number == self._picture and after_s >= 0):
             return None
-        index, t_s, picture = self._views[PICTURE].find(self._begin_s + self.position_s)
-        if picture is None or (index == self._picture and after_s >= 0):
-            return None
-        self._picture = index
-        lens, cloud = self._views[LENS].find(t_s)[2], self._views[CLOUD].find(t_s)[2]
-        pose = self._views[CAMERA_POSE].find(t_s)[2] if CAMERA_POSE in self._views else None
+        self._picture = picture.number
+        lens, cloud = self._find(LENS, picture.t_s), self._find(CLOUD, picture.t_s)
         if lens is None or cloud is None:
             return None
-        return decode_frame(picture, lens, cloud, pose, self._clock())
+        pose = self._find(CAMERA_POSE, picture.t_s)
+        placed = None if pose is None else pose.values
+        return decode_frame(picture.values, lens.values, cloud.values, placed, self._clock())
 
     def submit(self, request: OperatorRequest) -> bool:
         """See `PageFeed`; moves along the recording."""
@@ -209,95 +204,96 @@ class ReplayFeed:
         """See `PageFeed`; nothing moves."""
         return True
 
-    def _find(self, topic: str, at_s: float) -> tuple[int, float, dict[str, Any]] | None:
-        """Return number, time and values of the last message of a topic at `at_s`."""
-        found = self._topics.get(topic)
+    def _find(self, topic: str, at_s: float) -> _Found | None:
+        """Return the last message of a topic at `at_s`, `None` before the first."""
+        found = self._series.get(topic)
         return None if found is None else found.find(at_s)
 
-    def _measure_age(self, topic: str, at_s: float) -> float | None:
-        found = self._find(topic, at_s)
-        return None if found is None else at_s - found[1]
+    def _measure_ages(self, at_s: float, state: OperatorState) -> tuple[SourceAge, ...]:
+        replay, ages = self._replay, []
+        for name, t_s in (("positions", state.q_t_s), ("levers", state.levers_t_s)):
+            ages.append(SourceAge(name, at_s - t_s if np.isfinite(t_s) else None, replay.bus_s))
+        topics = [("advice", "advice", replay.advice_s), ("borehole", "holes", replay.borehole_s)]
+        if PICTURE in self._series:
+            topics.append(("camera", PICTURE, replay.camera_s))
+        for name, topic, limit_s in topics:
+            found = self._find(topic, at_s)
+            ages.append(SourceAge(name, None if found is None else at_s - found.t_s, limit_s))
+        return tuple(ages)
 
     def _read_signal(self, signal: str, at_s: float) -> tuple[float, float]:
-        """Return value and age of a signal of the bus; 0 and infinite where none has come."""
-        topic = self._sources[signal]
-        found = None if topic is None else topic.find(at_s)
-        return (0.0, np.inf) if found is None else (found[2][signal], at_s - found[1])
+        """Return value and time of a signal of the bus; 0 and `-inf` where none has come."""
+        series = self._signals.get(signal)
+        found = None if series is None else series.find(at_s)
+        return (0.0, -math.inf) if found is None else (found.values[signal], found.t_s)
 
-    def _build_state(self, at_s: float) -> tuple[OperatorState, dict[str, float]]:
+    def _build_state(self, at_s: float) -> OperatorState:
         names = self._machine.joint_names
         positions = [self._read_signal(f"Position_{name}", at_s) for name in names]
         levers = [self._read_signal(f"Lever_{side}_{axis}", at_s) for side, axis in AXES]
-        ages_s = {"positions": max(age for _, age in positions), "levers": levers[0][1]}
-        guard = self._find("guard", at_s)
+        q_t_s, levers_t_s = min(t_s for _, t_s in positions), levers[0][1]
         state = replace(
             self._blank,
             t_s=at_s,
             q=np.array([value for value, _ in positions]),
+            q_t_s=q_t_s,
             lever=np.array([value for value, _ in levers]),
-            button_right=bool(self._read_signal("ButtonRight", at_s)[0]),
-            deadman=bool(self._read_signal("DeadMan", at_s)[0]),
-            remote_on=bool(self._read_signal("RemoteOn", at_s)[0]),
-            estop=bool(self._read_signal("EStop", at_s)[0]),
-            exclusive_selected=bool(self._read_signal("ExclusiveSelected", at_s)[0]),
-            bus_up=min(ages_s.values()) < ALIVE_S,
+            levers_t_s=levers_t_s,
+            bus_up=at_s - max(q_t_s, levers_t_s) < ALIVE_S,
+            **{name: bool(self._read_signal(one, at_s)[0]) for name, one in SWITCHES.items()},
         )
-        if guard is not None:
-            values = guard[2]
-            joint = values.get("joint")
-            state = replace(
-                state,
-                guard=GuardState[values["state"]],
-                trip=GuardTrip(values["trip"]),
-                cause=GuardTrip(values["cause"]),
-                observed_joint=names.index(joint) + 1 if joint else 0,
-            )
-        return state, ages_s
+        guard = self._find("guard", at_s)
+        if guard is None:
+            return state
+        joint = guard.values.get("joint")
+        return replace(
+            state,
+            guard=GuardState[guard.values["state"]],
+            trip=GuardTrip(guard.values["trip"]),
+            cause=GuardTrip(guard.values["cause"]),
+            observed_joint=names.index(joint) + 1 if joint else 0,
+        )
 
-    def _convert_advice(self, number: int, values: dict[str, Any]) -> ShownAdvice:
-        button = bool(values["button_right"])
-        angles_rad = np.array(values["lever_rad"])
-        levers = convert_to_positions(angles_rad, self._full_rad, button)
-        reason = values["reason"]
-        valid = reason == AdviceStatus.VALID.value
-        return ShownAdvice(valid, reason, number, levers, 0.0 if button else None)
+    def _convert_advice(self, advice: _Found) -> ShownAdvice:
+        values, button = advice.values, bool(advice.values["button_right"])
+        levers = self._levers.read_positions(np.array(values["lever_rad"]), button)
+        valid = values["reason"] == AdviceStatus.VALID.value
+        return ShownAdvice(valid, values["reason"], advice.number, levers, 0.0 if button else None)
 
-    def _list_targets(
-        self, at_s: float, advice: dict[str, Any] | None
-    ) -> tuple[BoreholeChoice, ...]:
+    def _list_targets(self, at_s: float, advice: _Found | None) -> tuple[BoreholeChoice, ...]:
         """Return the boreholes known at that time; the one that the advice is for is chosen."""
         seen, aim = self._find("holes", at_s), None
-        if advice is not None and advice["reason"] == AdviceStatus.VALID.value:
-            aim = {"center_in_base_m": advice["target_in_base_m"], "std_m": 0.0}
-        return list_boreholes([] if seen is None else seen[2]["holes"], aim, RADIUS_M)
+        if advice is not None and advice.values["reason"] == AdviceStatus.VALID.value:
+            aim = {"center_in_base_m": advice.values["target_in_base_m"], "std_m": 0.0}
+        return list_boreholes([] if seen is None else seen.values["holes"], aim, RADIUS_M)
 
 
-class _Topic:
-    """Messages of a topic with their times as an array."""
+class _Found(NamedTuple):
+    """A message of a topic: its number from 0, its time, and its values, or the data of a picture."""
 
-    def __init__(self, rows: TopicMessages) -> None:
-        self.rows, self.t_s = rows, rows.series("t_s")
+    number: int
+    t_s: float
+    values: Any
 
-    def find(self, at_s: float) -> tuple[int, float, dict[str, Any]] | None:
-        """Return number, time and values of the last message at `at_s`, `None` before the first."""
+
+class _Series:
+    """Messages of a topic in order of time.
+
+    Args:
+        t_s: Times from which they count, `(T,)`.
+        rows: Time and values of each.
+    """
+
+    def __init__(self, t_s: np.ndarray, rows: Any) -> None:
+        self.t_s, self.rows = t_s, rows
+
+    def find(self, at_s: float) -> _Found | None:
+        """Return the last message at `at_s`, `None` before the first."""
         index = int(np.searchsorted(self.t_s, at_s, side="right")) - 1
-        return None if index < 0 else (index, *self.rows[index])
+        return None if index < 0 else _Found(index, *self.rows[index])
 
 
-class _View:
-    """Messages for viewers, likewise."""
-
-    def __init__(self, rows: list[tuple[float, bytes]]) -> None:
-        self._rows, self._t_s = rows, np.array([t_s for t_s, _ in rows])
-
-    def find(self, at_s: float) -> tuple[int, float, bytes | None]:
-        """Return number, time and data of the last message at `at_s`, `None` before the first."""
-        # Times come from whole nanoseconds of the wall clock; they are off by less than this.
-        index = int(np.searchsorted(self._t_s, at_s + CLOCK_S, side="right")) - 1
-        return (index, 0.0, None) if index < 0 else (index, *self._rows[index])
-
-
-def _list_marks(topics: dict[str, _Topic], begin_s: float) -> tuple[TimelineMark, ...]:
+def _list_marks(topics: dict[str, _Series], begin_s: float) -> tuple[TimelineMark, ...]:
     """Return the changes of the guard, and requests of the operator, in order of time."""
     found, before = [], None
     for t_s, values in topics["guard"].rows if "guard" in topics else ():
@@ -313,7 +309,3 @@ def _list_marks(topics: dict[str, _Topic], begin_s: float) -> tuple[TimelineMark
     # Where there are too many, alarms say most.
     found.sort(key=lambda mark: mark.kind != "alarm")
     return tuple(sorted(found[:MOST_MARKS], key=lambda mark: mark.t_s))
-
-
-def _drop_infinite(age_s: float) -> float | None:
-    return age_s if np.isfinite(age_s) else None

@@ -16,7 +16,6 @@ import numpy as np
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET
 from deploy.guidance import LeverDisplay, LeverGuidance
-from deploy.kernel.bus_process import TEXT
 from deploy.kernel.guard import GuardTrip
 from deploy.policy.bundle import PolicyBundle
 from deploy.runtime.operator_state import (
@@ -26,7 +25,7 @@ from deploy.runtime.operator_state import (
     RequestedCommand,
 )
 from deploy.runtime.process import CycleTimer, Stop
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.shm_layout import LoopMemory, log_text
 
 OBSERVATION_DECIMALS = 5
 """Decimals of the observation in the log, for `mode=doctor_policy`; its tolerance is 1e-3."""
@@ -266,9 +265,7 @@ class PolicyAdviser:
         # The request slot exists only where commands may be sent.
         if self._memory.request is not None:
             self._memory.request.write(self._build_request(status, u, now_s))
-        text = {
-            "topic": "advice",
-            "t_s": now_s,
+        values = {
             "reason": status.value,
             "u": u.round(5).tolist(),
             "lever_rad": np.round(shown.angles_rad, 5).tolist(),
@@ -277,4 +274,4 @@ class PolicyAdviser:
             "infer_s": round(infer_s, 6),
             "observation": self._observed.round(OBSERVATION_DECIMALS).tolist(),
         }
-        self._memory.policy_log.put(TEXT + json.dumps(text).encode())
+        log_text(self._memory.policy_log, "advice", now_s, values)

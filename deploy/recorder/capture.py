@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.kernel.protection import MessageFault
 from deploy.recorder.camera_topics import encode_frame
 from deploy.recorder.topics import TIME, TOPICS, TopicSchema, describe_bus_fields
-from deploy.runtime.perception_process import read_frame
+from deploy.runtime.perception_process import read_newer_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
@@ -207,22 +208,21 @@ class PictureSampler:
     """Takes pictures for the recording, at a limited rate.
 
     Args:
-        slot: The camera's newest frame; `None`: there is none.
+        slot: The camera's newest frame.
         rate_hz: Pictures a second; 0: none.
     """
 
-    def __init__(self, slot: Slot | None, rate_hz: float) -> None:
-        self._slot = slot if rate_hz > 0 else None
-        self._apart_s, self._taken, self._next_s = 1.0 / rate_hz if rate_hz else 0.0, 0, 0.0
+    def __init__(self, slot: Slot, rate_hz: float) -> None:
+        self._slot, self._apart_s = slot, EARLY / rate_hz if rate_hz else math.inf
+        self._taken_s, self._next_s = -math.inf, 0.0 if rate_hz else math.inf
 
     def due(self) -> Frame | None:
         """Return the newest frame, if one is due."""
         now_s = time.monotonic()
-        if self._slot is None or now_s < self._next_s or self._slot.number == self._taken:
-            return None
-        self._taken, self._next_s = self._slot.number, now_s + EARLY * self._apart_s
-        record = self._slot.read()
-        return None if record is None else read_frame(record)
+        frame = read_newer_frame(self._slot, self._taken_s) if now_s >= self._next_s else None
+        if frame is not None:
+            self._taken_s, self._next_s = frame.t_s, now_s + self._apart_s
+        return frame
 
 
 def _iterate_frames(data: bytes) -> Iterator[tuple[float, int, bool, bytes]]:

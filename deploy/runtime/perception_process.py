@@ -6,7 +6,6 @@ grows old.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -30,11 +29,10 @@ from brokk_rl.contracts.vision import (
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
-from deploy.kernel.bus_process import TEXT
 from deploy.picture import shrink_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
-from deploy.runtime.shm_layout import HOLE, MOST_HOLES, LoopMemory
+from deploy.runtime.shm_layout import HOLE, MOST_HOLES, LoopMemory, log_text
 from deploy.runtime.target import NEAR_M, read_holes
 
 log = logging.getLogger(__name__)
@@ -89,7 +87,6 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
     Raises:
         FrameError: there is no such camera.
     """
-    assert memory.frame is not None
     finder = camera.finder.build() if camera.finder else None
     tracker, complained_s = camera.tracker.build(), -math.inf
     tracked: Sequence[TrackedHole] = ()
@@ -115,8 +112,8 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
             if finder is not None and frame.base_from_camera is not None:
                 tracked = tracker.update(_find_holes(finder, frame), now_s)
                 write_holes(memory.holes, tracked, now_s)
-                text = {"topic": "holes", "t_s": now_s, "holes": _list_holes(memory.holes)}
-                memory.vision_log.put(TEXT + json.dumps(text).encode())
+                known = {"holes": _list_holes(memory.holes)}
+                log_text(memory.vision_log, "holes", now_s, known)
             time.sleep(max(0.0, began_s + 1.0 / camera.rate_hz - time.monotonic()))
 
 
@@ -135,8 +132,7 @@ def point_camera(
     if view is None:
         return
     memory.view.write(view)
-    text = {"topic": "view", "t_s": t_s, **vars(view)}
-    memory.vision_log.put(TEXT + json.dumps(text).encode())
+    log_text(memory.vision_log, "view", t_s, vars(view))
 
 
 def _find_holes(finder: BoreholeFinder, frame: Frame) -> Sequence[HolePose]:
@@ -197,3 +193,13 @@ def read_frame(record: Any) -> Frame:
         base_from_camera=pose if np.isfinite(pose).all() else None,
         t_s=float(record["t_s"]),
     )
+
+
+def read_newer_frame(slot: Slot, after_s: float) -> Frame | None:
+    """Return the newest frame if it is later than `after_s`, else `None`."""
+    # The time alone is read first: copying a picture that has not changed would cost milliseconds.
+    taken_s = slot.peek("t_s")
+    if taken_s is None or taken_s <= after_s:
+        return None
+    record = slot.read()
+    return None if record is None else read_frame(record)

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -28,6 +30,8 @@ REQUEST_BYTES = 1 << 12
 """Size of the pipe for the page's requests, which the supervisor takes 50 times a second. Chosen by hand."""
 REPORT_BYTES = 1 << 16
 """Size of the pipe for the processes' reports on their timing, one each. Chosen by hand."""
+TEXT = b"J"
+"""First byte of a text in a pipe to the log."""
 MOST_HOLES = 8
 """Boreholes that perception hands on, the surest first. Chosen by hand."""
 
@@ -81,7 +85,7 @@ class LoopMemory:
         target: The borehole.
         controls: From the operator's side.
         page: From the page, straight to the bus process.
-        frame: Newest frame of the camera; `None` without one.
+        frame: Newest frame of the camera.
         holes: Boreholes that perception knows.
         view: Where a moving camera looks.
         bus_log: From the bus process to the log.
@@ -99,7 +103,7 @@ class LoopMemory:
         self.target = Slot("target", TARGET)
         self.controls = RecordSlot("controls", OperatorControls, num_joints)
         self.page = RecordSlot("page", PageSignal, num_joints)
-        self.frame = Slot("frame", build_frame_fields(frame_px)) if frame_px else None
+        self.frame = Slot("frame", build_frame_fields(frame_px))
         self.holes = Slot("holes", HOLES)
         self.view = RecordSlot("view", CameraView, num_joints)
         self.bus_log = Pipe("bus_log", LOG_BYTES)
@@ -130,6 +134,11 @@ class LoopMemory:
         for part in vars(self).values():
             if part is not None:
                 part.memory.close()
+
+
+def log_text(pipe: Pipe, topic: str, t_s: float, values: Mapping[str, object]) -> None:
+    """Put a decision into a pipe to the log, as a JSON text with topic and time."""
+    pipe.put(TEXT + json.dumps({"topic": topic, "t_s": t_s, **values}).encode())
 
 
 def measure_wall_offset_ns() -> int:

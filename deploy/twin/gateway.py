@@ -19,7 +19,7 @@ import numpy as np
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import COUNTER, LEVER_AXES, STAMP, BusDescription
-from deploy.guidance import AXES, LeverMap, find_full_angles_rad
+from deploy.guidance import AXES, LeverMap
 from deploy.kernel.protection import ChannelTrust, MessageFault
 
 TIMEOUT_S = 0.07
@@ -76,7 +76,6 @@ class Gateway:
             self._channels[layout.name] = layout.open_channel()
         self._most_s = {self._command.name: ROUND_TRIP_S, self._remote.name: REMOTE_S}
         self._map = LeverMap(machine)
-        self._axis_full_rad = find_full_angles_rad(machine)
         self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0
         self._lever, self._remote_s = np.zeros(len(AXES)), -np.inf
         self._button = self._deadman = self._on = False
@@ -128,7 +127,7 @@ class Gateway:
             return nothing, NOBODY, GatewayState.STOPPED
         if np.abs(self._lever).max() > NEUTRAL:
             self._idle = 0
-            flow = self._map.command(self._lever * self._axis_full_rad, self._button)
+            flow = self._map.command(self._lever * self._map.axis_full_rad, self._button)
             return flow, LEVERS, GatewayState.LEVERS
         if now_s - self._u_s > TIMEOUT_S or not self._trusts(self._command.name):
             return nothing, NOBODY, GatewayState.TIMEOUT

@@ -18,7 +18,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import Index, spec
 from deploy.bus.can_bus import CanBus, CanFrame, OpenCanBus
 from deploy.bus.description import LEVER_AXES, STAMP, BusDescription
-from deploy.guidance import AXES, LeverMap, find_full_angles_rad
+from deploy.guidance import AXES, LeverMap
 from deploy.kernel.protection import MessageFault
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -49,7 +49,6 @@ class RadioRemote:
 
     def __init__(self, description: BusDescription, machine: Machine) -> None:
         self.machine, self.map = machine, LeverMap(machine)
-        self._full_rad = find_full_angles_rad(machine)
         self._description = description
         self._layout = description.layouts[description.message_of("DeadMan")]
         self.period_s = self._layout.period_s
@@ -68,7 +67,7 @@ class RadioRemote:
     def move_levers(self, u: np.ndarray) -> None:
         """Move the levers to where they stand for commands, `(J,)`; press the button with them."""
         angles_rad, self.button_right = self.map.levers(u)
-        self.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
+        self.levers = (angles_rad / self.map.axis_full_rad).clip(-1.0, 1.0).tolist()
 
     def hear(self, frame: CanFrame) -> None:
         """Take the gateway's clock from its status; other frames are ignored."""

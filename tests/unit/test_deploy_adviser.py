@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 from composed import option
 
-from deploy.kernel.bus_process import TEXT
 from deploy.kernel.guard import GuardTrip
 from deploy.policy import policy_process
 from deploy.policy.policy_process import PolicyAdviser, PolicyHistory, PolicyProcessConfig
 from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.shared_memory import RecordLayout
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.shm_layout import TEXT, LoopMemory
 
 MACHINE = option("machine", "brokk170")
 NUM_JOINTS, NUM_HISTORY = MACHINE.num_joints, MACHINE.num_history

@@ -23,7 +23,7 @@ from deploy.kernel.guard import NOTHING_OBSERVED, GuardDecision, GuardState, Gua
 from deploy.kernel.protection import MessageFault
 from deploy.kernel.target_check import SeenTarget
 from deploy.runtime.operator_state import OperatorControls, PageSignal, RequestedCommand
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.shm_layout import TEXT, LoopMemory
 
 MACHINE, LIMITS = option("machine", "brokk170"), option("guard", "default")
 STILL = GuardDecision(GuardState.READY, (0.0,) * 5, GuardTrip.DEADMAN, GuardTrip.NONE)
@@ -135,7 +135,7 @@ class Rig:
         frames, texts = [], []
         for entry in self.memory.bus_log.take():
             kind, data = entry[:1], entry[1:]
-            if kind == bus_process.TEXT:
+            if kind == TEXT:
                 texts.append(json.loads(data))
                 continue
             while data:

@@ -304,4 +304,3 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(
     )
     assert picture is not None and np.abs(picture[..., ::-1].astype(int) - FRAME.color).mean() < 6
     assert PictureSampler(exchange.frame, 0.0).due() is None
-    assert PictureSampler(None, 2.0).due() is None

@@ -22,10 +22,11 @@ from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
-from deploy.kernel.bus_process import FRAME, FRAMES, TEXT
+from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.recorder import capture_reader
 from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.conversion import CaptureLogReader
+from deploy.runtime.shm_layout import TEXT
 
 READER = CaptureLogReader(longest_gap_s=0.15, shortest_s=1.0)
 

@@ -18,11 +18,12 @@ from mcap.reader import make_reader
 
 from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
-from deploy.kernel.bus_process import FRAME, FRAMES, TEXT
+from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.page.replay import ReplayFeed
 from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.capture_reader import read_capture
 from deploy.recorder.topics import TOPICS, TopicSchema
+from deploy.runtime.shm_layout import TEXT
 
 BEGIN_S = 700.0
 Q = [0.3, -0.8, 0.6, 1.0, 0.4]

@@ -15,12 +15,11 @@ from composed import option
 
 from brokk_rl.session import Session
 from deploy.guidance import LeverPositions
-from deploy.kernel.bus_process import TEXT
 from deploy.kernel.guard import GuardState
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.protocol import OperatorRequest
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.shm_layout import TEXT, LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")

@@ -18,12 +18,13 @@ from websockets.asyncio.client import connect
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
-from deploy.kernel.bus_process import FRAME, FRAMES, TEXT
+from deploy.kernel.bus_process import FRAME, FRAMES
 from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.protocol import OperatorRequest
 from deploy.page.replay import CaptureReplay, ReplayFeed
 from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.capture_reader import read_capture
+from deploy.runtime.shm_layout import TEXT
 
 BEGIN_S = 500.0
 CENTER_M = [2.6, 0.1, 0.75]
