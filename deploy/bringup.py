@@ -163,13 +163,6 @@ class BringupChecklist(BusAndPolicySettings):
         return BringupResult("bus", passed, text, {"messages": values, "refused": refused})
 
 
-@dataclass(frozen=True)
-class _Sample:
-    t_s: float
-    q: np.ndarray
-    flow: np.ndarray
-
-
 class _StateChecks:
     """The checks of the machine's state."""
 
@@ -182,7 +175,7 @@ class _StateChecks:
     ) -> None:
         self._checklist, self._machine, self._group, self._say = checklist, machine, group, say
         self._memory = group.memory
-        self._samples: list[_Sample] = []
+        self._samples: list[OperatorState] = []
         # By number of the joint, from 1.
         self._flow_faults: dict[int, GuardTrip] = {}
 
@@ -339,7 +332,7 @@ class _StateChecks:
             state = self._memory.state.read()
             # The state is read faster than it changes; doubles would bias the noise to zero.
             if state is not None and (not self._samples or state.t_s > self._samples[-1].t_s):
-                self._samples.append(_Sample(state.t_s, state.q, state.flow))
+                self._samples.append(state)
                 if state.trip in FLOW_FAULTS:
                     self._flow_faults[state.observed_joint] = state.trip
             time.sleep(POLL_S)

@@ -41,18 +41,17 @@ class ValvePush:
     Attributes:
         joint: Number of the valve's joint.
         sign: Sign of its flow.
-        moved: Number of the joint that moved most, by its travel.
-        others: Numbers of further joints that moved half as much or more.
-        agrees: Whether the moved joint went in the direction of the flow.
+        moves: Numbers of the joint that moved most, by its travel, and of those that moved half as
+            much or more.
+        agrees: Whether the joint that moved most went in the direction of the flow.
         dead_time_s: From the beginning of flow to the first motion.
-        speed: Largest speed of the moved joint, rad/s or m/s.
+        speed: Its largest speed, rad/s or m/s.
         ratio: This speed over the one that the flow gives by the machine's file.
     """
 
     joint: int
     sign: int
-    moved: int
-    others: tuple[int, ...]
+    moves: tuple[int, ...]
     agrees: bool
     dead_time_s: float
     speed: float
@@ -127,43 +126,50 @@ def find_pushes(
         if end == len(t_s) or len(driven) != 1 or is_moving.any():
             continue
         ways = np.abs(q[row:end] - q[row]).max(0) / travel
-        moved = int(ways.argmax())
-        if ways[moved] > MOVED:
-            others = np.flatnonzero((ways > MOVED) & (ways > ways[moved] / 2)).tolist()
-            others.remove(moved)
-            rows = slice(row, end)
-            joint = int(driven[0])
-            one = t_s[rows], q[rows, moved], flow[rows, joint]
-            pushes.append(_measure_push(joint, moved, tuple(others), *one, machine))
+        moves = np.flatnonzero((ways > MOVED) & (ways > ways.max() / 2))
+        if len(moves):
+            first = int(ways.argmax())
+            one = t_s[row:end], q[row:end, first], flow[row:end, driven[0]]
+            full_speed, least = float(machine.max_speed[first]), MOVED * float(travel[first])
+            push = _measure_push(int(driven[0]), tuple(moves.tolist()), *one, full_speed, least)
+            pushes.append(push)
     return pushes
 
 
 def _measure_push(
     joint: int,
-    moved: int,
-    others: tuple[int, ...],
+    moves: tuple[int, ...],
     t_s: np.ndarray,
     q: np.ndarray,
     flow: np.ndarray,
-    machine: Machine,
+    full_speed: float,
+    least: float,
 ) -> ValvePush:
-    """Return a push from the positions of the joint that moved and the flow of the driven valve."""
+    """Return a push from the positions of the joint that moved most and the flow of the driven valve.
+
+    Args:
+        joint: Of the driven valve.
+        moves: Joints that moved.
+        t_s: Times, `(T,)`.
+        q: Positions, `(T,)`.
+        flow: Flow of the valve, `(T,)`.
+        full_speed: Of the joint by the machine's file.
+        least: Way that counts as motion.
+    """
     way = q - q[0]
-    first = int(np.argmax(np.abs(way) > MOVED * (machine.upper - machine.lower)[moved]))
+    first = int(np.argmax(np.abs(way) > least))
     sign = int(np.sign(flow[0]))
     # Differences over a longer step: noise over one sample would look like speed.
     step = max(1, round(SPEED_S / max(1e-3, float(np.median(np.diff(t_s))))))
     speed = float((np.abs(q[step:] - q[:-step]) / (t_s[step:] - t_s[:-step])).max(initial=0.0))
-    full = float(np.abs(flow).max()) * float(machine.max_speed[moved])
     return ValvePush(
         joint=joint,
         sign=sign,
-        moved=moved,
-        others=others,
+        moves=moves,
         agrees=bool(np.sign(way[first]) == sign),
         dead_time_s=_estimate_onset_s(t_s, way, first) - float(t_s[0]),
         speed=speed,
-        ratio=speed / full,
+        ratio=speed / (float(np.abs(flow).max()) * full_speed),
     )
 
 
@@ -179,7 +185,7 @@ def describe_joint(
         return None
     moved: Counter[int] = Counter()
     for one in own:
-        moved.update((one.moved, *one.others))
+        moved.update(one.moves)
     # A joint that moved once among many was moved by somebody else.
     steady = [number for number, count in moved.items() if 2 * count > len(own)]
     return JointResponse(

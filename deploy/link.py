@@ -193,15 +193,7 @@ class CanLink:
 
     def _arm(self) -> None:
         now_s = time.monotonic()
-        armed = OperatorControls(
-            t_s=now_s,
-            armed=True,
-            armed_t_s=now_s,
-            recording=False,
-            recording_t_s=0.0,
-            recording_failed=False,
-        )
-        self._opened().controls.write(armed)
+        self._opened().controls.write(OperatorControls(now_s, armed=True, armed_t_s=now_s))
 
     def _average_growth(self, wanted: np.ndarray) -> np.ndarray:
         """Return the mean over a period of commands that grow towards `wanted`, `(J,)`.

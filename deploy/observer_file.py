@@ -44,13 +44,6 @@ class AlarmCounts:
     num_runs: int = 0
     faults: Counter[str] = field(default_factory=Counter)
 
-    def note(self, observer: Observer, machine: Machine) -> None:
-        """Take in what an observer found in one period, and clear its fault."""
-        found = observer.observation
-        if found.joint >= 0:
-            self.faults[f"{machine.joint_names[found.joint]} {found.fault.value}"] += 1
-            observer.clear()
-
     @property
     def faults_a_shift(self) -> float:
         """Alarms extrapolated to a shift."""
@@ -175,7 +168,10 @@ def count_alarms(
             observer.forget()
             counts.seconds += part.duration_s
             for _ in _replay(observer, part, machine):
-                counts.note(observer, machine)
+                found = observer.observation
+                if found.joint >= 0:
+                    counts.faults[f"{machine.joint_names[found.joint]} {found.fault.value}"] += 1
+                    observer.clear()
         counts.num_runs += 1
     return counts
 

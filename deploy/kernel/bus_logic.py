@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,14 +22,12 @@ from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import STAMP, BusDescription
 from deploy.kernel.guard import (
-    CommandEnvelope,
     CommandRequest,
     Guard,
     GuardDecision,
     GuardInput,
     GuardState,
     GuardTrip,
-    Observation,
 )
 from deploy.kernel.limits import GuardLimits
 from deploy.kernel.protection import MessageFault
@@ -41,6 +39,11 @@ from deploy.runtime.operator_state import (
     PageSignal,
     RequestedCommand,
 )
+
+# They are handed in.
+if TYPE_CHECKING:
+    from deploy.checks.envelope import Envelope
+    from deploy.checks.observer import Observer
 
 CYCLE_S = 0.01
 """Half the cycle time of valve commands in the example DBC (20 ms)."""
@@ -74,28 +77,6 @@ class BusInputs:
     target: SeenTarget | None
 
 
-class MotionObserver(Protocol):
-    """A check of the joints' motion, beside the guard; see `deploy.checks.observer`."""
-
-    @property
-    def observation(self) -> Observation:
-        """The newest result."""
-        ...
-
-    def is_due(self, now_s: float) -> bool:
-        """Return whether a control period has gone by since the last update."""
-        ...
-
-    def update(self, now_s: float, q: np.ndarray, u: np.ndarray, may_touch: bool) -> None:
-        """Take in a control period: positions at its end, mean flow, whether contact may hold the arm."""
-
-    def forget(self) -> None:
-        """Begin anew: positions are missing or not plausible."""
-
-    def clear(self) -> None:
-        """Take back the named fault."""
-
-
 class BusLogic:
     """Decisions of one bus cycle: frames to send and the state to publish.
 
@@ -118,8 +99,8 @@ class BusLogic:
         description: BusDescription,
         machine: Machine,
         limits: GuardLimits,
-        envelope: CommandEnvelope | None,
-        observer: MotionObserver | None,
+        envelope: Envelope | None,
+        observer: Observer | None,
         commands: bool,
         needs_page: bool,
     ) -> None:
@@ -210,7 +191,7 @@ class BusLogic:
         u, age_s = tuple(requested.u.tolist()), now_s - requested.t_s
         return CommandRequest(u, age_s, self._target, faces_m, is_seen)
 
-    def _observe(self, observer: MotionObserver, now_s: float, target: SeenTarget | None) -> None:
+    def _observe(self, observer: Observer, now_s: float, target: SeenTarget | None) -> None:
         """Let the observer compare the last control period with its model, where one is over."""
         known = self.receiver
         # An armed operator clears a fault by the dead-man. Who only listens has to be told for a while.

@@ -27,10 +27,14 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from deploy.kernel.limits import GuardLimits, JointBounds, Numbers
 from deploy.kernel.under_way import CommandsUnderWay
+
+# It is handed in: the guard itself needs no numpy.
+if TYPE_CHECKING:
+    from deploy.checks.envelope import Envelope
 
 
 class GuardState(Enum):
@@ -201,21 +205,6 @@ class GuardDecision:
         return self.state.sends
 
 
-class CommandEnvelope(Protocol):
-    """A check of commands by the place of the arm, beside the guard; see `deploy.checks.envelope`."""
-
-    def limit_command(
-        self,
-        u: Numbers,
-        q: Numbers,
-        under_way_s: Numbers,
-        faces_in_base_m: tuple[Numbers, ...] | None,
-        is_seen: bool,
-    ) -> tuple[Numbers, bool]:
-        """Return the command within the envelope, and whether it was withheld."""
-        ...
-
-
 class Guard:
     """State machine that passes, limits or withholds each requested command.
 
@@ -225,9 +214,7 @@ class Guard:
         envelope: Of the arm; `None`: there is none.
     """
 
-    def __init__(
-        self, limits: GuardLimits, bounds: JointBounds, envelope: CommandEnvelope | None
-    ) -> None:
+    def __init__(self, limits: GuardLimits, bounds: JointBounds, envelope: Envelope | None) -> None:
         self._limits, self._bounds, self._envelope = limits, bounds, envelope
         self._still = (0.0,) * len(bounds.lower)
         self._state, self._cause = GuardState.SILENT, GuardTrip.NONE

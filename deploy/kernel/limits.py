@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -200,7 +199,7 @@ class GuardLimits:
 
 @dataclass(frozen=True)
 class JointBounds:
-    """Bounds of the machine's joints, each of length `J`.
+    """Bounds of the machine's joints, each of length `J`, in plain numbers: the guard knows no numpy.
 
     Attributes:
         lower: Lower joint limits, rad or m.
@@ -215,21 +214,3 @@ class JointBounds:
     max_speed: Numbers
     exclusive: tuple[bool, ...]
     dead_time_s: float
-
-
-def build_joint_bounds(
-    lower: Sequence[float],
-    upper: Sequence[float],
-    max_speed: Sequence[float],
-    exclusive: Sequence[bool],
-    dead_time_s: float,
-) -> JointBounds:
-    """Return the bounds of the joints, from arrays of length `J`."""
-    return JointBounds(
-        # Plain floats, since the guard must not depend on numpy.
-        tuple(map(float, lower)),
-        tuple(map(float, upper)),
-        tuple(map(float, max_speed)),
-        tuple(map(bool, exclusive)),
-        dead_time_s,
-    )

@@ -27,7 +27,7 @@ from deploy.guidance import LeverMap
 from deploy.kernel.clock import GatewayClock
 from deploy.kernel.flow_check import FROM_PC, FlowCheck
 from deploy.kernel.guard import NOTHING_OBSERVED, GuardDecision, GuardInput, GuardTrip, Observation
-from deploy.kernel.limits import GuardLimits, build_joint_bounds
+from deploy.kernel.limits import GuardLimits, JointBounds
 from deploy.kernel.plausibility import PlausibilityFilter
 from deploy.kernel.protection import ChannelTrust, MessageFault, ProtectedChannel
 from deploy.runtime.operator_state import OperatorState
@@ -69,11 +69,11 @@ class BusReceiver:
         # A gateway that does not measure it reports none.
         self.round_trip_s = math.inf if described.has_signal("RoundTrip") else 0.0
         self._needed = described.list_needed() & set(self.channels)
-        self.bounds = build_joint_bounds(
-            machine.lower.tolist(),
-            machine.upper.tolist(),
-            machine.max_speed.tolist(),
-            machine.is_exclusive.tolist(),
+        self.bounds = JointBounds(
+            tuple(machine.lower.tolist()),
+            tuple(machine.upper.tolist()),
+            tuple(machine.max_speed.tolist()),
+            tuple(machine.is_exclusive.tolist()),
             machine.dead_time_s,
         )
         self.flow_check = FlowCheck(self.limits.flow, machine.num_joints, self.limits.round_trip_s)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from rich.console import Console
 
 from brokk_rl.errors import LinkError
@@ -27,11 +29,7 @@ class BringupMode:
         Raises:
             LinkError: nothing is heard from the machine, or a check has failed.
         """
-        console = Console()
-
-        def say(text: str) -> None:
-            console.print(text, highlight=False)
-
+        say = partial(Console().print, highlight=False)
         companions = self.bench.companions(self.machine, self.session) if self.bench else ()
         results = self.bringup.run(self.machine, self.session, say, companions)
         failed = [one.check for one in results if not one.passed]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 from rich.console import Console
@@ -30,14 +31,13 @@ class PageMode:
         Raises:
             LinkError: the address is taken.
         """
-        end_s = None if self.seconds is None else time.monotonic() + self.seconds
+        end_s = time.monotonic() + (self.seconds or math.inf)
         console = Console(stderr=True)
-
-        def stop() -> bool:
-            return end_s is not None and time.monotonic() > end_s
 
         def show(link: str) -> None:
             console.print(f"operator's page: {link}", soft_wrap=True, highlight=False)
 
         feed = self.feed.build(self.machine)
-        serve_page(self.page, stop, self.machine, feed, self.session, show)
+        serve_page(
+            self.page, lambda: time.monotonic() > end_s, self.machine, feed, self.session, show
+        )

@@ -10,7 +10,7 @@ from brokk_rl.contracts.link import Connection
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.twin.twin import Twin
+from deploy.twin.twin import Twin, run
 
 
 @spec
@@ -38,4 +38,4 @@ class TwinMode:
             highlight=False,
         )
         with contextlib.suppress(KeyboardInterrupt):
-            twin.run(lambda: False, self.machine, self.link, self.session)
+            run(lambda: False, twin, self.machine, self.link, self.session)

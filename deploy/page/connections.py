@@ -50,26 +50,25 @@ class SendWindow:
     """Keeps a page from having more than `limit` messages that it has not drawn."""
 
     def __init__(self, limit: int) -> None:
-        self._limit, self._undrawn, self._free = limit, list[int](), asyncio.Event()
-        self._free.set()
+        self._limit, self._num_sent, self._num_drawn = limit, 0, 0
+        self._changed = asyncio.Event()
 
     def note_sent(self, number: int) -> None:
         """Note that message `number` went out."""
-        self._undrawn.append(number)
-        if len(self._undrawn) >= self._limit:
-            self._free.clear()
+        self._num_sent = number
 
     def note_drawn(self, number: int) -> None:
         """Note that message `number` was drawn; those before it are of no use any more."""
         # A page draws the newest message and skips older ones, so a later number answers for all
         # before it.
-        self._undrawn = [one for one in self._undrawn if one > number]
-        if len(self._undrawn) < self._limit:
-            self._free.set()
+        self._num_drawn = max(self._num_drawn, min(number, self._num_sent))
+        self._changed.set()
 
     async def wait(self) -> None:
         """Wait until another message may go out."""
-        await self._free.wait()
+        while self._num_sent - self._num_drawn >= self._limit:
+            self._changed.clear()
+            await self._changed.wait()
 
 
 class Places(Generic[C]):

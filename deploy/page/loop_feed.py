@@ -326,28 +326,23 @@ def list_boreholes(
     # The target may be perception's own or one from a file; the nearest known hole is shown as
     # chosen.
     chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
+    shown = list(holes)
+    if aim is not None and chosen is None:
+        chosen = {"name": None, "axis_in_base": UP, "radius_m": radius_m, "score": None}
+        # 0 stands for "not known".
+        std_m = float(aim["std_m"]) or None
+        chosen |= {"center_in_base_m": aim["center_in_base_m"], "std_m": std_m}
+        shown.append(chosen)
     found = []
-    for hole in holes:
+    for hole in shown:
         choice = BoreholeChoice(
-            name=str(int(hole["name"])),
+            name=UNNAMED if hole["name"] is None else str(int(hole["name"])),
             center_in_base_m=to_vector(hole["center_in_base_m"]),
             axis_in_base=to_vector(hole["axis_in_base"]),
             radius_m=float(hole["radius_m"]),
-            std_m=float(hole["std_m"]),
-            confidence=float(hole["score"]),
+            std_m=hole["std_m"],
+            confidence=hole["score"],
             chosen=hole is chosen,
-        )
-        found.append(choice)
-    if aim is not None and chosen is None:
-        choice = BoreholeChoice(
-            name=UNNAMED,
-            center_in_base_m=to_vector(aim["center_in_base_m"]),
-            axis_in_base=UP,
-            radius_m=radius_m,
-            # 0 stands for "not known".
-            std_m=float(aim["std_m"]) or None,
-            confidence=None,
-            chosen=True,
         )
         found.append(choice)
     return tuple(found)

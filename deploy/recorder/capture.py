@@ -124,7 +124,6 @@ class CaptureWriter:
         )
         self._schemas: dict[str, TopicSchema] = {}
         self._channels: dict[str, int] = {}
-        self._sequence: dict[str, int] = {}
         self._flushed_s = time.monotonic()
 
     def add(self, data: bytes) -> None:
@@ -198,10 +197,8 @@ class CaptureWriter:
         if topic not in self._channels:
             number = self._mcap.register_schema(schema, "protobuf", schema_data)
             self._channels[topic] = self._mcap.register_channel(topic, "protobuf", number)
-            self._sequence[topic] = 0
-        self._sequence[topic] += 1
         wall_ns = int(t_s * 1e9) + self._offset_ns
-        self._mcap.add_message(self._channels[topic], wall_ns, data, wall_ns, self._sequence[topic])
+        self._mcap.add_message(self._channels[topic], wall_ns, data, wall_ns)
 
 
 class PictureSampler:

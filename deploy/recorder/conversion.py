@@ -8,7 +8,6 @@ metadata `run`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -49,7 +48,7 @@ class CaptureLogReader:
             RecordingError: it cannot be read, was made on another machine, or holds no piece that
                 is long enough.
         """
-        signals, found = _read_signals(path, machine), []
+        signals, found = _Signals(path, machine), []
         for begin_s, end_s in signals.split(self.longest_gap_s):
             if end_s - begin_s >= max(self.shortest_s, 2 * machine.period_s):
                 found.append(signals.cut(begin_s, end_s))
@@ -66,7 +65,7 @@ class CaptureLogReader:
         Raises:
             RecordingError: it cannot be read, was made on another machine, or has a gap there.
         """
-        signals = _read_signals(path, machine)
+        signals = _Signals(path, machine)
         for first_s, last_s in signals.split(self.longest_gap_s):
             # The ends may be off by less than a gap, since messages do not fall on them.
             if first_s <= begin_s + self.longest_gap_s and last_s >= end_s - self.longest_gap_s:
@@ -76,15 +75,16 @@ class CaptureLogReader:
         )
 
 
-@dataclass(frozen=True)
 class _Signals:
     """Positions and valve feedback of a capture, by joint."""
 
-    contents: CaptureContents
-    q: dict[str, Series]
-    flow: dict[str, Series]
-    path: Path
-    machine: Machine
+    def __init__(self, path: Path, machine: Machine) -> None:
+        self.contents = contents = capture_reader.read_capture(path)
+        contents.check_machine(machine, path)
+        self.path, self.machine = path, machine
+        names = machine.joint_names
+        self.q = {name: _find_series(contents, f"Position_{name}", path) for name in names}
+        self.flow = {name: _find_series(contents, f"Flow_{name}", path) for name in names}
 
     def split(self, longest_gap_s: float) -> list[tuple[float, float]]:
         """Return begin and end of the pieces; a gap in one joint ends the piece for all."""
@@ -128,15 +128,6 @@ class _Signals:
             metadata=metadata,
             path=None,
         )
-
-
-def _read_signals(path: Path, machine: Machine) -> _Signals:
-    contents = capture_reader.read_capture(path)
-    contents.check_machine(machine, path)
-    names = machine.joint_names
-    q = {name: _find_series(contents, f"Position_{name}", path) for name in names}
-    flow = {name: _find_series(contents, f"Flow_{name}", path) for name in names}
-    return _Signals(contents, q, flow, path, machine)
 
 
 def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:

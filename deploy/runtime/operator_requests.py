@@ -8,14 +8,16 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from brokk_rl.errors import ConfigError
+from deploy.recorder.capture import CaptureConfig
 from deploy.runtime.operator_state import OperatorControls
 from deploy.runtime.process import ChildProcess
+from deploy.runtime.process_group import ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import TargetPosition, TargetSelector
 
@@ -29,9 +31,9 @@ class RecordingControl:
     counts as lost.
 
     Args:
-        memory: With the pipes.
-        folder: Of the first recording; the next ones go into `recording_2`, … in it.
-        start: Starts a log process that writes into a folder.
+        group: The processes of the run.
+        capture: Settings; the first recording goes into its folder, the next ones into
+            `recording_2`, … in it.
 
     Attributes:
         wanted: Whether a recording is to be running.
@@ -40,12 +42,10 @@ class RecordingControl:
         failed: Whether the last recording has ended unasked.
     """
 
-    def __init__(
-        self, memory: LoopMemory, folder: Path, start: Callable[[Path], ChildProcess]
-    ) -> None:
-        self._memory, self._folder, self._start = memory, folder, start
+    def __init__(self, group: ProcessGroup, capture: CaptureConfig) -> None:
+        self._group, self._capture = group, capture
         self._child: ChildProcess | None = None
-        self._asked_to_stop, self._number = False, 0
+        self._number = 0
         # Set by the supervisor and by requests; `refresh` acts on it.
         self.wanted = False
         self.next_folder: Path | None = None
@@ -54,46 +54,28 @@ class RecordingControl:
     @property
     def recording(self) -> bool:
         """True while a log process is writing."""
-        return self._child is not None and not self._asked_to_stop
-
-    @property
-    def pids(self) -> dict[str, int]:
-        """Process id of the log process by its name, empty without one."""
-        return {} if self._child is None else {"log": self._child.pid}
+        return self._child is not None and not self._child.asked_to_stop
 
     def refresh(self) -> None:
-        """Start or end the log process as wanted.
-
-        One that died raises an alarm and is not started again by itself.
-        """
+        """Start or end the log process as wanted."""
         child = self._child
         if child is not None and child.code is not None:
-            # An exit that was not asked for loses data, and the operator must know.
-            if not self._asked_to_stop:
-                log.error(
-                    "ALARM: the log has died (exit code %s); nothing is recorded any more",
-                    child.code,
-                )
-                # Otherwise it would be started again and hide the fault.
+            # One that died is not started again by itself: that would hide the fault, and the group
+            # raises the alarm.
+            if not child.asked_to_stop:
                 self.wanted, self.failed = False, True
             self._child = child = None
         if child is None and self.wanted:
-            folder = self._choose_folder()
-            self._child, self._asked_to_stop = self._start(folder), False
+            capture = replace(self._capture, folder=self._choose_folder())
+            self._child = self._group.start("log", "deploy.recorder.capture:run", (capture,))
             self.since_s, self.failed = time.monotonic(), False
-        elif child is not None and not self.wanted and not self._asked_to_stop:
+        elif child is not None and not self.wanted and not child.asked_to_stop:
             child.ask_to_stop()
-            self._asked_to_stop = True
         # The pipes fill while nothing is recorded; their writers would count losses.
         elif child is None:
-            for pipe in self._memory.logs:
+            for pipe in self._group.memory.logs:
                 for _ in pipe.take():
                     pass
-
-    def end(self, patience_s: float) -> None:
-        """End it, once no process writes into the pipes any more."""
-        if self._child is not None:
-            self._child.end(patience_s)
 
     def _choose_folder(self) -> Path:
         # Numbered from 1: the first recording has the run folder itself.
@@ -101,7 +83,8 @@ class RecordingControl:
         chosen, self.next_folder = self.next_folder, None
         if chosen is not None:
             return chosen
-        return self._folder if self._number == 1 else self._folder / f"recording_{self._number}"
+        folder = self._capture.folder
+        return folder if self._number == 1 else folder / f"recording_{self._number}"
 
 
 class RequestHandler:

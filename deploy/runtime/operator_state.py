@@ -177,9 +177,9 @@ class OperatorControls:
     t_s: float
     armed: bool
     armed_t_s: float
-    recording: bool
-    recording_t_s: float
-    recording_failed: bool
+    recording: bool = False
+    recording_t_s: float = 0.0
+    recording_failed: bool = False
 
 
 @dataclass(frozen=True)

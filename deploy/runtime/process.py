@@ -52,6 +52,9 @@ class ChildProcess:
         arguments: Anything that can be pickled.
         files: File descriptors that it inherits.
         realtime: Priority of SCHED_FIFO to ask for, 1 to 99; `None` for an ordinary process.
+
+    Attributes:
+        asked_to_stop: Whether it is to end.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class ChildProcess:
         files: Sequence[int],
         realtime: int | None = None,
     ) -> None:
-        self.name = name
+        self.name, self.asked_to_stop = name, False
         command = [sys.executable, "-P", "-c", ENTRY]
         # libraries of numbers would start threads that compete with the loop
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -87,6 +90,7 @@ class ChildProcess:
 
     def ask_to_stop(self) -> None:
         """Ask it to end."""
+        self.asked_to_stop = True
         with contextlib.suppress(ProcessLookupError):
             self._process.terminate()
 

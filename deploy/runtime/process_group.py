@@ -35,6 +35,7 @@ OPTIONAL = {
     "page": "nothing is shown any more, and where commands are sent they end",
     "camera": "nothing new is seen any more",
     "video": "the page shows no video any more",
+    "log": "nothing is recorded any more",
 }
 """Processes without which the loop goes on, and the loss that the alarm names."""
 END_ORDER = {"policy": 0, "bus": 1, "log": 3}
@@ -65,14 +66,16 @@ class ProcessGroup:
 
     def start(
         self, name: str, target: str, arguments: tuple[Any, ...], priority: int | None = None
-    ) -> None:
+    ) -> ChildProcess:
         """Start `target` (`module:function`), called as `function(stop, *arguments, memory)`."""
         realtime = priority if self.realtime else None
         arguments = (*arguments, self.memory)
-        self._running.append(ChildProcess(name, target, arguments, self.memory.files, realtime))
+        child = ChildProcess(name, target, arguments, self.memory.files, realtime)
+        self._running.append(child)
+        return child
 
     def check(self) -> None:
-        """Report once each optional process that has ended.
+        """Report once each optional process that has ended unasked.
 
         Raises:
             LinkError: another process has died.
@@ -81,6 +84,8 @@ class ProcessGroup:
             if child.code is None:
                 continue
             self._running.remove(child)
+            if child.asked_to_stop:
+                continue
             if child.name not in OPTIONAL:
                 raise LinkError(
                     f"the {child.name} process has died (exit code {child.code}); its own message stands above"

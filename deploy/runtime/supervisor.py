@@ -27,8 +27,8 @@ from deploy.recorder.capture import CaptureConfig
 from deploy.runtime.detached_log import detach_logging
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.perception_process import CameraConfig
-from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_priority
-from deploy.runtime.process_group import PATIENCE_S, BusAndPolicySettings, ProcessGroup
+from deploy.runtime.process import ask_for_priority, give_up_priority
+from deploy.runtime.process_group import BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import DetectedTarget, TargetSelector
 from deploy.video.settings import VideoSettings
@@ -125,7 +125,7 @@ class DeploymentLoop(BusAndPolicySettings):
         frame_px = self.camera.num_px if self.camera else 0
         memory = LoopMemory(machine.num_joints, self.commands, frame_px)
         group = ProcessGroup(memory, self.realtime)
-        recorder = self._build_recorder(memory, machine, session.folder)
+        recorder = self._build_recorder(group, machine, session.folder)
         try:
             # Companions first: the loop then finds its bus in use from the beginning.
             for one in companions:
@@ -135,7 +135,7 @@ class DeploymentLoop(BusAndPolicySettings):
                 ask_for_priority(SUPERVISOR_PRIORITY, inherited=False)
             recorder.refresh()
             # Process ids are written before the loop runs, for tools that watch it from outside.
-            write_json(session.folder / PROCESSES, group.pids | recorder.pids)
+            write_json(session.folder / PROCESSES, group.pids)
             selector = TargetSelector(self.target.build(), memory.target, memory.holes)
             handler = RequestHandler(memory, recorder, selector, self.armed, self.commands)
             self._watch(group, handler)
@@ -144,9 +144,7 @@ class DeploymentLoop(BusAndPolicySettings):
         finally:
             if self.realtime:
                 give_up_priority()
-            # The order matters: the log is ended last, so that it records how the others ended.
             group.end()
-            recorder.end(PATIENCE_S)
             # Also after an error: the timing often explains it.
             _write_timing_report(memory, session)
             memory.close()
@@ -178,18 +176,13 @@ class DeploymentLoop(BusAndPolicySettings):
         )
 
     def _build_recorder(
-        self, memory: LoopMemory, machine: Machine, folder: Path
+        self, group: ProcessGroup, machine: Machine, folder: Path
     ) -> RecordingControl:
         # These facts go into every recording, so that it can be read without the run folder.
         facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
         pictures_hz = self.camera.record_hz if self.camera else 0.0
-
-        def start(folder: Path) -> ChildProcess:
-            capture = CaptureConfig(folder, self.dbc, machine, facts, pictures_hz)
-            target = "deploy.recorder.capture:run"
-            return ChildProcess("log", target, (capture, memory), memory.files)
-
-        recorder = RecordingControl(memory, folder, start)
+        capture = CaptureConfig(folder, self.dbc, machine, facts, pictures_hz)
+        recorder = RecordingControl(group, capture)
         recorder.wanted = self.record
         return recorder
 
@@ -233,14 +226,8 @@ def _write_timing_report(memory: LoopMemory, session: Session) -> None:
     """Write `timing.json` and log a line for each process."""
     reports = [json.loads(text) for text in memory.reports.take()]
     for one in reports:
-        log.info(
-            "%s: %d cycles of %.0f ms, %d missed, late by %.1f ms (99 %%), %.1f ms at most",
-            one["process"],
-            one["cycles"],
-            1e3 * one["period_s"],
-            one["missed"],
-            1e3 * one["late_p99_s"],
-            1e3 * one["late_max_s"],
-        )
+        cycles = f"{one['cycles']} cycles of {1e3 * one['period_s']:.0f} ms, {one['missed']} missed"
+        late = f"{1e3 * one['late_p99_s']:.1f} ms (99 %), {1e3 * one['late_max_s']:.1f} ms at most"
+        log.info("%s: %s, late by %s", one["process"], cycles, late)
     report = {"processes": reports, "log_dropped": memory.read_snapshot().log_dropped}
     write_json(session.folder / TIMING, report)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from brokk_rl.session import Session, write_text
 from brokk_rl.signals import Command
 from brokk_rl.spec import Port, Positive, spec
 from deploy.bus.c_header import generate_c_header
-from deploy.bus.can_bus import CanBus, CanFrame
+from deploy.bus.can_bus import CanBus, CanFrame, OpenCanBus
 from deploy.bus.description import GATEWAY, STAMP, BusDescription
 from deploy.runtime.process import CycleTimer, Stop, ask_for_priority, read_steady_s
 from deploy.twin.faults import ActiveFaults, FaultPort
@@ -82,30 +82,6 @@ class Twin:
     seconds: Positive | None
     realtime: bool
 
-    def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
-        """Run until told to stop, or the time is over.
-
-        Writes `gateway.h`, the bus for the firmware of a real gateway.
-
-        Raises:
-            LinkError: the bus cannot be opened.
-        """
-        # The twin stands for a machine, which is never late because of the computer.
-        if self.realtime:
-            ask_for_priority(TWIN_PRIORITY)
-        # The header describes the bus to the firmware of a real gateway; it must fit this very
-        # run.
-        session.folder.mkdir(parents=True, exist_ok=True)
-        description = BusDescription(self.dbc, machine)
-        header = generate_c_header(description, ROUND_TRIP_S, REMOTE_S, TIMEOUT_S)
-        write_text(session.folder / HEADER, header)
-        with (
-            plant.build(machine, 1, session) as link,
-            self.wire.open() as bus,
-            FaultPort(self.fault_port) as port,
-        ):
-            RunningTwin(self, machine, link, bus, port).run(stop)
-
 
 def run(
     stop: Stop,
@@ -115,19 +91,27 @@ def run(
     session: Session,
     memory: Any = None,
 ) -> None:
-    """Run a twin as a child process."""
-    twin.run(stop, machine, plant, session)
+    """Run a twin until told to stop, or the time is over.
 
+    Writes `gateway.h`, the bus for the firmware of a real gateway.
 
-class FrameBus(Protocol):
-    """Bus of a twin: an open CAN bus, or a stand-in."""
-
-    def recv(self, timeout_s: float) -> CanFrame | None:
-        """Return the next frame, `None` when none came in time."""
-        ...
-
-    def send(self, frame: CanFrame) -> None:
-        """Send a frame."""
+    Raises:
+        LinkError: the bus cannot be opened.
+    """
+    # The twin stands for a machine, which is never late because of the computer.
+    if twin.realtime:
+        ask_for_priority(TWIN_PRIORITY)
+    # The header describes the bus to the firmware of a real gateway; it must fit this very run.
+    session.folder.mkdir(parents=True, exist_ok=True)
+    description = BusDescription(twin.dbc, machine)
+    header = generate_c_header(description, ROUND_TRIP_S, REMOTE_S, TIMEOUT_S)
+    write_text(session.folder / HEADER, header)
+    with (
+        plant.build(machine, 1, session) as link,
+        twin.wire.open() as bus,
+        FaultPort(twin.fault_port) as port,
+    ):
+        RunningTwin(twin, machine, link, bus, port).run(stop)
 
 
 class RunningTwin:
@@ -142,14 +126,14 @@ class RunningTwin:
     """
 
     def __init__(
-        self, twin: Twin, machine: Machine, link: Link, bus: FrameBus, port: FaultPort
+        self, twin: Twin, machine: Machine, link: Link, bus: OpenCanBus, port: FaultPort
     ) -> None:
         self._twin, self._machine, self._link = twin, machine, link
         self._bus, self._port = bus, port
         self._description = BusDescription(twin.dbc, machine)
         self._gateway = Gateway(self._description, machine)
         self._remote = RadioRemote(self._description, machine)
-        self._second, self._second_due_s = RadioRemote(self._description, machine), -np.inf
+        self._second = RadioRemote(self._description, machine)
         self._second.deadman = True
         self._faults, self._timer = ActiveFaults(), CycleTimer(CYCLE_S)
         self._counters: dict[str, int] = {}
@@ -227,8 +211,8 @@ class RunningTwin:
                 )
             )
         # A second remote: nobody else can tell which of the two is the operator's.
-        if faults.on("second_remote", "", now_s) and now_s >= self._second_due_s:
-            self._second_due_s = now_s + self._second.period_s - CYCLE_S / 2
+        is_on, period_s = faults.on("second_remote", "", now_s), self._second.period_s
+        if is_on and self._is_due("second_remote", period_s, now_s):
             frame = self._second.build_frame()
             self._gateway.take(frame, now_s)
             self._bus.send(frame)
@@ -276,13 +260,8 @@ class RunningTwin:
         layout = self._description.layouts[self._description.message_of("DeadMan")]
         held = self._holds_deadman(now_s)
         released = remote.deadman and not held  # a release does not wait for its turn
-        if not remote.is_ready or (now_s < self._due_s.get(layout.name, now_s) and not released):
+        if not remote.is_ready or not self._is_due(layout.name, layout.period_s, now_s, released):
             return
-        # The schedule keeps its phase after a delay, and does not send the missed ones in a
-        # burst.
-        self._due_s[layout.name] = (
-            max(self._due_s.get(layout.name, now_s), now_s - layout.period_s) + layout.period_s
-        )
         remote.deadman = held
         remote.on = not faults.on("remote_off", "", now_s)
         remote.levers = (LEVER_FAULT if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
@@ -309,15 +288,22 @@ class RunningTwin:
             self._grip_s = now_s + LET_GO_S
         return pressed and now_s >= self._grip_s
 
+    def _is_due(self, name: str, period_s: float, now_s: float, at_once: bool = False) -> bool:
+        """Return whether a message is to be sent now; then the next one is due a period later."""
+        due_s = self._due_s.get(name, now_s)
+        # Half a cycle early is on time: the next chance would be half a cycle late.
+        if now_s < due_s - CYCLE_S / 2 and not at_once:
+            return False
+        # The phase is kept after a delay, and the missed ones are not sent in a burst.
+        self._due_s[name] = max(due_s, now_s - period_s) + period_s
+        return True
+
     def _send(
         self, name: str, values: dict[str, float], now_s: float, at_once: bool = False
     ) -> None:
         layout = self._description.layouts[name]
-        due_s = self._due_s.get(name, now_s)
-        if now_s < due_s - CYCLE_S / 2 and not at_once:
+        if not self._is_due(name, layout.period_s, now_s, at_once):
             return
-        # See `_play_remote`: phase is kept, missed messages are not sent in a burst.
-        self._due_s[name] = max(due_s, now_s - layout.period_s) + layout.period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1
         # A frozen counter is a fault that only the end-to-end protection can see.
         if self._faults.on("freeze_counter", name, now_s):

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -171,9 +172,10 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     aim = TargetSelector(
         FileTarget(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes
     )
+    group: Any = SimpleNamespace(memory=exchange)
     wanted = RequestHandler(
         exchange,
-        RecordingControl(exchange, tmp_path, lambda folder: pytest.fail("nothing is recorded")),
+        RecordingControl(group, CaptureConfig(tmp_path, "", MACHINE, {}, 0.0)),
         aim,
         armed=False,
         commands=False,

@@ -22,12 +22,10 @@ from deploy.kernel.guard import (
     GuardState,
     GuardTrip,
 )
-from deploy.kernel.limits import FlowLimits, GuardLimits, TargetLimits, build_joint_bounds
+from deploy.kernel.limits import FlowLimits, GuardLimits, JointBounds, TargetLimits
 from deploy.kernel.plausibility import PlausibilityFilter
 
-BODY = build_joint_bounds(
-    [-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False], 0.2
-)
+BODY = JointBounds((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0), (0.5, 0.5, 0.5), (False, True, False), 0.2)
 FLOW = FlowLimits(tolerance=0.02, settle_s=0.04, num_messages=2, lever_scale=1.5)
 TARGET = TargetLimits(
     age_s=600.0,

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from deploy.guidance import LeverPositions
 from deploy.kernel.guard import GuardState
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.protocol import OperatorRequest
+from deploy.recorder.capture import CaptureConfig
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.shm_layout import TEXT, LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
@@ -140,14 +142,10 @@ class Process:
 
     folder: Path
     code: int | None = None
-    asked: bool = False
-    pid: int = 4711
+    asked_to_stop: bool = False
 
     def ask_to_stop(self) -> None:
-        self.asked = True
-
-    def end(self, patience_s: float) -> int:
-        return 0
+        self.asked_to_stop = True
 
 
 def wanted(
@@ -155,16 +153,16 @@ def wanted(
 ) -> tuple[RequestHandler, list[Process]]:
     started: list[Process] = []
 
-    def start(folder: Path) -> Any:
-        started.append(Process(folder))
+    def start(name: str, target: str, arguments: tuple[CaptureConfig]) -> Any:
+        started.append(Process(arguments[0].folder))
         return started[-1]
 
     aim = TargetSelector(
         FileTarget(path=str(tmp_path / "none.json")).build(), memory.target, memory.holes
     )
-    return RequestHandler(
-        memory, RecordingControl(memory, tmp_path, start), aim, armed=False, commands=commands
-    ), started
+    group: Any = SimpleNamespace(memory=memory, start=start)
+    recorder = RecordingControl(group, CaptureConfig(tmp_path, "", MACHINE, {}, 0.0))
+    return RequestHandler(memory, recorder, aim, armed=False, commands=commands), started
 
 
 def controls(memory: LoopMemory) -> Any:
@@ -252,7 +250,7 @@ def test_recordings_begin_and_end_one_at_a_time(
     feed.submit(OperatorRequest("record", "on"))
     feed.submit(OperatorRequest("record", "off"))
     supervisor.refresh()
-    assert started[0].asked and not feed.read_state().recording.on
+    assert started[0].asked_to_stop and not feed.read_state().recording.on
     feed.submit(OperatorRequest("record", "on"))
     supervisor.refresh()
     assert len(started) == 1, "the first still writes its last words"
