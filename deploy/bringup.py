@@ -183,7 +183,7 @@ class _StateChecks:
         """Run them."""
         self._say("listening for the machine")
         patience_s = self._checklist.patience_s
-        if self._wait_until(lambda state: state.q_t_s > 0) is None:
+        if self._group.wait_for_state(lambda state: state.q_t_s > 0, patience_s) is None:
             raise LinkError(
                 f"no joint positions within {patience_s:g} s; is the machine on, and the bus connected?"
             )
@@ -236,14 +236,15 @@ class _StateChecks:
         """Check that a switch of the state is seen pressed and released."""
         self._say(task)
         patience_s, missing = self._checklist.patience_s, "pressed"
-        pressed_s = self._wait_until(lambda state: getattr(state, field))
+        wait_for_state = self._group.wait_for_state
+        pressed = wait_for_state(lambda state: getattr(state, field), patience_s)
         # Pressed and released are seen separately: a switch that is stuck would pass a single
         # look.
-        if pressed_s is not None:
+        if pressed is not None:
             missing = "released"
-            released_s = self._wait_until(lambda state: not getattr(state, field))
-            if released_s is not None:
-                values = {"held_s": released_s - pressed_s}
+            released = wait_for_state(lambda state: not getattr(state, field), patience_s)
+            if released is not None:
+                values = {"held_s": released.t_s - pressed.t_s}
                 return BringupResult(check, True, "pressed and released", values)
         return BringupResult(check, False, f"not seen to be {missing} within {patience_s:g} s", {})
 
@@ -253,10 +254,7 @@ class _StateChecks:
             f"move one joint after the other, both ways, half a second or more each, with rests of two seconds: {', '.join(names)}"
         )
         found = self._watch_joints()
-        missing = []
-        for name in names:
-            if name not in found:
-                missing.append(name)
+        missing = [name for name in names if name not in found]
         dead_s = [response.dead_time_s for response in found.values()]
         faults = []
         if missing:
@@ -336,8 +334,3 @@ class _StateChecks:
                 if state.trip in FLOW_FAULTS:
                     self._flow_faults[state.observed_joint] = state.trip
             time.sleep(POLL_S)
-
-    def _wait_until(self, holds: Callable[[OperatorState], bool]) -> float | None:
-        """Return when the state first `holds`; `None` if it does not in all of the time."""
-        state = self._group.wait_for_state(holds, self._checklist.patience_s)
-        return None if state is None else state.t_s

@@ -210,7 +210,8 @@ class LoopFeed:
             facts = {
                 "center_in_base_m": place.center_in_base_m.tolist(),
                 "std_m": place.std_m,
-                "t_s": place.t_s,
+                # The time of the record is that of the request; the place was measured before.
+                "seen_s": place.t_s,
             }
         values: dict[str, Any] = {"kind": request.kind, "value": request.value}
         if request.kind == "stop":
@@ -221,9 +222,7 @@ class LoopFeed:
             facts = {"asked_s": self._clock()}
         # The request goes through a pipe: this process may not touch the loop's slots.
         taken = self._memory.requests.put(json.dumps(values | facts).encode())
-        # The time of the record is that of the request; the place was measured before.
-        told = {"seen_s" if name == "t_s" else name: value for name, value in facts.items()}
-        log_text(self._memory.page_log, "wish", self._clock(), values | {"taken": taken} | told)
+        log_text(self._memory.page_log, "wish", self._clock(), values | {"taken": taken} | facts)
         if request.kind in ("start", "stop"):
             # guiding stops on the page even where the supervisor has no room for the request
             self._guiding = request.kind == "start"

@@ -28,6 +28,7 @@ from typing import Any, Protocol
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from brokk_rl.errors import LinkError, StorageError
@@ -76,8 +77,6 @@ CONFIRM_S, CONFIRM_POLL_S = 0.3, 0.005
 within 0.3 s that the stop is not confirmed."""
 STATE, FRAMES, CONTROL = "/state", "/frames", "/control"
 Handler = Callable[[ServerConnection], Coroutine[None, None, None]]
-POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013
-"""Close codes of a WebSocket (RFC 6455 and the registry of its codes at IANA)."""
 
 
 class PageExtension(Protocol):
@@ -318,7 +317,7 @@ class PageServer:
         admitted, evicted = places.admit(connection, time.monotonic())
         self._close_later(evicted)
         if not admitted:
-            await connection.close(TRY_AGAIN_LATER, "too many pages; see page.clients")
+            await connection.close(CloseCode.TRY_AGAIN_LATER, "too many pages; see page.clients")
             return
         try:
             await handle(connection)
@@ -329,7 +328,9 @@ class PageServer:
         """Close a connection without waiting for its answer: a mute one gives none."""
         if connection is None:
             return
-        task = asyncio.create_task(connection.close(TRY_AGAIN_LATER, "others need the place"))
+        task = asyncio.create_task(
+            connection.close(CloseCode.TRY_AGAIN_LATER, "others need the place")
+        )
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
 
@@ -343,7 +344,7 @@ class PageServer:
             async for text in connection:
                 self._watchers.note_heard(connection, time.monotonic())
                 if not str(text).isdecimal():
-                    await connection.close(POLICY_VIOLATION, "malformed")
+                    await connection.close(CloseCode.POLICY_VIOLATION, "malformed")
                     return
                 window.note_drawn(int(text))
 
@@ -377,7 +378,7 @@ class PageServer:
         async with self._guess:  # one guess at a time, whoever guesses
             await asyncio.sleep(WRONG_TOKEN_S)
         log.warning("refused a page with a wrong token")
-        await connection.close(POLICY_VIOLATION, "token")
+        await connection.close(CloseCode.POLICY_VIOLATION, "token")
         return False
 
     async def _submit(self, text: str | bytes) -> dict[str, str]:

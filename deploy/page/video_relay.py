@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from websockets.asyncio.server import ServerConnection
+from websockets.frames import CloseCode
 
 from deploy.video.settings import SOCKET
 
@@ -21,8 +22,6 @@ LONGEST_OFFER = 1 << 16
 PATIENCE_S = 10.0
 """Time for the video process to answer. Chosen by hand: it starts its encoders meanwhile."""
 IDLE_S = 3600.0
-TRY_AGAIN_LATER = 1013
-"""Close code of a WebSocket: try again later (registry of IANA)."""
 
 
 class VideoRelay:
@@ -42,7 +41,7 @@ class VideoRelay:
         try:
             reader, writer = await asyncio.open_unix_connection(self._socket, limit=LONGEST_OFFER)
         except OSError:
-            await connection.close(TRY_AGAIN_LATER, "no video process")
+            await connection.close(CloseCode.TRY_AGAIN_LATER, "no video process")
             return
         try:
             await self._hand_on(connection, reader)
@@ -57,7 +56,7 @@ class VideoRelay:
                 pieces.clear()
                 await self._hand_on(connection, reader)
         except (OSError, TimeoutError):
-            await connection.close(TRY_AGAIN_LATER, "the video process does not answer")
+            await connection.close(CloseCode.TRY_AGAIN_LATER, "the video process does not answer")
         finally:
             writer.close()
 

@@ -154,7 +154,6 @@ class PolicyAdviser:
         self._display = LeverDisplay(config.guidance, config.machine)
         self._number = 0
         self._observed = np.zeros(0)
-        self._exclusive = config.machine.is_exclusive
         bundle.command(np.zeros((1, bundle.encoder.size)))  # the first call is slow
 
     def run_cycle(self, missed: int, now_s: float) -> AdviceStatus:
@@ -173,7 +172,7 @@ class PolicyAdviser:
             elif not self._bundle.is_trained_for(target_m):
                 status = AdviceStatus.TARGET_UNKNOWN
             # What comes after the end of its episodes no policy has been trained for.
-            elif self._is_done(target_m):
+            elif self._bundle.is_done(self._history.q[-1], target_m, self._config.pitch_rad):
                 status = AdviceStatus.DONE
         if status is AdviceStatus.VALID:
             begun = time.perf_counter()
@@ -205,9 +204,6 @@ class PolicyAdviser:
         self._history.sample(state, missed)
         return AdviceStatus.VALID if self._history.full else AdviceStatus.WARMING_UP
 
-    def _is_done(self, target_m: np.ndarray) -> bool:
-        return self._bundle.is_done(self._history.q[-1], target_m, self._config.pitch_rad)
-
     def _infer(self, target_m: np.ndarray) -> np.ndarray | None:
         """Return masked commands, `(J,)`; `None` where the policy's answer is not usable."""
         history = self._history
@@ -226,7 +222,7 @@ class PolicyAdviser:
         u = self._bundle.command(observation)[0].astype(float)
         moved = u != 0
         # the bundle masks its commands; an exclusive joint beside others means that it is damaged
-        together = moved[self._exclusive].any() and moved.sum() > 1
+        together = moved[self._machine.is_exclusive].any() and moved.sum() > 1
         if not np.isfinite(u).all() or np.abs(u).max() > 1.0 + ROUNDING or together:
             return None
         return u

@@ -114,14 +114,8 @@ class CaptureWriter:
         # Without them no capture can be read, and one wrong byte spoils one of them.
         for _ in range(NUM_FACTS):
             self._mcap.add_metadata(FACTS, self._facts)
-        now_ns = time.time_ns()
-        self._mcap.add_attachment(
-            now_ns,
-            now_ns,
-            Path(capture.dbc).name,
-            "text/plain",
-            resolve_package_path(capture.dbc).read_bytes(),
-        )
+        now_ns, dbc = time.time_ns(), resolve_package_path(capture.dbc).read_bytes()
+        self._mcap.add_attachment(now_ns, now_ns, Path(capture.dbc).name, "text/plain", dbc)
         self._schemas: dict[str, TopicSchema] = {}
         self._channels: dict[str, int] = {}
         self._flushed_s = time.monotonic()

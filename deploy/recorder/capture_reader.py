@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import logging
 import mmap
-import os
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -130,7 +129,7 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
     Raises:
         RecordingError: there is none, or not even its beginning can be read.
     """
-    contents, decoder = CaptureContents(whole=is_whole(path)), _Decoder()
+    contents, decoder = CaptureContents(), _Decoder()
     seen: list[tuple[str, Message]] = []
     ahead_ns, waiting, facts = None, list[Message](), list[dict[str, str]]()
 
@@ -191,17 +190,6 @@ class _Decoder:
         return decode_message(decode(message.data))
 
 
-def is_whole(path: Path) -> bool:
-    """Return whether the capture at `path` was closed properly."""
-    if not path.exists():
-        raise RecordingError(f"{path}: no such capture")
-    if not path.is_file() or path.stat().st_size < MAGIC_SIZE:
-        return False
-    with path.open("rb") as file:
-        file.seek(-MAGIC_SIZE, os.SEEK_END)
-        return file.read() == MCAP_MAGIC
-
-
 def _iterate_records(path: Path, contents: CaptureContents) -> Iterator[Any]:
     """Yield the records of a capture; what is damaged is left out and counted in `contents`.
 
@@ -212,11 +200,12 @@ def _iterate_records(path: Path, contents: CaptureContents) -> Iterator[Any]:
     """
     try:
         if not path.is_file():
-            raise FileNotFoundError(errno.ENOENT, "no such file, or no plain one")
+            raise FileNotFoundError(errno.ENOENT, "no such capture, or no plain file")
         if path.stat().st_size == 0:
             return
         # A link is followed; a pipe or a device was refused.
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=PROT_READ) as data:
+            contents.whole = data[-MAGIC_SIZE:] == MCAP_MAGIC
             yield from _scan(data, contents)
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: cannot be read ({error})") from error

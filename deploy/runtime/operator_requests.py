@@ -34,6 +34,7 @@ class RecordingControl:
         group: The processes of the run.
         capture: Settings; the first recording goes into its folder, the next ones into
             `recording_2`, … in it.
+        wanted: Whether a recording is to be running from the beginning.
 
     Attributes:
         wanted: Whether a recording is to be running.
@@ -42,12 +43,12 @@ class RecordingControl:
         failed: Whether the last recording has ended unasked.
     """
 
-    def __init__(self, group: ProcessGroup, capture: CaptureConfig) -> None:
+    def __init__(self, group: ProcessGroup, capture: CaptureConfig, wanted: bool) -> None:
         self._group, self._capture = group, capture
         self._child: ChildProcess | None = None
         self._number = 0
         # Set by the supervisor and by requests; `refresh` acts on it.
-        self.wanted = False
+        self.wanted = wanted
         self.next_folder: Path | None = None
         self.since_s, self.failed = 0.0, False
 
@@ -136,7 +137,7 @@ class RequestHandler:
                 self._recorder.next_folder = Path(request["into"])
         elif "center_in_base_m" in request:
             center_m = np.array(request["center_in_base_m"])
-            place = TargetPosition(center_m, request["std_m"], request["t_s"])
+            place = TargetPosition(center_m, request["std_m"], request["seen_s"])
             self._selector.choose(place)
         else:
             # `commands` is a promise of the run's configuration that no request can break.

@@ -193,8 +193,8 @@ class RecordLayout(Generic[R]):
         return self.unpack(np.zeros((), self.fields))
 
 
-class RecordSlot(Generic[R]):
-    """A slot whose record is a dataclass, written and read as such; see `Slot`, `RecordLayout`.
+class RecordSlot(Slot, Generic[R]):
+    """A slot whose record is a dataclass, written and read as such; see `RecordLayout`.
 
     Args:
         name: Of the slot.
@@ -204,30 +204,16 @@ class RecordSlot(Generic[R]):
 
     def __init__(self, name: str, kind: type[R], num_joints: int) -> None:
         self._layout = RecordLayout(kind, num_joints)
-        self._slot = Slot(name, self._layout.fields)
-
-    @property
-    def memory(self) -> AnonymousMemory:
-        """The slot's memory."""
-        return self._slot.memory
-
-    @property
-    def number(self) -> int:
-        """Number of records written so far; see `Slot.number`."""
-        return self._slot.number
+        super().__init__(name, self._layout.fields)
 
     def write(self, record: R) -> None:
         """Make `record` the newest."""
-        self._slot.write(self._layout.pack(record))
+        super().write(self._layout.pack(record))
 
     def read(self) -> R | None:
         """Return the newest record; `None` before the first."""
-        packed = self._slot.read()
+        packed = super().read()
         return None if packed is None else self._layout.unpack(packed)
-
-    def peek(self, field: str) -> Any | None:
-        """Return one number of the newest record; see `Slot.peek`."""
-        return self._slot.peek(field)
 
     def new(self) -> R:
         """Return an empty record; see `RecordLayout.new`."""

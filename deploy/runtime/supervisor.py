@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Protocol
 
 from brokk_rl.errors import ConfigError
@@ -103,6 +103,41 @@ class DeploymentLoop(BusAndPolicySettings):
             FrameError: the camera's folder holds no frames.
             LinkError: bus or policy process died.
         """
+        self._check_parts(machine)
+        frame_px = self.camera.num_px if self.camera else 0
+        # These facts go into every recording, so that it can be read without the run folder.
+        facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
+        pictures_hz = self.camera.record_hz if self.camera else 0.0
+        capture = CaptureConfig(session.folder, self.dbc, machine, facts, pictures_hz)
+        with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:
+            memory = LoopMemory(machine.num_joints, self.commands, frame_px)
+            group = ProcessGroup(memory, self.realtime)
+            recorder = RecordingControl(group, capture, wanted=self.record)
+            try:
+                # Companions first: the loop then finds its bus in use from the beginning.
+                for one in companions:
+                    group.start(one.name, one.target, one.arguments, one.realtime)
+                self._start(group, machine, session, sockets)
+                if self.realtime:
+                    ask_for_priority(SUPERVISOR_PRIORITY, inherited=False)
+                recorder.refresh()
+                # Process ids are written before the loop runs, for tools that watch it from outside.
+                write_json(session.folder / PROCESSES, group.pids)
+                selector = TargetSelector(self.target.build(), memory.target, memory.holes)
+                handler = RequestHandler(memory, recorder, selector, self.armed, self.commands)
+                self._watch(group, handler)
+            except KeyboardInterrupt:
+                log.info("stopping")
+            finally:
+                if self.realtime:
+                    give_up_priority()
+                group.end()
+                # Also after an error: the timing often explains it.
+                _write_timing_report(memory, session)
+                memory.close()
+
+    def _check_parts(self, machine: Machine) -> None:
+        """Check before any process runs that all parts of the loop can."""
         self.check_machine(machine)
         if self.commands:
             BusDescription(self.dbc, machine).check_protection()
@@ -112,42 +147,6 @@ class DeploymentLoop(BusAndPolicySettings):
             self.video.require_packages()
         if self.camera is not None:
             self.camera.check_frames()
-        with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:
-            self._run(machine, session, companions, sockets)
-
-    def _run(
-        self,
-        machine: Machine,
-        session: Session,
-        companions: Sequence[CompanionProcess],
-        sockets: str,
-    ) -> None:
-        frame_px = self.camera.num_px if self.camera else 0
-        memory = LoopMemory(machine.num_joints, self.commands, frame_px)
-        group = ProcessGroup(memory, self.realtime)
-        recorder = self._build_recorder(group, machine, session.folder)
-        try:
-            # Companions first: the loop then finds its bus in use from the beginning.
-            for one in companions:
-                group.start(one.name, one.target, one.arguments, one.realtime)
-            self._start(group, machine, session, sockets)
-            if self.realtime:
-                ask_for_priority(SUPERVISOR_PRIORITY, inherited=False)
-            recorder.refresh()
-            # Process ids are written before the loop runs, for tools that watch it from outside.
-            write_json(session.folder / PROCESSES, group.pids)
-            selector = TargetSelector(self.target.build(), memory.target, memory.holes)
-            handler = RequestHandler(memory, recorder, selector, self.armed, self.commands)
-            self._watch(group, handler)
-        except KeyboardInterrupt:
-            log.info("stopping")
-        finally:
-            if self.realtime:
-                give_up_priority()
-            group.end()
-            # Also after an error: the timing often explains it.
-            _write_timing_report(memory, session)
-            memory.close()
 
     def _start(self, group: ProcessGroup, machine: Machine, session: Session, sockets: str) -> None:
         needs_page = self.page is not None
@@ -175,22 +174,11 @@ class DeploymentLoop(BusAndPolicySettings):
             camera_s=self.camera.stale_s if self.camera else None,
         )
 
-    def _build_recorder(
-        self, group: ProcessGroup, machine: Machine, folder: Path
-    ) -> RecordingControl:
-        # These facts go into every recording, so that it can be read without the run folder.
-        facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
-        pictures_hz = self.camera.record_hz if self.camera else 0.0
-        capture = CaptureConfig(folder, self.dbc, machine, facts, pictures_hz)
-        recorder = RecordingControl(group, capture)
-        recorder.wanted = self.record
-        return recorder
-
     def _watch(self, group: ProcessGroup, handler: RequestHandler) -> None:
         """Carry out requests and watch the processes, until it is time to stop."""
-        end_s = None if self.seconds is None else time.monotonic() + self.seconds
         # Times are monotonic: a clock that is set must not end a run.
-        while end_s is None or time.monotonic() < end_s:
+        end_s = time.monotonic() + (self.seconds or math.inf)
+        while time.monotonic() < end_s:
             handler.refresh()
             group.check()
             time.sleep(WATCH_S)

@@ -195,22 +195,21 @@ class FaultPort:
             self._socket.bind(("127.0.0.1", port))
             self._socket.setblocking(False)
 
-    def poll(self, faults: ActiveFaults, now_s: float) -> str | None:
-        """Answer a request that has come in by `now_s`, if any; return its text."""
+    def poll(self, faults: ActiveFaults, now_s: float) -> None:
+        """Answer a request that has come in by `now_s`, if any."""
         if self._socket is None:
-            return None
+            return
         try:
             text, sender = self._socket.recvfrom(REQUEST_BYTES)
         except BlockingIOError:
             # No request is the usual case in a cycle.
-            return None
+            return
         try:
             faults.request(text, now_s)
             answer = f"ok {time.monotonic()!r}"
         except ConfigError as error:
             answer = str(error)
         self._socket.sendto(answer.encode(), sender)
-        return text.decode(errors="replace")
 
     def __enter__(self) -> FaultPort:
         return self

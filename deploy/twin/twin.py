@@ -153,7 +153,7 @@ class RunningTwin:
     def run(self, stop: Stop) -> None:
         """Run in real time until told to stop, or until its time is over."""
         # The shortest wait is that to the next cycle, so frames take effect when they arrive.
-        end_s = np.inf if self._twin.seconds is None else time.monotonic() + self._twin.seconds
+        end_s = time.monotonic() + (self._twin.seconds or np.inf)
         while not stop() and time.monotonic() < end_s:
             try:
                 while (left_s := self._timer.next_s - time.monotonic()) > 0:
@@ -175,8 +175,7 @@ class RunningTwin:
 
     def cycle(self, now_s: float) -> None:
         """Let `CYCLE_S` go by: valves, motion, messages."""
-        if (text := self._port.poll(self._faults, now_s)) is not None:
-            log.debug("fault: %s", text)
+        self._port.poll(self._faults, now_s)
         # A study puts the machine elsewhere between two cycles, never within one.
         if (place := self._faults.take_place()) is not None:
             self._place(*place)

@@ -175,7 +175,7 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     group: Any = SimpleNamespace(memory=exchange)
     wanted = RequestHandler(
         exchange,
-        RecordingControl(group, CaptureConfig(tmp_path, "", MACHINE, {}, 0.0)),
+        RecordingControl(group, CaptureConfig(tmp_path, "", MACHINE, {}, 0.0), False),
         aim,
         armed=False,
         commands=False,

@@ -161,7 +161,7 @@ def wanted(
         FileTarget(path=str(tmp_path / "none.json")).build(), memory.target, memory.holes
     )
     group: Any = SimpleNamespace(memory=memory, start=start)
-    recorder = RecordingControl(group, CaptureConfig(tmp_path, "", MACHINE, {}, 0.0))
+    recorder = RecordingControl(group, CaptureConfig(tmp_path, "", MACHINE, {}, 0.0), False)
     return RequestHandler(memory, recorder, aim, armed=False, commands=commands), started
 
 
