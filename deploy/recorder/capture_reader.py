@@ -200,7 +200,7 @@ def _iterate_records(path: Path, contents: CaptureContents) -> Iterator[Any]:
     """
     try:
         if not path.is_file():
-            raise FileNotFoundError(errno.ENOENT, "no such capture, or no plain file")
+            raise FileNotFoundError(errno.ENOENT, "no such capture, or no plain one")
         if path.stat().st_size == 0:
             return
         # A link is followed; a pipe or a device was refused.
