@@ -67,6 +67,29 @@ def thresholds() -> InspectionThresholds:
     return load_part("thresholds")
 
 
+@pytest.fixture(scope="session")
+def carriage() -> Machine:
+    """A machine of one joint, for logs of every kind."""
+    from carriage import make_carriage
+
+    return make_carriage()
+
+
+@pytest.fixture
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty folder is the working directory."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def warp_device() -> Iterator[None]:
+    """Warp's device is a GPU where there is one: there a world has 32 threads."""
+    import warp as wp
+
+    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
+        yield
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """A headless Chromium."""

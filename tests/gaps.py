@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 from motion import make_recording
 
+from brokk_rl import extensions
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis import effect_library
+from diagnosis.answer import Answer
+from diagnosis.case import GapCase
+from diagnosis.reference_diagnosis import ReferenceDiagnosis
 
 PERIOD_S = 0.05
 DELAY = 11
@@ -30,3 +35,11 @@ def recording(
     noise = NOISE * np.random.default_rng(0).standard_normal((steps, 5))
     q = machine.home + np.cumsum(moved, 0) + noise
     return make_recording(machine, u, q, "planted")
+
+
+def diagnose(case: GapCase) -> Answer:
+    """Returns the answer of the engine."""
+    kinds = effect_library.load_effects(case.machine)
+    generator = np.random.default_rng(0)
+    work = ReferenceDiagnosis(case, kinds, extensions.load_part("thresholds"), generator)
+    return work.run(lambda *_: None).answer

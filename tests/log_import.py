@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,19 @@ from actuators.recordings.guess import GivenColumns
 from actuators.recordings.log_draft import Draft
 from brokk_rl import extensions
 from brokk_rl.errors import BrokkError
+
+
+def delay(values: np.ndarray, num: int) -> np.ndarray:
+    """Returns values `(T, …)` so many rows later, at rest before."""
+    return np.concatenate([np.repeat(values[:1], num, 0), values[:-num]])
+
+
+def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Writes columns of numbers, each with all its digits."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(repr, row)) for row in rows)]
+    Path(path).write_text("\n".join(lines) + "\n")
 
 
 def make_draft(*options: str) -> Draft:

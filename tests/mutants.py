@@ -112,10 +112,8 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.Not, ast.USub)):
         yield f"no {type(node.op).__name__}", node.operand
     elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC and not _is_type(node):
-        yield (
-            f"{type(node.op).__name__} -> {ARITHMETIC[type(node.op)].__name__}",
-            other(op=ARITHMETIC[type(node.op)]()),
-        )
+        kind = ARITHMETIC[type(node.op)]
+        yield f"{type(node.op).__name__} -> {kind.__name__}", other(op=kind())
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
         yield f"{node.value} -> {not node.value}", ast.Constant(not node.value)
     elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
@@ -124,10 +122,8 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
         yield "condition true", other(test=ast.Constant(True))
         yield "condition false", other(test=ast.Constant(False))
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CALLED:
-        yield (
-            f"{node.func.id} -> {CALLED[node.func.id]}",
-            other(func=ast.Name(CALLED[node.func.id], ast.Load())),
-        )
+        name = CALLED[node.func.id]
+        yield f"{node.func.id} -> {name}", other(func=ast.Name(name, ast.Load()))
     elif isinstance(node, (ast.Assign, ast.AugAssign)):
         yield "dropped", ast.Pass()
 
@@ -142,27 +138,9 @@ def mutants(tree: ast.Module, source: str) -> Iterator[tuple[str, ast.Module]]:
     A place is named by its line, not by its number: the list of survivors outlives other changes.
     """
     lines, seen = source.splitlines(), Counter[str]()
-    dead = {
-        id(one)
-        for node in ast.walk(tree)
-        for decorator in getattr(node, "decorator_list", ())
-        for one in ast.walk(decorator)
-    }
-    places = [
-        (parent, field, index)
-        for parent in ast.walk(tree)
-        if id(parent) not in dead
-        for field, value in ast.iter_fields(parent)
-        for index, child in enumerate(value if isinstance(value, list) else [value])
-        if isinstance(child, ast.AST)
-        and field not in ("annotation", "returns", "decorator_list", "bases")
-    ]
-    for parent, field, index in places:
+    for parent, field, index in list(find_places(tree)):
         value = getattr(parent, field)
         original = value[index] if isinstance(value, list) else value
-        # Of a module's own statements only the numbers of constants matter.
-        if isinstance(parent, ast.Module):
-            continue
         for words, changed in changes(original):
             number = getattr(original, "lineno", getattr(parent, "lineno", 0))
             name = f"{lines[number - 1].strip()} :: {words}"
@@ -172,6 +150,23 @@ def mutants(tree: ast.Module, source: str) -> Iterator[tuple[str, ast.Module]]:
             _put(parent, field, index, changed)
             yield name, ast.fix_missing_locations(copy.deepcopy(tree))
             _put(parent, field, index, original)
+
+
+def find_places(tree: ast.AST) -> Iterator[tuple[ast.AST, str, int]]:
+    """Yields the parent, the field and the index in it of each node that may be changed."""
+    nodes = [tree]
+    for parent in nodes:
+        for field, value in ast.iter_fields(parent):
+            # what decorates a function is no part of what it decides
+            if field == "decorator_list":
+                continue
+            for index, child in enumerate(value if isinstance(value, list) else [value]):
+                if isinstance(child, ast.AST):
+                    nodes.append(child)
+                    # Of a module's own statements only the numbers of constants matter.
+                    is_type = field in ("annotation", "returns", "bases")
+                    if not is_type and not isinstance(parent, ast.Module):
+                        yield parent, field, index
 
 
 def _put(parent: ast.AST, field: str, index: int, child: ast.AST) -> None:

@@ -28,9 +28,8 @@ START = MACHINE.home + np.array([0.3, 0, 0, 0, 0])
 def make_design(count: int = 2, practice: int = 0, trials: int = 2) -> design.Design:
     """Returns a design of studies whose holes all lie where the arm is at home."""
     tip = compute_tool_kinematics(MACHINE, MACHINE.home).tip_in_base_m
-    hole = design.Hole(
-        center_in_base_m=(float(tip[0]), float(tip[1]), float(tip[2]) + 0.12), radius_m=0.05
-    )
+    center_m = (float(tip[0]), float(tip[1]), float(tip[2]) + 0.12)
+    hole = design.Hole(center_in_base_m=center_m, radius_m=0.05)
     return design.Design(
         num_participants=count,
         holes=dict.fromkeys("ABCD"[:trials], hole),

@@ -118,9 +118,8 @@ def test_an_option_that_two_packages_offer_is_chosen_by_its_file(
 
 
 def test_an_entry_point_without_its_package_is_named(mine: Path, brokk: Callable[..., Any]) -> None:
-    (mine / "mine-1.0.dist-info" / "entry_points.txt").write_text(
-        "[brokk_rl.conf]\nmine = mine.missing\n"
-    )
+    path = mine / "mine-1.0.dist-info" / "entry_points.txt"
+    path.write_text("[brokk_rl.conf]\nmine = mine.missing\n")
     done = brokk("mode=list")
     assert done.code == 2
     assert "mine.missing" in done.err
@@ -156,12 +155,8 @@ def test_a_sweep_has_one_folder_for_each_job_and_no_others(
 ) -> None:
     words = ("mode=show", "session.seed=3,4", "actuator.share=0.5,0.75", "session.device=cpu")
     assert brokk("-m", *words, "session.out=sweep").code == 0
-    jobs = [
-        "0_seed-3_share-0.5",
-        "1_seed-3_share-0.75",
-        "2_seed-4_share-0.5",
-        "3_seed-4_share-0.75",
-    ]
+    values = [f"seed-{seed}_share-{share}" for seed in (3, 4) for share in (0.5, 0.75)]
+    jobs = [f"{number}_{one}" for number, one in enumerate(values)]
     assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [*jobs, "multirun.yaml"]
     files = sorted(path.name for path in (tmp_path / "sweep" / jobs[1]).iterdir())
     assert files == ["resolved.yaml", "seen.json", "session.json"]

@@ -54,9 +54,8 @@ def test_a_file_may_hold_several_effects_and_stand_in_a_list(
     brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
     (tmp_path / "found, today.yaml").write_text(EFFECTS)
-    (tmp_path / "one.yaml").write_text(
-        "_target_: actuators.effects.speed.FlowGain\njoints: all\ngain: [0.9, 1.1]\n"
-    )
+    gain = "_target_: actuators.effects.speed.FlowGain\njoints: all\ngain: [0.9, 1.1]\n"
+    (tmp_path / "one.yaml").write_text(gain)
     words = ("mode=train", 'effect=["@found, today.yaml", lag, @one.yaml]')
     effect = composed(brokk, *words)["effect"]
     assert list(effect) == ["stiction", "backlash", "lag", "flow_gain"]
@@ -77,9 +76,8 @@ def test_a_file_replaces_a_part_of_another_option(
 
 
 def test_an_experiment_may_be_a_file(brokk: Callable[..., Any], tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(
-        "defaults: [override /task: goal_pose]\nsession: {seed: 7}\n"
-    )
+    text = "defaults: [override /task: goal_pose]\nsession: {seed: 7}\n"
+    (tmp_path / "mine.yaml").write_text(text)
     cfg = composed(brokk, "mode=train", "experiment=@mine.yaml")
     assert cfg["session"]["seed"] == 7
     assert "goal_pose" in cfg["task"]["_target_"]

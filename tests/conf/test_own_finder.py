@@ -73,15 +73,11 @@ class TwoFrames:
 @pytest.mark.parametrize("name", ["own", "truth"])
 def test_the_camera_process_publishes_its_holes(name: str, finder_spec: Any) -> None:
     frame, _, _ = drawn()
+    finder = finder_spec if name == "own" else option("perception", "truth")
     camera = CameraConfig(
-        source=TwoFrames(frame),
-        finder=finder_spec if name == "own" else option("perception", "truth"),
-        tracker=load_part("tracker"),
-        rate_hz=100.0,
-        num_px=frame.depth_m.size,
-        stale_s=1.0,
-        record_hz=0.0,
-    )
+        source=TwoFrames(frame), finder=finder, tracker=load_part("tracker"), rate_hz=100.0, num_px=frame.depth_m.size,
+        stale_s=1.0, record_hz=0.0,
+    )  # fmt: skip
     num_joints = option("machine", "brokk170").num_joints
     memory = LoopMemory(num_joints, commands=False, frame_px=frame.depth_m.size)
     try:

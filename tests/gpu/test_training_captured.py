@@ -20,9 +20,8 @@ from brokk_rl.rl.settings import Teacher
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.filterwarnings("ignore::DeprecationWarning:torch"),
-    pytest.mark.filterwarnings(
-        "ignore:TensorFloat32:UserWarning"
-    ),  # wanted: see brokk_rl.rl.runner
+    # wanted: see brokk_rl.rl.runner
+    pytest.mark.filterwarnings("ignore:TensorFloat32:UserWarning"),
 ]
 
 CUDA = torch.device("cuda")

@@ -37,11 +37,8 @@ QUICK = ("experiment=paper",)
 
 def read_options(group: str) -> dict[str, dict[str, Any]]:
     """Returns the content of each option's file: composing all of them takes longer than a test."""
-    return {
-        one.name: yaml.safe_load(one.path.read_text())
-        for one in registry.list_options()
-        if one.group == group
-    }
+    options = [one for one in registry.list_options() if one.group == group]
+    return {one.name: yaml.safe_load(one.path.read_text()) for one in options}
 
 
 def list_cases() -> list[Any]:
@@ -96,10 +93,8 @@ def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
     found = read(tmp_path / "seen" / "evaluation.json")
     assert found["task"] == made["task"]
     if shared:  # on the same plant the figures are those of the training
-        assert (
-            found["policies"]["trained"]
-            == read(tmp_path / "run" / "evaluation.json")["policies"]["trained"]
-        )
+        of_training = read(tmp_path / "run" / "evaluation.json")["policies"]
+        assert found["policies"]["trained"] == of_training["trained"]
 
     command("mode=export", "policy=./run", "session.out=export")
     exported = read(tmp_path / "export" / "policy.json")

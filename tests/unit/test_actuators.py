@@ -37,14 +37,8 @@ def held(machine: Machine, steps: int, **level: float) -> torch.Tensor:
 
 
 def lag(**changes: Any) -> FirstOrderLag:
-    plain = {
-        "dead_time_s": 0.0,
-        "dead_band_extend": 0.0,
-        "dead_band_retract": 0.0,
-        "gain": 1.0,
-        "time_constant_s": 0.0,
-    }
-    return FirstOrderLag(**(plain | changes))
+    none = ("dead_time_s", "dead_band_extend", "dead_band_retract", "time_constant_s")
+    return FirstOrderLag(**({"gain": 1.0} | dict.fromkeys(none, 0.0) | changes))
 
 
 def hydraulic(**changes: Any) -> Hydraulic:
@@ -53,28 +47,23 @@ def hydraulic(**changes: Any) -> Hydraulic:
 
 def plain_plant(**changes: Any) -> Hydraulic:
     """A plant without load sensitivity, dry friction, overlap, notch and drift: speed is flow, and well damped."""
-    none = {
-        "overlap_extend": 0.0,
-        "overlap_retract": 0.0,
-        "hysteresis": 0.0,
-        "notch": 0.0,
-        "load_sensitivity": 0.0,
-    }
-    quiet = {
-        "coulomb": 0.0,
-        "breakaway": 0.0,
-        "viscous": 0.3,
-        "leak_hz": 0.0,
-        "thermal_gain": 0.0,
-        "speed_scale": 1.0,
-    }
-    return hydraulic(**(none | quiet | {"retract_ratio": 1.0, "flow_share": 0.1} | changes))
+    none = (
+        "overlap_extend", "overlap_retract", "hysteresis", "notch", "load_sensitivity", "coulomb", "breakaway", "leak_hz",
+        "thermal_gain",
+    )  # fmt: skip
+    plain = {"viscous": 0.3, "speed_scale": 1.0, "retract_ratio": 1.0, "flow_share": 0.1}
+    return hydraulic(**(dict.fromkeys(none, 0.0) | plain | changes))
 
 
-def speed(path: torch.Tensor, machine: Machine, name: str, last: int = 6) -> float:
-    """Returns the mean speed of a joint over the last periods."""
+def speed(path: torch.Tensor, machine: Machine, name: str) -> float:
+    """Returns the mean speed of a joint over the last six periods."""
     j = machine.joint_names.index(name)
-    return float(path[-1, 0, j] - path[-1 - last, 0, j]) / (last * machine.period_s)
+    return float(path[-1, 0, j] - path[-7, 0, j]) / (6 * machine.period_s)
+
+
+def find_speed(plant: Any, machine: Machine, name: str, **level: float) -> float:
+    """Returns the speed of a joint after two seconds of constant commands."""
+    return speed(roll(plant, machine, held(machine, 40, **level)), machine, name)
 
 
 def test_ideal_moves_full_speed_times_command(machine: Machine) -> None:
@@ -92,9 +81,8 @@ def test_a_joint_stays_at_its_stop(name: str, machine: Machine) -> None:
 
 def test_lag_follows_the_analytic_step_response(machine: Machine) -> None:
     delay_s, constant_s, level = 0.23, 0.12, 0.6
-    path = roll(
-        lag(dead_time_s=delay_s, time_constant_s=constant_s), machine, held(machine, 24, q1=level)
-    )
+    model = lag(dead_time_s=delay_s, time_constant_s=constant_s)
+    path = roll(model, machine, held(machine, 24, q1=level))
     t_s = np.maximum(0.0, 0.05 * np.arange(25) - delay_s)
     expected = 0.4 * level * (t_s - constant_s * (1.0 - np.exp(-t_s / constant_s)))
     np.testing.assert_allclose(path[:, 0, 0], expected, atol=2e-6)
@@ -115,9 +103,8 @@ def test_the_machines_dead_time_shifts_by_eleven_periods(machine: Machine) -> No
 def test_the_dead_band_ends_on_each_side_by_itself() -> None:
     u = torch.tensor([-1.0, -0.6, -0.2, 0.0, 0.1, 0.55, 1.0])
     expected = [-1.0, -0.5, 0.0, 0.0, 0.0, 0.5, 1.0]  # (0.6 - 0.2) / 0.8 and (0.55 - 0.1) / 0.9
-    np.testing.assert_allclose(
-        open_valve(u, torch.tensor(0.1), torch.tensor(0.2)), expected, atol=1e-6
-    )
+    found = open_valve(u, torch.tensor(0.1), torch.tensor(0.2))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("dead_time_s", [0.61, 2.0])
@@ -127,37 +114,30 @@ def test_a_dead_time_beyond_the_history_is_refused(machine: Machine, dead_time_s
 
 
 def test_the_plant_starts_to_move_near_the_machines_dead_time(machine: Machine) -> None:
-    for name in machine.joint_names:
+    for j, name in enumerate(machine.joint_names):
         path = roll(option("actuator", "hydraulic"), machine, held(machine, 20, **{name: 1.0}))
-        moved = (
-            path[:, 0, machine.joint_names.index(name)]
-            - path[0, 0, machine.joint_names.index(name)]
-        ).abs() > 0.002
+        moved = (path - path[0])[:, 0, j].abs() > 0.002
         assert int(moved.int().argmax()) in (11, 12, 13)  # within 0.55 to 0.65 s
 
 
 def test_the_plant_reaches_about_the_machines_speed(machine: Machine) -> None:
     for name, full in zip(machine.joint_names, machine.max_speed, strict=True):
-        path = roll(option("actuator", "hydraulic"), machine, held(machine, 40, **{name: 1.0}))
-        assert speed(path, machine, name) == pytest.approx(full, rel=0.12)
+        found = find_speed(option("actuator", "hydraulic"), machine, name, **{name: 1.0})
+        assert found == pytest.approx(full, rel=0.12)
 
 
 def test_retracting_is_faster_by_the_area_ratio(machine: Machine) -> None:
     plant = plain_plant(retract_ratio=1.4)
-    out, back = (
-        speed(roll(plant, machine, held(machine, 40, q3=level)), machine, "q3")
-        for level in (0.5, -0.5)
-    )
+    out, back = (find_speed(plant, machine, "q3", q3=level) for level in (0.5, -0.5))
     assert back / out == pytest.approx(-1.4, rel=0.01)
     assert out == pytest.approx(0.5 * 0.26, rel=0.01)
 
 
 def test_twice_the_pumps_flow_halves_the_speeds(machine: Machine) -> None:
     plant = plain_plant(flow_share=1.0)
-    alone = roll(plant, machine, held(machine, 40, q3=1.0))
-    both = roll(plant, machine, held(machine, 40, q3=1.0, q4=1.0))
-    assert speed(both, machine, "q3") == pytest.approx(0.5 * speed(alone, machine, "q3"), rel=0.01)
-    assert speed(both, machine, "q4") == pytest.approx(0.5 * 0.34, rel=0.01)
+    alone = find_speed(plant, machine, "q3", q3=1.0)
+    both = [find_speed(plant, machine, name, q3=1.0, q4=1.0) for name in ("q3", "q4")]
+    assert both == pytest.approx([0.5 * alone, 0.5 * 0.34], rel=0.01)
 
 
 def test_a_command_inside_the_overlap_moves_nothing(machine: Machine) -> None:
@@ -169,10 +149,7 @@ def test_a_command_inside_the_overlap_moves_nothing(machine: Machine) -> None:
 
 def test_lowering_is_faster_than_lifting_under_load(machine: Machine) -> None:
     plant = plain_plant(load_sensitivity=1.0, viscous=0.02)
-    down, up = (
-        speed(roll(plant, machine, held(machine, 40, q2=level)), machine, "q2")
-        for level in (1.0, -1.0)
-    )
+    down, up = (find_speed(plant, machine, "q2", q2=level) for level in (1.0, -1.0))
     assert down > 0.18 > -up > 0.1
 
 
@@ -197,27 +174,18 @@ def test_oil_warms_with_work_and_speeds_the_machine_up(machine: Machine) -> None
 
 
 def test_half_the_time_step_gives_the_same_path(machine: Machine) -> None:
-    u = (
-        torch.rand(20, 1, 5, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0
-    ).repeat_interleave(5, 0)
+    drawn = torch.rand(20, 1, 5, generator=torch.Generator().manual_seed(3))
+    u = (2.0 * drawn - 1.0).repeat_interleave(5, 0)
     coarse, fine = (roll(hydraulic(substep_s=step_s), machine, u) for step_s in (0.005, 0.0025))
     assert (coarse - fine).abs().max() < 0.01
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"breakaway": 0.01}, "breakaway"),
-        ({"mode_hz": 0.0}, "mode_hz"),
-        ({"notch": 1.5}, "notch"),
-        ({"substep_s": 0.02}, "substep_s"),
-    ],
+    ("name", "value"), [("breakaway", 0.01), ("mode_hz", 0.0), ("notch", 1.5), ("substep_s", 0.02)]
 )
-def test_a_plant_that_makes_no_sense_is_refused(
-    machine: Machine, changes: dict[str, float], message: str
-) -> None:
-    with pytest.raises(ConfigError, match=message):
-        hydraulic(**changes).build(machine, 1, CPU)
+def test_a_plant_that_makes_no_sense_is_refused(machine: Machine, name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=name):
+        hydraulic(**{name: value}).build(machine, 1, CPU)
 
 
 @pytest.mark.parametrize("name", ["lag", "hydraulic"])

@@ -22,15 +22,18 @@ from brokk_rl.machine import Machine
 CPU = torch.device("cpu")
 
 
+def bounds(machine: Machine) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.tensor(machine.lower).float(), torch.tensor(machine.upper).float()
+
+
 def networks(seed: int = 0) -> JointNetworks:
     return JointNetworks(5, 13, 32, torch.Generator().manual_seed(seed))
 
 
 def written(path: Path, machine: Machine, **tensors: torch.Tensor) -> Path:
     made = networks()
-    checkpoint.write_checkpoint(
-        path, "mlp", machine, {**made.state_dict(), **tensors}, {"width": 32}
-    )
+    weights = {**made.state_dict(), **tensors}
+    checkpoint.write_checkpoint(path, "mlp", machine, weights, {"width": 32})
     return path
 
 
@@ -46,9 +49,8 @@ def test_one_batched_network_is_five_networks() -> None:
             for layer, weight, bias in zip(alone[::2], batched.weight, batched.bias, strict=True):
                 layer.weight.copy_(weight[joint].T)
                 layer.bias.copy_(bias[joint, 0])
-        torch.testing.assert_close(
-            together[joint], alone(inputs[joint])[:, 0], atol=1e-6, rtol=1e-5
-        )
+        expected = alone(inputs[joint])[:, 0]
+        torch.testing.assert_close(together[joint], expected, atol=1e-6, rtol=1e-5)
 
 
 def test_inputs_are_commands_increments_and_the_newest_position() -> None:
@@ -66,20 +68,15 @@ def test_inputs_are_commands_increments_and_the_newest_position() -> None:
 def test_a_free_run_in_one_go_is_step_by_step(machine: Machine, tmp_path: Path) -> None:
     made = networks(3)
     made.increment_scale.fill_(0.01)
-    lower, upper = (
-        torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper)
-    )
+    lower, upper = bounds(machine)
     generator = torch.Generator().manual_seed(1)
     u = torch.rand(5, 4, 12 + 30, generator=generator) * 2.0 - 1.0
     q = (0.03 * torch.rand(5, 4, 13, generator=generator)).cumsum(2) - 0.3
     path = made.roll_out(u, q, lower, upper)
-    checkpoint.write_checkpoint(
-        tmp_path / "a.safetensors", "mlp", machine, made.state_dict(), {"width": 32}
-    )
-    model = Mlp(checkpoint=str(tmp_path / "a.safetensors")).build(machine, 4, CPU)
-    history = History(
-        q=q.permute(1, 2, 0).clone(), u=u[..., :13].roll(1, 2).permute(1, 2, 0).clone()
-    )
+    path_there = written(tmp_path / "a.safetensors", machine, **made.state_dict())
+    model = Mlp(checkpoint=str(path_there)).build(machine, 4, CPU)
+    before = u[..., :13].roll(1, 2)
+    history = History(q=q.permute(1, 2, 0).clone(), u=before.permute(1, 2, 0).clone())
     for k in range(30):
         history.push_u(u[..., 12 + k].T)
         history.push_q(model.step(history))
@@ -90,17 +87,14 @@ def test_increments_below_the_noise_are_none() -> None:
     made = networks()
     made.quiet.fill_(0.001)
     output = torch.tensor([[-0.004, -0.0005, 0.0, 0.001, 0.003]]).expand(5, 5)
-    torch.testing.assert_close(
-        made.increment(output)[0], torch.tensor([-0.003, 0.0, 0.0, 0.0, 0.002])
-    )
+    expected = torch.tensor([-0.003, 0.0, 0.0, 0.0, 0.002])
+    torch.testing.assert_close(made.increment(output)[0], expected)
 
 
 def test_the_shipped_machine_at_rest_stays_at_rest(machine: Machine) -> None:
     actuator, num_envs = option("actuator", "mlp"), 64
     generator = torch.Generator().manual_seed(0)
-    lower, upper = (
-        torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper)
-    )
+    lower, upper = bounds(machine)
     q = lower + (upper - lower) * torch.rand(num_envs, 5, generator=generator)
     # Half of the smallest dead band of the plant; close to it the fit is a few mrad worse.
     for level in (0.0, 0.03, -0.03):
@@ -141,9 +135,8 @@ def test_a_truncated_checkpoint_is_refused(tmp_path: Path, machine: Machine, kee
 
 
 def test_nan_weights_are_refused(tmp_path: Path, machine: Machine) -> None:
-    path = written(
-        tmp_path / "a.safetensors", machine, quiet=torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0])
-    )
+    quiet = torch.tensor([0.0, 0.0, float("nan"), 0.0, 0.0])
+    path = written(tmp_path / "a.safetensors", machine, quiet=quiet)
     with pytest.raises(CheckpointError, match=r"tensor 'quiet' holds NaN"):
         load_networks(str(path), machine)
 

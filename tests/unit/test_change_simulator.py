@@ -34,10 +34,9 @@ def estimate(value: float, half: float) -> Estimate:
 def name_effects() -> Answer:
     """Returns a diagnosis that names a delay, friction at the elbow, and play at the shoulder."""
     part = FRICTION_NM / (30 * 0.05 * 3.0)  # of kp times 5 % of the travel
+    delays = {name: estimate(DELAY_S, 0.004) for name in ("shoulder", "elbow")}
     parameters: dict[str, Any] = {
-        "dead_time": {
-            "dead_time_s": {name: estimate(DELAY_S, 0.004) for name in ("shoulder", "elbow")}
-        },
+        "dead_time": {"dead_time_s": delays},
         "joint_friction": {"part": {"elbow": estimate(part, 0.01)}},
         "backlash": {"gap_rad": {"shoulder": estimate(0.03, 0.01)}},
     }
@@ -126,10 +125,9 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
     known = effect_library.load_effects(machine, names, api._load_simulator(source))
     kinds = {kind.name: kind for kind in known}
     for name, numbers in CHANGES:
-        kind, findings = kinds[name], []
-        for joint in machine.joint_names:
-            sizes = {number: Estimate(value, (value, value)) for number, value in numbers.items()}
-            findings.append(JointFinding(kind.name, joint, sizes))
+        kind = kinds[name]
+        sizes = {number: estimate(value, 0.0) for number, value in numbers.items()}
+        findings = [JointFinding(name, joint, sizes) for joint in machine.joint_names]
         changed = tmp_path / "changed.xml"
         assert write_changed_mjcf(source, machine, findings, changed)[1] == {}
         values = {name: np.full((1, 2), value) for name, value in numbers.items()}

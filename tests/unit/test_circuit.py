@@ -48,12 +48,11 @@ class Run:
         machine: Machine,
         levels: dict[str, float],
         periods: int,
-        q: np.ndarray | None = None,
         blocked: tuple[str, ...] = (),
     ) -> None:
         self.model = CircuitModel(config, machine, 1, CPU)
-        at = torch.tensor(machine.home if q is None else q, dtype=torch.float32)[None]
-        history = rest(machine, at)
+        history = rest(machine)
+        at = history.q[:, -1].clone()
         u = torch.zeros(1, machine.num_joints)
         for name, level in levels.items():
             u[0, machine.joint_names.index(name)] = level
@@ -150,35 +149,19 @@ def solve_one_joint(
             0.0 if (p <= 0 and rate_p < 0) or (p >= 1 and rate_p > 0) else rate_p
             for p, rate_p in ((bore, d_bore), (rod, d_rod), (supply, d_supply))
         )
-        return [
-            full * w,
-            d_w,
-            d_bore,
-            d_rod,
-            rate,
-            omega * (omega * (u - spool) - 2 * number("spool_damping") * rate),
-            (wanted - poppet) / number("counterbalance_s"),
-            d_supply,
-        ]
+        d_rate = omega * (omega * (u - spool) - 2 * number("spool_damping") * rate)
+        d_poppet = (wanted - poppet) / number("counterbalance_s")
+        return [full * w, d_w, d_bore, d_rod, rate, d_rate, d_poppet, d_supply]
 
     start = CircuitModel(config, machine, 1, CPU)
     history = rest(machine)
     lever, _ = start._follow_linkage(history.q[:, -1])
     force = start.parameters["supply_ratio"] * start._yield_force
     begun = start._begin(history, torch.zeros(1, machine.num_joints), lever, force)
-    first = [
-        home[joint],
-        0.0,
-        float(begun["bore"][0, joint]),
-        float(begun["rod"][0, joint]),
-        0.0,
-        0.0,
-        0.0,
-        config.standby,
-    ]
-    found = solve_ivp(
-        slopes, (0, t_s[-1]), first, "LSODA", t_s, rtol=1e-5, atol=1e-7, max_step=0.002
-    )
+    bore, rod = (float(begun[name][0, joint]) for name in ("bore", "rod"))
+    first = [home[joint], 0.0, bore, rod, 0.0, 0.0, 0.0, config.standby]
+    span, how = (0, t_s[-1]), {"rtol": 1e-5, "atol": 1e-7, "max_step": 0.002}
+    found = solve_ivp(slopes, span, first, "LSODA", t_s, **how)
     return found.y[0], found.y[7]
 
 
@@ -234,12 +217,10 @@ def test_a_saturated_pump_slows_all_joints_alike_only_behind_post_compensators(
     # q1 has no load; q3 lifts: a pre-compensated valve loses the heavy joint first
     def share(name: str) -> tuple[float, float]:
         config = circuit(name, flow_share=0.9, power=2.0)
-        alone = [
-            Run(config, machine, {joint: level}, 40).speed(j, 10, machine)
-            for j, joint, level in ((0, "q1", 1.0), (Q3, "q3", -1.0))
-        ]
         both = Run(config, machine, {"q1": 1.0, "q3": -1.0}, 40)
-        return both.speed(0, 10, machine) / alone[0], both.speed(Q3, 10, machine) / alone[1]
+        q1, q3 = (Run(config, machine, one, 40) for one in ({"q1": 1.0}, {"q3": -1.0}))
+        light = both.speed(0, 10, machine) / q1.speed(0, 10, machine)
+        return light, both.speed(Q3, 10, machine) / q3.speed(Q3, 10, machine)
 
     light, heavy = share("post_compensated")
     assert light < 0.8
@@ -249,10 +230,8 @@ def test_a_saturated_pump_slows_all_joints_alike_only_behind_post_compensators(
 
 
 def test_pump_stays_within_its_power(machine: Machine) -> None:
-    limited, free = (
-        Run(circuit(power=power), machine, {"q3": -1.0, "q4": -1.0, "q5": -1.0}, 40)
-        for power in (0.15, 2.0)
-    )
+    lifting = {"q3": -1.0, "q4": -1.0, "q5": -1.0}
+    limited, free = (Run(circuit(power=one), machine, lifting, 40) for one in (0.15, 2.0))
     model = limited.model
     used = []
     for row in limited.state[20:]:
@@ -268,10 +247,8 @@ def test_pump_stays_within_its_power(machine: Machine) -> None:
 
 def test_a_counterbalance_valve_makes_the_pump_push_a_falling_load(machine: Machine) -> None:
     """Lowering with the valve takes inlet pressure: ratio * inlet + outlet = setting + opening."""
-    held, free = (
-        Run(circuit(counterbalance_setting=setting), machine, {"q3": 0.5}, 40)
-        for setting in (0.8, 0.0)
-    )
+    configs = (circuit(counterbalance_setting=setting) for setting in (0.8, 0.0))
+    held, free = (Run(config, machine, {"q3": 0.5}, 40) for config in configs)
     bore, rod, poppet = (held.get(name, Q3)[20:].mean() for name in ("bore", "rod", "poppet"))
     assert 3.0 * bore + rod == pytest.approx(0.8 + 0.5 * poppet, abs=0.03)
     assert bore > 0.05
@@ -326,9 +303,8 @@ def test_outriggers_tilt_the_machine_by_the_moment_of_its_arm(machine: Machine) 
         moment_nm += body.mass_kg.value * GRAVITY_M_S2 * (x_m + body.com_m[0])
     overturn = Gravity(machine, CPU).overturn(q)[0].numpy()
     np.testing.assert_allclose(overturn, [0.0, moment_nm, 0.0], rtol=1e-5, atol=1e-2)
-    home_nm = float(
-        Gravity(machine, CPU).overturn(torch.tensor(np.array(machine.home)[None]).float())[0, 1]
-    )
+    home = torch.tensor(np.array(machine.home)[None]).float()
+    home_nm = float(Gravity(machine, CPU).overturn(home)[0, 1])
     tilt_rad = (moment_nm - home_nm) / stiffness
     reach_m = x_m + machine.tip_m[0]
     height_m = sum(body.origin_m[2].value for body in machine.bodies)
@@ -340,25 +316,16 @@ def test_outriggers_tilt_the_machine_by_the_moment_of_its_arm(machine: Machine) 
     rigid = circuit(outrigger_nm_rad=0.0).build(machine, 1, CPU)
     assert rigid.sides == frozenset()
     assert float(rigid.misplacement(q).abs().max()) == 0.0
-    home = torch.tensor(np.array(machine.home)[None]).float()
     assert float(model.misplacement(home).abs().max()) == pytest.approx(0.0, abs=1e-7)
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("name", "value"),
     [
-        ({"substep_s": 0.02}, "substep_s"),
-        ({"margin": 0.0}, "margin"),
-        ({"compensation": "both"}, "compensation"),
-        ({"outrigger_nm_rad": float("nan")}, "outrigger_nm_rad"),
-        ({"linkage_lower_rad": 0.0}, "linkage_lower_rad"),
-        ({"rod_area": 1.5}, "rod_area"),
-        ({"breakaway": 0.0}, "breakaway"),
-        ({"transport_s": 0.9}, "transport_s"),
+        ("substep_s", 0.02), ("margin", 0.0), ("compensation", "both"), ("outrigger_nm_rad", float("nan")),
+        ("linkage_lower_rad", 0.0), ("rod_area", 1.5), ("breakaway", 0.0), ("transport_s", 0.9),
     ],
-)
-def test_numbers_that_make_no_sense_are_refused(
-    changes: dict[str, Any], words: str, machine: Machine
-) -> None:
-    with pytest.raises(ConfigError, match=words):
-        circuit(**changes).build(machine, 1, CPU)
+)  # fmt: skip
+def test_numbers_that_make_no_sense_are_refused(name: str, value: Any, machine: Machine) -> None:
+    with pytest.raises(ConfigError, match=name):
+        circuit(**{name: value}).build(machine, 1, CPU)

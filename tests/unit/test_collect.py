@@ -7,12 +7,14 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from composed import option
+from motion import rest
 
 from actuators.effects.composition import ActuatorWithEffects
 from actuators.excite.player import NominalLink
@@ -20,7 +22,6 @@ from actuators.modes.collect import Collect
 from brokk_rl import record
 from brokk_rl.errors import LinkError
 from brokk_rl.extensions import load_mode
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
@@ -36,10 +37,8 @@ SMALL = (
 
 
 def made(folder: Path, machine: Machine) -> dict[str, Recording]:
-    return {
-        path.stem: record.read_recording(path, machine)
-        for path in sorted((folder / "recordings").glob("*.parquet"))
-    }
+    paths = sorted((folder / "recordings").glob("*.parquet"))
+    return {path.stem: record.read_recording(path, machine) for path in paths}
 
 
 def mode(out: Path, *overrides: str) -> Collect:
@@ -75,9 +74,8 @@ def test_the_plan_says_beforehand_what_the_run_will_do(collected: Path, machine:
     assert (collected / "plan.png").read_bytes().startswith(b"\x89PNG")
     assert plan["num_runs"] == 2 and plan["run_s"] == 30.0
     # the plant lags and has a dead band, the nominal machine does not
-    commanded = np.concatenate(
-        [file.u for name, file in made(collected, machine).items() if name.startswith("sine_00")]
-    )
+    files = made(collected, machine)
+    commanded = np.concatenate([files[name].u for name in files if name.startswith("sine_00")])
     for entry in plan["runs"][0]:
         joint = machine.joint_names.index(entry["name"].removeprefix("sine_"))
         moving = np.flatnonzero(commanded[:, joint])
@@ -95,9 +93,8 @@ def test_the_same_seed_records_the_same_and_another_does_not(
     for out, seed in ((tmp_path / "again", 0), (tmp_path / "other", 1)):
         torch.rand(3)  # whatever else drew from the global generator
         mode(out, *SMALL, f"session.seed={seed}").run()
-    first, again, other = (
-        made(folder, machine) for folder in (collected, tmp_path / "again", tmp_path / "other")
-    )
+    folders = (collected, tmp_path / "again", tmp_path / "other")
+    first, again, other = (made(folder, machine) for folder in folders)
     for name, file in first.items():
         assert np.array_equal(file.u, again[name].u) and np.array_equal(file.q, again[name].q)
     assert any(not np.array_equal(file.u, other[name].u) for name, file in first.items())
@@ -107,18 +104,12 @@ def test_actuator_and_effects_are_chosen_as_everywhere(
     brokk: Callable[..., Any], machine: Machine
 ) -> None:
     small = ("collect.num_runs=1", "collect.run_minutes=0.4", "collect.file_minutes=0.4")
-    chosen = (
-        "actuator=hydraulic",
-        "effect=[backlash,stiction]",
-        "effect.backlash.gap_rad=0.01",
-        "excitation=levels",
-    )
-    done = brokk("mode=collect", "session.out=run", *chosen, *small)
+    chosen = ("actuator=hydraulic", "effect=[backlash,stiction]", "effect.backlash.gap_rad=0.01")
+    done = brokk("mode=collect", "session.out=run", "excitation=levels", *chosen, *small)
     assert done.code == 0, done.err
     (file,) = made(Path("run"), machine).values()
-    assert (
-        file.metadata["source"] == "simulator: Hydraulic + backlash + stiction, excitation: levels"
-    )
+    source = "simulator: Hydraulic + backlash + stiction, excitation: levels"
+    assert file.metadata["source"] == source
     assert file.extra["oil_c"].shape == (file.num_samples,) and 0.0 < file.extra["oil_c"][0] < 60.0
 
 
@@ -191,9 +182,8 @@ class Killed(NominalLink):
     def send(self, command: Command) -> Command:
         if self.read().t_s > 9.99 and self.seen is None:
             paths = self.folder.glob("recordings/*.parquet")
-            type(self).seen = [
-                record.read_recording(path, self._machine).num_samples for path in paths
-            ]
+            files = [record.read_recording(path, self._machine) for path in paths]
+            type(self).seen = [file.num_samples for file in files]
         return super().send(command)
 
 
@@ -203,14 +193,11 @@ def test_a_file_that_grows_is_on_the_disk_before_it_is_full(
     collect = replace(mode(tmp_path / "run", *SMALL), link=Connected(Killed))
     collect = replace(collect, collect=replace(collect.collect, flush_s=1.0))
     Killed.folder, clock_s = tmp_path / "run", iter(np.arange(0.0, 1e3, 0.05))
-    monkeypatch.setattr(
-        "actuators.modes.collect.time",
-        type("Clock", (), {"monotonic": staticmethod(lambda: next(clock_s))}),
-    )
+    clock = SimpleNamespace(monotonic=lambda: next(clock_s))
+    monkeypatch.setattr("actuators.modes.collect.time", clock)
     collect.run()
-    assert Killed.seen is not None and len(Killed.seen) == 2 and min(Killed.seen) >= 160, (
-        "of 200 samples"
-    )
+    assert Killed.seen is not None and len(Killed.seen) == 2
+    assert min(Killed.seen) >= 160, "of 200 samples"
 
 
 class RealTime(NominalLink):
@@ -235,13 +222,9 @@ class RealTime(NominalLink):
 def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(
     tmp_path: Path, machine: Machine
 ) -> None:
-    small = (
-        "excitation=levels",
-        "collect.num_runs=1",
-        "collect.run_minutes=0.04",
-        "collect.file_minutes=0.04",
-    )
-    collect = replace(mode(tmp_path / "run", *small), link=Connected(RealTime))
+    small = ("collect.num_runs=1", "collect.run_minutes=0.04", "collect.file_minutes=0.04")
+    asked = mode(tmp_path / "run", "excitation=levels", *small)
+    collect = replace(asked, link=Connected(RealTime))
     before = time.monotonic()
     collect.run()
     assert time.monotonic() - before > 2.2
@@ -250,37 +233,34 @@ def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(
     assert first.metadata["run"] == last.metadata["run"] and first is not last
     # Busy computers come late more than once.
     periods_s = np.concatenate([np.diff(file.t_s) for file in files])
-    assert (
-        np.median(periods_s) == pytest.approx(0.05, abs=0.006) and len(np.unique(periods_s)) > 3
-    ), "as measured"
+    assert np.median(periods_s) == pytest.approx(0.05, abs=0.006)
+    assert len(np.unique(periods_s)) > 3, "as measured"
     assert 0.0 < max(np.abs(file.u).max() for file in (first, last)) <= 0.5, "as sent"
+
+
+def surround(actuator: str, *effects: str) -> ActuatorWithEffects:
+    chosen = {name: option("effect", name) for name in effects}
+    return ActuatorWithEffects(actuator=option("actuator", actuator), effects=chosen)
 
 
 def test_a_simulated_machine_is_its_actuator_model_with_noise(
     machine: Machine, tmp_path: Path
 ) -> None:
-    plant = ActuatorWithEffects(
-        actuator=option("actuator", "lag"), effects={"backlash": option("effect", "backlash")}
-    )
     session = Session(out=str(tmp_path), seed=0, device="cpu")
-    quiet, noisy = (
-        SimulatedMachines(actuator=plant, noise=noise, one_machine=True).build(machine, 2, session)
-        for noise in (0.0, 0.01)
-    )
+    links = []
+    for effects, noise in ((("backlash",), 0.0), (("backlash",), 0.01), ((), 0.0)):
+        plant = surround("lag", *effects)
+        spec = SimulatedMachines(actuator=plant, noise=noise, one_machine=True)
+        links.append(spec.build(machine, 2, session))
+    quiet, noisy, neutral = links
     model = option("actuator", "lag").build(machine, 2, torch.device("cpu"))
-    neutral = SimulatedMachines(
-        actuator=ActuatorWithEffects(actuator=option("actuator", "lag"), effects={}),
-        noise=0.0,
-        one_machine=True,
-    ).build(machine, 2, session)
-    home = torch.as_tensor(machine.home, dtype=torch.float32).repeat(2, 1)
-    history = History(q=home[:, None].repeat(1, 13, 1), u=torch.zeros(2, 13, 5))
+    history = rest(machine, num=2)
     generator, differences, played = np.random.default_rng(0), [], []
     for _ in range(200):
         u = generator.uniform(-1, 1, (2, 5)).astype(np.float32)
         history.push_u(torch.as_tensor(u))
         history.push_q(model.step(history))
-        for link in (quiet, noisy, neutral):
+        for link in links:
             assert (link.send(Command(u)).u == u).all()
         assert neutral.read().q == pytest.approx(history.q[:, -1].numpy(), abs=1e-6)
         differences.append(noisy.read().q - quiet.read().q)
@@ -294,9 +274,7 @@ def test_a_simulated_machine_is_its_actuator_model_with_noise(
 def test_all_runs_record_one_machine_where_effects_are_drawn(
     one_machine: bool, machine: Machine, tmp_path: Path
 ) -> None:
-    plant = ActuatorWithEffects(
-        actuator=option("actuator", "ideal"), effects={"asymmetry": option("effect", "asymmetry")}
-    )
+    plant = surround("ideal", "asymmetry")
     connection = SimulatedMachines(actuator=plant, noise=0.0, one_machine=one_machine)
     link = connection.build(machine, 3, Session(out=str(tmp_path), seed=0, device="cpu"))
     for _ in range(60):

@@ -29,23 +29,16 @@ from brokk_rl.statistics import compute_student_interval, compute_wilson_interva
 def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any) -> None:
     folder.mkdir(parents=True)
     figures = {
-        "episodes": 100,
-        "success_strict": {"mean": strict, "ci95": [0, 1]},
-        "success_paper": {"mean": strict / 2, "ci95": [0, 1]},
-        "time_to_insert_s": {"median": 8.0, "p95": 12.0},
-        "lateral_error_m": {"mean": 0.004},
-        "peak_force_n": 1500.0,
-        "valve_travel": 0.7,
-        "seed": seed,
-        "actuator": actuator,
-        "policy": "trained",
-    }
+        "episodes": 100, "success_strict": {"mean": strict, "ci95": [0, 1]},
+        "success_paper": {"mean": strict / 2, "ci95": [0, 1]}, "time_to_insert_s": {"median": 8.0, "p95": 12.0},
+        "lateral_error_m": {"mean": 0.004}, "peak_force_n": 1500.0, "valve_travel": 0.7, "seed": seed,
+        "actuator": actuator, "policy": "trained",
+    }  # fmt: skip
     record = {
-        "seed": seed,
-        "outcome": "finished",
+        "seed": seed, "outcome": "finished",
         "choices": {"mode": "train", "actuator": actuator, "session": "default"},
         "overrides": [f"actuator={actuator}", f"session.seed={seed}"],
-    }
+    }  # fmt: skip
     (folder / "evaluation.json").write_text(json.dumps(figures | more))
     (folder / "session.json").write_text(json.dumps(record))
 
@@ -115,12 +108,8 @@ def test_a_single_run_has_the_interval_of_its_episodes(sweep: Path) -> None:
 
 
 def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
-    figures = {
-        "episodes": 10,
-        "success_strict": {"mean": 0.5},
-        "success_paper": {"mean": None},
-        "time_to_insert_s": {"median": None},
-    }
+    figures = {"episodes": 10, "success_strict": {"mean": 0.5}, "success_paper": {"mean": None}}
+    figures["time_to_insert_s"] = {"median": None}
     write_run(tmp_path / "run", "mlp", 0, 0.9, policies={"trained": figures, "classical": figures})
     rows = average(tmp_path / "run")
     assert [row["policy"] for row in rows] == ["trained", "classical"]
@@ -159,9 +148,8 @@ def test_differences_are_those_of_the_same_seed_and_condition() -> None:
     names = ["policy", "seed", *columns, "episodes", "success_strict"]
     table = pd.DataFrame(rows, columns=[*names, "success_strict_low", "success_strict_high"])
     groups = average_seeds(table, columns)
-    base, other_base, other, single = compare_to_baseline(groups, table, columns, None).to_dict(
-        "records"
-    )
+    compared = compare_to_baseline(groups, table, columns, None)
+    base, other_base, other, single = compared.to_dict("records")
     assert np.isnan(base["difference"]) and np.isnan(other_base["difference"])
     assert other["by_seed"] == pytest.approx({0: 0.2, 1: 0.1})
     # mean 0.15, standard error 0.05, t(0.975, 1) = 12.706

@@ -59,16 +59,11 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
     said().write(path)
     found = json.loads(path.read_text())
     assert found["schema"] == 1 and found["sanity"] == [{"a": 1}]
-    assert found["selected"][0]["parameters"]["gap_rad"]["q3"] == {
-        "mean": 0.031,
-        "ci95": [0.028, 0.034],
-    }
+    size = {"mean": 0.031, "ci95": [0.028, 0.034]}
+    assert found["selected"][0]["parameters"]["gap_rad"]["q3"] == size
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
-    assert found["where"] == {
-        "joints": {"q3": PLACE},
-        "regimes": [{"joint": "q3", "regime": "after a reversal", "share": 0.8}],
-        "stage": "actuation",
-    }
+    regimes = [{"joint": "q3", "regime": "after a reversal", "share": 0.8}]
+    assert found["where"] == {"joints": {"q3": PLACE}, "regimes": regimes, "stage": "actuation"}
     experiment = {"excitation": "a dial gauge", "separates": ["backlash", "lag"]}
     assert found["next_experiment"] == experiment
     assert found["ranking"] == [{"effect": "backlash", "joints": ["q3"], "probability": 0.97}]

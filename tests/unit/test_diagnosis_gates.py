@@ -12,6 +12,7 @@ from gaps import recording
 from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
 from diagnosis import gates
 from diagnosis.answer import Answer, parse_answer
 from diagnosis.closure import Gap, Gate, RivalError
@@ -44,9 +45,8 @@ def test_findings_beyond_their_share_forbid_any_telling(
     some = [remark(name, "q3", 1.9 * limit)]
     assert by_name(gates.judge_recordings(some, [], [*field, calm], [], machine))[gate.name].passed
     more = [remark(name, "q3", 2.1 * limit)]
-    assert not by_name(gates.judge_recordings(more, [], [*field, calm], [], machine))[
-        gate.name
-    ].passed
+    told = by_name(gates.judge_recordings(more, [], [*field, calm], [], machine))
+    assert not told[gate.name].passed
 
 
 def test_what_the_reference_shows_as_often_forbids_no_telling(machine: Machine) -> None:
@@ -78,22 +78,21 @@ def test_limits_that_the_recordings_leave_are_told(machine: Machine) -> None:
         q[:400, 3] = machine.upper[3] + beyond * travel[3]
         return replace(plain, q=q)
 
+    def judge_limits(field: list[Recording], reference: list[Recording]) -> Gate:
+        return by_name(gates.judge_recordings([], [], field, reference, machine))["limits"]
+
     for beyond, passes in ((0.049, True), (0.051, False)):
-        (gate,) = [
-            one for one in gates.judge_recordings([], [], [moved(beyond)], [], machine) if one.name == "limits"
-        ]  # fmt: skip
+        gate = judge_limits([moved(beyond)], [])
         assert gate.passed is passes and gate.value == pytest.approx(beyond)
         assert ("q4" in gate.text) is not passes
     below = replace(plain, q=2 * machine.lower - machine.upper + 0.0 * plain.q)
-    assert not by_name(gates.judge_recordings([], [], [below], [], machine))["limits"].passed
+    assert not judge_limits([below], []).passed
     # a field that alone leaves them may have a biased encoder
-    assert by_name(gates.judge_recordings([], [], [moved(0.3)], [plain], machine))["limits"].passed
-    assert not by_name(gates.judge_recordings([], [], [plain], [moved(0.3)], machine))[
-        "limits"
-    ].passed
+    assert judge_limits([moved(0.3)], [plain]).passed
+    assert not judge_limits([plain], [moved(0.3)]).passed
     spike = moved(0.3)
     spike.q[4:400, 3] = machine.home[3]
-    assert by_name(gates.judge_recordings([], [], [spike], [], machine))["limits"].passed
+    assert judge_limits([spike], []).passed
 
 
 def test_fast_motion_without_command_is_an_unlogged_input_and_slow_one_a_leak(

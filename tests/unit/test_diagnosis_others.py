@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from motion import make_recording
+from scipy.spatial.transform import Rotation
 
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -66,17 +67,10 @@ def tracked(
     """Returns a recording with tool points as measured beside a machine whose encoders show too much and whose base is tilted."""
     true_q = torch.as_tensor(recording.q - bias, dtype=torch.float32)
     tip = Kinematics(machine, CPU).pose(true_q).tip_in_base_m.numpy()
-    turn = np.array(
-        [
-            [1, 0, 0],
-            [0, np.cos(tilt_rad), -np.sin(tilt_rad)],
-            [0, np.sin(tilt_rad), np.cos(tilt_rad)],
-        ]
-    )
-    seen = tip @ turn.T + 2e-3 * np.random.default_rng(seed).standard_normal(tip.shape)
-    return dataclasses.replace(
-        recording, extra=dict(zip(geometry.TOOL_COLUMNS, seen.T, strict=True))
-    )
+    turned = Rotation.from_rotvec([tilt_rad, 0.0, 0.0]).apply(tip)
+    seen = turned + 2e-3 * np.random.default_rng(seed).standard_normal(tip.shape)
+    columns = dict(zip(geometry.TOOL_COLUMNS, seen.T, strict=True))
+    return dataclasses.replace(recording, extra=columns)
 
 
 def find(machine: Machine, reference: Recording, field: Recording) -> list[DetectedEffect]:
@@ -88,10 +82,9 @@ def find(machine: Machine, reference: Recording, field: Recording) -> list[Detec
 def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Machine) -> None:
     none, bias = np.zeros(5), np.array([0.0, 0.0, 0.015, 0.0, 0.0])
     reference = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 6)
-    biased, tilted = (
-        tracked(swept(machine, 120.0, 7), machine, b, tilt, 8)
-        for b, tilt in ((bias, 0.0), (none, 0.03))
-    )
+    sound = swept(machine, 120.0, 7)
+    biased = tracked(sound, machine, bias, 0.0, 8)
+    tilted = tracked(sound, machine, none, 0.03, 8)
     one = find(machine, reference, biased)
     assert [found.kind.name for found in one] == ["encoder_bias"]
     assert one[0].parameters["bias_rad"]["q3"].mean == pytest.approx(0.015, abs=0.002)
@@ -102,10 +95,9 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
     assert not find(machine, tracked(swept(machine, 120.0, 5), machine, bias, 0.0, 6), biased)
     # two milliradians are seen, explained, and not worth a name; nothing else is named in their
     # place
-    faint = tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)
-    assert not find(machine, reference, faint)
+    assert not find(machine, reference, tracked(sound, machine, bias / 7.5, 0.0, 8))
     # What a tilt and a zero do to a point is more than the sum of both.
-    found = find(machine, reference, tracked(swept(machine, 120.0, 7), machine, 2 * bias, 0.05, 8))
+    found = find(machine, reference, tracked(sound, machine, 2 * bias, 0.05, 8))
     (roll,) = [one.parameters["roll_rad"]["machine"] for one in found if len(one.parameters) == 2]
     assert roll.ci95[0] <= 0.05 <= roll.ci95[1]
 
@@ -114,12 +106,8 @@ def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine:
     none, bias = np.zeros(5), np.array([0.0, 0.0, 0.0, 0.012, 0.0])
 
     def late(recording: Recording) -> Recording:
-        return dataclasses.replace(
-            recording,
-            extra={
-                name: np.concatenate([row[:1], row[:-1]]) for name, row in recording.extra.items()
-            },
-        )
+        columns = {name: np.r_[row[:1], row[:-1]] for name, row in recording.extra.items()}
+        return dataclasses.replace(recording, extra=columns)
 
     reference, field, biased = (
         late(tracked(swept(machine, 120.0, seed), machine, b, 0.0, seed))

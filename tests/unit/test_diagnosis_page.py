@@ -70,13 +70,8 @@ def test_the_report_holds_names_numbers_and_pictures_and_fetches_nothing(
 def test_an_answer_without_effects_has_a_report(
     machine: Machine, seen: Outcome, tmp_path: Path, verdict
 ) -> None:
-    answer = replace(
-        seen.answer,
-        verdict=verdict,
-        selected=(),
-        gap=Gap(0.012, 0.012, 0.01, None),
-        reason="Few data.",
-    )
+    gap = Gap(0.012, 0.012, 0.01, None)
+    answer = replace(seen.answer, verdict=verdict, selected=(), gap=gap, reason="Few data.")
     remark = RecordingRemark("jumps", "q4", "run", 0.0, 1.0, 1, "one")
     bare = replace(answer, more={"sanity": [remark.plain()] * 30})
     assert report.write_headline(bare)[1] == ("good" if verdict == "none" else "warn")

@@ -52,12 +52,11 @@ def test_recordings_that_can_tell_nothing_get_no_name_but_a_reason(
 def test_neither_a_simulator_nor_a_reference_is_refused(
     machine: Machine, brokk: Brokk, tmp_path: Path
 ) -> None:
-    done = brokk("mode=diagnose", given(tmp_path / "field", recording(machine)), "session.out=out")
-    assert done.code != 0 and "add actuator=<name>" in done.err
-    done = brokk("mode=diagnose", f"diagnosis.case={tmp_path}", "session.out=out2")
-    assert done.code != 0 and "no reference/*.parquet" in done.err
-    done = brokk("mode=diagnose", "session.out=out3")
-    assert done.code != 0 and "give either case=" in done.err
+    field = given(tmp_path / "field", recording(machine))
+    case = f"diagnosis.case={tmp_path}"
+    for word, told in ((field, "add actuator=<name>"), (case, "no reference/*.parquet")):
+        done = brokk("mode=diagnose", word, "session.out=out")
+        assert done.code != 0 and told in done.err
 
 
 def test_recordings_of_another_machine_are_refused_by_name(
@@ -65,9 +64,8 @@ def test_recordings_of_another_machine_are_refused_by_name(
 ) -> None:
     stretched = replace(machine.joints[2], upper=replace(machine.joints[2].upper, value=2.5))
     other = replace(machine, joints=(*machine.joints[:2], stretched, *machine.joints[3:]))
-    stamped = replace(
-        recording(machine), metadata={"fingerprint": record.format_fingerprint(other)}
-    )
+    stamp = {"fingerprint": record.format_fingerprint(other)}
+    stamped = replace(recording(machine), metadata=stamp)
     words = ("mode=diagnose", given(tmp_path / "field", stamped), "actuator=lag")
     done = brokk(*words, "session.out=out")
     assert done.code != 0 and "limits differ" in done.err and "0.parquet" in done.err
@@ -87,8 +85,7 @@ def test_a_position_that_is_no_number_is_refused_by_name(
     values = table.column(place).to_numpy().copy()
     values[100] = np.nan
     pq.write_table(table.set_column(place, table.field(place), [values]), path)
-    done = brokk(
-        "mode=diagnose", f"diagnosis.field={tmp_path}/field/*", "actuator=lag", "session.out=out"
-    )
+    field = f"diagnosis.field={tmp_path}/field/*"
+    done = brokk("mode=diagnose", field, "actuator=lag", "session.out=out")
     assert done.code != 0 and "1.parquet" in done.err and "q_q3_rad" in done.err
     assert not Path("out/diagnosis.json").exists()

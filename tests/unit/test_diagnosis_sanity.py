@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,19 @@ from gaps import DELAY, recording
 from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import REMARKS, RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+Examine = Callable[[Recording], dict[str, RecordingRemark]]
 
 
-def named(remarks: list[RecordingRemark]) -> dict[str, RecordingRemark]:
-    return {remark.name: remark for remark in remarks}
+@pytest.fixture
+def examine(machine: Machine, thresholds: InspectionThresholds) -> Examine:
+    """Returns the remarks on a recording by name."""
+
+    def run(one: Recording) -> dict[str, RecordingRemark]:
+        return {found.name: found for found in examine_recordings([one], machine, thresholds)}
+
+    return run
 
 
 def test_a_sound_recording_says_only_which_joint_rested(
@@ -25,12 +35,10 @@ def test_a_sound_recording_says_only_which_joint_rested(
 
 
 def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
-    machine: Machine, thresholds: InspectionThresholds
+    machine: Machine, examine: Examine
 ) -> None:
     sound = recording(machine)
-    found = named(
-        examine_recordings([recording(machine, np.abs(sound.u[:, 3]) > 0)], machine, thresholds)
-    )["interlock"]
+    found = examine(recording(machine, np.abs(sound.u[:, 3]) > 0))["interlock"]
     assert found.joint == "q3"
     assert found.kind.severity == "bad"
     assert found.recording == "planted"
@@ -39,25 +47,21 @@ def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
 
 
 def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(
-    machine: Machine, thresholds: InspectionThresholds
+    machine: Machine, examine: Examine
 ) -> None:
     sound = recording(machine)
     limit = float(np.quantile(sound.q[:, 0], 0.5))
-    found = named(
-        examine_recordings(
-            [recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY))], machine, thresholds
-        )
-    )["interlock"]
+    found = examine(recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY)))["interlock"]
     assert found.joint == "q3" and "q3 ignores its command when q1 is above" in found.amount
 
 
 def test_a_lock_without_a_common_condition_stays_unexplained(
-    machine: Machine, thresholds: InspectionThresholds
+    machine: Machine, examine: Examine
 ) -> None:
     ignored = np.zeros(4800, dtype=bool)
     for begin in np.random.default_rng(3).integers(0, 4700, 12):
         ignored[begin : begin + 60] = True
-    found = named(examine_recordings([recording(machine, ignored)], machine, thresholds))
+    found = examine(recording(machine, ignored))
     assert "interlock" not in found and found["command without motion"].joint == "q3"
     assert "s in all" in found["command without motion"].amount
 
@@ -70,41 +74,36 @@ def test_a_lock_without_a_common_condition_stays_unexplained(
     ],
 )
 def test_only_rows_that_are_not_equally_spaced_are_a_fault_of_the_clock(
-    machine: Machine, thresholds: InspectionThresholds, change, name: str | None
+    machine: Machine, examine: Examine, change, name: str | None
 ) -> None:
     sound = recording(machine)
-    found = named(examine_recordings([replace(sound, t_s=change(sound.t_s))], machine, thresholds))
+    found = examine(replace(sound, t_s=change(sound.t_s)))
     assert {key for key in found if "clock" in key} == ({name} if name else set())
 
 
 def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(
-    machine: Machine, thresholds: InspectionThresholds
+    machine: Machine, examine: Examine
 ) -> None:
     sound = recording(machine)
     middle = float(sound.q[:, 2].min() + 0.7 * np.ptp(sound.q[:, 2]))
     q = sound.q.copy()
     q[:, 2] = np.minimum(q[:, 2], middle)
-    found = named(examine_recordings([replace(sound, q=q)], machine, thresholds))[
-        "saturated sensor"
-    ]
+    found = examine(replace(sound, q=q))["saturated sensor"]
     assert found.joint == "q3" and found.kind.severity == "bad"
-    shifted = q + np.where(np.arange(5) == 2, machine.upper[2] - q[:, 2].max(), 0.0).astype(
-        np.float32
-    )
-    assert "saturated sensor" not in named(
-        examine_recordings([replace(sound, q=shifted)], machine, thresholds)
-    )
+    shifted = q.copy()
+    shifted[:, 2] += machine.upper[2] - q[:, 2].max()
+    assert "saturated sensor" not in examine(replace(sound, q=shifted))
 
 
 def test_lost_frames_and_broken_rules_are_one_remark_each(
-    machine: Machine, thresholds: InspectionThresholds
+    machine: Machine, examine: Examine
 ) -> None:
     sound = recording(machine)
     q, u = sound.q.copy(), sound.u.copy()
     for row in range(100, 4000, 97):
         q[row] = q[row - 1]
     u[400:420, 1] = 0.5
-    found = named(examine_recordings([replace(sound, q=q, u=u)], machine, thresholds))
+    found = examine(replace(sound, q=q, u=u))
     assert found["lost frames"].count > 10 and found["exclusive joint"].joint == "q2"
     assert found["exclusive joint"].from_s == pytest.approx(20.0)
 
@@ -113,14 +112,10 @@ def test_the_gravest_comes_first_and_all_of_it_is_plain(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     sound = recording(machine)
-    remarks = examine_recordings(
-        [replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)],
-        machine,
-        thresholds,
-    )
-    assert [remark.kind.severity for remark in remarks] == sorted(
-        (r.kind.severity for r in remarks), key=["bad", "warn", "note"].index
-    )
+    slow = replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)
+    remarks = examine_recordings([slow], machine, thresholds)
+    places = [["bad", "warn", "note"].index(remark.kind.severity) for remark in remarks]
+    assert places == sorted(places)
     for remark in remarks:
         assert remark.plain()["name"] in REMARKS
         assert remark.plain()["advice"]

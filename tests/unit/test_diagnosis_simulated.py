@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from gaps import diagnose
 from motion import make_recording
 from scipy.signal import lsim
 from scipy.stats import multivariate_normal
 
-from brokk_rl import extensions
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -31,7 +33,7 @@ from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_full_loads, measure_units, stack_side
 from diagnosis.engine.valve import VALVE
 from diagnosis.geometry import TOOL_COLUMNS
-from diagnosis.reference_diagnosis import ReferenceDiagnosis, measure_clock_shift
+from diagnosis.reference_diagnosis import measure_clock_shift
 from diagnosis.repair_proof import EngineProof
 
 RATE_HZ = 20.0
@@ -79,8 +81,10 @@ def record(machine: Machine, u: np.ndarray, q: np.ndarray) -> Recording:
     return make_recording(machine, u, middle + 0.5 * (q - q.mean(0)))
 
 
-def make_case(machine: Machine, delay_s: np.ndarray, gain: np.ndarray) -> GapCase:
-    """Return a case whose field has other delays and gains of each joint than 0.3 s and 1."""
+def make_case(
+    machine: Machine, delay_s: Sequence[float] = (0.3, 0.3), gain: Sequence[float] = (1.0, 1.0)
+) -> GapCase:
+    """Return a case whose field may have other delays and gains of each joint than 0.3 s and 1."""
     reference, field = [], []
     for seed in range(4):
         u = make_commands(100.0, seed)
@@ -90,14 +94,6 @@ def make_case(machine: Machine, delay_s: np.ndarray, gain: np.ndarray) -> GapCas
         every = [move(u, delay_s[j], gain[j], seed)[:, j] for j in range(2)]
         field.append(record(machine, u, np.stack(every, 1)))
     return GapCase(machine, reference, field)
-
-
-def diagnose(case: GapCase):
-    """Return the answer of the engine."""
-    thresholds = extensions.load_part("thresholds")
-    kinds = effect_library.load_effects(case.machine)
-    work = ReferenceDiagnosis(case, kinds, thresholds, np.random.default_rng(0))
-    return work.run(lambda *_: None).answer
 
 
 def make_side(machine: Machine, u: np.ndarray) -> Side:
@@ -242,26 +238,21 @@ def test_courses_are_the_likeliest_of_all(effect: str, chance: tuple[tuple[float
 
 
 def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:
-    answer = diagnose(make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, 1.0])))
+    answer = diagnose(make_case(two_joints))
     assert answer.verdict == "none"
 
 
 @pytest.mark.parametrize(
-    ("delay_s", "gain", "effect", "number", "size"),
+    ("changes", "effect", "number", "size"),
     [
-        ((0.3, 0.45), (1.0, 1.0), "dead_time", "dead_time_s", 0.15),
-        ((0.3, 0.3), (1.0, 0.8), "flow_gain", "gain", 0.8),
+        ({"delay_s": (0.3, 0.45)}, "dead_time", "dead_time_s", 0.15),
+        ({"gain": (1.0, 0.8)}, "flow_gain", "gain", 0.8),
     ],
 )
 def test_a_changed_joint_is_named_sized_and_proven(
-    two_joints: Machine,
-    delay_s: tuple[float, float],
-    gain: tuple[float, float],
-    effect: str,
-    number: str,
-    size: float,
+    two_joints: Machine, changes: dict[str, Any], effect: str, number: str, size: float
 ) -> None:
-    answer = diagnose(make_case(two_joints, np.array(delay_s), np.array(gain)))
+    answer = diagnose(make_case(two_joints, **changes))
     assert [(one.effect, one.joints) for one in answer.selected] == [(effect, ("q4",))]
     estimate = answer.selected[0].parameters[number]["q4"]
     assert estimate.mean == pytest.approx(size, rel=0.1)
@@ -274,7 +265,7 @@ def test_a_changed_joint_is_named_sized_and_proven(
 def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine) -> None:
     joints = (machine.joints[0], machine.joints[2])
     pair = replace(machine, joints=joints, exclusive=(), levers=(), name="two")
-    case = make_case(pair, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
+    case = make_case(pair)
     for recording in case.field:
         recording.q[:, 0] += 0.004 * recording.t_s
     answer = diagnose(case)
@@ -284,7 +275,7 @@ def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine)
 
 @pytest.mark.parametrize("step_rad", [0.004, 0.04])
 def test_a_coarse_sensor_is_named_with_its_step(two_joints: Machine, step_rad: float) -> None:
-    case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
+    case = make_case(two_joints)
     for one in case.field:
         one.q[:] = np.round(one.q / step_rad) * step_rad
     answer = diagnose(case)
@@ -295,7 +286,7 @@ def test_a_coarse_sensor_is_named_with_its_step(two_joints: Machine, step_rad: f
 
 
 def test_a_lattice_that_the_reference_has_too_is_no_coarse_sensor(two_joints: Machine) -> None:
-    case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, 1.0]))
+    case = make_case(two_joints)
     for one in (*case.reference, *case.field):
         one.q[:] = np.round(one.q / 0.004) * 0.004
     assert diagnose(case).verdict == "none"
@@ -327,9 +318,9 @@ def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
 
 
 def test_a_late_clock_is_told_once_and_beside_other_effects(two_joints: Machine) -> None:
-    case = make_case(two_joints, np.array([0.4, 0.4]), np.array([1.0, 0.8]))
-    reference, field = (stack_side(side, two_joints) for side in (case.reference, case.field))
-    decider = Decider(reference, field, clock_late_s=0.1)
+    case = make_case(two_joints, (0.4, 0.4), (1.0, 0.8))
+    sides = (stack_side(side, two_joints) for side in (case.reference, case.field))
+    decider = Decider(*sides, clock_late_s=0.1)
     named = [(one.name, one.joints) for one in decider.decide().named]
     # The engine calls a late clock a dead time of all joints.
     assert named == [("dead_time", (0, 1)), ("flow_gain", (1,))]
@@ -337,9 +328,9 @@ def test_a_late_clock_is_told_once_and_beside_other_effects(two_joints: Machine)
 
 def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machine) -> None:
     # The second joint goes the other way: a simulator without this errs by twice its motion.
-    case = make_case(two_joints, np.array([0.3, 0.3]), np.array([1.0, -1.0]))
-    reference, field = (stack_side(side, two_joints) for side in (case.reference, case.field))
-    proof = EngineProof(case, Decider(reference, field), [], np.random.default_rng(0))
+    case = make_case(two_joints, gain=(1.0, -1.0))
+    sides = (stack_side(side, two_joints) for side in (case.reference, case.field))
+    proof = EngineProof(case, Decider(*sides), [], np.random.default_rng(0))
     assert [one.passed for one in proof.judge()] == [True, False]
     assert diagnose(case).verdict == "unknown"
 

@@ -30,6 +30,11 @@ def run_freely(machine: Machine, error: np.ndarray) -> WindowedRuns:
     return WindowedRuns([recording], np.array([0]), np.array([1]), q[None], q[None] - error)
 
 
+def name_regimes(runs: WindowedRuns, machine: Machine, steps: tuple[int, ...]) -> list[str]:
+    labels = label_regimes(runs, machine)[0, :, Q3]
+    return [REGIMES[labels[step]] for step in steps]
+
+
 @pytest.mark.parametrize("regime", REGIMES)
 def test_an_error_lies_where_it_arises(machine: Machine, regime: str) -> None:
     begin_s, end_s = MOMENTS[regime]
@@ -46,12 +51,8 @@ def test_a_joint_that_rested_in_between_turns_too(machine: Machine) -> None:
     runs = run_freely(machine, np.zeros((1, 100, 5)))
     out = runs.simulated.copy()
     held = np.concatenate([out[:, :50], np.repeat(out[:, 49:50], 20, 1), out[:, 50:80]], 1)
-    regimes = label_regimes(replace(runs, simulated=held), machine)[0, :, Q3]
-    assert [REGIMES[regimes[step]] for step in (30, 65, 75)] == [
-        "after a start",
-        "at rest",
-        "after a reversal",
-    ]
+    found = name_regimes(replace(runs, simulated=held), machine, (30, 65, 75))
+    assert found == ["after a start", "at rest", "after a reversal"]
 
 
 def test_two_causes_share_the_square_of_their_sum(machine: Machine) -> None:
@@ -60,10 +61,7 @@ def test_two_causes_share_the_square_of_their_sum(machine: Machine) -> None:
     error[0, 30:, Q3] += 0.003
     error[0, 60:, Q3] += 0.001
     runs = run_freely(machine, error)
-    assert [REGIMES[label_regimes(runs, machine)[0, step, Q3]] for step in (30, 60)] == [
-        "after a start",
-        "after a reversal",
-    ]
+    assert name_regimes(runs, machine, (30, 60)) == ["after a start", "after a reversal"]
     found = locate_gap(runs, np.zeros(5), np.zeros(5), machine)
     shares = [one.share for one in found.regimes]
     # Of the start 3 * 3 in 30 steps and 3 * 4 in 40, of the reversal 1 * 4 in 40.

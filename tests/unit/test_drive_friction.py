@@ -123,9 +123,8 @@ def test_effects_of_friction_are_numbers_of_the_drive(arm: Machine) -> None:
     drive = replace(option("actuator", "force", **plain), stribeck_m_s=TRUE["stribeck_m_s"])
     model: Any = drive.build(arm, 1, CPU)
     model = option("effect", "stribeck_friction", stribeck_n=0.2).wrap(model, arm, 1, CPU)
-    model = option("effect", "load_friction", motor_load=0.2, outside_load=0.05).wrap(
-        model, arm, 1, CPU
-    )
+    load = option("effect", "load_friction", motor_load=0.2, outside_load=0.05)
+    model = load.wrap(model, arm, 1, CPU)
     model = option("effect", "pose_force", pose_sin_n=0.0, pose_cos_n=1.5).wrap(model, arm, 1, CPU)
     whole = option("actuator", "force", **TRUE).build(arm, 1, CPU)
     np.testing.assert_array_equal(run_drive(model, arm, u, -0.4), run_drive(whole, arm, u, -0.4))

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from composed import option
@@ -50,10 +51,12 @@ def places(model: Any, q: torch.Tensor) -> torch.Tensor:
     return torch.cat((model.tool(point_m, q), model.target(point_m)), 1)
 
 
-def stack(machine: Machine, inner: Any, specs: list[Any], num: int) -> Any:
+def wrap(machine: Machine, *specs: Any, actuator: str = "ideal", num: int = 1) -> Any:
+    """Returns an actuator model with effects around it, the first one nearest to it."""
+    model = shipped("actuator", actuator).build(machine, num, CPU)
     for spec in specs:
-        inner = spec.wrap(inner, machine, num, CPU)
-    return inner
+        model = spec.wrap(model, machine, num, CPU)
+    return model
 
 
 @pytest.mark.parametrize("name", FIXED)
@@ -66,8 +69,7 @@ def test_an_effect_says_what_a_diagnosis_must_know(name: str, machine: Machine) 
         assert number.bounds[0] <= number.typical <= number.bounds[1]
         assert number.none is None or number.bounds[0] <= number.none <= number.bounds[1]
         assert number.typical != number.none
-    model = spec.wrap(shipped("actuator", "ideal").build(machine, 1, CPU), machine, 1, CPU)
-    assert set(model.parameters) == set(spec.numbers)
+    assert set(wrap(machine, spec).parameters) == set(spec.numbers)
 
 
 @pytest.mark.parametrize("name", FIXED)
@@ -76,15 +78,10 @@ def test_an_effect_says_what_a_diagnosis_must_know(name: str, machine: Machine) 
 def test_the_neutral_value_changes_nothing(
     name: str, actuator: str, moving: bool, machine: Machine
 ) -> None:
-    build = shipped("actuator", actuator).build
     u = draw_commands(machine, 25, 2, seed=3)
-    model = neutral(name).wrap(build(machine, 2, CPU), machine, 2, CPU)
-    with torch.no_grad():
-        expected, path = (
-            roll(build(machine, 2, CPU), machine, u, moving=moving),
-            roll(model, machine, u, moving=moving),
-        )
-    assert torch.equal(path, expected)
+    plain, model = (wrap(machine, *one, actuator=actuator, num=2) for one in ([], [neutral(name)]))
+    path = roll(model, machine, u, moving=moving)
+    assert torch.equal(path, roll(plain, machine, u, moving=moving))
     assert torch.equal(model.measure(path[-1]), path[-1])
     assert torch.equal(model.truth(path[-1]), path[-1])
     assert torch.equal(model.misplacement(path[-1]), torch.zeros(2, 3))
@@ -93,21 +90,18 @@ def test_the_neutral_value_changes_nothing(
 
 @pytest.mark.parametrize("name", FIXED)
 def test_the_typical_value_changes_something(name: str, machine: Machine) -> None:
-    build = shipped("actuator", "ideal").build
     u = draw_commands(machine, 60, 2)
     # Seldom seen at their typical size.
     seldom = {"frame_loss": {"probability": 0.5}, "stiction": {"start": 0.5}}
-    model = effect(name, **seldom.get(name, {})).wrap(build(machine, 2, CPU), machine, 2, CPU)
-    expected, path = roll(build(machine, 2, CPU), machine, u), roll(model, machine, u)
+    model = wrap(machine, effect(name, **seldom.get(name, {})), num=2)
+    expected, path = (roll(one, machine, u) for one in (wrap(machine, num=2), model))
     seen = model.measure(path[-1])
     moved = [
         (path - expected).abs().amax(),
         (seen - path[-1]).abs().amax(),
         (places(model, path[-1]) - 1.0).abs().amax(),
     ]
-    acting = {"command": 0, "speed": 0, "joints": 0, "measurement": 1, "kinematics": 2}[
-        model.effects[""].side
-    ]
+    acting = {"measurement": 1, "kinematics": 2}.get(model.effects[""].side, 0)
     assert [float(size) > 1e-5 for size in moved] == [place == acting for place in range(3)]
 
 
@@ -115,13 +109,10 @@ def test_the_typical_value_changes_something(name: str, machine: Machine) -> Non
     "name", [name for name in FIXED if name not in ("base_tilt", "extrinsics")]
 )
 def test_only_the_named_joints_have_it(name: str, machine: Machine) -> None:
-    model = effect(name, joints=["q3"]).wrap(
-        shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU
-    )
+    model = wrap(machine, effect(name, joints=["q3"]), num=3)
     for key, number in model.effects[""].numbers.items():
-        expected = torch.full(
-            (3, machine.num_joints), number.typical if number.none is None else number.none
-        )
+        elsewhere = number.typical if number.none is None else number.none
+        expected = torch.full((3, machine.num_joints), elsewhere)
         # a machine with masses has no pose term
         expected[:, 2] = number.typical if number.is_on(machine) else number.none
         assert torch.equal(model.parameters[key], expected)
@@ -132,17 +123,11 @@ def test_ranges_are_drawn_anew_at_each_reset_for_each_environment(
     name: str, machine: Machine
 ) -> None:
     spec = shipped("effect", name)
-    ranges = {
-        key: (number.typical, max(2.0 * number.typical, number.bounds[0]))
-        for key, number in spec.numbers.items()
-        if number.is_on(machine)
-    }
-    ranges = {
-        key: (low, min(high, spec.numbers[key].bounds[1])) for key, (low, high) in ranges.items()
-    }
-    model = replace(spec, **ranges).wrap(
-        shipped("actuator", "ideal").build(machine, 400, CPU), machine, 400, CPU
-    )
+    ranges = {}
+    for key, number in spec.numbers.items():
+        if number.is_on(machine):
+            ranges[key] = (number.typical, float(np.clip(2.0 * number.typical, *number.bounds)))
+    model = wrap(machine, replace(spec, **ranges), num=400)
     before = {key: value.clone() for key, value in model.parameters.items()}
     mask = torch.arange(400) < 200
     model.reset(mask)
@@ -160,9 +145,7 @@ def test_ranges_are_drawn_anew_at_each_reset_for_each_environment(
 
 def test_a_table_gives_values_and_ranges_joint_by_joint(machine: Machine) -> None:
     spec = effect("backlash", gap_rad={"q2": [0.01, 0.02], "q3": 0.05, "other": 0})
-    value = spec.wrap(
-        shipped("actuator", "ideal").build(machine, 50, CPU), machine, 50, CPU
-    ).parameters["gap_rad"]
+    value = wrap(machine, spec, num=50).parameters["gap_rad"]
     assert value[:, 1].min() >= 0.01 and value[:, 1].max() <= 0.02 and value[:, 1].std() > 0.001
     assert torch.equal(value[:, [0, 2, 3, 4]], torch.tensor([0.0, 0.05, 0.0, 0.0]).expand(50, 4))
 
@@ -183,37 +166,28 @@ def test_what_makes_no_sense_is_refused(
     name: str, changes: dict[str, Any], message: str, machine: Machine
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        effect(name, **changes).wrap(
-            shipped("actuator", "ideal").build(machine, 1, CPU), machine, 1, CPU
-        )
+        wrap(machine, effect(name, **changes))
 
 
 def test_all_effects_together_make_an_actuator_model(machine: Machine) -> None:
-    specs = [
-        shipped("effect", name) for name in FIXED if name not in ("sensor_noise", "quantisation")
-    ]
-    model = stack(
-        machine, shipped("actuator", "lag").build(machine, NUM_ENVS, CPU), specs, NUM_ENVS
-    )
+    names = [name for name in FIXED if name not in ("sensor_noise", "quantisation")]
+    specs = [shipped("effect", name) for name in names]
+    model = wrap(machine, *specs, actuator="lag", num=NUM_ENVS)
     check_actuator_model(model, machine, CPU)
     assert model.sides == {"command", "speed", "joints", "measurement", "kinematics"}
 
 
 @pytest.mark.parametrize("name", [*FIXED, "library"])
 def test_a_run_goes_on_exactly_from_its_state(name: str, machine: Machine) -> None:
-    def fresh() -> Any:
-        return shipped("effect", name).wrap(
-            shipped("actuator", "lag").build(machine, 2, CPU), machine, 2, CPU
-        )
-
     torch.manual_seed(0)
-    model, u = fresh(), draw_commands(machine, 30, 2)
+    model = wrap(machine, shipped("effect", name), actuator="lag", num=2)
+    u = draw_commands(machine, 30, 2)
     roll(model, machine, u)
     model.measure(u[0])
     kept = {key: value.clone() for key, value in model.state.items()}
     on, seen = roll(model, machine, u), model.measure(u[0])
     torch.manual_seed(1)
-    other = fresh()
+    other = wrap(machine, shipped("effect", name), actuator="lag", num=2)
     for key, value in other.state.items():
         value.copy_(kept[key])
     assert torch.equal(roll(other, machine, u), on)
@@ -221,26 +195,22 @@ def test_a_run_goes_on_exactly_from_its_state(name: str, machine: Machine) -> No
 
 
 def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:
-    inner = shipped("actuator", "ideal").build
     band, cut = effect("dead_band", extend=0.2, retract=0.2), effect("saturation", level=0.6)
     full = torch.ones(1, 1, 5)
-    # cut first: (0.6 - 0.2) / 0.8 = 0.5 of 0.02 rad; band first leaves a full command, of which 0.6
-    # remain
-    for specs, share in (([band, cut], 0.5), ([cut, band], 0.6)):
-        path = roll(stack(machine, inner(machine, 1, CPU), specs, 1), machine, full)
-        assert (path[1] - path[0])[0, 0].item() == pytest.approx(share * 0.02, abs=1e-7)
-    # a gain of a half before a play of 0.02, half of it open, uses up 0.01 of 0.01; behind it 0.5
-    # of 0.02 - 0.01
     half, play = effect("flow_gain", gain=0.5), effect("backlash", gap_rad=0.02)
-    for specs, moved in (([half, play], 0.0), ([play, half], 0.005)):
-        path = roll(stack(machine, inner(machine, 1, CPU), specs, 1), machine, full)
+    # cut first: (0.6 - 0.2) / 0.8 = 0.5 of 0.02 rad; band first leaves a full command, of which 0.6
+    # remain; a gain of a half before a play of 0.02, half of it open, uses up 0.01 of 0.01; behind
+    # it 0.5 of 0.02 - 0.01
+    for first, second, moved in (
+        (band, cut, 0.01), (cut, band, 0.012), (half, play, 0.0), (play, half, 0.005)
+    ):  # fmt: skip
+        path = roll(wrap(machine, first, second), machine, full)
         assert (path[1] - path[0])[0, 0].item() == pytest.approx(moved, abs=1e-7)
     biased, coarse = effect("encoder_bias", bias_rad=0.006), effect("quantisation", step_rad=0.01)
     q = torch.full((1, 5), 0.1)
-    for specs, shown in (([biased, coarse], 0.11), ([coarse, biased], 0.106)):
-        assert stack(machine, inner(machine, 1, CPU), specs, 1).measure(q)[
-            0, 0
-        ].item() == pytest.approx(shown, abs=1e-6)
+    for first, second, shown in ((biased, coarse, 0.11), (coarse, biased, 0.106)):
+        seen = wrap(machine, first, second).measure(q)
+        assert seen[0, 0].item() == pytest.approx(shown, abs=1e-6)
 
 
 @pytest.mark.gpu

@@ -36,28 +36,23 @@ def library(share: float | dict[str, float], *specs: Any) -> Library:
 
 def test_all_together_are_one_around_the_other(machine: Machine) -> None:
     chance = ("frame_loss", "delay_jitter", "sensor_noise")
-    build, u, specs = (
-        option("actuator", "lag").build,
-        draw_commands(machine, 100, 3, 1),
-        [fixed(n) for n in EFFECTS if n not in chance],
-    )
-    stacked = build(machine, 3, CPU)
+    specs = [fixed(name) for name in EFFECTS if name not in chance]
+    u = draw_commands(machine, 100, 3, 1)
+    stacked, together = (option("actuator", "lag").build(machine, 3, CPU) for _ in range(2))
     for spec in specs:
         stacked = spec.wrap(stacked, machine, 3, CPU)
-    together = library(1.0, *specs).wrap(build(machine, 3, CPU), machine, 3, CPU)
-    torch.testing.assert_close(
-        roll(together, machine, u), roll(stacked, machine, u), rtol=0, atol=2e-6
-    )
+    together = library(1.0, *specs).wrap(together, machine, 3, CPU)
+    found, expected = (roll(model, machine, u) for model in (together, stacked))
+    torch.testing.assert_close(found, expected, rtol=0, atol=2e-6)
     torch.testing.assert_close(together.measure(u[7]), stacked.measure(u[7]), rtol=0, atol=1e-6)
     assert together.sides == {"command", "speed", "joints", "measurement"}
 
 
 def test_where_no_effect_is_there_nothing_changes(machine: Machine) -> None:
-    build, u = option("actuator", "mlp").build, draw_commands(machine, 60, 3, 1)
-    model = replace(option("effect", "library"), share=0.0).wrap(
-        build(machine, 3, CPU), machine, 3, CPU
-    )
-    assert torch.equal(roll(model, machine, u), roll(build(machine, 3, CPU), machine, u))
+    plain, inner = (option("actuator", "mlp").build(machine, 3, CPU) for _ in range(2))
+    model = replace(option("effect", "library"), share=0.0).wrap(inner, machine, 3, CPU)
+    u = draw_commands(machine, 60, 3, 1)
+    assert torch.equal(roll(model, machine, u), roll(plain, machine, u))
     assert torch.equal(model.measure(u[0]), u[0])
 
 
@@ -68,39 +63,33 @@ def test_each_effect_is_there_in_its_share_of_environments_independently_of_the_
     model = shipped.wrap(option("actuator", "ideal").build(machine, 6000, CPU), machine, 6000, CPU)
     there = {}
     for name, spec in shipped.effects.items():
-        off = [
-            (model.parameters[f"{name}.{key}"] == n.none).all(1)
-            for key, n in spec.numbers.items()
-            if n.none is not None
-        ]
+        off = []
+        for key, number in spec.numbers.items():
+            if number.none is not None:
+                off.append((model.parameters[f"{name}.{key}"] == number.none).all(1))
         there[name] = ~torch.stack(off).all(0)
     assert there.pop("dead_time").all()
     shares = torch.stack(list(there.values())).float()
     assert shares.mean(1).tolist() == pytest.approx([0.15] * len(there), abs=0.015)
     assert torch.corrcoef(shares).fill_diagonal_(0).abs().max() < 0.06
     gain = model.parameters["flow_gain.gain"][there["flow_gain"]]
-    assert 0.85 <= gain.min() < 0.87 and 1.13 < gain.max() <= 1.15, (
-        "where it is there its range is drawn"
-    )
-    before = torch.stack(list(there.values()))
+    assert 0.85 <= gain.min() < 0.87 and 1.13 < gain.max() <= 1.15, "its range is drawn there"
+    before = there["flow_gain"]
     model.reset(torch.arange(6000) < 3000)
-    after = model.parameters["flow_gain.gain"] != 1.0
-    assert torch.equal(after[3000:].all(1), before[EFFECTS.index("flow_gain") - 1, 3000:])
-    assert (after[:3000].all(1) != before[EFFECTS.index("flow_gain") - 1, :3000]).any(), (
-        "another machine"
-    )
+    after = (model.parameters["flow_gain.gain"] != 1.0).all(1)
+    assert torch.equal(after[3000:], before[3000:])
+    assert (after[:3000] != before[:3000]).any(), "another machine"
 
 
 def test_a_step_and_a_reset_ask_the_host_nothing_and_have_fixed_shapes(machine: Machine) -> None:
     """Both would break the trace; a CUDA graph can hold what is left."""
     u = draw_commands(machine, 20, 4, 1)
     torch.manual_seed(0)
-    plain, traced = (
-        option("effect", "library").wrap(
-            option("actuator", "lag").build(machine, 4, CPU), machine, 4, CPU
-        )
-        for _ in "ab"
-    )
+    models = []
+    for _ in range(2):
+        inner = option("actuator", "lag").build(machine, 4, CPU)
+        models.append(option("effect", "library").wrap(inner, machine, 4, CPU))
+    plain, traced = models
     step = torch.compile(traced.step, backend="eager", fullgraph=True, dynamic=False)
     reset = torch.compile(traced.reset, backend="eager", fullgraph=True, dynamic=False)
     history = History(q=torch.zeros(4, 13, 5), u=torch.zeros(4, 13, 5))
@@ -123,18 +112,17 @@ def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
     for added in (0.0, shift_s):
         model = option("actuator", "mlp").build(machine, 4, CPU)
         model = library(1.0, fixed("dead_time", dead_time_s=added)).wrap(model, machine, 4, CPU)
-        generator = torch.Generator().manual_seed(0)
-        u = (torch.rand(150, 4, 5, generator=generator) * 1.4 - 0.7).repeat_interleave(8, 0) * (
-            torch.arange(5) == 0
-        )
-        q = roll(model, machine, u)[:-1]
-        recordings = [
-            make_recording(machine, u[:, k].numpy(), q[:, k].numpy(), str(k)) for k in range(4)
-        ]
+        levels = torch.rand(150, 4, 5, generator=torch.Generator().manual_seed(0)) * 1.4 - 0.7
+        u = levels.repeat_interleave(8, 0) * (torch.arange(5) == 0)
+        rows = zip(u.unbind(1), roll(model, machine, u)[:-1].unbind(1), strict=True)
+        recordings = [make_recording(machine, one.numpy(), q.numpy()) for one, q in rows]
         delay = dead_time.estimate_dead_times(recordings, machine, np.random.default_rng(0))["q1"]
         assert delay is not None
         found.append(delay.value_s)
     assert found[1] - found[0] == pytest.approx(shift_s, abs=0.0101)
+
+
+BESIDE = {"effects": {"link_length": option("effect", "link_length")}, "share": 0.1}
 
 
 @pytest.mark.parametrize(
@@ -142,11 +130,9 @@ def test_the_dead_time_of_a_learned_model_moves_by_what_is_asked(
     [
         ({"share": 1.5}, "expected 0 to 1, got 1.5"),
         ({"share": {"backslash": 0.1, "other": 0.2}}, "did you mean 'backlash'"),
-        ({"effects": ["link_length"]}, "acts on kinematics; put it beside the library"),
+        (BESIDE, "acts on kinematics; put it beside the library"),
     ],
 )
 def test_what_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -> None:
-    if isinstance(names := changes.get("effects"), list):
-        changes = {"effects": {name: option("effect", name) for name in names}, "share": 0.1}
     with pytest.raises(ConfigError, match=message):
         replace(option("effect", "library"), **changes)

@@ -87,39 +87,26 @@ def seen(name: str, machine: Machine, levels: list[float], **numbers: Any) -> li
     return model.inner.seen
 
 
-SEEN: list[tuple[str, dict[str, float], list[float], list[float]]] = [
-    # 75 ms are one and a half periods: nothing, then half a period of full speed, then all of it
-    ("dead_time", {"dead_time_s": 0.075}, [1, 1, 1, 0, 0, 0], [0, 0.5, 1, 1, 0.5, 0]),
-    # (0.55 - 0.1) / 0.9 and (0.6 - 0.2) / 0.8
-    ("dead_band", {"extend": 0.1, "retract": 0.2}, [1, 0.55, 0.1, 0, -0.2, -0.6, -1], [1, 0.5, 0, 0, 0, -0.5, -1]),
-    ("saturation", {"level": 0.7}, [1, 0.6, -0.8, -1], [0.7, 0.6, -0.7, -0.7]),
-    # a full stroke in 0.2 s is a quarter a period
-    ("rate_limit", {"stroke_s": 0.2}, [1, 1, 0.6, 0.6, -1], [0.25, 0.5, 0.6, 0.6, 0.35]),
-    # a reversal is a new start
-    ("stiction", {"start": 0.15, "stop": 0.05}, [0.1, 0.2, 0.1, 0.06, 0.05, 0.1, -0.1, -0.16, 0.1],
-     [0, 0.2, 0.1, 0.06, 0, 0, 0, -0.16, 0]),
-]  # fmt: skip
-MOVED: list[tuple[str, dict[str, float], list[float], list[float]]] = [
-    ("flow_gain", {"gain": 0.8}, [1, 0.5, -1], [0.016, 0.008, -0.016]),
-    ("asymmetry", {"extend_gain": 1.0, "retract_gain": 1.5}, [1, -1], [0.02, -0.03]),
-    # a play of 0.03, half of it open at rest: 0.015 lost, then 0.03 at each reversal
-    ("backlash", {"gap_rad": 0.03}, [1, 1, -1, -1, -1, 0, 1, 1], [0.005, 0.02, 0, -0.01, -0.02, 0, 0, 0.01]),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "numbers", "levels", "expected"), SEEN)
-def test_the_valve_sees_other_commands(
-    name: str,
-    numbers: dict[str, float],
-    levels: list[float],
-    expected: list[float],
-    machine: Machine,
-) -> None:
-    assert seen(name, machine, levels, **numbers) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize(("name", "numbers", "levels", "expected"), MOVED)
-def test_the_joint_moves_otherwise(
+@pytest.mark.parametrize(
+    ("name", "numbers", "levels", "expected"),
+    [
+        # 75 ms are one and a half periods: nothing, then half a period of full speed, then all of it
+        ("dead_time", {"dead_time_s": 0.075}, [1, 1, 1, 0, 0, 0], [0, 0.5, 1, 1, 0.5, 0]),
+        # (0.55 - 0.1) / 0.9 and (0.6 - 0.2) / 0.8
+        ("dead_band", {"extend": 0.1, "retract": 0.2}, [1, 0.55, 0.1, 0, -0.2, -0.6, -1], [1, 0.5, 0, 0, 0, -0.5, -1]),
+        ("saturation", {"level": 0.7}, [1, 0.6, -0.8, -1], [0.7, 0.6, -0.7, -0.7]),
+        # a full stroke in 0.2 s is a quarter a period
+        ("rate_limit", {"stroke_s": 0.2}, [1, 1, 0.6, 0.6, -1], [0.25, 0.5, 0.6, 0.6, 0.35]),
+        # a reversal is a new start
+        ("stiction", {"start": 0.15, "stop": 0.05}, [0.1, 0.2, 0.1, 0.06, 0.05, 0.1, -0.1, -0.16, 0.1],
+         [0, 0.2, 0.1, 0.06, 0, 0, 0, -0.16, 0]),
+        ("flow_gain", {"gain": 0.8}, [1, 0.5, -1], [0.8, 0.4, -0.8]),
+        ("asymmetry", {"extend_gain": 1.0, "retract_gain": 1.5}, [1, -1], [1, -1.5]),
+        # a play of 1.5 periods, half of it open at rest: 0.75 lost, then 1.5 at each reversal
+        ("backlash", {"gap_rad": 0.03}, [1, 1, -1, -1, -1, 0, 1, 1], [0.25, 1, 0, -0.5, -1, 0, 0, 0.5]),
+    ],
+)  # fmt: skip
+def test_the_joint_moves_by_so_much_of_full_speed(
     name: str,
     numbers: dict[str, float],
     levels: list[float],
@@ -127,7 +114,7 @@ def test_the_joint_moves_otherwise(
     machine: Machine,
 ) -> None:
     got = steps(wrapped(name, machine, **numbers), machine, levels)
-    assert got == pytest.approx(expected, abs=1e-6)
+    assert got == pytest.approx(FULL * np.array(expected), abs=1e-6)
 
 
 def build_late_model(machine: Machine) -> Any:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from composed import names, option
+from motion import rest
 
 from actuators.effects.load import Creep, LoadDependence
 from actuators.scales import choose_horizon_s, measure_time_scale
 from brokk_rl.errors import ConfigError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from diagnosis import effect_library
 
@@ -80,10 +80,8 @@ def test_the_library_is_drawn_on_every_machine_with_sizes_that_fit_its_joints(na
     for key in ("lag.time_constant_s", "dead_time.dead_time_s", "delay_jitter.jitter_s"):
         assert (drawn[key] > 0.2 * machine.period_s).all(), key
         assert (drawn[key] < 4.0 * max(machine.period_s, machine.dead_time_s)).all(), key
-    history = History(
-        q=torch.as_tensor(machine.home, dtype=torch.float32).expand(500, machine.num_history, -1),
-        u=torch.ones(500, machine.num_history, machine.num_joints),
-    )
+    history = rest(machine, num=500)
+    history.u.fill_(1.0)
     with torch.no_grad():
         assert torch.isfinite(model.step(history)).all()
 
@@ -166,13 +164,9 @@ def test_a_pose_on_a_machine_with_masses_is_refused(machine: Machine) -> None:
 def test_the_pose_term_is_a_line_over_a_cylinder_and_a_harmonic_of_an_angle() -> None:
     """A joint that extends bears the weight; sqrt(1 - 0.19) is 0.9."""
     small = option("machine", "mini_excavator")
-    at = torch.tensor(
-        np.stack([small.lower, (small.lower + small.upper) / 2, small.upper]), dtype=torch.float32
-    )
-    history = History(
-        q=at[:, None].repeat(1, small.num_history, 1),
-        u=torch.full((3, small.num_history, 4), -1.0),  # in the sense of the weight: faster
-    )
+    at = np.stack([small.lower, (small.lower + small.upper) / 2, small.upper])
+    history = rest(small, at, 3)
+    history.u.fill_(-1.0)  # in the sense of the weight: faster
     full = torch.as_tensor(small.max_speed * small.period_s, dtype=torch.float32)
     history.q[0] += 2.0 * full  # an effect never moves a joint through a stop
     build = option("actuator", "ideal").build

@@ -34,6 +34,9 @@ def event(name: str, **changes: Any) -> Event:
     return dataclasses.replace(option("event", name), **changes)
 
 
+FIELDS = (
+    "body_mass", "body_inertia", "geom_friction", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
+)  # fmt: skip
 FIXED = tuple(event(name, when="startup", factor=(1.0, 1.0)) for name in ALL)
 """Events that change nothing by themselves."""
 
@@ -78,9 +81,7 @@ def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> Non
             edited.actuator_forcerange[j] *= float(FACTORS["yield_force"][i, j])
         edited.geom_friction[:] *= float(FACTORS["friction"][i, 0])
         used = world._batch.get_model(i)
-        for field in ("body_mass", "body_inertia", "geom_friction", "actuator_gainprm"):
-            np.testing.assert_allclose(getattr(used, field), getattr(edited, field), rtol=1e-6)
-        for field in ("actuator_biasprm", "actuator_forcerange"):
+        for field in FIELDS:
             np.testing.assert_allclose(getattr(used, field), getattr(edited, field), rtol=1e-6)
         np.testing.assert_allclose(used.body_subtreemass[0], edited.body_mass.sum(), rtol=1e-6)
 

@@ -18,7 +18,7 @@ from promises import check_follower
 from actuators.person import HumanFollower
 from brokk_rl.build import describe_spec
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine
+from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.policy_choice import CLASSICAL, _insert_behaviour
 from brokk_rl.policy_folder import find_policy
 from brokk_rl.rl.loop import ControlLoop
@@ -53,11 +53,9 @@ def q1(machine: Machine, values: list[float], **numbers: Any) -> list[float]:
     return found[:, 0].tolist()
 
 
-def exclusive_proposals(
-    machine: Machine, num_steps: int, num: int = 1, seed: int = 0
-) -> torch.Tensor:
+def exclusive_proposals(machine: Machine, num_steps: int, num: int = 1) -> torch.Tensor:
     """Returns random proposals under the masks, `(T, N, J)`."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     proposed = torch.rand((num_steps, num, 5), generator=generator) * 2 - 1
     positioning = torch.rand((num_steps, num, 1), generator=generator) < 0.3
     return torch.where(torch.as_tensor(machine.is_exclusive) == positioning, proposed, 0.0)
@@ -72,9 +70,8 @@ def test_the_delay_is_exact_to_the_fraction_of_a_period(machine: Machine) -> Non
     steps = [0.8] * 3 + [0.0] * 9
     assert q1(machine, steps, delay_s=0.3) == pytest.approx([0.0] * 6 + [0.8] * 3 + [0.0] * 3)
     # 0.22 s are 4.4 periods: of the fifth period 0.6 have the new command
-    assert q1(machine, steps, delay_s=0.22) == pytest.approx(
-        [0.0] * 4 + [0.48, 0.8, 0.8, 0.32] + [0.0] * 4, abs=1e-6
-    )
+    expected = [0.0] * 4 + [0.48, 0.8, 0.8, 0.32] + [0.0] * 4
+    assert q1(machine, steps, delay_s=0.22) == pytest.approx(expected, abs=1e-6)
 
 
 def test_delay_and_lag_together_are_those_of_continuous_time(machine: Machine) -> None:
@@ -93,27 +90,27 @@ def test_delay_and_lag_together_are_those_of_continuous_time(machine: Machine) -
     assert q1(machine, shown, delay_s=0.27, lag_s=0.12) == pytest.approx(means, abs=1e-4)
 
 
-def test_a_person_looks_every_so_often_and_goes_on_with_what_was_seen(machine: Machine) -> None:
-    shown = [0.1 * k for k in range(1, 9)]
-    assert q1(machine, shown, attention_s=0.15) == pytest.approx(
-        [0.1, 0.1, 0.1, 0.4, 0.4, 0.4, 0.7, 0.7]
-    )
-    # every 2.5 periods: two and three in turn
-    assert q1(machine, shown, attention_s=0.125) == pytest.approx(
-        [0.1, 0.1, 0.1, 0.4, 0.4, 0.6, 0.6, 0.6]
-    )
+RISING = [0.1 * k for k in range(1, 9)]
+BOTH_WAYS = [0.05, 0.5, -0.5, 1.0]
 
 
-def test_gain_and_dead_zone_shape_the_deflection(machine: Machine) -> None:
-    shown = [0.05, 0.5, -0.5, 1.0]
-    assert q1(machine, shown, gain=0.8) == pytest.approx([0.04, 0.4, -0.4, 0.8])
-    assert q1(machine, shown, gain=1.5) == pytest.approx([0.075, 0.75, -0.75, 1.0]), (
-        "a lever has a stop"
-    )
-    assert q1(machine, shown, dead_zone=0.1) == pytest.approx([0.0, 0.4 / 0.9, -0.4 / 0.9, 1.0])
-    assert q1(machine, shown, dead_zone={"q1": 0.2, "other": 0.0}) == pytest.approx(
-        [0.0, 0.375, -0.375, 1.0]
-    )
+@pytest.mark.parametrize(
+    ("numbers", "shown", "expected"),
+    [
+        # a person looks every so often and goes on with what was seen
+        ({"attention_s": 0.15}, RISING, [0.1, 0.1, 0.1, 0.4, 0.4, 0.4, 0.7, 0.7]),
+        # every 2.5 periods: two and three in turn
+        ({"attention_s": 0.125}, RISING, [0.1, 0.1, 0.1, 0.4, 0.4, 0.6, 0.6, 0.6]),
+        ({"gain": 0.8}, BOTH_WAYS, [0.04, 0.4, -0.4, 0.8]),
+        ({"gain": 1.5}, BOTH_WAYS, [0.075, 0.75, -0.75, 1.0]),  # a lever has a stop
+        ({"dead_zone": 0.1}, BOTH_WAYS, [0.0, 0.4 / 0.9, -0.4 / 0.9, 1.0]),
+        ({"dead_zone": {"q1": 0.2, "other": 0.0}}, BOTH_WAYS, [0.0, 0.375, -0.375, 1.0]),
+    ],
+)
+def test_a_lever_is_deflected_as_worked_by_hand(
+    numbers: dict[str, Any], shown: list[float], expected: list[float], machine: Machine
+) -> None:
+    assert q1(machine, shown, **numbers) == pytest.approx(expected)
 
 
 def test_tremor_is_in_proportion_to_the_deflection_and_has_no_mean(machine: Machine) -> None:
@@ -125,24 +122,19 @@ def test_tremor_is_in_proportion_to_the_deflection_and_has_no_mean(machine: Mach
     assert found.mean(0).tolist() == pytest.approx([0.2, 0.0, 0.4, 0.0, 0.6], abs=0.005)
     assert not torch.equal(found, again)
     assert torch.corrcoef(torch.stack((found[:, 0], again[:, 0])))[0, 1].abs() < 0.1
-    assert torch.corrcoef(found[:, [0, 2, 4]].T).fill_diagonal_(0).abs().max() < 0.1, (
-        "each hand trembles by itself"
-    )
+    # each hand trembles by itself
+    assert torch.corrcoef(found[:, [0, 2, 4]].T).fill_diagonal_(0).abs().max() < 0.1
 
 
 def test_few_levers_are_moved_at_once_the_largest_first(machine: Machine) -> None:
     proposed = torch.tensor(
         [[0.3, 0.0, -0.5, 0.4, 0.2], [0.5, 0.0, 0.5, 0.5, 0.5], [0.1, 0.0, 0.0, 0.0, 0.0]]
     )
-    one = follow(machine, proposed, joints_at_once=1)
-    assert torch.equal(
-        one, torch.tensor([[0, 0, -0.5, 0, 0], [0, 0, 0.5, 0, 0], [0.1, 0, 0, 0, 0]])
-    ), "of equals the one in hand"
-    two = follow(machine, proposed, joints_at_once=2)
-    assert torch.equal(
-        two, torch.tensor([[0, 0, -0.5, 0.4, 0], [0, 0, 0.5, 0.5, 0], [0.1, 0, 0, 0, 0]])
-    )
-    assert torch.equal(follow(machine, proposed, joints_at_once=9), proposed)
+    # of equals the one in hand
+    one = torch.tensor([[0, 0, -0.5, 0, 0], [0, 0, 0.5, 0, 0], [0.1, 0, 0, 0, 0]])
+    two = torch.tensor([[0, 0, -0.5, 0.4, 0], [0, 0, 0.5, 0.5, 0], [0.1, 0, 0, 0, 0]])
+    for count, expected in ((1, one), (2, two), (9, proposed)):
+        assert torch.equal(follow(machine, proposed, joints_at_once=count), expected)
 
 
 def test_a_lever_once_taken_is_kept_for_a_while_as_long_as_it_is_asked_for(
@@ -158,29 +150,23 @@ def test_a_lever_once_taken_is_kept_for_a_while_as_long_as_it_is_asked_for(
     assert moved[:, 0].tolist() == [True] * 2 + [False] * 6, "what is no longer asked for is let go"
     proposed[3:] = torch.tensor([0.0, 0.2, 0.0, 0.0, 0.0])
     moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
-    assert moved[3:, 1].all() and not moved[3:, [0, 2, 3, 4]].any(), (
-        "nor is an exclusive joint kept waiting"
-    )
+    # nor is an exclusive joint kept waiting
+    assert moved[3:, 1].all() and not moved[3:, [0, 2, 3, 4]].any()
 
 
 def test_how_many_levers_is_drawn_evenly(machine: Machine) -> None:
     model = person(joints_at_once=(1, 4)).build(machine, 4000, CPU)
     moved = (model.step(torch.tensor([0.5, 0.0, 0.4, 0.3, 0.2]).expand(4000, 5)) != 0).sum(1)
-    assert [int((moved == count).sum()) for count in range(1, 5)] == pytest.approx(
-        [1000] * 4, rel=0.1
-    )
+    assert moved.bincount()[1:].tolist() == pytest.approx([1000] * 4, rel=0.1)
 
 
 def test_the_hand_changes_over_when_the_person_sees_it(machine: Machine) -> None:
     """From q2 to q1 and q3 after three periods: until the reaction has passed q2 goes on, then it is let go at once."""
-    proposed = torch.tensor(
-        [[0.0, 0.6, 0.0, 0.0, 0.0]] * 3 + [[0.4, 0.0, 0.8, 0.0, 0.0]] * 3 + [[0.0] * 5] * 3
-    )
+    proposed = torch.zeros(9, 5)
+    proposed[:3, 1], proposed[3:6, 0], proposed[3:6, 2] = 0.6, 0.4, 0.8
     found = follow(machine, proposed, delay_s=0.1, lag_s=0.1)
     assert (found[2:5, 1] > 0).all() and not found[5:, 1].any() and not found[:5, [0, 2]].any()
-    assert (found[5:8, [0, 2]] > 0).all() and (found[8, [0, 2]] > 0).all(), (
-        "the hand comes back as it went, with its lag"
-    )
+    assert (found[5:, [0, 2]] > 0).all(), "the hand comes back as it went, with its lag"
 
 
 @settings(max_examples=30, deadline=None)
@@ -273,31 +259,25 @@ def test_a_loop_behind_a_perfect_person_is_the_loop_without_one(machine: Machine
     assert all(torch.equal(value, behind[name]) for name, value in alone.items())
 
 
-def test_histories_and_recordings_hold_what_was_given_and_not_what_was_proposed(
+def test_histories_and_recordings_hold_what_was_expectedand_not_what_was_proposed(
     machine: Machine,
 ) -> None:
     loop = loop_with(machine, person(delay_s=0.1, gain=0.5))
     proposed = []
     for _ in range(6):
         action = torch.rand(8, 5)
-        positioning = loop.task.state["positioning"].bool()[:, None]
-        proposed.append(
-            torch.where(torch.as_tensor(machine.is_exclusive) == positioning, action, 0.0)
-        )
+        positioning = loop.task.state["positioning"].bool()
+        is_allowed = mask_exclusive_joints(torch.as_tensor(machine.is_exclusive), positioning)
+        proposed.append(action.where(is_allowed, 0.0))
         loop.step(action)
     torch.testing.assert_close(loop.history.u[:, -4:], 0.5 * torch.stack(proposed[:4], 1))
     assert torch.equal(loop.end_u, loop.history.u[:, -1])
     assert torch.equal(loop.truth.u, loop.history.u)
-    assert torch.equal(loop.task.state["u"], proposed[-1]), (
-        "the reward is about what the policy asks of the person"
-    )
+    # the reward is about what the policy asks of the person
+    assert torch.equal(loop.task.state["u"], proposed[-1])
     given = torch.cat((torch.zeros(8, 2, 5), 0.5 * torch.stack(proposed[:4], 1)), 1)
-    travel = (given[:, 1:] - given[:, :-1]).abs().sum((1, 2)) / 0.05 / 6
-    torch.testing.assert_close(
-        loop.task.episode["valve_travel"],
-        travel,
-        msg="the valves' travel is that of what was given",
-    )
+    travel = given.diff(dim=1).abs().sum((1, 2)) / 0.05 / 6
+    torch.testing.assert_close(loop.task.episode["valve_travel"], travel)
 
 
 def test_the_controller_beside_a_policy_without_advice_keeps_its_own(

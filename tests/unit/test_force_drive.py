@@ -50,9 +50,7 @@ def test_a_mass_follows_its_differential_equation(drive: Machine) -> None:
 
 
 def test_friction_holds_a_joint_and_brings_it_to_rest(drive: Machine) -> None:
-    model: Any = replace(option("actuator", "force"), **{**TRUE, "offset_n": 0.0}).build(
-        drive, 1, CPU
-    )
+    model: Any = option("actuator", "force", **TRUE | {"offset_n": 0.0}).build(drive, 1, CPU)
     still = run_drive(model, drive, np.full(50, 14.9 / drive.max_force[0]), 0.1)
     np.testing.assert_array_equal(still, np.float32(0.1))
     pushed = run_drive(model, drive, np.r_[np.full(40, 0.3), np.zeros(200)], 0.05)
@@ -144,6 +142,5 @@ def test_a_diagnosis_names_mass_friction_and_offset_of_a_drive(
 
 def test_a_force_is_averaged_over_a_period() -> None:
     signal = Signal("", np.arange(0.0, 0.02, 0.001), np.arange(20.0), np.arange(20), "u")
-    np.testing.assert_allclose(
-        signal.average(np.array([0.0, 0.005, 0.01]), 0.005), [2.0, 7.0, 12.0]
-    )
+    found = signal.average(np.array([0.0, 0.005, 0.01]), 0.005)
+    np.testing.assert_allclose(found, [2.0, 7.0, 12.0])

@@ -20,13 +20,11 @@ def test_one_control_step_follows_the_trace_of_the_docstring() -> None:
     history.q[0, :, 0] = torch.tensor([8.0, 9.0, 10.0])  # q(t-2), q(t-1), q(t) at t = 10
     history.u[0, :, 0] = torch.tensor([7.0, 8.0, 9.0])  # u(t-3), u(t-2), u(t-1)
     history.push_u(torch.tensor([[10.0]]))
-    assert rows(history) == ([8, 9, 10], [8, 9, 10]), (
-        "the actuator model sees position and command of the same moment in one row"
-    )
+    # the actuator model sees position and command of the same moment in one row
+    assert rows(history) == ([8, 9, 10], [8, 9, 10])
     history.push_q(torch.tensor([[11.0]]))
-    assert rows(history) == ([9, 10, 11], [8, 9, 10]), (
-        "the next observation knows one position more than commands"
-    )
+    # the next observation knows one position more than commands
+    assert rows(history) == ([9, 10, 11], [8, 9, 10])
 
 
 def test_a_reset_backfills_its_environments_and_leaves_the_others() -> None:

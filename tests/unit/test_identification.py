@@ -38,10 +38,8 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for part in range(2):
             rows = slice(300 * part, 300 * part + 300)
             half = {"t_s": made.t_s[rows], "u": made.u[rows], "q": made.q[rows]}
-            told = {"run": f"run {run}", "source": "test"}
-            record.write_recording(
-                replace(made, **half, metadata=told), folder / f"run{run}_{part}.parquet"
-            )
+            half["metadata"] = {"run": f"run {run}", "source": "test"}
+            record.write_recording(replace(made, **half), folder / f"run{run}_{part}.parquet")
     return folder
 
 
@@ -73,14 +71,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def identify(
     machine: Machine, out: Path, folder: Path, fit: Any, resume: bool = False, **options: Any
 ) -> Identify:
-    settings = {
-        "recordings": f"{folder}/*",
-        "test": None,
-        "folds": None,
-        "hold_out": 3,
-        "stride_s": 1.0,
-        "threads": 1,
-    } | options
+    settings = {"recordings": f"{folder}/*", "hold_out": 3, "stride_s": 1.0, "threads": 1}
+    settings |= dict.fromkeys(("test", "folds")) | options
     return Identify(
         session=Session(out=str(out), seed=0, device="cpu"), machine=machine, fit=fit,
         baselines={"hold": option("fit", "hold"), "arx": option("fit", "arx")},
@@ -109,11 +101,8 @@ def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(
     assert stages[-1]["test"] == [] and len(stages) == 4
     assert result["data"]["test"]["runs"] == 6 and len(result["fold_seconds"]) == 3
     # 15 s files: 1 s windows up to those of 10 s
-    assert (
-        result["joints"]["q1"]["plant"]["10"]["percent"]
-        < 0.1
-        < result["joints"]["q1"]["hold"]["10"]["percent"]
-    )
+    plant, hold = (result["joints"]["q1"][name]["10"]["percent"] for name in ("plant", "hold"))
+    assert plant < 0.1 < hold
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -147,10 +136,8 @@ def test_going_on_needs_the_folder_itself_and_a_run_in_it(
 def test_a_run_is_refused_as_test_when_it_was_fitted_to(
     machine: Machine, recordings: Path, tmp_path: Path
 ) -> None:
-    seen: dict[str, Any] = {
-        "recordings": f"{recordings}/*_0.parquet",
-        "test": f"{recordings}/run0_1.parquet",
-    }
+    seen: dict[str, Any] = {"recordings": f"{recordings}/*_0.parquet"}
+    seen["test"] = f"{recordings}/run0_1.parquet"
     with pytest.raises(RecordingError, match=r"run 0 is also among identify\.recordings"):
         run(identify(machine, tmp_path / "a", recordings, Fit(), **seen))
     with pytest.raises(ConfigError, match="folds and test are two ways"):
@@ -179,11 +166,8 @@ def test_a_model_that_stands_still_is_no_good_news(
     result = run(identify(machine, tmp_path / "out", recordings, Fit(Hold())))
     verdict = result["verdict"][0]
     assert verdict["tone"] == "bad" and "worse on q1, q2, q3, q4, q5" in verdict["text"]
-    result["data"]["excitation"]["q3"] |= {
-        "commanded_s": 30.0,
-        "largest_command": [-0.9, 0.2],
-        "judged_s": 0.0,
-    }
+    q3 = {"commanded_s": 30.0, "largest_command": [-0.9, 0.2], "judged_s": 0.0}
+    result["data"]["excitation"]["q3"] |= q3
     result["delay_s"]["q4"] |= {"value": 0.8, "ci95": [0.78, 0.82]}
     texts = [finding.text for finding in write_verdict(result, machine)]
     for part in (

@@ -11,25 +11,20 @@ import numpy as np
 import pytest
 import yaml
 from conftest import Done
-from log_import import import_log, make_draft, try_draft
+from log_import import delay, import_log, make_draft, try_draft, write_csv
 
 from actuators.recordings.guess import Guess
 from actuators.recordings.log_draft import MACHINE_TEMPLATE, MAP_TEMPLATE
 from actuators.recordings.name_evidence import read_column_name
 
+pytestmark = pytest.mark.usefixtures("empty_folder")
 RATE_HZ = 50.0
 LAG = 6
 
 
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
 def read_guesses(*options: str) -> dict[str, Guess]:
-    return {
-        guess.subject: guess for guess in make_draft("log.input=a.csv", *options).list_guesses()
-    }
+    draft = make_draft("log.input=a.csv", *options)
+    return {guess.subject: guess for guess in draft.list_guesses()}
 
 
 def draft_file(template: str, *options: str) -> dict[str, Any]:
@@ -42,10 +37,6 @@ def make_targets(num: int = 1500) -> np.ndarray:
     return 0.4 * np.sin(t_s * [0.9, 1.7, 2.6]) + 0.2 * np.sin(t_s * [2.3, 0.6, 1.1])
 
 
-def delay(values: np.ndarray, num: int = LAG) -> np.ndarray:
-    return np.concatenate([np.repeat(values[:1], num, 0), values[:-num]])
-
-
 def make_valve(levels: list[float], back: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns times, commands that are held for half a second, and the positions that they move to."""
     commands = np.repeat(np.random.default_rng(0).choice(levels, 60), 25)
@@ -53,21 +44,15 @@ def make_valve(levels: list[float], back: float = 0.0) -> tuple[np.ndarray, np.n
     return t_s, commands, np.cumsum(delay(commands, 4) - back) / RATE_HZ * 0.1
 
 
-def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [",".join(repr(float(v)) for v in row) for row in zip(*columns.values(), strict=True)]
-    path.write_text("\n".join([",".join(columns), *rows]) + "\n")
-
-
 def write_servo_log(path: Path, swapped: bool = False) -> None:
     targets = make_targets()
-    positions = delay(targets)[:, [1, 0, 2]] if swapped else delay(targets)
+    positions = delay(targets, LAG)[:, [1, 0, 2]] if swapped else delay(targets, LAG)
     columns = {"time_ms": np.arange(len(targets)) * 1000.0 / RATE_HZ}
     for j, name in enumerate(("hip", "knee", "foot")):
         columns[f"{name}_target"] = targets[:, j]
         columns[f"{name}_pos_rad"] = positions[:, j]
         columns[f"{name}_torque"] = np.sin(targets[:, j])
-    write_table(path, columns)
+    write_csv(path, columns)
 
 
 def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
@@ -103,13 +88,13 @@ def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
 
 def test_columns_that_share_no_names_are_paired_by_their_numbers() -> None:
     rows = make_targets()
-    commands, speeds = np.tanh(3 * rows), np.cumsum(delay(np.tanh(3 * rows)), 0) / RATE_HZ
+    commands, speeds = np.tanh(3 * rows), np.cumsum(delay(np.tanh(3 * rows), LAG), 0) / RATE_HZ
     columns = {"t": np.arange(len(rows)) / RATE_HZ}
     for j in range(3):
         columns[f"valve{j}"] = commands[:, j]
     for j, k in enumerate((1, 2, 0)):
         columns[f"angle_{'abc'[j]}_deg"] = 57.3 * speeds[:, k]
-    write_table(Path("a.csv"), columns)
+    write_csv(Path("a.csv"), columns)
     guesses = read_guesses()
     for j, k in enumerate((1, 2, 0)):
         guess = guesses[f"{'abc'[j]}: columns"]
@@ -127,14 +112,9 @@ def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person() -> 
 
 def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[..., Done]) -> None:
     targets = make_targets()
-    write_table(
-        Path("a.csv"),
-        {
-            "t_s": np.arange(len(targets)) / RATE_HZ,
-            "u": targets[:, 0],
-            "q": 100 + 60 * np.cumsum(targets[:, 0]) / RATE_HZ,
-        },
-    )
+    columns = {"t_s": np.arange(len(targets)) / RATE_HZ, "u": targets[:, 0]}
+    columns["q"] = 100 + 60 * np.cumsum(targets[:, 0]) / RATE_HZ
+    write_csv(Path("a.csv"), columns)
     assert read_guesses()["joint: unit"].sureness == "unsure"
     (joint,) = draft_file(MACHINE_TEMPLATE)["joints"]
     assert {joint[name]["value"] for name in ("lower", "upper", "max_speed")} == {"???"}
@@ -151,7 +131,7 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[
 def test_valve_commands_get_neutral_full_and_sign_from_the_logs(sign: int) -> None:
     t_s, levels, q = make_valve([0.0, 0.0, 0.6, -0.5, 1.0, -1.0])
     pwm = 7.5 + 2.5 * sign * levels
-    write_table(Path("a.csv"), {"Time": 12.0 + t_s, "Boom Cmd": pwm, "Boom Ms": q})
+    write_csv(Path("a.csv"), {"Time": 12.0 + t_s, "Boom Cmd": pwm, "Boom Ms": q})
     command = draft_file(MAP_TEMPLATE)["joints"]["boom"]["command"]
     expected = {"neutral": 7.5, "full_plus": 7.5 + 2.5 * sign, "full_minus": 7.5 - 2.5 * sign}
     assert {key: command[key] for key in expected} == pytest.approx(expected)
@@ -159,17 +139,10 @@ def test_valve_commands_get_neutral_full_and_sign_from_the_logs(sign: int) -> No
 
 def test_joints_that_are_never_commanded_are_left_out_and_said() -> None:
     targets = make_targets()
-    still = np.full(len(targets), 0.5)
-    write_table(
-        Path("a.csv"),
-        {
-            "t": np.arange(len(targets)) / RATE_HZ,
-            "target_a": targets[:, 0],
-            "q_a": delay(targets)[:, 0],
-            "target_b": still,
-            "q_b": still,
-        },
-    )
+    columns = {"t": np.arange(len(targets)) / RATE_HZ}
+    columns |= {"target_a": targets[:, 0], "q_a": delay(targets, LAG)[:, 0]}
+    columns |= dict.fromkeys(("target_b", "q_b"), np.full(len(targets), 0.5))
+    write_csv(Path("a.csv"), columns)
     assert "b is left out: its command never changes" in try_draft("log.input=a.csv").out
     assert list(draft_file(MAP_TEMPLATE)["joints"]) == ["a"]
 
@@ -180,7 +153,7 @@ def test_columns_that_no_name_tells_are_given_with_the_torque_that_they_set(
     t_s = np.arange(500) / RATE_HZ
     volts = 5.0 * np.sin(2.0 * t_s) + np.where(t_s > 5, 3.0, 0.0)
     q = np.cumsum(np.cumsum(volts)) / RATE_HZ**2 / 10.0
-    write_table(Path("a.csv"), {"t": t_s, "q": q, "vir": volts})
+    write_csv(Path("a.csv"), {"t": t_s, "q": q, "vir": volts})
     refused = try_draft("log.input=a.csv").err
     assert "no column is named like commands" in refused and "vir" in refused
     assert "log.joints={boom" in refused
@@ -230,13 +203,13 @@ def test_names_are_read_as_words(table: str, column: str, expected: tuple[str | 
 
 def test_rows_that_lack_a_number_are_left_out_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     targets = make_targets()
-    positions = delay(targets)[:, 0].copy()
+    positions = delay(targets, LAG)[:, 0].copy()
     positions[[7, 900]] = np.nan
     columns = {"t": np.arange(len(targets)) / RATE_HZ, "hip_cmd": targets[:, 0]}
-    write_table(Path("a.csv"), columns | {"hip_pos_rad": positions})
+    write_csv(Path("a.csv"), columns | {"hip_pos_rad": positions})
     _, (recording,) = import_log("log.input=a.csv", "log.damaged=skip")
     assert "column 'hip_pos_rad': 2 of 1500 rows lack a number and are left out" in caplog.text
-    np.testing.assert_allclose(recording["q_hip_rad"], delay(targets)[:, 0], atol=2e-3)
+    np.testing.assert_allclose(recording["q_hip_rad"], delay(targets, LAG)[:, 0], atol=2e-3)
 
 
 def test_actions_that_are_scaled_and_added_to_a_pose_are_targets_in_another_unit() -> None:
@@ -244,7 +217,7 @@ def test_actions_that_are_scaled_and_added_to_a_pose_are_targets_in_another_unit
     actions = (targets - [0.1, 0.8, -1.5]) / 0.25
     elapsed = (np.arange(len(targets)) * 1e9 / RATE_HZ).astype("timedelta64[ns]")
     stamps = np.datetime64("2026-11-27", "ns") + elapsed
-    np.savez("a.npz", time=stamps, actions=actions, dof_pos=delay(targets))
+    np.savez("a.npz", time=stamps, actions=actions, dof_pos=delay(targets, LAG))
     draft = make_draft("log.input=a.npz")
     guesses = {guess.subject: guess for guess in draft.list_guesses()}
     assert guesses["joint_1: command"].value == "a target of the position"
@@ -256,8 +229,8 @@ def test_actions_that_are_scaled_and_added_to_a_pose_are_targets_in_another_unit
 def test_a_position_that_leads_its_target_is_left_to_a_person() -> None:
     targets = make_targets()
     columns = {"t": np.arange(len(targets)) / RATE_HZ}
-    columns |= {"hip_target": delay(targets)[:, 0], "hip_pos_rad": targets[:, 0]}
-    write_table(Path("a.csv"), columns)
+    columns |= {"hip_target": delay(targets, LAG)[:, 0], "hip_pos_rad": targets[:, 0]}
+    write_csv(Path("a.csv"), columns)
     guess = read_guesses()["hip: columns"]
     assert guess.sureness == "unsure"
     assert "the position leads it by 0.12 s: columns swapped, or clocks apart?" in guess.reason
@@ -268,16 +241,14 @@ def test_files_of_one_run_in_a_folder_keep_their_clocks_and_a_given_offset() -> 
     t_s = np.arange(len(targets)) / RATE_HZ
     for run in ("one", "two"):
         goals = {"stamp": t_s[::5], "hip.goal": targets[::5, 0]}  # slower than the states
-        write_table(Path(f"logs/{run}/goals.csv"), goals)
-        write_table(
-            Path(f"logs/{run}/states.csv"),
-            {"stamp": t_s + 3600.0, "hip.pos_rad": delay(targets)[:, 0]},
-        )
+        write_csv(Path(f"logs/{run}/goals.csv"), goals)
+        states = {"stamp": t_s + 3600.0, "hip.pos_rad": delay(targets, LAG)[:, 0]}
+        write_csv(Path(f"logs/{run}/states.csv"), states)
     offset = "log.clock_offset_s={states: -3600}"
     assert f"if they began together, give '{offset}'" in try_draft("log.input=logs").err
     _, recordings = import_log("log.input=logs", offset)
     found = recordings[0]["q_hip_rad"]
-    np.testing.assert_allclose(found, delay(targets)[: len(found), 0], atol=1e-5)
+    np.testing.assert_allclose(found, delay(targets, LAG)[: len(found), 0], atol=1e-5)
 
 
 def test_speeds_in_rad_per_second_count_alike_both_ways() -> None:
@@ -285,7 +256,7 @@ def test_speeds_in_rad_per_second_count_alike_both_ways() -> None:
     speeds = np.repeat(generator.uniform(-3.0, 5.0, 60), 25)
     columns = {"t_s": np.arange(len(speeds)) / RATE_HZ, "cmd_left_rad_s": speeds}
     columns["ticks_left"] = np.cumsum(delay(speeds, 4)) / RATE_HZ / 0.00153
-    write_table(Path("a.csv"), columns)
+    write_csv(Path("a.csv"), columns)
     unit = "log.position_unit=0.00153 rad"
     full = speeds.max()
     command = draft_file(MAP_TEMPLATE, unit)["joints"]["left"]["command"]

@@ -40,11 +40,8 @@ def sound(machine: Machine, seconds: float = 60.0) -> Recording:
     u[:, 2] = np.repeat([0.0, 0.5, 0.0, -0.5], 80)[np.arange(steps) % 320]
     moved = np.zeros((steps, 5))
     moved[DELAY:] = u[:-DELAY] * machine.max_speed * PERIOD_S
-    q = (
-        machine.home
-        + np.cumsum(moved, 0)
-        + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
-    )
+    noise = NOISE * np.random.default_rng(0).standard_normal((steps, 5))
+    q = machine.home + np.cumsum(moved, 0) + noise
     told = {"run": "sound", "created": "2026-11-20T10:00:00.000+00:00"}
     return make_recording(machine, u, q, metadata=told)
 
@@ -222,17 +219,14 @@ def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
         assert Path(f"out/{name}.png").stat().st_size > 1000
 
 
+IDENTIFICATION = {"test": None, "folds": None, "hold_out": 6, "stride_s": 2.0, "threads": 1}
+
+
 @pytest.mark.parametrize(
-    "request_recordings",
-    [
-        lambda where: InspectionRequest(recordings=where, pictures=0),
-        lambda where: Identification(
-            recordings=where, test=None, folds=None, hold_out=6, stride_s=2.0, threads=1
-        ),
-    ],
+    ("kind", "numbers"), [(InspectionRequest, {"pictures": 0}), (Identification, IDENTIFICATION)]
 )
 def test_recordings_that_match_nothing_are_refused_before_anything_is_loaded(
-    request_recordings: Callable[[str], object],
+    kind: Callable[..., object], numbers: dict[str, Any]
 ) -> None:
     with pytest.raises(RecordingError, match="no recording matches nowhere"):
-        request_recordings("nowhere/*.parquet")
+        kind(recordings="nowhere/*.parquet", **numbers)

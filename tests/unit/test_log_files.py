@@ -10,26 +10,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
-from carriage import NUM, check, make_carriage, make_map, make_signals
+from carriage import NUM, check, make_map, make_signals
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_import import write_csv
 
 from actuators.recordings.column_map import AlignedTime, Column, ColumnMap, CommandColumn
 from actuators.recordings.expression import parse_expression
 from actuators.recordings.log_files import expand_logs, open_log
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
-
-
-@pytest.fixture(scope="module")
-def carriage() -> Machine:
-    """A machine of one joint."""
-    return make_carriage()
-
-
-def write_csv(path: Path, signals: dict[str, np.ndarray]) -> None:
-    rows = [",".join(repr(float(v)) for v in row) for row in zip(*signals.values(), strict=True)]
-    path.write_text("\n".join([",".join(signals), *rows]) + "\n")
 
 
 def write_lists(path: Path) -> None:
@@ -135,10 +125,8 @@ def test_a_folder_of_folders_gives_the_logs_below_it(tmp_path: Path) -> None:
 
 def test_arithmetic_stands_in_the_place_of_a_column(tmp_path: Path, carriage: Machine) -> None:
     signals = make_signals()
-    write_csv(
-        tmp_path / "a.csv",
-        {"t": signals["t"], "target pos": signals["u"] + signals["q"], "q": signals["q"]},
-    )
+    target = {"t": signals["t"], "target pos": signals["u"] + signals["q"], "q": signals["q"]}
+    write_csv(tmp_path / "a.csv", target)
     (recording,) = make_map("`target pos` - q").read(tmp_path / "a.csv", carriage)
     check(recording)
 

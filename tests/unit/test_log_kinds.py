@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
-from log_import import import_log, try_draft, write_messages
+from log_import import delay, import_log, try_draft, write_messages
 
 from actuators.recordings.advice import ADVICE
 from actuators.recordings.log_files import open_log
@@ -25,13 +25,10 @@ from brokk_rl import extensions
 from brokk_rl.errors import RecordingError
 from diagnosis import api
 
+pytestmark = pytest.mark.usefixtures("empty_folder")
 RATE_HZ = 50.0
 LAG = 5
 NAMES = ("time_s", "hip_target_rad", "hip_pos_rad", "knee_target_rad", "knee_pos_rad")
-
-
-def delay(values: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.repeat(values[:1], LAG, 0), values[:-LAG]])
 
 
 def make_rows(num: int = 600) -> np.ndarray:
@@ -39,17 +36,12 @@ def make_rows(num: int = 600) -> np.ndarray:
     t_s = np.arange(num) / RATE_HZ
     hip = 0.5 * np.sin(0.9 * t_s) + 0.2 * np.sin(2.3 * t_s)
     knee = 0.4 * np.sin(1.7 * t_s + 1.0) - 0.3 * np.sin(0.6 * t_s)
-    return np.stack([t_s, hip, delay(hip), knee, delay(knee)], 1)
+    return np.stack([t_s, hip, delay(hip, LAG), knee, delay(knee, LAG)], 1)
 
 
 def write_text(path: str, rows: np.ndarray, names: tuple[str, ...] = NAMES) -> None:
     lines = [",".join(f"{value:.6f}" for value in row) for row in rows]
     Path(path).write_text("\n".join([",".join(names), *lines]) + "\n")
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def check_joints(recordings: list[dict[str, Any]], num: int = 600, atol: float = 2e-3) -> None:
@@ -80,11 +72,8 @@ COMMAS = [",".join(f"{v:.6f}" for v in row) for row in make_rows()]
 QUOTED = [",".join(f'"{v:.6f}"'.replace(".", ",") for v in row) for row in make_rows()]
 NESTED = []
 for stamp_s, hip_target, hip, knee_target, knee in make_rows().tolist():
-    pair = {
-        "target": {"hip": hip_target, "knee": knee_target},
-        "position": {"hip": hip, "knee": knee},
-    }
-    NESTED.append(json.dumps({"stamp": stamp_s, **pair}))
+    nested: dict[str, Any] = {"stamp": stamp_s, "target": {"hip": hip_target, "knee": knee_target}}
+    NESTED.append(json.dumps(nested | {"position": {"hip": hip, "knee": knee}}))
 PLAIN = [" ".join(f"{v:.6f}" for v in row) for row in make_rows()]
 FORTRAN = [" ".join(f"{v:.8e}".replace("e", "D") for v in row) for row in make_rows()]
 GROUPED = [";".join(f"{1e3 * v:,.3f}".replace(",", "'") for v in row) for row in make_rows()]
@@ -306,7 +295,7 @@ def test_steps_that_no_machine_makes_are_found() -> None:
     for cause in (np.zeros(1000), 300.0 * np.sin(0.5 * t_s + 0.1)):
         assert find_jumps(t_s, reset, cause).tolist() == [499]
     step = np.where(t_s > 5.0, 1.0, 0.0)
-    assert not len(find_jumps(t_s, delay(step), step))
+    assert not len(find_jumps(t_s, delay(step, LAG), step))
 
 
 def test_what_is_given_is_weighed_like_a_guess() -> None:
@@ -381,12 +370,7 @@ def list_frames(foreign: bool) -> list[can.Message]:
             )  # fmt: skip
         if foreign:
             time_s = 1.7e9 + number / RATE_HZ + 0.007
-            data = b"\x55" * 8
-            found.append(
-                can.Message(
-                    timestamp=time_s, arbitration_id=257, is_extended_id=True, data=data, channel=0
-                )
-            )
+            found.append(can.Message(time_s, 257, data=b"\x55" * 8, channel=0))
     return found
 
 
@@ -489,7 +473,7 @@ def write_advised(case: str) -> list[str]:
             rows[:, 1:], names = np.round(2000.0 + rows[:, 1:] * 652.0), plain
         case "command":
             wave = np.sin(2.0 * np.pi * rows[:, :1] / 4.0)
-            rows = np.column_stack([rows[:, 0], 3.0 * wave, delay(wave)])
+            rows = np.column_stack([rows[:, 0], 3.0 * wave, delay(wave, LAG)])
             names = ("time_s", "hip_action", "hip_pos_rad")
         case "time":
             rows[:, 0], names = 2.0 * np.arange(len(rows)), ("x", *NAMES[1:])
@@ -560,12 +544,8 @@ def test_arm_and_wheels_on_one_topic_keep_their_own_rates() -> None:
     assert done.code == 0, done.err
     assert "2 joints at 50 Hz" in done.out
     columns = open_log(Path("a.mcap")).list_tables()
-    assert [*columns["/joint_states"]] == [
-        "log_time",
-        "position[hip]",
-        "position[knee]",
-        "position[7]",
-    ]
+    joints = ["position[hip]", "position[knee]", "position[7]"]
+    assert [*columns["/joint_states"]] == ["log_time", *joints]
     assert "layout" not in "".join(columns["/command"])
     check_joints(recordings)
 

@@ -15,13 +15,8 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def unseen(machine: Machine) -> Machine:
-    return replace(
-        machine,
-        name="unseen",
-        mjcf=None,
-        tool_m=None,
-        joints=tuple(replace(j, body=None) for j in machine.joints),
-    )
+    joints = tuple(replace(joint, body=None) for joint in machine.joints)
+    return replace(machine, name="unseen", mjcf=None, tool_m=None, joints=joints)
 
 
 @pytest.mark.parametrize(
@@ -34,8 +29,5 @@ def test_what_needs_its_links_says_what_is_missing(unseen: Machine, use) -> None
 
 def test_bodies_stand_in_the_fingerprint(machine: Machine, unseen: Machine) -> None:
     assert machine.has_bodies
-    assert {
-        key
-        for key in machine.fingerprint()
-        if machine.fingerprint()[key] != unseen.fingerprint()[key]
-    } == {"name", "geometry"}
+    known, other = machine.fingerprint(), unseen.fingerprint()
+    assert {key for key in known if known[key] != other[key]} == {"name", "geometry"}

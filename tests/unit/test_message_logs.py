@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from carriage import check, make_carriage, make_map, make_signals
+from carriage import check, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from log_import import write_messages
 from mcap.writer import Writer
@@ -33,12 +33,6 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-
-
-@pytest.fixture(scope="module")
-def carriage() -> Machine:
-    """A machine of one joint."""
-    return make_carriage()
 
 
 def make_topic_map(command: str, position: str, time: str = "log_time") -> Any:
@@ -127,13 +121,8 @@ def write_bag(path: Path, storage: str) -> Any:
         for time_ns, *values in list_rows():
             for connection, value in zip(connections, values, strict=True):
                 stamp = types["builtin_interfaces/msg/Time"](time_ns // 10**9, time_ns % 10**9)
-                message = kind(
-                    types["std_msgs/msg/Header"](stamp, ""),
-                    ["slide"],
-                    np.array([value]),
-                    np.empty(0),
-                    np.empty(0),
-                )
+                header = types["std_msgs/msg/Header"](stamp, "")
+                message = kind(header, ["slide"], np.array([value]), np.empty(0), np.empty(0))
                 data = store.serialize_cdr(message, kind.__msgtype__)
                 writer.write(connection, time_ns, data)
     return make_topic_map("position[slide]", "position[slide]", "header.stamp")
@@ -152,9 +141,8 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
 def test_messages_of_every_encoding_give_the_same_recording(
     tmp_path: Path, carriage: Machine, name: str
 ) -> None:
-    pytest.importorskip(
-        {"json.mcap": "mcap", "protobuf.mcap": "mcap_protobuf"}.get(name, "rosbags")
-    )
+    needed = {"json.mcap": "mcap", "protobuf.mcap": "mcap_protobuf"}
+    pytest.importorskip(needed.get(name, "rosbags"))
     reader = WRITERS[name](tmp_path / name)
     (recording,) = reader.read(tmp_path / name, carriage)
     # stamps are seconds since 1970, rounded to 0.2 µs; the position steps by 0.12 m within 10 ms
@@ -191,9 +179,8 @@ def write_chunks(path: Path) -> Any:
     for t_s, u, q in zip(*make_signals().values(), strict=True):
         messages.append((t_s, "/state", {"u": u, "q": q, "text": generator.random()}))
     write_messages(path, messages, 2000)
-    return replace(
-        make_map("/state:u", "/state:q", "log_time"), longest_gap_s=0.015, shortest_s=0.0
-    )
+    reader = make_map("/state:u", "/state:q", "log_time")
+    return replace(reader, longest_gap_s=0.015, shortest_s=0.0)
 
 
 def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(

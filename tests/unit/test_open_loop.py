@@ -49,10 +49,8 @@ def test_a_plant_with_a_state_runs_freely_without_error_wherever_a_window_begins
     assert (cut.q.shape, cut.u.shape) == ((8, 233, 5), (8, 232, 5))
     assert list(cut.run) == ["run 0"] * 4 + ["run 1"] * 4
     # what is left of the speed at rest after the warm-up: exp(-1 / 0.3) of it, 0.3 s long
-    assert (
-        np.abs(open_loop.roll_out(PLANT, machine, cut, CPU) - cut.measured).max()
-        < 0.2 * 0.3 * np.exp(-1.0 / 0.3) * 1.5
-    )
+    error = np.abs(open_loop.roll_out(PLANT, machine, cut, CPU) - cut.measured)
+    assert error.max() < 0.2 * 0.3 * np.exp(-1.0 / 0.3) * 1.5
 
 
 def test_short_recordings_serve_the_horizons_that_fit(machine: Machine) -> None:
@@ -68,9 +66,8 @@ def test_short_recordings_serve_the_horizons_that_fit(machine: Machine) -> None:
 
 
 def test_recordings_too_short_for_any_horizon_are_refused(machine: Machine) -> None:
-    with pytest.raises(
-        RecordingError, match=r"needs 11\.65 s of recording, the longest of 2 has 5"
-    ):
+    told = r"needs 11\.65 s of recording, the longest of 2 has 5"
+    with pytest.raises(RecordingError, match=told):
         open_loop.cut_windows(levels(machine, [100, 100]), machine, 10.0, 1.0)
 
 
@@ -113,9 +110,8 @@ def test_a_small_difference_that_every_run_shows_is_certain_although_intervals_o
     still = np.zeros((200, 5))
     runs = [make_recording(machine, still, still, f"run {n}") for n in range(9)]
     cut = open_loop.cut_windows(runs, machine, 1.0, 1.0)
-    size = np.array([0.1 * (1 + int(name[-1])) for name in cut.run])[:, None, None] * np.ones(
-        (1, 20, 5)
-    )
+    size = np.array([0.1 * (1 + int(name[-1])) for name in cut.run])[:, None, None]
+    size = np.broadcast_to(size, cut.measured.shape)
     found = scores(cut, machine, mine=cut.measured + 0.95 * size, rival=cut.measured + size)
     mine, rival = found.at("mine", 1.0)[0]["ci95"], found.at("rival", 1.0)[0]["ci95"]
     assert mine[1] > rival[0]

@@ -112,19 +112,13 @@ def test_effects_behind_the_simulator_do_not_run_it_again(pendulum: str) -> None
     assert calls
 
 
-def test_a_function_for_one_state_is_that_for_many(
-    pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    single = PENDULUM.replace(
-        "np.stack([angle, speed], axis=-1)", "np.array([float(angle), speed])"
-    )
-    (tmp_path / "my_single.py").write_text(single)
+def test_a_function_for_one_state_is_that_for_many(pendulum: str, tmp_path: Path) -> None:
+    many, one = "np.stack([angle, speed], axis=-1)", "np.array([float(angle), speed])"
+    (tmp_path / "my_single.py").write_text(PENDULUM.replace(many, one))
     machine = make_machine("hinge")
     state, commands = np.array([[0.1, 0.0], [-0.4, 1.0]]), np.full((2, 5, 1), 0.3)
-    runs = [
-        api._load_simulator(name).load(machine).run(state, commands)
-        for name in (pendulum, "my_single:step")
-    ]
+    plants = [api._load_simulator(name).load(machine) for name in (pendulum, "my_single:step")]
+    runs = [plant.run(state, commands) for plant in plants]
     np.testing.assert_allclose(runs[0], runs[1], atol=1e-12)
     module = sys.modules["my_pendulum"]
     expected = state[0]
@@ -134,7 +128,7 @@ def test_a_function_for_one_state_is_that_for_many(
 
 
 def test_function_and_file_of_the_tutorial_are_the_same_pendulum(
-    pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pendulum: str, tmp_path: Path
 ) -> None:
     (tmp_path / "pendulum.xml").write_text(PENDULUM_FILE)
     (tmp_path / "record.py").write_text(RECORDER)
@@ -167,9 +161,8 @@ def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: 
         simulator.load(make_machine("wrist"))
     with pytest.raises(ConfigError, match="is no multiple of the time step"):
         simulator.load(replace(make_machine("shoulder"), period_s=0.019))
-    arm.write_text(ARM.replace('<position joint="elbow" kp="30" kv="1.5"/>', ""))
     other = arm.with_name("other.xml")
-    other.write_text(arm.read_text())
+    other.write_text(ARM.replace('<position joint="elbow" kp="30" kv="1.5"/>', ""))
     with pytest.raises(ConfigError, match="expected one actuator on joint 'elbow', found 0"):
         api._load_simulator(other).load(make_machine("shoulder", "elbow"))
 
@@ -223,21 +216,14 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
     Path(name).parent.mkdir()
     Path(name).write_text(ARM)
     asked = why.Why(
-        session=Session(out=str(tmp_path), seed=0, device="cpu"),
-        machine=make_machine("hinge"),
-        evaluation=api.extensions.load_part("evaluation"),
-        log="log.parquet",
-        policy_path="policy",
-        simulator=name,
-        own=api._load_option("actuator", "own"),
-        sent=True,
-        target_in_base_m=None,
-    )
+        session=Session(out=str(tmp_path), seed=0, device="cpu"), machine=make_machine("hinge"),
+        evaluation=api.extensions.load_part("evaluation"), log="log.parquet", policy_path="policy", simulator=name,
+        own=api._load_option("actuator", "own"), sent=True, target_in_base_m=None,
+    )  # fmt: skip
     parser = OverridesParser.create()
     for stage in (asked._examine(), asked._diagnose(), asked._evaluate("all", "[library]")):
-        given = {
-            one.key_or_group: one.value() for one in parser.parse_overrides(list(stage.command))
-        }
+        overrides = parser.parse_overrides(list(stage.command))
+        given = {one.key_or_group: one.value() for one in overrides}
         assert given["actuator"] == "own"
         assert str(given["actuator.source"]) == name
     named = replace(asked, simulator="servo")

@@ -118,12 +118,8 @@ def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
     classical = ClassicalPolicy(task=mine.task)
     policies: Any = {"shallow": mine, "shipped": shipped, "classical": classical}
     by_default = evaluate_policies(runs.plant(machine, default), how, session, policies)
-    alone = evaluate_policies(
-        runs.plant(machine, insertion(episode_s=short, depth_m=0.1)),
-        how,
-        session,
-        {"shallow": mine},
-    )
+    own = runs.plant(machine, insertion(episode_s=short, depth_m=0.1))
+    alone = evaluate_policies(own, how, session, {"shallow": mine})
     other = evaluate_policies(runs.plant(machine, default), how, session, {"shipped": shipped})
     assert by_default["policies"]["shallow"] == alone["policies"]["shallow"]
     assert by_default["policies"]["shipped"] == other["policies"]["shipped"]
@@ -201,9 +197,8 @@ FEW = ("evaluation.num_recorded=1", "evaluation.video=false", "actuator=lag", "s
 def test_values_of_an_experiment_yield_to_the_policy(
     brokk: Callable[..., Done], tmp_path: Path
 ) -> None:
-    (tmp_path / "other.yaml").write_text(
-        "# @package _global_\ntask: {episode_s: 1.0, switch: {rule: text}}\n"
-    )
+    other = "# @package _global_\ntask: {episode_s: 1.0, switch: {rule: text}}\n"
+    (tmp_path / "other.yaml").write_text(other)
     done = brokk(*EVALUATE, *FEW, "experiment=@other.yaml")
     assert done.code == 0, done.err
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())

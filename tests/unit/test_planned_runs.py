@@ -138,19 +138,16 @@ def test_a_clock_ahead_shows_no_command_before_it_is_given(machine: Machine) -> 
 
 def test_effects_that_draw_together_and_the_library_are_stepped(machine: Machine) -> None:
     for name in ("library", "delay_jitter"):
-        model = option("effect", name).wrap(
-            bases(machine)["lag"].build(machine, NUM_ENVS, CPU), machine, NUM_ENVS, CPU
-        )
+        inner = bases(machine)["lag"].build(machine, NUM_ENVS, CPU)
+        model = option("effect", name).wrap(inner, machine, NUM_ENVS, CPU)
         assert model.plan_run(torch.zeros(20, NUM_ENVS, machine.num_joints), 13) is None
 
 
 def test_the_weight_of_a_planar_arm_is_that_of_its_mechanics(machine: Machine) -> None:
     weight = build_joint_weight(machine, CPU)
     generator = torch.Generator().manual_seed(7)
-    lower, upper = (
-        torch.as_tensor(side, dtype=torch.float32) for side in (machine.lower, machine.upper)
-    )
-    q = torch.rand(100, machine.num_joints, generator=generator) * (upper - lower) + lower
+    share = torch.rand(100, machine.num_joints, generator=generator).numpy()
+    q = torch.tensor(machine.lower + share * (machine.upper - machine.lower)).float()
     force = torch.tensor([body.yield_force.value for body in machine.bodies])
     truth = Gravity(machine, CPU).load(q) / force
     assert weight.is_planar

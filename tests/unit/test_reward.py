@@ -17,44 +17,28 @@ from tasks.terms import ToolState
 YES, NO = torch.tensor([True]), torch.tensor([False])
 
 
-@pytest.fixture
-def state() -> ToolState:
-    still = torch.zeros(1, 2, 5)
-    return ToolState(
-        history=History(q=still, u=still),
-        lower=-torch.ones(5),
-        upper=torch.ones(5),
-        steps=torch.tensor([4.0]),
-        max_steps=100,
-        age=torch.tensor([4.0]),
-        period_s=0.05,
-        start={},
-        held_share=torch.zeros(1),
-        tip_m=torch.tensor([[2.5, 0.0, 0.9]]),
-        pitch_rad=torch.tensor([1.25]),
-        target_m=torch.tensor([[2.5, 0.2, 0.75]]),  # 0.2 and 0.15 make 0.25
-        target_pitch_rad=torch.tensor([1.5]),
-        reach_m=torch.tensor([2.0]),
-        reach_range_m=(1.7, 2.4),
-        positioning=NO,
-        contact_force_n=torch.tensor([0.0]),
-        peak_force_n=torch.tensor([0.0]),
-        u=torch.tensor([[0.5, 0.0, -0.25, 0.0, 1.0]]),
-        u_before=torch.tensor([[0.25, 0.0, 0.25, 0.0, 1.0]]),
-        success=NO,
-        reached=NO,
-        inserted=NO,
-        paper_success=NO,
-        failed=NO,
-        closeness=torch.tensor([0.5]),
-        closeness_before=torch.tensor([0.375]),
-        lateral_m=torch.tensor([0.2]),
-    )
-
-
 def put(**changes: float | bool) -> dict[str, torch.Tensor]:
     """Returns changes of a state of one environment."""
     return {name: torch.tensor([value]) for name, value in changes.items()}
+
+
+@pytest.fixture
+def state() -> ToolState:
+    still = torch.zeros(1, 2, 5)
+    outcomes = ("positioning", "success", "reached", "inserted", "paper_success", "failed")
+    numbers = put(
+        steps=4.0, age=4.0, held_share=0.0, pitch_rad=1.25, target_pitch_rad=1.5, reach_m=2.0, contact_force_n=0.0,
+        peak_force_n=0.0, closeness=0.5, closeness_before=0.375, lateral_m=0.2,
+    )  # fmt: skip
+    return ToolState(
+        **dict.fromkeys(outcomes, NO), **numbers,
+        history=History(q=still, u=still), lower=-torch.ones(5), upper=torch.ones(5), max_steps=100, period_s=0.05, start={},
+        tip_m=torch.tensor([[2.5, 0.0, 0.9]]),
+        target_m=torch.tensor([[2.5, 0.2, 0.75]]),  # 0.2 and 0.15 make 0.25
+        reach_range_m=(1.7, 2.4),
+        u=torch.tensor([[0.5, 0.0, -0.25, 0.0, 1.0]]),
+        u_before=torch.tensor([[0.25, 0.0, 0.25, 0.0, 1.0]]),
+    )  # fmt: skip
 
 
 AWAY, BEYOND = {"edge": 0.25}, {"largest": 0.7}
@@ -105,9 +89,8 @@ def test_a_term_has_the_value_worked_by_hand(
     assert float(term(replace(state, **changes))) == pytest.approx(expected, rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("distance_m", "expected"), [(0.43, 120.0), (0.42, 0.0)]
-)  # r^d = 0.7 at 3/7 m = 0.4286 m
+# r^d = 0.7 at 3/7 m = 0.4286 m
+@pytest.mark.parametrize(("distance_m", "expected"), [(0.43, 120.0), (0.42, 0.0)])
 def test_contact_costs_its_force_only_far_from_the_hole(
     state: ToolState, distance_m: float, expected: float
 ) -> None:
@@ -127,20 +110,15 @@ def test_travel_of_the_valves_is_that_of_the_last_period(state: ToolState) -> No
 def test_the_papers_total_on_one_state(state: ToolState) -> None:
     """r^d + r^o + r^i - r^c - r^a, 0.8 + 0.8 + 5 (0.8 + 0.8) - 0 - 0.0075."""
     done = replace(state, paper_success=YES)
-    weights = {
-        "distance": 1,
-        "pitch": 1,
-        "insertion": 5,
-        "far_contact": -0.01,
-        "approach_command_change": -0.01,
-        "working_distance": 1,
-    }
-    params = {"far_contact": {"largest": 0.7}, "working_distance": {"edge": 0.25}}
+    terms = {
+        ("distance", 1.0): {}, ("pitch", 1.0): {}, ("insertion", 5.0): {}, ("far_contact", -0.01): BEYOND,
+        ("approach_command_change", -0.01): {}, ("working_distance", 1.0): AWAY,
+    }  # fmt: skip
     total = 0.0
-    for name, weight in weights.items():
-        term = RewardTerm(function=f"tasks.terms:{name}", params=params.get(name, {}), weight=1.0)
-        total = total + weight * term.resolve()(done)
-    assert float(total) == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
+    for (name, weight), params in terms.items():
+        term = RewardTerm(function=f"tasks.terms:{name}", params=params, weight=1.0)
+        total += weight * float(term.resolve()(done))
+    assert total == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
 
 
 @pytest.mark.parametrize(

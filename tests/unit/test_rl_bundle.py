@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -44,9 +45,8 @@ def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundl
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
     task = option("task", name)
-    task = replace(
-        task, noise=replace(task.noise, **runs.SILENT), action=replace(task.action, kind=kind)
-    )
+    silent, action = replace(task.noise, **runs.SILENT), replace(task.action, kind=kind)
+    task = replace(task, noise=silent, action=action)
     loop = runs.plant(machine, task).build(CPU, 16, 64, 3)
     network = TRAINING.describe_network()
     actor = make_actor(network, loop.get_observations(), loop.num_actions)
@@ -64,11 +64,15 @@ def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundl
     return Bundle(folder, loop, actor, json.loads((folder / "policy.json").read_text()))
 
 
+def open_network(bundle: Bundle) -> onnxruntime.InferenceSession:
+    path = bundle.folder / "policy.onnx"
+    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+
 @pytest.fixture(scope="module")
 def bundle(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Bundle:
-    return export_policy(
-        machine, tmp_path_factory.mktemp("policy"), "borehole_insertion", "residual"
-    )
+    folder = tmp_path_factory.mktemp("policy")
+    return export_policy(machine, folder, "borehole_insertion", "residual")
 
 
 @pytest.fixture
@@ -96,9 +100,7 @@ def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle, machine: M
 
 
 def test_the_onnx_file_carries_the_contract(bundle: Bundle, machine: Machine) -> None:
-    session = onnxruntime.InferenceSession(
-        bundle.folder / "policy.onnx", providers=["CPUExecutionProvider"]
-    )
+    session = open_network(bundle)
     told = session.get_modelmeta().custom_metadata_map
     assert told["brokk.machine"] == "brokk170" and float(told["brokk.rate_hz"]) == 20.0
     assert json.loads(told["brokk.fingerprint"]) == machine.fingerprint()
@@ -107,45 +109,32 @@ def test_the_onnx_file_carries_the_contract(bundle: Bundle, machine: Machine) ->
     assert (given.name, given.shape) == ("observation", ["batch", 133]) and taken.name == "command"
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("borehole_insertion", "residual"),
-        ("borehole_insertion", "direct"),
-        ("goal_pose", "residual"),
-    ],
-)
+@pytest.mark.parametrize("kind", ["residual", "direct"])
+@pytest.mark.parametrize("name", ["borehole_insertion", "goal_pose"])
 def test_on_the_machine_it_commands_what_it_did_in_the_simulator(
     name: str, kind: str, machine: Machine, tmp_path: Path
 ) -> None:
     """Numpy's encoder and onnxruntime on the recorded history against the control loop's own way from observation to command."""
     made = export_policy(machine, tmp_path / "policy", name, kind)
-    session = onnxruntime.InferenceSession(
-        made.folder / "policy.onnx", providers=["CPUExecutionProvider"]
-    )
+    session = open_network(made)
     encoder = ObservationEncoder(list_pose_parts(machine, option("task", name).scaling))
     loop, policy = made.loop, NetworkPolicy(made.actor, made.loop)
     loop.begin()
-    off, rows = [], 0
+    off = []
     for _ in range(60):
         groups = dict(loop.get_observations().items())
-        recorded = {
-            "target_in_base_m": loop.task.state["start.target_m"],
-            "q": loop.history.q,
-            "u": loop.history.u,
-            "pitch_rad": loop.task.state["start.target_pitch_rad"],
-        }
+        recorded = {"q": loop.history.q, "u": loop.history.u}
+        recorded["target_in_base_m"] = loop.task.state["start.target_m"]
+        recorded["pitch_rad"] = loop.task.state["start.target_pitch_rad"]
         vector = encoder.encode({name: value.numpy() for name, value in recorded.items()})
         on_machine = session.run(None, {"observation": vector.astype(np.float32)})[0]
         with torch.no_grad():
             _, _, done, _ = loop.step(policy.act(groups))
         in_force = loop.history.u[:, -1].numpy()[~done.numpy()]
         difference = np.abs(on_machine[~done.numpy()] - in_force).max(1)
-        off.append(difference > 1e-3)
-        rows += len(difference)
-    assert rows > 900 and np.concatenate(off).mean() < 0.005, (
-        "but at the edges of masks and dead bands, as in the parity check"
-    )
+        off += (difference > 1e-3).tolist()
+    # but at the edges of masks and dead bands, as in the parity check
+    assert len(off) > 900 and np.mean(off) < 0.005
 
 
 def test_a_trained_policy_is_read_back_as_it_was_written(bundle: Bundle) -> None:
@@ -183,12 +172,13 @@ def test_a_damaged_file_is_named_with_the_way_out(
 
 
 def test_the_plant_of_a_stranger_names_no_class_but_those_of_options(copied: Path) -> None:
-    contract = json.loads((copied / "policy.json").read_text())
+    path = copied / "policy.json"
+    contract = json.loads(path.read_text())
     contract["plant"]["machine"]["joints"][0]["_target_"] = "os.system"
-    (copied / "policy.json").write_text(json.dumps(contract))
+    path.write_text(json.dumps(contract))
     assert "_target_" not in find_policy(str(copied)).list_plant()["machine"]["joints"][0]
     contract["plant"]["machine"]["_target_"] = "os.system"
-    (copied / "policy.json").write_text(json.dumps(contract))
+    path.write_text(json.dumps(contract))
     with pytest.raises(CheckpointError, match=r"machine os\.system, which no installed option has"):
         find_policy(str(copied)).list_plant()
 
@@ -219,14 +209,11 @@ def test_a_file_that_says_something_else_is_not_left_behind(
     for name in ("policy.onnx", "golden.json"):
         (copied / name).unlink()
 
-    class Wrong:
-        def __init__(self, *args: Any, **kwargs: Any) -> None:
-            pass
+    def answer(names: None, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
+        return [np.ones((len(feed["observation"]), 5), np.float32)]
 
-        def run(self, names: None, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
-            return [np.ones((len(feed["observation"]), 5), np.float32)]
-
-    monkeypatch.setattr(export.onnxruntime, "InferenceSession", Wrong)
+    wrong = SimpleNamespace(run=answer)
+    monkeypatch.setattr(export.onnxruntime, "InferenceSession", lambda *_, **__: wrong)
     task = option("task", "borehole_insertion").build(machine, 1, CPU)
     answers = bundle.loop.record_answers(bundle.actor, 16)
     with pytest.raises(CheckpointError, match=r"differs from the answers .* custom layer"):

@@ -113,19 +113,24 @@ def test_tensorboard_gets_parts_reward_terms_and_the_evaluation(run: Callable[..
 def test_wandb_gets_the_evaluation_before_the_run_closes(
     run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls: list[dict[str, Any]] = []
-    original = wandb.sdk.wandb_run.Run.finish
-    monkeypatch.setattr(
-        wandb.sdk.wandb_run.Run,
-        "finish",
-        lambda self, *rest: (calls.append(dict(self.summary)), original(self, *rest))[1],
-    )
+    summaries: list[dict[str, Any]] = []
     configs: list[dict[str, Any]] = []
-    init = wandb.init
-    monkeypatch.setattr(wandb, "init", lambda **given: (configs.append(given), init(**given))[1])
+    kind = wandb.sdk.wandb_run.Run
+    finish, init = kind.finish, wandb.init
+
+    def note_summary(run: Any, *rest: Any) -> None:
+        summaries.append(dict(run.summary))
+        finish(run, *rest)
+
+    def note_config(**given: Any) -> Any:
+        configs.append(given)
+        return init(**given)
+
+    monkeypatch.setattr(kind, "finish", note_summary)
+    monkeypatch.setattr(wandb, "init", note_config)
     folder = run("tracking=wandb")
     evaluation = json.loads((folder / "evaluation.json").read_text())
-    (summary,), (given,) = calls, configs
+    (summary,), (given,) = summaries, configs
     assert summary["evaluation/trained/valve_travel"] == pytest.approx(evaluation["valve_travel"])
     assert given["config"]["choices"]["effect"] == "[backlash]"
     assert given["config"]["config"]["rl"]["num_envs"] == 8

@@ -8,20 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
+from gaps import diagnose
 from motion import make_recording
 from scipy.signal import cont2discrete, lsim
 
-from brokk_rl import extensions
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library
-from diagnosis.answer import Answer
 from diagnosis.case import GapCase
 from diagnosis.engine.rows import Row
 from diagnosis.engine.servo import SERVO
 from diagnosis.engine.side import Side, stack_side
 from diagnosis.engine.sizes import is_plain, translate
-from diagnosis.reference_diagnosis import ReferenceDiagnosis
 
 RESPONSE_S, DAMPING, DELAY_S = 0.05, 0.7, 0.06
 ARM_RESPONSE_S, ARM_DAMPING = 0.03, 0.8
@@ -69,25 +67,10 @@ def pair() -> Machine:
     return replace(arm, joints=arm.joints[:2], name="pair")
 
 
-def diagnose(case: GapCase) -> Answer:
-    """Return the answer of the engine."""
-    thresholds = extensions.load_part("thresholds")
-    kinds = effect_library.load_effects(case.machine)
-    work = ReferenceDiagnosis(case, kinds, thresholds, np.random.default_rng(0))
-    return work.run(lambda *_: None).answer
-
-
 def cut_joints(recording: Recording, machine: Machine) -> Recording:
     """Return a recording of the first joints only."""
     count = machine.num_joints
-    return replace(
-        recording,
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=recording.units[:count],
-        u=recording.u[:, :count],
-        q=recording.q[:, :count],
-    )
+    return make_recording(machine, recording.u[:, :count], recording.q[:, :count])
 
 
 def record_pair(pair: Machine, seeds: tuple[int, ...], **changes: float) -> list[Recording]:
@@ -156,11 +139,16 @@ def test_a_joint_falls_where_the_limit_is_below_its_weight(pair: Machine) -> Non
     assert falls[-1] < -0.3
 
 
-@pytest.mark.parametrize("name", ["so101", "brokk170"])
-def test_every_row_has_the_numbers_of_its_effect(name: str) -> None:
+def command_positions(name: str) -> Machine:
+    """Return a machine whose joints are commanded by position."""
     known = option("machine", name)
     joints = [replace(joint, command="position") for joint in known.joints]
-    machine = replace(known, joints=tuple(joints), levers=())
+    return replace(known, joints=tuple(joints), levers=())
+
+
+@pytest.mark.parametrize("name", ["so101", "brokk170"])
+def test_every_row_has_the_numbers_of_its_effect(name: str) -> None:
+    machine = command_positions(name)
     kinds = {kind.name: kind for kind in effect_library.load_effects(machine)}
     loaded = {"sag_load"} if machine.has_bodies else {"sag", "sag_pose_1"}
     for row in SERVO.rows:
@@ -170,9 +158,7 @@ def test_every_row_has_the_numbers_of_its_effect(name: str) -> None:
 
 
 def test_weight_pulls_a_joint_from_its_target() -> None:
-    known = option("machine", "brokk170")
-    joints = [replace(joint, command="position") for joint in known.joints]
-    machine = replace(known, joints=tuple(joints), levers=())
+    machine = command_positions("brokk170")
     side = stand_still(machine, np.zeros((100, machine.num_joints)))
     joint = int(np.abs(side.load[:, 0]).argmax())
     numbers = SERVO.list_values("mean")

@@ -5,10 +5,12 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from warp_states import copy_state
 
 from brokk_rl.sim.warp_dynamics import ArmDynamics
 from brokk_rl.sim.warp_solver import ContactSolver
 
+pytestmark = pytest.mark.usefixtures("warp_device")
 NUM_WORLDS = 16
 ARM = """
 <mujoco><compiler autolimits="true" angle="radian"/>
@@ -52,19 +54,11 @@ class Arms:
         self.reference = []
         for world in range(NUM_WORLDS):
             data = mujoco.MjData(self.model)
-            data.qpos, data.qvel = (
-                random.uniform(-1.0, 1.0, self.model.nq),
-                random.normal(size=self.model.nv),
-            )
-            data.act, data.ctrl = (
-                data.qpos + random.normal(scale=0.2, size=self.model.na),
-                random.normal(size=self.model.nu),
-            )
-            for name in ("qpos", "qvel", "act", "ctrl"):
-                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(
-                    wp.array(getattr(data, name), dtype=float, device="cpu")
-                )
-            mujoco.mj_forward(self.model, data)
+            data.qpos = random.uniform(-1.0, 1.0, self.model.nq)
+            data.qvel = random.normal(size=self.model.nv)
+            data.act = data.qpos + random.normal(scale=0.2, size=self.model.na)
+            data.ctrl = random.normal(size=self.model.nu)
+            copy_state(self.model, data, ("qpos", "qvel", "act", "ctrl"), self.data, world)
             self.reference.append(data)
 
     def prepare(self):
@@ -77,13 +71,6 @@ class Arms:
         mjw.make_constraint(self.device_model, self.data)
         self.solve()
         self.dynamics.after_contacts()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _device():
-    """A GPU where there is one."""
-    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
-        yield
 
 
 @pytest.fixture
@@ -116,11 +103,9 @@ def test_a_hundred_substeps_with_servos_at_their_limit_and_contact_are_those_of_
             mujoco.mj_step(arms.model, data)
             touched += data.ncon > 0
     assert touched > 20
-    apart = [
-        np.abs(arms.data.qpos.numpy()[world] - data.qpos).max()
-        for world, data in enumerate(arms.reference)
-    ]
-    assert np.median(apart) < 1e-4 and sum(a < 5e-3 for a in apart) >= NUM_WORLDS - 1
+    expected = np.array([data.qpos for data in arms.reference])
+    apart = np.abs(arms.data.qpos.numpy() - expected).max(1)
+    assert np.median(apart) < 1e-4 and (apart < 5e-3).sum() >= NUM_WORLDS - 1
     np.testing.assert_allclose(arms.data.act.numpy()[0], arms.reference[0].act, atol=1e-5)
     np.testing.assert_allclose(arms.data.time.numpy(), 1.0, rtol=1e-5)
     assert not arms.data.overflow.numpy().any()
@@ -131,12 +116,10 @@ def test_rows_contacts_and_pairs_without_room_are_reported(arms):
     data.nefc.fill_(0)
     data.nefc[3:4].fill_(data.njmax + 1)
     arms.dynamics.after_contacts()
-    assert (
-        data.overflow.numpy() == np.where(np.arange(NUM_WORLDS) == 3, int(mjw.OverflowType.NEFC), 0)
-    ).all()
+    expected = np.where(np.arange(NUM_WORLDS) == 3, int(mjw.OverflowType.NEFC), 0)
+    assert (data.overflow.numpy() == expected).all()
     data.nacon.fill_(data.naconmax + 1)
     data.ncollision.fill_(data.naconmax + 1)
     arms.dynamics.after_contacts()
-    assert (
-        data.overflow.numpy() & int(mjw.OverflowType.NARROWPHASE | mjw.OverflowType.BROADPHASE) != 0
-    ).all()
+    pairs = int(mjw.OverflowType.NARROWPHASE | mjw.OverflowType.BROADPHASE)
+    assert (data.overflow.numpy() & pairs != 0).all()

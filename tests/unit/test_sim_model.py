@@ -16,16 +16,12 @@ from brokk_rl.sim.scene import ScenePlacement, build_collision_geoms, make_nomin
 def test_numbers_of_the_machine_stand_in_the_model(machine):
     model = compile_model(machine, 0.01)
     np.testing.assert_allclose(model.jnt_range, np.stack([machine.lower, machine.upper], 1))
-    np.testing.assert_allclose(
-        [model.body(f"{j.name}_link").mass[0] for j in machine.joints],
-        [body.mass_kg.value for body in machine.bodies],
-    )
-    np.testing.assert_allclose(
-        model.actuator_gainprm[:, 0], [body.stiffness.value for body in machine.bodies]
-    )
-    np.testing.assert_allclose(
-        model.actuator_forcerange[:, 1], [body.yield_force.value for body in machine.bodies]
-    )
+    masses = [model.body(f"{joint.name}_link").mass[0] for joint in machine.joints]
+    numbers = {"mass_kg": masses, "stiffness": model.actuator_gainprm[:, 0]}
+    numbers["yield_force"] = model.actuator_forcerange[:, 1]
+    for name, found in numbers.items():
+        expected = [getattr(body, name).value for body in machine.bodies]
+        np.testing.assert_allclose(found, expected, err_msg=name)
     assert [model.actuator(i).name for i in range(model.nu)] == list(machine.joint_names)
 
 
@@ -51,17 +47,12 @@ def test_joints_that_do_not_match_are_named(machine):
 def test_a_hole_has_walls_all_round_and_nothing_inside(scale, radius_m):
     block = build_collision_geoms(scale, radius_m)
     angles = np.linspace(0, 2 * np.pi, 721)
-    for distance, expected in (
-        (0.999, False),
-        (1.0 / np.cos(np.pi / 8) + 0.001, True),
-        (1.4, True),
-        (1.8, True),
-    ):
+    around = 1.0 / np.cos(np.pi / 8) + 0.001
+    for distance, expected in ((0.999, False), (around, True), (1.4, True), (1.8, True)):
         points = distance * radius_m * np.stack([np.cos(angles), np.sin(angles)], 1)
         inside = np.zeros(len(points), dtype=bool)
-        for name, size, pos, yaw in zip(
-            block.names, block.size, block.pos, block.yaw_rad, strict=True
-        ):
+        walls = zip(block.names, block.size, block.pos, block.yaw_rad, strict=True)
+        for name, size, pos, yaw in walls:
             if name.startswith(("slab", "post")):
                 turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
                 inside |= (np.abs((points - pos[:2]) @ turn) <= size[:2]).all(1)

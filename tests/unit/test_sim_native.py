@@ -98,41 +98,33 @@ def test_worlds_do_exactly_what_a_loop_over_plain_mujoco_does(machine):
     world = _world(machine, 3)
     generator = torch.Generator().manual_seed(0)
     speed = torch.tensor(machine.max_speed, dtype=torch.float32)
-    data = [mujoco.MjData(world._batch.get_model(i)) for i in range(3)]
-    for i, one in enumerate(data):
-        mujoco.mj_setState(
-            world._batch.get_model(i),
-            one,
-            world._batch.state[i],
-            mujoco.mjtState.mjSTATE_INTEGRATION,
-        )
+    models = [world._batch.get_model(i) for i in range(3)]
+    data = [mujoco.MjData(model) for model in models]
+
+    def set_states() -> None:
+        for model, one, state in zip(models, data, world._batch.state, strict=True):
+            mujoco.mj_setState(model, one, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+
+    set_states()
     velocity = torch.zeros(3, 5)
     touched = False
     for _ in range(60):
         velocity = 0.9 * velocity + 0.3 * speed * torch.randn(3, 5, generator=generator)
         world.step(velocity * machine.period_s)
-        for i, one in enumerate(data):
+        for i, (model, one) in enumerate(zip(models, data, strict=True)):
             # the drive's outputs at the start of the period: what MuJoCo integrated since is ctrl
             # for one period
-            one.ctrl[:] = world._views["ctrl"][i].numpy()
-            one.act[:] = (
-                world._drive.reference[i].numpy()
-                - world._views["ctrl"][i].numpy() * 0.05
-                + (world._drive._lead * world._views["ctrl"][i]).numpy()
-            )
+            ctrl = world._views["ctrl"][i]
+            one.ctrl[:] = ctrl
+            one.act[:] = world._drive.reference[i] - 0.05 * ctrl + world._drive._lead * ctrl
             peak = 0.0
             for _ in range(5):
-                mujoco.mj_step(world._batch.get_model(i), one)
-                peak = max(peak, _sum_normal_forces(world._batch.get_model(i), one))
+                mujoco.mj_step(model, one)
+                peak = max(peak, _sum_normal_forces(model, one))
             assert world.contact_force_n[i].item() == pytest.approx(peak, rel=1e-4, abs=1e-3)
             np.testing.assert_allclose(world._views["qpos"][i].numpy(), one.qpos, atol=1e-6)
             touched = touched or peak > 0
-            mujoco.mj_setState(
-                world._batch.get_model(i),
-                one,
-                world._batch.state[i],
-                mujoco.mjtState.mjSTATE_INTEGRATION,
-            )
+        set_states()
     assert touched
 
 

@@ -27,14 +27,11 @@ CHANGES: dict[str, tuple[str, str]] = {
     "friction": (JOINT, '<joint frictionloss="9000" name="q3"'),
     "armature": (JOINT, '<joint armature="900" name="q3"'),
     "soft limits": (JOINT, '<joint solreflimit="0.2 1" margin="0.05" name="q3"'),
-    "adhesion": (TOOL, '<geom adhesion="9000" name="chisel" class="chisel_contact"'),
-    "surface velocity": (TOOL, '<geom surfacevel="0.9 0.4 0" name="chisel" class="chisel_contact"'),
-    "torsional friction": (TOOL, '<geom condim="4" name="chisel" class="chisel_contact"'),
-    "soft contact": (
-        TOOL,
-        '<geom solref="0.2 1" priority="1" name="chisel" class="chisel_contact"',
-    ),
-    "margin": (TOOL, '<geom margin="0.03" name="chisel" class="chisel_contact"'),
+    "adhesion": (TOOL, f'{TOOL} adhesion="9000"'),
+    "surface velocity": (TOOL, f'{TOOL} surfacevel="0.9 0.4 0"'),
+    "torsional friction": (TOOL, f'{TOOL} condim="4"'),
+    "soft contact": (TOOL, f'{TOOL} solref="0.2 1" priority="1"'),
+    "margin": (TOOL, f'{TOOL} margin="0.03"'),
     "no actuation": (OPTIONS, f'{OPTIONS}<option><flag actuation="disable"/></option>'),
     "no contact": (OPTIONS, f'{OPTIONS}<option><flag contact="disable"/></option>'),
     "no limits": (OPTIONS, f'{OPTIONS}<option><flag limit="disable"/></option>'),
@@ -92,11 +89,8 @@ class Spoiled:
 
     def __init__(self, machine: Machine, fault: str) -> None:
         self._world, self._fault = NATIVE.build(machine, "cpu"), fault
-        self.num_worlds, self.device, self.faults = (
-            NUM_WORLDS,
-            torch.device("cpu"),
-            self._world.faults,
-        )
+        self.num_worlds, self.device = NUM_WORLDS, torch.device("cpu")
+        self.faults = self._world.faults
 
     @property
     def q(self) -> torch.Tensor:

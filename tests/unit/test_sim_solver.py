@@ -5,9 +5,11 @@ import mujoco_warp as mjw
 import numpy as np
 import pytest
 import warp as wp
+from warp_states import copy_state
 
 from brokk_rl.sim.warp_solver import ContactSolver
 
+pytestmark = pytest.mark.usefixtures("warp_device")
 NUM_WORLDS = 64
 TOLERANCE = 1e-6
 
@@ -53,11 +55,8 @@ class Problem:
             data.qvel = random.normal(scale=random.choice([0.1, 2.0]), size=num_joints)
             data.qfrc_applied = random.normal(scale=50.0, size=num_joints)
             data.qacc_warmstart = random.normal(scale=10.0, size=num_joints)
-            for name in ("qpos", "qvel", "qfrc_applied", "qacc_warmstart"):
-                wp.to_torch(getattr(self.data, name))[world] = wp.to_torch(
-                    wp.array(getattr(data, name), dtype=float, device="cpu")
-                )
-            mujoco.mj_forward(self.model, data)
+            fields = ("qpos", "qvel", "qfrc_applied", "qacc_warmstart")
+            copy_state(self.model, data, fields, self.data, world)
             self.reference.append(data)
         self.peak = wp.zeros(NUM_WORLDS, dtype=float)
         self.solve = ContactSolver(self.warp_model, self.data, self.peak)
@@ -77,13 +76,6 @@ class Problem:
         return [array.numpy().copy() for array in arrays]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _device():
-    """A GPU where there is one: there a world has 32 threads."""
-    with wp.ScopedDevice("cuda:0" if wp.is_cuda_available() else "cpu"):
-        yield
-
-
 @pytest.fixture(scope="module")
 def problem():
     return Problem(num_joints=5)
@@ -94,15 +86,12 @@ def test_accelerations_and_forces_are_those_of_mujoco_c(num_joints):
     problem = Problem(num_joints)
     acceleration, _, force, _, peak = problem.found()
     for world, data in enumerate(problem.reference):
-        np.testing.assert_allclose(
-            acceleration[world], data.qacc, rtol=2e-3, atol=2e-3 * np.abs(data.qacc).max()
-        )
-        np.testing.assert_allclose(
-            force[world],
-            data.qfrc_constraint,
-            rtol=2e-3,
-            atol=2e-3 * np.abs(data.qfrc_constraint).max(),
-        )
+        for found, expected in (
+            (acceleration[world], data.qacc),
+            (force[world], data.qfrc_constraint),
+        ):
+            atol = 2e-3 * np.abs(expected).max()
+            np.testing.assert_allclose(found, expected, rtol=2e-3, atol=atol)
         normal = [data.efc_force[c.efc_address] for c in data.contact if c.efc_address >= 0]
         np.testing.assert_allclose(peak[world], sum(normal), rtol=5e-3, atol=0.1)
 

@@ -65,10 +65,8 @@ def test_a_sitting_is_walked_through_by_touch(
     page.locator("#study .primary").tap()
     until(page, "() => window.sitting().kind === 'trial'")
     condition = lead.view()["condition"]
-    assert (
-        page.locator("#study h1").inner_text()
-        == {"guided": "With guidance", "unguided": "Without guidance"}[condition]
-    )
+    title = "With guidance" if condition == "guided" else "Without guidance"
+    assert page.locator("#study h1").inner_text() == title
     assert page.locator("#study .joints .there").count() == 5
     page.locator("#begin").tap()
     until(page, "() => window.sitting().phase === 'countdown'")
@@ -103,10 +101,8 @@ def test_the_whole_questionnaire_by_key_in_german(
         at(page, screen)
         for key in ("ArrowRight", *["ArrowRight"] * screen, "ArrowLeft"):
             page.keyboard.press(key)
-        until(
-            page,
-            f"() => window.sitting().ratings[window.sitting().scales[{screen}]] === {45 + 5 * screen}",
-        )
+        rating = f"window.sitting().ratings[window.sitting().scales[{screen}]]"
+        until(page, f"() => {rating} === {45 + 5 * screen}")
         page.keyboard.press("Enter")
     at(page, 6)
     page.keyboard.press("Backspace")

@@ -84,10 +84,8 @@ def test_what_went_wrong_is_kept_and_said(tmp_path: Path) -> None:
     (trials / "P01_1_02.json").unlink()
     for path in [*trials.glob("P02_1_*"), *trials.glob("P02_2_*")]:  # stopped after practice
         path.unlink()
-    study_folder.update_record(
-        tmp_path / "participants/P02.json",
-        {"participant": "P02", "stopped": True, "reason": "felt unwell"},
-    )
+    told = {"participant": "P02", "stopped": True, "reason": "felt unwell"}
+    study_folder.update_record(tmp_path / "participants/P02.json", told)
     first = json.loads((trials / "P03_1_01.json").read_text())
     study_folder.write_trial(tmp_path, "P03_1_01", {**first, "created": "2999-01-01"})
     study_folder.write_trial(tmp_path, "P99_1_01", {**first, "participant": "P99"})
@@ -127,9 +125,8 @@ def test_a_study_without_trials_is_reported_as_that(tmp_path: Path) -> None:
 
 def test_a_participant_is_forgotten_on_request(tmp_path: Path) -> None:
     study(tmp_path, count=4)
-    study_folder.update_record(
-        tmp_path / "participants/P02.json", {"participant": "P02", "hand": "left"}
-    )
+    told = {"participant": "P02", "hand": "left"}
+    study_folder.update_record(tmp_path / "participants/P02.json", told)
     (tmp_path / study_folder.TRIALS / "P02_1_01.json").rename(tmp_path / "trials" / "copy.json")
     assert len(study_folder.erase(tmp_path, "P02")) == 8 + 8 + 2 + 1
     assert not list(tmp_path.rglob("P02*"))

@@ -50,9 +50,8 @@ def lead(tmp_path: Path, arm: Arm) -> Conductor:
 def captures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every capture shows an insertion at the end of the trial, and advice."""
 
-    def between(
-        reader: CaptureLogReader, path: Path, machine: Any, begin_s: float, end_s: float
-    ) -> Recording:
+    def between(*given: Any) -> Recording:
+        begin_s, end_s = given[-2:]
         q = inserted_after(int((end_s - begin_s) * 20) - 9)
         return recorded(q, **{f"advice_{name}": q[:, 0] for name in MACHINE.joint_names})
 
@@ -99,9 +98,8 @@ def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(
     consent = read(tmp_path / "participants" / "P01.json")["consent"]
     assert consent["agreed"] and consent["language"] == "de" and consent["version"] == "v1"
     for trial in data.planned[:4]:
-        columns = record.read_recording(
-            tmp_path / f"recordings/{trial.name}.parquet", MACHINE
-        ).extra
+        path = tmp_path / f"recordings/{trial.name}.parquet"
+        columns = record.read_recording(path, MACHINE).extra
         assert ("advice_q1" in columns) == (trial.condition == "guided")
         assert data.trials[trial.key]["twin"] is True
 
@@ -168,12 +166,10 @@ def test_who_stops_in_a_trial_is_believed_and_may_come_back(
 @pytest.mark.parametrize(
     ("happens", "outcome", "reason"),
     [
-        ("late", "time limit", ""),
-        ("stop_trial", "stopped", ""),
-        ("abort", "aborted", "experimenter"),
+        ("late", "time limit", ""), ("stop_trial", "stopped", ""), ("abort", "aborted", "experimenter"),
         ("silence", "aborted", "positions"),
     ],
-)
+)  # fmt: skip
 def test_how_a_trial_can_end(
     tmp_path: Path, arm: Arm, lead: Conductor, happens: str, outcome: str, reason: str
 ) -> None:
@@ -273,11 +269,8 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
 
 
 def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None:
-    with (
-        reserve_study(tmp_path),
-        pytest.raises(ConfigError, match="go on already"),
-        reserve_study(tmp_path),
-    ):
+    refused = pytest.raises(ConfigError, match="go on already")
+    with reserve_study(tmp_path), refused, reserve_study(tmp_path):
         pass
     with reserve_study(tmp_path):
         pass

@@ -72,9 +72,8 @@ def test_a_trial_is_the_same_whoever_does_it_beside(tmp_path: Path) -> None:
 
 
 def test_a_twin_is_put_elsewhere_with_its_block(tmp_path: Path) -> None:
-    link = replace(GROUND.plant, start=tuple(START), hole_in_base_m=(2.6, 0.0, 0.75)).build(
-        MACHINE, 1, Session(out=str(tmp_path), seed=0, device="cpu")
-    )
+    plant = replace(GROUND.plant, start=tuple(START), hole_in_base_m=(2.6, 0.0, 0.75))
+    link = plant.build(MACHINE, 1, Session(out=str(tmp_path), seed=0, device="cpu"))
     for _ in range(30):
         link.send(Command(GIVEN))
     other = np.array([-0.3, -0.9, 0.5, 1.2, 0.5])
@@ -87,9 +86,8 @@ def test_a_twin_is_put_elsewhere_with_its_block(tmp_path: Path) -> None:
 
 def test_a_place_is_asked_for_once_and_nonsense_refused() -> None:
     faults = ActiveFaults()
-    faults.request(
-        json.dumps({"place": {"q": [0.0] * 5, "hole_in_base_m": [2.6, 0.0, 0.75]}}).encode(), 0.0
-    )
+    place = {"q": [0.0] * 5, "hole_in_base_m": [2.6, 0.0, 0.75]}
+    faults.request(json.dumps({"place": place}).encode(), 0.0)
     assert faults.take_place() == ([0.0] * 5, [2.6, 0.0, 0.75]) and faults.take_place() is None
     with pytest.raises(ConfigError, match="expected JSON"):
         faults.request(b'{"place": {"q": [0.0]}}', 0.0)

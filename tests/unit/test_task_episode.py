@@ -10,11 +10,11 @@ import pytest
 import torch
 from composed import option
 from kinematic import KinematicWorld
+from motion import rest
 from scipy import optimize
 from training import SILENT, plant
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.sim.scene import COLUMNS, make_nominal_scenes
@@ -35,10 +35,7 @@ class Stage:
         self.process: Any = self.task.build(machine, num_envs, CPU)
         self.world = KinematicWorld(machine, num_envs)
         start = self.process.starts(num_envs, 1)
-        self.history = History(
-            q=start["q"][:, None].repeat(1, machine.num_history, 1),
-            u=torch.zeros(num_envs, machine.num_history, 5),
-        )
+        self.history = rest(machine, start["q"], num_envs)
         self.process.reset(torch.ones(num_envs, dtype=torch.bool), start)
         self.start = start
         pose = Kinematics(machine).pose(start["q"])
@@ -51,6 +48,15 @@ class Stage:
 
     def step(self) -> Any:
         return self.process.step(self.history, self.world)
+
+    def end(self) -> tuple[Any, str]:
+        """Takes a step that ends the episode; returns it and the reason."""
+        end = self.step()
+        return end, self.process.reasons[int(end.reason)]
+
+    def observe(self) -> dict[str, torch.Tensor]:
+        """Returns what the policy sees, by its parts."""
+        return self.process.control.encoder.decode(self.process.observe(self.history)["policy"])
 
 
 def terminations(**changes: Any) -> dict[str, Any]:
@@ -181,44 +187,78 @@ def test_a_pitch_that_varies_must_be_told_to_the_policy(name: str) -> None:
         replace(task, scaling=replace(task.scaling, pitch_rad=None))
 
 
-def judged(
-    name: str,
-    at_m: tuple[float, float, float],
-    pitch_rad: float = torch.pi / 2,
-    force_n: float = 0.0,
+Place = tuple[float, float, float]
+
+
+def judge(
+    name: str, at_m: Place, turn_rad: float = 0.0, force_n: float = 0.0
 ) -> tuple[bool, bool, bool]:
     """Returns whether a tool at `at_m` from a target below it is there, and strict and paper's success."""
-    start = {
-        "target_m": torch.tensor([[2.5, 0.5, 0.75]]),
-        "target_pitch_rad": torch.tensor([torch.pi / 2]),
-        "scene": make_nominal_scenes(1),
-    }
-    verdict = option("task", name).judge(
-        start["target_m"] + torch.tensor([at_m]),
-        torch.tensor([pitch_rad]),
-        torch.tensor([force_n]),
-        start,
-    )
+    target_m, down = torch.tensor([[2.5, 0.5, 0.75]]), torch.tensor([torch.pi / 2])
+    start = {"target_m": target_m, "target_pitch_rad": down, "scene": make_nominal_scenes(1)}
+    tip_m, force = target_m + torch.tensor([at_m]), torch.tensor([force_n])
+    verdict = option("task", name).judge(tip_m, down + turn_rad, force, start)
     return bool(verdict.reached), bool(verdict.success), bool(verdict.paper_success)
 
 
+DEEP = (0.0, 0.0, -0.12)
+"""A place in the hole, m from the target."""
+
+
 @pytest.mark.parametrize(
-    ("at_m", "strict"),
+    ("name", "at_m", "turn_rad", "force_n", "reached", "strict"),
     [
-        ((0.0, 0.0, -0.101), True),  # 0.10 m below the rim
-        ((0.0, 0.0, -0.099), False),
-        ((0.0, 0.0, -0.30), True),  # deeper is as good
-        ((0.0125, 0.0, -0.12), True),  # 5 cm hole, 4 cm chisel and 3 mm of slack leave 13 mm
-        ((0.0, -0.0135, -0.12), False),  # that deep beside the hole would be in the concrete
-        ((0.0095, 0.0095, -0.12), False),  # 13.4 mm off axis
-        ((0.0, 0.0, 0.2), False),
+        *((name, *row) for name in ("borehole_insertion", "slanted") for row in (  # both vertical
+            ((0.0, 0.0, -0.101), 0.0, 0.0, True, True),  # 0.10 m below the rim
+            ((0.0, 0.0, -0.099), 0.0, 0.0, False, False),
+            ((0.0, 0.0, -0.30), 0.0, 0.0, True, True),  # deeper is as good
+            ((0.0125, 0.0, -0.12), 0.0, 0.0, True, True),  # 5 cm hole, 4 cm chisel and 3 mm of slack leave 13 mm
+            ((0.0, -0.0135, -0.12), 0.0, 0.0, False, False),  # that deep beside the hole would be in the concrete
+            ((0.0095, 0.0095, -0.12), 0.0, 0.0, False, False),  # 13.4 mm off axis
+            ((0.0, 0.0, 0.2), 0.0, 0.0, False, False),
+        )),
+        # a tilted or forced insertion is inserted but no strict success
+        ("borehole_insertion", DEEP, 0.10, 9.9e3, True, True),
+        ("borehole_insertion", DEEP, -0.12, 0.0, True, False),
+        ("borehole_insertion", DEEP, 0.12, 0.0, True, False),  # the paper's limit is 1 / 0.9 - 1 = 0.11
+        ("borehole_insertion", DEEP, 0.0, 1.01e4, True, False),
+        # a pose is reached within three centimetres and a twentieth of a radian
+        *(("goal_pose", at_m, turn_rad, 0.0, is_there, is_there) for at_m, turn_rad, is_there in (
+            ((0.0, 0.0, 0.0), 0.0, True),
+            ((0.0, 0.0, 0.0295), 0.0, True),
+            ((0.0, 0.0, -0.0305), 0.0, False),
+            ((0.018, 0.018, 0.018), 0.0, False),  # 31 mm
+            ((0.0, 0.0, 0.0), 0.0495, True),
+            ((0.0, 0.0, 0.0), -0.0505, False),
+        )),
     ],
-)
-def test_strict_insertion_needs_depth_inside_the_hole(
-    at_m: tuple[float, float, float], strict: bool
+)  # fmt: skip
+def test_success_is_judged_by_place_angle_and_force(
+    name: str, at_m: Place, turn_rad: float, force_n: float, reached: bool, strict: bool
 ) -> None:
-    assert judged("borehole_insertion", at_m)[:2] == (strict, strict)
-    assert judged("slanted", at_m)[:2] == (strict, strict)  # this hole is vertical
+    assert judge(name, at_m, turn_rad, force_n)[:2] == (reached, strict)
+
+
+@pytest.mark.parametrize(
+    ("name", "at_m", "turn_rad", "paper"),
+    [
+        ("borehole_insertion", (0.0, 0.0, -0.14), 0.0, True),
+        ("borehole_insertion", (0.0, 0.0, -0.051), 0.0, True),  # the height limit; 8.9 cm from the target point
+        ("borehole_insertion", (0.0, 0.0, -0.049), 0.0, False),
+        ("borehole_insertion", (0.11, 0.0, -0.14), 0.0, True),  # 1 / 1.11 = 0.901; it need not be inside the hole
+        ("borehole_insertion", (0.112, 0.0, -0.14), 0.0, False),  # 1 / 1.112 = 0.899
+        ("borehole_insertion", (0.0, 0.0, -0.14), 0.110, True),
+        ("borehole_insertion", (0.0, 0.0, -0.14), -0.112, False),
+        ("goal_pose", (0.11, 0.0, 0.0), 0.0, True),
+        ("goal_pose", (0.112, 0.0, 0.0), 0.0, False),
+        ("goal_pose", (0.0, 0.0, 0.0), -0.110, True),
+        ("goal_pose", (0.0, 0.0, 0.0), 0.112, False),
+    ],
+)  # fmt: skip
+def test_the_papers_success_needs_alignment_and_of_an_insertion_height(
+    name: str, at_m: Place, turn_rad: float, paper: bool
+) -> None:
+    assert judge(name, at_m, turn_rad)[2] is paper
 
 
 def test_an_insertion_is_measured_along_the_axis_and_by_the_radius_of_its_own_hole() -> None:
@@ -237,59 +277,6 @@ def test_an_insertion_is_measured_along_the_axis_and_by_the_radius_of_its_own_ho
     torch.testing.assert_close(verdict.lateral_m, aside_m[:, 0], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("turn_rad", "force_n", "strict"),
-    [
-        (0.10, 9.9e3, True),
-        (-0.12, 0.0, False),
-        (0.12, 0.0, False),  # the paper's limit is 1 / 0.9 - 1 = 0.11
-        (0.0, 1.01e4, False),
-    ],
-)
-def test_a_tilted_or_forced_insertion_is_inserted_but_no_strict_success(
-    turn_rad: float, force_n: float, strict: bool
-) -> None:
-    found = judged("borehole_insertion", (0.0, 0.0, -0.12), torch.pi / 2 + turn_rad, force_n)
-    assert found[:2] == (True, strict)
-
-
-@pytest.mark.parametrize(
-    ("at_m", "turn_rad", "paper"),
-    [
-        ((0.0, 0.0, -0.14), 0.0, True),
-        ((0.0, 0.0, -0.051), 0.0, True),  # the height limit; 8.9 cm from the target point
-        ((0.0, 0.0, -0.049), 0.0, False),
-        ((0.11, 0.0, -0.14), 0.0, True),  # 1 / 1.11 = 0.901; it need not be inside the hole
-        ((0.112, 0.0, -0.14), 0.0, False),  # 1 / 1.112 = 0.899
-        ((0.0, 0.0, -0.14), 0.110, True),
-        ((0.0, 0.0, -0.14), -0.112, False),
-    ],
-)
-def test_the_papers_success_needs_alignment_and_height(
-    at_m: tuple[float, float, float], turn_rad: float, paper: bool
-) -> None:
-    assert judged("borehole_insertion", at_m, torch.pi / 2 + turn_rad)[2] is paper
-
-
-@pytest.mark.parametrize(
-    ("at_m", "turn_rad", "strict", "paper"),
-    [
-        ((0.0, 0.0, 0.0), 0.0, True, True),
-        ((0.0, 0.0, 0.0295), 0.0, True, True),
-        ((0.0, 0.0, -0.0305), 0.0, False, True),
-        ((0.018, 0.018, 0.018), 0.0, False, True),  # 31 mm
-        ((0.0, 0.0, 0.0), 0.0495, True, True),
-        ((0.0, 0.0, 0.0), -0.0505, False, True),
-        ((0.112, 0.0, 0.0), 0.0, False, False),
-        ((0.0, 0.0, 0.0), 0.112, False, False),
-    ],
-)
-def test_a_pose_is_reached_within_three_centimetres_and_a_twentieth_of_a_radian(
-    at_m: tuple[float, float, float], turn_rad: float, strict: bool, paper: bool
-) -> None:
-    assert judged("goal_pose", at_m, torch.pi / 2 + turn_rad) == (strict, strict, paper)
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_closeness_grows_on_the_way_from_none_to_one(name: str) -> None:
     depth_m = 0.0 if name == "goal_pose" else 0.14
@@ -306,9 +293,9 @@ def test_closeness_grows_on_the_way_from_none_to_one(name: str) -> None:
 def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> None:
     stage = Stage(machine)
     stage.world.contact_force_n.fill_(500.0)
-    end = stage.step()
+    end, reason = stage.end()
     assert end.terminated.item() and not end.timed_out.item() and end.reward.item() == 0.0
-    assert stage.process.reasons[int(end.reason)] == "start_in_contact"
+    assert reason == "start_in_contact"
 
 
 def test_contact_later_in_the_episode_goes_on(machine: Machine) -> None:
@@ -327,9 +314,8 @@ def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine:
     stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.011
     assert not stage.step().terminated.item(), "11 mrad from the end of the travel is still inside"
     stage.history.q[0, -1, joint] = float(machine.upper[joint]) - 0.009
-    end = stage.step()
-    assert stage.process.reasons[int(end.reason)] == "joint_limit"
-    assert end.terminated.item() and not end.timed_out.item()
+    end, reason = stage.end()
+    assert reason == "joint_limit" and end.terminated.item() and not end.timed_out.item()
     assert end.reward.item() < -5.0, "5 (1 + closeness) is lost"
 
 
@@ -337,7 +323,7 @@ def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine:
     stage = Stage(machine, episode_s=1.0)
     stage.process.state["steps"].fill_(18.0)  # what rsl-rl does through episode_length_buf
     stage.world.contact_force_n.fill_(500.0)
-    assert stage.process.reasons[int(stage.step().reason)] == "start_in_contact"
+    assert stage.end()[1] == "start_in_contact"
     stage.world.contact_force_n.fill_(0.0)
     assert stage.step().timed_out.item()
 
@@ -346,9 +332,8 @@ def test_a_fault_ends_the_episode_without_reward_or_success(machine: Machine) ->
     stage = Stage(machine)
     stage.target_below_tip(z_m=-0.12)
     stage.world.faults.fill_(True)
-    end = stage.step()
-    assert stage.process.reasons[int(end.reason)] == "fault"
-    assert end.terminated.item() and end.reward.item() == 0.0
+    end, reason = stage.end()
+    assert reason == "fault" and end.terminated.item() and end.reward.item() == 0.0
     assert stage.process.episode["success_strict"].item() == 0.0
 
 
@@ -357,10 +342,9 @@ def test_success_ends_the_episode_only_where_it_shall(machine: Machine) -> None:
         stage = Stage(machine, termination=terminations(**switch))
         stage.step()
         stage.target_below_tip(z_m=-0.12)
-        end = stage.step()
-        ends = not switch
-        assert bool(end.terminated) is ends
-        assert int(end.reason) == (stage.process.reasons.index("success") if ends else -1)
+        end, reason = stage.end()
+        assert bool(end.terminated) is (not switch)
+        assert reason == "success" if not switch else int(end.reason) == -1
         assert stage.process.episode["success_strict"].item() == 1.0
 
 
@@ -452,8 +436,7 @@ def estimates(stage: Stage, count: int) -> torch.Tensor:
     """Returns the errors of the first estimates of an episode, `(count, N, 3)`."""
     found = []
     for _ in range(count):
-        seen = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
-        found.append(seen["target_in_base_m"] - stage.process.state["start.target_m"])
+        found.append(stage.observe()["target_in_base_m"] - stage.process.state["start.target_m"])
         stage.step()
     return torch.stack(found)
 
@@ -505,7 +488,7 @@ def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Mac
     stage = Stage(machine, num_envs=256, noise=noise(q_scale=0.1, u_scale=0.1))
     stage.history.q.fill_(1.0)
     stage.history.u.fill_(0.5)
-    seen = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
+    seen = stage.observe()
     q_factor, u_factor = seen["q"].flatten(1), seen["u"].flatten(1) / 0.5
     for factor in (q_factor, u_factor):
         middle = factor.median(1).values
@@ -521,8 +504,7 @@ def test_a_scale_of_the_motion_leaves_the_newest_position_as_it_is(machine: Mach
     torch.manual_seed(0)
     stage = Stage(machine, num_envs=64, noise=noise(q_scale=0.1, q_scale_of="motion"))
     stage.history.q.copy_(torch.linspace(0.4, 1.0, 13)[None, :, None].expand(64, 13, 5))
-    seen = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
-    q = seen["q"]
+    q = stage.observe()["q"]
     assert torch.allclose(q[:, -1], torch.ones(64, 5), atol=1e-6)
     factor = (q[:, -1:] - q[:, :-1]) / (1.0 - stage.history.q[:, :-1])
     assert (factor - stage.process.state["q_scale"][:, None, None]).abs().max() < 1e-4
@@ -565,12 +547,6 @@ def test_terms_of_ones_own_extend_what_the_critic_sees(machine: Machine) -> None
 
 def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
     stage = Stage(machine, "goal_pose", num_envs=4, noise=noise())
-    vector = stage.process.observe(stage.history)["policy"]
-    seen = stage.process.control.encoder.decode(vector)
-    expected = {
-        "target_in_base_m": stage.start["target_m"],
-        "q": stage.history.q,
-        "pitch_rad": stage.start["target_pitch_rad"],
-    }
-    for part, value in expected.items():
-        torch.testing.assert_close(seen[part], value, rtol=0, atol=1e-6)
+    expected = {"target_in_base_m": stage.start["target_m"], "q": stage.history.q}
+    expected |= {"pitch_rad": stage.start["target_pitch_rad"], "u": stage.history.u}
+    torch.testing.assert_close(stage.observe(), expected, rtol=0, atol=1e-6)

@@ -12,11 +12,11 @@ import pytest
 import torch
 from composed import option
 from kinematic import Kinematic, KinematicWorld
+from motion import rest
 
 from brokk_rl.build import build_node, describe_spec
 from brokk_rl.checks import check_task
 from brokk_rl.errors import CheckpointError, ConfigError
-from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import restore_encoder
@@ -109,8 +109,7 @@ class Stage:
         self.process: Any = make(**changes).build(machine, 1, CPU)
         self.world = KinematicWorld(machine, 1)
         self.start = self.process.starts(1, 1)
-        still = self.start["q"][:, None].repeat(1, machine.num_history, 1)
-        self.history = History(q=still, u=torch.zeros_like(still))
+        self.history = rest(machine, self.start["q"])
         self.process.reset(torch.ones(1, dtype=torch.bool), self.start)
         self.first = self.process.observe(self.history)["policy"].clone()
         self.period_s = machine.period_s
@@ -160,10 +159,7 @@ def test_a_bias_stays_for_an_episode_and_noise_does_not(machine: Machine) -> Non
     tip = term("tasks.terms:tip_position", bias=0.02)
     process: Any = make(observation={"tip": tip}).build(machine, 256, CPU)
     start, everywhere = process.starts(256, 1), torch.ones(256, dtype=torch.bool)
-    history = History(
-        q=start["q"][:, None].repeat(1, machine.num_history, 1),
-        u=torch.zeros(256, machine.num_history, 5),
-    )
+    history = rest(machine, start["q"], 256)
     true_m = Kinematics(machine).pose(start["q"]).tip_in_base_m
     errors = []
     for mask in (everywhere, ~everywhere, everywhere):

@@ -55,14 +55,8 @@ def test_a_term_holds_in_the_second_environment_only(term: Any, changes: dict[st
 
 
 def test_the_first_term_counts_and_time_counts_last() -> None:
-    terms = TerminationManager(
-        {
-            "time_limit": TIME,
-            "blow": ends("force_limit", largest_n=100.0),
-            "off": None,
-            "limit": ends("joint_limit", margin=0.0),
-        }
-    )
+    blow, limit = ends("force_limit", largest_n=100.0), ends("joint_limit", margin=0.0)
+    terms = TerminationManager({"time_limit": TIME, "blow": blow, "off": None, "limit": limit})
     assert terms.reasons == ("blow", "limit", "fault", "time_limit")
     here = state(
         steps=torch.tensor([10.0, 10.0, 1.0]),

@@ -10,16 +10,9 @@ from typing import Any
 import pytest
 
 from brokk_rl.statistics import compute_wilson_interval
+from diagnosis import why_answer
 from diagnosis.answer import Answer, Selected
-from diagnosis.why_answer import (
-    ALL_EFFECTS,
-    BEFORE,
-    WhyResult,
-    list_changes,
-    list_records,
-    subtract_rates,
-    write_summary,
-)
+from diagnosis.why_answer import ALL_EFFECTS, BEFORE, WhyResult, subtract_rates
 
 DOCTOR: dict[str, Any] = {
     "verdict": "nothing",
@@ -63,17 +56,17 @@ def test_the_cause_weighs_all_stages(
     result = make_result(tmp_path, after, verdict)
     assert result.cause == cause
     assert title in result.title[0]
-    summary = write_summary(result)
+    summary = why_answer.write_summary(result)
     assert said in summary
     assert ("lag on q3" in summary) == (cause != "code")
 
 
 def test_next_steps_are_commands_with_their_paths(tmp_path: Path) -> None:
-    ((_, command),) = list_changes(make_result(tmp_path, 0.5))
+    ((_, command),) = why_answer.list_changes(make_result(tmp_path, 0.5))
     assert "policy=runs/policy" in command
     assert f"@{tmp_path}/diagnosis/effects.yaml" in command
     own = replace(make_result(tmp_path, 0.5), simulator="my.xml")
-    ((_, command),) = list_changes(own)
+    ((_, command),) = why_answer.list_changes(own)
     assert "mode=change_simulator" in command
     assert "simulator=my.xml" in command
 
@@ -81,7 +74,7 @@ def test_next_steps_are_commands_with_their_paths(tmp_path: Path) -> None:
 def test_a_diagnosis_without_an_answer_asks_for_recordings(tmp_path: Path) -> None:
     result = replace(make_result(tmp_path, None), diagnosis=None)
     assert result.title == ("No cause found, but not all could be judged", "warn")
-    ((text, command),) = list_records(result)
+    ((text, command),) = why_answer.list_records(result)
     assert "a minute or more in two files" in text
     assert "mode=collect" in command
 
@@ -109,8 +102,7 @@ def test_inputs_are_refused_before_the_first_stage(
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
     # his table II, case (a), 56/70 and 48/80: 0.0524 to 0.3339
-    first, second = (
-        {"mean": k / n, "ci95": list(compute_wilson_interval(k, n))}
-        for k, n in ((56, 70), (48, 80))
-    )
-    assert subtract_rates(first, second)["ci95"] == pytest.approx([0.0524, 0.3339], abs=5e-5)
+    rates = []
+    for k, n in ((56, 70), (48, 80)):
+        rates.append({"mean": k / n, "ci95": list(compute_wilson_interval(k, n))})
+    assert subtract_rates(*rates)["ci95"] == pytest.approx([0.0524, 0.3339], abs=5e-5)
