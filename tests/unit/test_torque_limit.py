@@ -69,7 +69,9 @@ def test_the_weight_of_a_falling_joint_is_that_of_its_place(arm: Machine) -> Non
 
 @pytest.mark.parametrize("inside", [0.0, 0.6])
 @pytest.mark.parametrize("limit_rad", [0.01, 0.08, None])
-@pytest.mark.parametrize(("response_s", "damping"), [(0.03, 0.8), (0.06, 0.4), (0.02, 2.0)])
+@pytest.mark.parametrize(
+    ("response_s", "damping"), [(0.03, 0.8), (0.06, 0.4), (0.02, 2.0), (0.05, 1.0)]
+)
 def test_a_servo_follows_its_differential_equation(
     arm: Machine, inside: float, limit_rad: float | None, response_s: float, damping: float
 ) -> None:
