@@ -201,16 +201,12 @@ class _StateChecks:
         self._collect(self._checklist.listen_s)
         q, machine = np.array([one.q for one in self._samples]), self._machine
         scatter, last = q.std(0), self._memory.state.read()
-        outside, noisy = [], []
-        for j, name in enumerate(machine.joint_names):
-            if not machine.lower[j] <= q[-1, j] <= machine.upper[j]:
-                outside.append(name)
-            if scatter[j] > self._checklist.quiet:
-                noisy.append(name)
-        faults = []
-        if outside:
+        names, faults = np.array(machine.joint_names), []
+        outside = names[~((machine.lower <= q[-1]) & (q[-1] <= machine.upper))]
+        noisy = names[scatter > self._checklist.quiet]
+        if len(outside):
             faults.append(f"{', '.join(outside)} outside the limits")
-        if noisy:
+        if len(noisy):
             faults.append(f"{', '.join(noisy)} not quiet")
         if last is None or not last.q_plausible:
             faults.append("not plausible")

@@ -19,7 +19,6 @@ from foxglove_schemas_protobuf import (
     Quaternion_pb2,
     Vector3_pb2,
 )
-from scipy.spatial.transform import Rotation
 
 from brokk_rl.signals import Frame
 from deploy.picture import decode_jpeg, encode_jpeg
@@ -84,7 +83,7 @@ def decode_frame(
     if pose is not None:
         message, placed = FrameTransform_pb2.FrameTransform.FromString(pose), np.eye(4)
         turn, at = message.rotation, message.translation
-        placed[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+        placed[:3, :3] = _to_rotation(np.array([turn.x, turn.y, turn.z, turn.w]))
         placed[:3, 3] = at.x, at.y, at.z
     return Frame(color, depth_m, matrix, placed, t_s)
 
@@ -120,7 +119,7 @@ def _build_cloud(frame: Frame) -> PointCloud_pb2.PointCloud:
 
 
 def _build_transform(base_from_camera: np.ndarray) -> FrameTransform_pb2.FrameTransform:
-    x, y, z, w = Rotation.from_matrix(base_from_camera[:3, :3]).as_quat()
+    x, y, z, w = _to_quaternion(base_from_camera[:3, :3])
     place_m = base_from_camera[:3, 3]
     return FrameTransform_pb2.FrameTransform(
         parent_frame_id=BASE_FRAME,
@@ -128,3 +127,23 @@ def _build_transform(base_from_camera: np.ndarray) -> FrameTransform_pb2.FrameTr
         translation=Vector3_pb2.Vector3(x=place_m[0], y=place_m[1], z=place_m[2]),
         rotation=Quaternion_pb2.Quaternion(x=x, y=y, z=z, w=w),
     )
+
+
+def _to_quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Return x, y, z, w of a rotation `(3, 3)`.
+
+    Source: Bar-Itzhack, New method for extracting the quaternion from a rotation matrix, 2000. It
+    is the eigenvector of the largest eigenvalue.
+    """
+    r = rotation
+    k = np.zeros((4, 4))
+    k[:3, :3] = r + r.T - r.trace() * np.eye(3)
+    k[3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r.trace()
+    return np.linalg.eigh(k)[1][:, -1]  # it reads the lower half alone
+
+
+def _to_rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation `(3, 3)` of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross

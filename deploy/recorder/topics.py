@@ -126,9 +126,8 @@ def describe_bus_fields(
     description: BusDescription, layout: MessageLayout
 ) -> tuple[TopicField, ...]:
     """Return the fields of a message of the bus: its signals, and whether we sent it."""
-    found = []
-    for signal, unit in description.units(layout.name).items():
-        found.append(TopicField(signal, "number", unit or "without unit"))
+    units = description.units(layout.name)
+    found = [TopicField(name, "number", unit or "without unit") for name, unit in units.items()]
     return (*found, TopicField("sent", "flag", "whether this computer sent it"))
 
 
