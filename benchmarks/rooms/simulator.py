@@ -6,19 +6,27 @@ from pathlib import Path
 
 from measurement import Measurement, Table, load_json
 
-CODE = ("brokk_rl", "tasks", "actuators/models", "actuators/effects", "conf")
+CODE = (
+    "brokk_rl/sim", "brokk_rl/rl", "brokk_rl/kinematics.py", "tasks", "actuators/models",
+    "actuators/effects", "conf/task", "conf/machine", "conf/actuator", "conf/effect", "conf/rl",
+    "conf/preset",
+)  # fmt: skip
+RATES = "brokk mode=bench preset=gpu bench.num_envs=[4096,16384,65536] bench.seconds=0.5 bench.iterations=8 rl.num_starts=4096"
 BENCH = "brokk mode=bench preset=gpu bench.num_envs=[16384] session.out={out}/"
 
 
 def read_rates(folder: Path) -> Table:
     """Return the rates for each number of worlds."""
     rows: Table = []
-    for one in load_json(folder / "bench/benchmark.json")["rows"]:
+    plain = load_json(folder / "bench/benchmark.json")["rows"]
+    mixed = load_json(folder / "bench16/benchmark.json")["rows"]
+    for one, other in zip(plain, mixed, strict=True):
         row = {
             "worlds": one["num_envs"],
             "physics alone, 1e6 steps/s": round(one["physics_env_steps_per_s"] / 1e6, 2),
             "whole control step, 1e6/s": round(one["env_steps_per_s"] / 1e6, 2),
             "training, 1e6 control steps/s": round(one["train_env_steps_per_s"] / 1e6, 2),
+            "training in bfloat16": round(other["train_env_steps_per_s"] / 1e6, 2),
         }
         rows.append(row)
     return rows
@@ -46,7 +54,8 @@ MEASUREMENTS = (
         title="Control steps a second",
         conditions="Training includes simulation, actuator networks, effects, task and PPO. Physics alone steps resting arms without contact; it is the upper bound.",
         commands=(
-            "brokk mode=bench preset=gpu bench.num_envs=[4096,16384,65536] bench.seconds=0.5 bench.iterations=8 rl.num_starts=4096 session.out={out}/bench",
+            f"{RATES} session.out={{out}}/bench",
+            f"{RATES} rl.runner.algorithm.use_mixed_precision=true session.out={{out}}/bench16",
         ),
         code=CODE,
         read=read_rates,
