@@ -1,9 +1,9 @@
 """The decision: which effects are named, none, or unknown.
 
-The best effect is simulated, and the table made again beside it; a second one is named if it earns
-enough there. The cause is unknown where a row outside the library or a flexible column explains much
-more than the effects. The constants were chosen on 250
-practice cases of three makes; leaving a make out was not tried.
+The best effect is simulated, and the table made again beside it; further ones are named while they
+earn enough there. The cause is unknown where a row outside the library or a flexible column explains
+much more than the effects. The constants were chosen on 250 practice cases of three makes; leaving a
+make out was not tried.
 Axes: `J` joints, `P` numbers.
 """
 
@@ -33,13 +33,11 @@ BESIDES_NATS = {"load_dependence": 12.0, "compliance": 30.0}
 mass of a heavy joint, a test programme does not: unchanged machines of a make with such joints earned up to
 48 nats of compliance, joints of other makes with air in the oil 60 to 3,500."""
 SECOND_SHARE = 0.03
-"""A second effect earns so much of the first at least: a first one is never quite of the right form."""
+"""A further effect earns so much of the first at least: a first one is never quite of the right form."""
 SAME_JOINT_SHARE = 0.5
 """Least share of the first where both share a joint."""
 HELD_NATS = 60.0
 """Least gain of held commands, which follow whatever is left."""
-MAX_SIMULATED = 2
-"""Most simulated effects that are named together: of eight third ones on 400 practice cases one was there."""
 SHOWN_NATS = 1e3
 """A coarse sensor or a late clock shows by itself and comes before all that is simulated."""
 JITTER_FACTOR = 2.0
@@ -162,8 +160,6 @@ class Decider:
             if one is not best and not self._is_further(best, one):
                 break
             named.append(one)
-            if len(named) == len(shown) + MAX_SIMULATED:
-                break
             numbers = [joint.numbers for joint in joints]
             joints = self._apply(numbers, one, joints[0].side)
             table = evidence.weigh_rows(joints)
