@@ -56,6 +56,7 @@ class FieldJoint:
         numbers: Its numbers, `(P,)`.
         step: Step of a coarse sensor, units; 0: none.
         noise: Standard deviation of noise that its sensor adds, units.
+        used: Samples that count, `(T,)` bool; `None`: all.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class FieldJoint:
         numbers: np.ndarray,
         step: float = 0.0,
         noise: float = 0.0,
+        used: np.ndarray | None = None,
     ) -> None:
         self.side = side
         self.joint = joint
@@ -77,7 +79,7 @@ class FieldJoint:
         if step or noise:
             memory = () if step else scale.memory
             scale = replace(scale, memory=memory, step=step, noise=noise)
-        self.measure = IncrementMeasure(side, scale, measure_motion(side, healthy))
+        self.measure = IncrementMeasure(side, scale, measure_motion(side, healthy), used)
         self.increments, slopes = linearise(side, joint, numbers, self.measure)
         self.path = side.simulate(joint, numbers)[0].astype(float)
         self.projection = nuisance.project(
@@ -173,14 +175,19 @@ class RowEvidence:
         return found
 
     def view_field(
-        self, numbers: Sequence[np.ndarray], field: Side | None = None
+        self,
+        numbers: Sequence[np.ndarray],
+        field: Side | None = None,
+        used: np.ndarray | None = None,
     ) -> list[FieldJoint]:
-        """Return the joints of the field with these numbers `(P,)`."""
+        """Return the joints of the field with these numbers `(P,)` each, seen in the samples `used` `(T,)`."""
         side = self.field if field is None else field
         found = []
         for j, row in enumerate(numbers):
             base, nuisance = self.bases[j], self.nuisances[j]
-            found.append(FieldJoint(side, j, base, nuisance, row, self.steps[j], self.noises[j]))
+            found.append(
+                FieldJoint(side, j, base, nuisance, row, self.steps[j], self.noises[j], used)
+            )
         return found
 
     def weigh_rows(self, joints: Sequence[FieldJoint]) -> dict[str, dict[int, JointRow]]:

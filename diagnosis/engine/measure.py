@@ -85,12 +85,17 @@ class IncrementMeasure:
         side: The recordings.
         scale: Variance and memory.
         motion: Motion of the simulated joint.
+        used: Samples that count, `(T,)` bool; `None`: all.
     """
 
-    def __init__(self, side: Side, scale: Scale, motion: Motion | None = None) -> None:
+    def __init__(
+        self, side: Side, scale: Scale, motion: Motion | None = None, used: np.ndarray | None = None
+    ) -> None:
         self.interval = side.count(side.model.interval_s)
         self.scale = scale
         valid = find_valid(side)
+        if used is not None:
+            valid &= used
         variance = FIRST_VARIANCE if motion is None else scale.variance(motion)
         weight = valid / np.sqrt(variance)
         self.valid = valid[: -self.interval]
