@@ -6,11 +6,8 @@ from pathlib import Path
 
 from measurement import Measurement, Table, load_json
 
-CODE = (
-    "brokk_rl/sim", "brokk_rl/rl", "brokk_rl/kinematics.py", "tasks", "actuators/models",
-    "actuators/effects", "conf/task", "conf/machine", "conf/actuator", "conf/effect", "conf/rl",
-    "conf/preset",
-)  # fmt: skip
+from rooms.training import TRAINING_CODE
+
 RATES = "brokk mode=bench preset=gpu bench.num_envs=[4096,16384,65536] bench.seconds=0.5 bench.iterations=8 rl.num_starts=4096"
 BENCH = "brokk mode=bench preset=gpu bench.num_envs=[16384] session.out={out}/"
 
@@ -57,7 +54,7 @@ MEASUREMENTS = (
             f"{RATES} session.out={{out}}/bench",
             f"{RATES} rl.runner.algorithm.use_mixed_precision=true session.out={{out}}/bench16",
         ),
-        code=CODE,
+        code=TRAINING_CODE,
         read=read_rates,
         where="one GPU of 80 GB, 5 min",
     ),
@@ -70,7 +67,7 @@ MEASUREMENTS = (
             f"torchrun --nproc-per-node=2 .venv/bin/{BENCH}2",
             f"torchrun --nproc-per-node=4 .venv/bin/{BENCH}4",
         ),
-        code=CODE,
+        code=TRAINING_CODE,
         read=read_scaling,
         where="four GPUs of one computer, 10 min",
     ),

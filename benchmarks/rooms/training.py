@@ -11,10 +11,6 @@ CIRCUITS = ("load_sensing", "post_compensated", "open_center")
 LEVELS = ("flat", "gentle", "tight", "several")
 DELAYS_S = ("0.1", "0.3", "0.5")
 EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=false"
-PAPER_LEVEL = (
-    "effect=[] task.termination.success=null "
-    "task.noise.target_bias_m=0 task.noise.q_scale=0.1 task.noise.q_scale_of=motion"
-)
 BEHIND = "follower=person evaluation.episodes=256"
 POLICY_CODE = (
     "tasks", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects",
@@ -127,8 +123,7 @@ MEASUREMENTS = (
         conditions="`experiment=paper_smooth`, five seeds of 170 million steps. Judged by MuJoCo C with the errors of their training, from the same 1,024 starts; an episode lasts 20 s. The baseline is the classical controller.",
         commands=(
             "brokk -m mode=train preset=gpu experiment=paper_smooth session.seed=1,2,3,4,5 rl.budget.max_env_steps=170e6 evaluation.video=false session.out={out}/trained",
-            f"{EVALUATE} policy={{out}}/trained/<seed> {PAPER_LEVEL} actuator=mlp session.out={{out}}/<seed>-mlp",
-            f"{EVALUATE} policy={{out}}/trained/<seed> {PAPER_LEVEL} actuator=hydraulic session.out={{out}}/<seed>-hydraulic",
+            f"{EVALUATE} policy={{out}}/trained/<seed> effect=[] task.termination.success=null task.noise.target_bias_m=0 task.noise.q_scale=0.1 task.noise.q_scale_of=motion actuator=<plant> session.out={{out}}/<seed>-<plant>",
         ),
         code=TRAINING_CODE,
         read=lambda folder: read_evaluations(folder, "seed and plant"),
