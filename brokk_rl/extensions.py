@@ -54,6 +54,8 @@ def register_options(arguments: Sequence[str]) -> None:
     for override in parse_words(arguments):
         group, names = override.key_or_group, list_names(override)
         if group in groups:
+            if isinstance(override.value(), list):
+                refuse_repeated(group, names)
             refuse_ambiguous({group: ",".join(names)})
             for name in names:
                 if name.startswith("@"):
@@ -64,6 +66,16 @@ def store_option(group: str, name: str, node: Any, package: str | None = None) -
     """Put an option into Hydra's store; a name with slashes is one, as that of a path."""
     *folders, stem = [part for part in name.split("/") if part]
     ConfigStore.instance().store(stem, node, "/".join([group, *folders]), package, "brokk")
+
+
+def refuse_repeated(group: str, names: Sequence[str]) -> None:
+    """Refuse a list that names an option twice: it has one place, so it would be there once."""
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(
+                f"{group}=[{','.join(names)}]: expected each option once, '{name}' stands there {names.count(name)} times; "
+                "name it once"
+            )
 
 
 def refuse_ambiguous(choices: Mapping[str, Any]) -> None:
