@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -57,8 +56,8 @@ def check_stages(stages: Mapping[str, StoryStage], groups: Sequence[str]) -> Non
 
 def write_groups(
     folder: Path, groups: Sequence[str], heads: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """Write composed groups of a story as files for `group=@<file>`; return them.
+) -> None:
+    """Write composed groups of a story as files for `group=@<file>`.
 
     Args:
         folder: Run folder of the story.
@@ -69,12 +68,9 @@ def write_groups(
         StorageError: a file could not be written.
     """
     composed = yaml.safe_load((folder / RESOLVED).read_text())
-    given = {name: composed[name] for name in groups}
-    (folder / HANDED_ON_FOLDER).mkdir(exist_ok=True)
-    for name, node in given.items():
-        text = (heads or {}).get(name, "") + yaml.safe_dump(node, sort_keys=False)
+    for name in groups:
+        text = (heads or {}).get(name, "") + yaml.safe_dump(composed[name], sort_keys=False)
         write_text(folder / HANDED_ON_FOLDER / f"{name}.yaml", text)
-    return given
 
 
 def run_story(session: Session, stages: Mapping[str, StoryStage]) -> None:

@@ -5,6 +5,7 @@ for the dead time (`actuators.identify.dead_time`) gives the start; nonlinear le
 """
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -20,14 +21,6 @@ from brokk_rl.commands import read_targets
 from brokk_rl.errors import RecordingError
 from brokk_rl.spec import Range, spec
 
-NUMBERS: tuple[str, ...] = (
-    "dead_time_s",
-    "response_s",
-    "damping",
-    "play_rad",
-    "sag_rad",
-    "sag_slope",
-)
 STEPS = np.array([5e-3, 2e-3, 5e-2, 2e-3, 1e-3, 1e-2])
 """Size of each number, in its own unit, by which steps of the search count; a tenth is a difference.
 Chosen by hand: above the grain of samples and encoders, below what changes a loop."""
@@ -51,6 +44,9 @@ class ServoBounds:
     play_rad: Range
     sag_rad: Range
     sag_slope: Range
+
+
+NUMBERS = tuple(field.name for field in fields(ServoBounds))
 
 
 @spec

@@ -33,13 +33,8 @@ log = logging.getLogger(__name__)
 PAGE_FILE = "inspection.html"
 TEMPLATE = Path(__file__).with_name("inspection.html.jinja")
 JOINTS = ["joint", "measured", "limits", "commanded", "at limit", "noise", "step", "dead time"]
-OVERALL = {
-    "lowest": np.min,
-    "highest": np.max,
-    "fastest": np.max,
-    "noise": np.median,
-    "step": np.median,
-}
+OVERALL = {"lowest": np.min, "highest": np.max, "fastest": np.max}
+OVERALL |= {"noise": np.median, "step": np.median}
 """Figure over all recordings of those that are no means."""
 FINDING, BREACH = "#e69f00", "#b00020"
 THINNEST = 0.002
@@ -199,12 +194,12 @@ class Inspect:
         rows = []
         for joint in self.machine.joints:
             entry, delay = result["joints"][joint.name], result["delay_s"][joint.name]
-            low, high = (_format_number(entry.get(key), 2) for key in ("lowest", "highest"))
-            lower, upper = (_format_number(entry[key], 2) for key in ("lower_limit", "upper_limit"))
+            low, high = (_format_number(entry.get(key)) for key in ("lowest", "highest"))
+            lower, upper = (_format_number(entry[key]) for key in ("lower_limit", "upper_limit"))
             rows.append([
                 joint.name, f"{low} … {high} {joint.unit}", f"{lower} … {upper}",
                 _format_percent(entry.get("commanded")), _format_percent(entry.get("at_limit")),
-                _format_number(entry.get("noise"), 2), _format_number(entry.get("step"), 2),
+                _format_number(entry.get("noise")), _format_number(entry.get("step")),
                 "–" if delay is None else f"{delay['value']:.2f} s",
             ])  # fmt: skip
         return JOINTS, rows
@@ -238,8 +233,8 @@ def _find_range(values: np.ndarray | None) -> list[float] | None:
     return [float(there.min()), float(there.max())] if len(there) else None
 
 
-def _format_number(value: float | None, digits: int = 3) -> str:
-    return "–" if value is None else f"{value:.{digits}g}"
+def _format_number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2g}"
 
 
 def _format_percent(value: float | None) -> str:

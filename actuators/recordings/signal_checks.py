@@ -11,18 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter
 
-MODULI = (
-    math.pi,
-    math.tau,
-    1.0,
-    180.0,
-    360.0,
-    400.0,
-    3600.0,
-    36000.0,
-    *(2.0**k for k in range(8, 33)),
-)
-"""Values at which angles (rad, deg, gon, parts of a degree, turns) and counters begin again."""
+ANGLES = (math.pi, math.tau, 1.0, 180.0, 360.0, 400.0, 3600.0, 36000.0)
+"""Values at which angles begin again, in rad, turns, deg, gon and parts of a degree."""
+MODULI = (*ANGLES, *(2.0**k for k in range(8, 33)))
+"""The same, and those of counters."""
 SIGN_BITS = tuple(2.0**k for k in range(7, 32))
 FIT_SHARE = 0.04
 """A step is a wrap where it differs by at most this part of the modulus from going on at the speed beside it."""
