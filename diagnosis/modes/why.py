@@ -27,16 +27,7 @@ from diagnosis import report, why_answer
 from diagnosis.deployment.contract import load_policy
 from diagnosis.own_simulator import OwnSimulator
 from diagnosis.story import HANDED_ON_FOLDER, StoryStage, run_story, write_groups
-from diagnosis.why_answer import (
-    ALL_EFFECTS,
-    BEFORE,
-    DIAGNOSIS,
-    DOCTOR,
-    WHY_FILE,
-    WHY_PAGE,
-    WhyResult,
-    is_own_simulator,
-)
+from diagnosis.why_answer import WhyResult
 
 log = logging.getLogger(__name__)
 
@@ -92,10 +83,10 @@ class Why:
         self._try_inputs()
         folder = self.session.folder.resolve()
         write_groups(folder, HANDED_ON_GROUPS)
-        run_story(self.session, {DOCTOR: self._examine()})
+        run_story(self.session, {why_answer.DOCTOR: self._examine()})
         result = self._write_answer()
         if result.doctor["verdict"] != "code":
-            self._try_to_play({DIAGNOSIS: self._diagnose()})
+            self._try_to_play({why_answer.DIAGNOSIS: self._diagnose()})
             if effects := why_answer.read_effects(folder):
                 self._try_to_play(self._list_evaluations(folder, effects))
             result = self._write_answer()
@@ -104,19 +95,19 @@ class Why:
         for step in (*why_answer.list_changes(result), *why_answer.list_records(result)):
             for line in filter(None, step):
                 print_text(line)
-        print_text(f"page: {self.session.folder / WHY_PAGE}", "bold")
+        print_text(f"page: {self.session.folder / why_answer.WHY_PAGE}", "bold")
 
     def _write_answer(self) -> WhyResult:
         """Write `why.json` and `why.html` from what the stages have left so far, and return it."""
         folder = self.session.folder.resolve()
         result = why_answer.read_result(folder, self.policy_path, self.simulator)
-        write_json(folder / WHY_FILE, result.to_json())
+        write_json(folder / why_answer.WHY_FILE, result.to_json())
         why_answer.write_page(result)
         return result
 
     @property
     def _is_own(self) -> bool:
-        return is_own_simulator(self.simulator)
+        return why_answer.is_own_simulator(self.simulator)
 
     def _build_own(self) -> OwnSimulator:
         return replace(self.own, source=self.simulator)
@@ -163,16 +154,16 @@ class Why:
         """
         if self.policy_path.endswith(ONNX_SUFFIX):
             return {}
-        stages = {BEFORE: self._evaluate("As trained", "[library]")}
+        stages = {why_answer.BEFORE: self._evaluate("As trained", "[library]")}
         for name, node in effects.items() if len(effects) > 1 else ():
             path = folder / HANDED_ON_FOLDER / f"found_{name}.yaml"
             write_text(path, EFFECT_HEAD + yaml.safe_dump({name: node}, sort_keys=False))
             title = f"With {report.name_effect(name)}"
             stages[f"with_{name}"] = self._evaluate(title, f"[library,@{path}]")
-        path = folder / DIAGNOSIS / "effects.yaml"
+        path = folder / why_answer.DIAGNOSIS / "effects.yaml"
         names = [report.name_effect(name) for name in effects]
         title = f"With {names[0]}" if len(names) == 1 else "With all of them"
-        stages[ALL_EFFECTS] = self._evaluate(title, f"[library,@{path}]")
+        stages[why_answer.ALL_EFFECTS] = self._evaluate(title, f"[library,@{path}]")
         return stages
 
     def _evaluate(self, title: str, effects: str) -> StoryStage:

@@ -20,18 +20,10 @@ from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
-from exam import dataset, metrics, run_cases
-from exam.answer_scoring import (
-    RUN_FILE,
-    build_table,
-    examine_answers,
-    publish_answers,
-    read_answers,
-    read_run,
-)
+from exam import answer_scoring, dataset, metrics, run_cases
 from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.examiner import examine_case
-from exam.generate import CASES_FOLDER, CaseRecorder, HalfPlan
+from exam.generate import CASES_FOLDER, STREAMS, CaseRecorder, HalfPlan
 from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
 
@@ -161,19 +153,9 @@ class Exam:
             "num_cases": len(labels),
         }
         found = dataset.seal_labels(folder, {**facts, "cases": labels}, salt)
-        recorder = CaseRecorder(
-            self.machine,
-            settings.plants,
-            settings.roughness,
-            self.excitation,
-            settings.approach,
-            {
-                "reference": settings.reference,
-                "field": settings.field,
-                "withheld": settings.withheld,
-            },
-            folder,
-        )
+        halves = {half: getattr(settings, half) for half in STREAMS}
+        drawn = (settings.plants, settings.roughness, self.excitation, settings.approach)
+        recorder = CaseRecorder(self.machine, *drawn, halves, folder)
         recorder.write_all(questions, settings.workers)
         write_json(folder / FACTS_FILE, {**facts, "labels_sha256": found})
         log.info("%d cases in %s, labels sealed: sha256 %s", len(labels), folder, found)
@@ -208,19 +190,19 @@ class Exam:
             "labels_sha256": facts["labels_sha256"],
             "candidate": repr(settings.candidate),
         }
-        before = {**run, **read_run(out)}
+        before = {**run, **answer_scoring.read_run(out)}
         for name in ("candidate", "labels_sha256"):
             if before[name] != run[name]:
                 raise ConfigError(
-                    f"resume={out}: expected {name}={before[name]}, as in its {RUN_FILE}, got {run[name]}: answers of two "
-                    "candidates or to two exams are not mixed; choose another session.out=<folder>"
+                    f"resume={out}: expected {name}={before[name]}, as in its {answer_scoring.RUN_FILE}, got {run[name]}: answers "
+                    "of two candidates or to two exams are not mixed; choose another session.out=<folder>"
                 )
         if before["commit"] != run["commit"]:
             log.warning("answers of two commits: %s, then %s", before["commit"], run["commit"])
         if not any(one.get("run") == run for one in dataset.read_ledger(self._folder)):
             entry = {"labels_sha256": facts["labels_sha256"], "run": run}
             dataset.append_entry(self._folder, dataset.BEGUN, entry)
-        write_json(out / RUN_FILE, run)
+        write_json(out / answer_scoring.RUN_FILE, run)
         failed = run_cases.answer_cases(
             settings.candidate, cases, out, self.machine, settings.workers
         )
@@ -256,7 +238,7 @@ class Exam:
         facts, text = dataset.open_labels(self._folder)
         labels = facts.pop("cases")
         answers = {name: Path(path) for name, path in self.exam.answers.items()}
-        given = {name: read_answers(path) for name, path in answers.items()}
+        given = {name: answer_scoring.read_answers(path) for name, path in answers.items()}
         for name, path in answers.items():
             hashes = {one.labels_sha256 for one in given[name].values()}
             if hashes - {None, facts["labels_sha256"]}:
@@ -265,23 +247,25 @@ class Exam:
                 )
         facts["ledger"] = []
         for path in answers.values():
-            run = read_run(path)
+            run = answer_scoring.read_run(path)
             facts["ledger"].append(dataset.describe_registration(self._folder, path, run))
         if not is_published:
             hashes = {"labels_sha256": facts["labels_sha256"]}
             dataset.append_entry(self._folder, dataset.OPENED, hashes)
         out = self.session.folder
         examine = partial(examine_case, self._folder, self.exam.fit, self.machine)
-        examined = examine_answers(self._folder, labels, answers, examine, self.exam.workers)
+        examined = answer_scoring.examine_answers(
+            self._folder, labels, answers, examine, self.exam.workers
+        )
         tables = {}
         for name, one in given.items():
             for case, figures in examined.items():
                 if name in figures:
                     one[case] = replace(one[case], examined=figures[name])
-            tables[name] = build_table(labels, one, self.exam.mix)
-            tables[name]["commit"] = read_run(answers[name]).get("commit")
+            tables[name] = answer_scoring.build_table(labels, one, self.exam.mix)
+            tables[name]["commit"] = answer_scoring.read_run(answers[name]).get("commit")
             # Answers and labels stand beside the score, so that anybody can score them again.
-            publish_answers(one, out / f"answers_{name}.jsonl")
+            answer_scoring.publish_answers(one, out / f"answers_{name}.jsonl")
         write_text(out / dataset.OPENED_FILE, text)
         write_json(out / "marks.json", {"exam": facts, "candidates": tables})
         metrics.write_report(out, facts, tables)
