@@ -17,7 +17,6 @@ from actuators import open_loop
 from actuators.scales import choose_horizon_s
 from brokk_rl.commands import view_recordings
 from diagnosis import sensors
-from diagnosis.bootstrap import BLOCK_WINDOWS, draw_weights, summarise_draws
 from diagnosis.case import GapCase, select_rows
 from diagnosis.closure import MIN_RESTORED, Estimate, Gap, Gate, RivalError
 from diagnosis.engine.decide import Decider, EffectFinding
@@ -26,8 +25,15 @@ from diagnosis.engine.proof import Floor, list_windows, run_free
 from diagnosis.engine.rows import Row
 from diagnosis.engine.side import choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
-from diagnosis.free_runs import WindowedRuns
-from diagnosis.gap import choose_unit, combine_joints, compute_shapley
+from diagnosis.free_runs import (
+    BLOCK_WINDOWS,
+    WindowedRuns,
+    choose_unit,
+    combine_joints,
+    compute_shapley,
+    draw_weights,
+    summarise_draws,
+)
 from diagnosis.rivals import measure_rivals
 
 NOISE_FACTOR = 3.0

@@ -13,7 +13,7 @@ import numpy as np
 
 from actuators.open_loop import FreeRunWindows
 from brokk_rl.parallel import map_parallel
-from diagnosis.bootstrap import BLOCK_WINDOWS
+from diagnosis.free_runs import BLOCK_WINDOWS
 
 # Chosen by hand; not searched.
 FOLDS = 4

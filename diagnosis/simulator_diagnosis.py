@@ -21,8 +21,7 @@ from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.engine.decide import EffectFinding
 from diagnosis.engine.sizes import SIGMAS
-from diagnosis.free_runs import WindowedRuns
-from diagnosis.gap import combine_joints
+from diagnosis.free_runs import WindowedRuns, combine_joints
 from diagnosis.gates import MAX_RIVAL_RATIO
 from diagnosis.grown_effects import GrownEffect
 from diagnosis.reference_diagnosis import (

@@ -12,8 +12,7 @@ from actuators import open_loop
 from actuators.identify import dead_time
 from actuators.identify.scores import FreeRunScores, average_joints
 from actuators.identify.stages import FitStage, list_recordings
-from actuators.identify.training_data import list_sources
-from actuators.recordings.split import measure_commanded_s
+from actuators.recordings.split import list_sources, measure_commanded_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 

@@ -100,7 +100,7 @@ class Collect:
                     writer.add(sample)
                     progress.advance()
             finally:
-                writer.close()  # what was recorded before an interruption is kept
+                writer.finish()  # what was recorded before an interruption is kept
         minutes = writer.recorded_s / 60.0
         log.info("%d recordings of %.1f minutes in all in %s", writer.files, minutes, self._folder)
 
@@ -173,16 +173,12 @@ class Writer:
         if self._samples:
             late = abs((sample.t_s - self._samples[-1].t_s) / self._period_s - 1.0) > RATE_TOLERANCE
             if late or len(self._samples) >= self._per_file:
-                self._finish()
+                self.finish()
         self._samples.append(sample)
         if time.monotonic() - self._written > self._flush_s:
             self._write()
 
-    def close(self) -> None:
-        """Write pending samples."""
-        self._finish()
-
-    def _finish(self) -> None:
+    def finish(self) -> None:
         """Write the present files for the last time; leave out a single sample."""
         if len(self._samples) > 1:
             self._write()

@@ -36,6 +36,11 @@ def group_by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
     return runs
 
 
+def list_sources(recordings: Sequence[Recording]) -> list[str]:
+    """Return where recordings come from, each source once."""
+    return sorted({recording.metadata.get("source", "unknown") for recording in recordings})
+
+
 def measure_commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
     """Return for how long each joint is commanded in all recordings together, s, shape `(J,)`."""
     return np.sum(

@@ -15,9 +15,8 @@ from composed import option
 from safetensors.torch import load_file
 
 from actuators.contracts import FitTask
-from actuators.identify import training_data
-from actuators.identify.network_fit import NetworkFit
-from actuators.identify.training_data import TrainingWindows
+from actuators.identify import network_fit
+from actuators.identify.network_fit import NetworkFit, TrainingWindows
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -86,7 +85,7 @@ def test_the_noise_of_a_resting_joint_is_that_of_its_sensor(
     q[: len(q) // 2] = q[0] + noise * np.random.default_rng(1).standard_normal((len(q) // 2, 5))
     if step:
         q = np.round(q / step) * step
-    found = training_data.estimate_resting_noise(
+    found = network_fit.estimate_resting_noise(
         [dataclasses.replace(made, u=u, q=q.astype(np.float32))], machine
     )
     assert found == pytest.approx(step / 6**0.5 if step else noise * 2**0.5, rel=0.05)
@@ -97,4 +96,4 @@ def test_too_little_data_says_how_much_and_of_which_joint(machine: Machine) -> N
     u = part.u.copy()
     u[:, 2] = np.minimum(u[:, 2], 0.0)
     with pytest.raises(RecordingError, match=r"q3 0\.0 min forth and .* needed are 0\.25 min"):
-        training_data.check_enough([dataclasses.replace(part, u=u)], machine)
+        network_fit.check_enough([dataclasses.replace(part, u=u)], machine)
