@@ -74,7 +74,7 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
             for place in filter(run_cases.is_begun, path.iterdir()):
                 where = place / ANSWER_FILE
                 content = json.loads(where.read_text()) if where.is_file() else None
-                note = run_cases.read_note(place)
+                note = run_cases.read_facts(place / run_cases.NOTE_FILE)
                 found[place.name] = GivenAnswer(note, content, labels_sha256=answered)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RecordingError(
@@ -88,10 +88,7 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
 
 def read_run(answers: Path) -> dict[str, Any]:
     """Return what `exam.do=run` noted beside answers; empty where nothing is noted, as of a published file."""
-    try:
-        return json.loads((answers / RUN_FILE).read_text())
-    except (OSError, ValueError):
-        return {}
+    return run_cases.read_facts(answers / RUN_FILE)
 
 
 def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:

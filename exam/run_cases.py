@@ -173,10 +173,10 @@ def is_begun(answer: Path) -> bool:
     return (answer / NOTE_FILE).is_file() or (answer / ANSWER_FILE).is_file()
 
 
-def read_note(answer: Path) -> dict[str, Any]:
-    """Return the note beside an answer, empty where there is none."""
+def read_facts(path: Path) -> dict[str, Any]:
+    """Return what was noted in a JSON file beside answers, empty where there is none."""
     try:
-        return json.loads((answer / NOTE_FILE).read_text())
+        return json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
 

@@ -14,8 +14,16 @@ from actuators import open_loop
 from actuators.contracts import ActuatorFit
 from actuators.identify import page
 from actuators.identify.request import Identification
-from actuators.identify.results import HOLD, HORIZONS_S, LINEAR, VerdictSentence, build_results
-from actuators.identify.stages import FitStage, fit_or_restore, list_recordings
+from actuators.identify.results import (
+    HOLD,
+    HORIZONS_S,
+    LINEAR,
+    FitStage,
+    VerdictSentence,
+    build_results,
+    fit_or_restore,
+    list_recordings,
+)
 from actuators.recordings.split import check_commanded, group_by_run, split_runs
 from brokk_rl import record
 from brokk_rl.console_table import TableCell, print_table, print_text

@@ -56,8 +56,7 @@ class ColumnName:
     """A column's name read as words.
 
     Attributes:
-        table: Its table.
-        column: Its name in the table.
+        column: Its name in its table.
         role: What the words say; `None` where they say nothing.
         quantity: The same.
         unit: Unit of a position, a key of `UNITS`; `None` where none is named.
@@ -68,7 +67,6 @@ class ColumnName:
         is_si: The words are those of a program that logs rad or m.
     """
 
-    table: str
     column: str
     role: Role | None
     quantity: Quantity
@@ -153,7 +151,7 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     known = ROLE_WORDS | WORDS["filler"] | UNITS.keys() | ({"d"} if "q" in words else set())
     joint, source = ("_".join(one for one in each if one not in known) for each in (words, outer))
     return ColumnName(
-        table, column, _find_role(words) or _find_role(outer), quantity, stated if stated in UNITS else None,
+        column, _find_role(words) or _find_role(outer), quantity, stated if stated in UNITS else None,
         joint, source, speed_unit, unit or _find_bracketed(column), is_si,
     )  # fmt: skip
 

@@ -256,13 +256,13 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
     first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
     assert sit(first, [case], answers, machine) == 1
-    assert run_cases.read_note(answers / "0000")["error"]
+    assert run_cases.read_facts(answers / "0000" / run_cases.NOTE_FILE)["error"]
     assert sit(second, [case], answers, machine) == sit(third, [case], answers, machine) == 0
     ((given, content),) = second.given
     assert content == ["field", "field/00.parquet"] and third.given == []
     assert tmp_path not in given.parents and "0000" not in str(given)
     assert (answers / "0000" / ANSWER_FILE).is_file()
-    assert run_cases.read_note(answers / "0000")["error"] is None
+    assert run_cases.read_facts(answers / "0000" / run_cases.NOTE_FILE)["error"] is None
 
 
 def test_a_program_that_fails_or_takes_too_long_says_so(machine: Machine, tmp_path: Path) -> None:
