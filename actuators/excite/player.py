@@ -22,6 +22,7 @@ from actuators.excite.schedule import Approach, ExcitationPlan
 from brokk_rl.commands import SpeedProgram, find_rest, read_targets
 from brokk_rl.contracts.link import Link
 from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
@@ -43,44 +44,17 @@ class CommandGuards:
     max_tool_speed_m_s: Positive | None
 
 
-class ToolSpeed:
-    """Speed of the tool point; needs torch, as all kinematics does.
-
-    Raises:
-        ConfigError: the machine's geometry is not known, or torch is not installed.
-    """
-
-    def __init__(self, machine: Machine) -> None:
-        if not machine.has_bodies:
-            raise ConfigError(
-                f"collect.guards.max_tool_speed_m_s: the geometry of machine '{machine.name}' is not known; give null, or bodies "
-                "and tool_m in its file"
-            )
-        try:
-            import torch
-
-            from brokk_rl.kinematics import Kinematics
-        except ImportError as error:
-            raise ConfigError(
-                "collect.guards.max_tool_speed_m_s: needs torch, which is not installed; give null, or a max_command"
-            ) from error
-        self._kinematics, self._tensor = Kinematics(machine), torch.as_tensor
-
-    def of(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return the tool speed in m/s, `(N,)`, at `q` and joint speeds `speed`, each `(N, J)`."""
-        tip = self._kinematics.jacobian(self._tensor(q.astype(np.float32))).tip.numpy()
-        return np.linalg.norm((tip @ speed[..., None])[..., 0], axis=-1)
+def measure_tool_speed(machine: Machine, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Return the speed of the tool point, `(N,)` m/s, at `q` and joint speeds `speed`, each `(N, J)`."""
+    jacobian = compute_tool_kinematics(machine, q).jacobian
+    return np.linalg.norm((jacobian @ speed[..., None])[..., 0], axis=-1)
 
 
 def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
-    """Return the tool speed in m/s, `(T,)`, along a path `q`, `(T, J)`.
-
-    `None` where geometry or torch are missing.
-    """
-    try:
-        return ToolSpeed(machine).of(q, np.gradient(q, machine.period_s, axis=0))
-    except ConfigError:
+    """Return the tool speed in m/s, `(T,)`, along a path `q`, `(T, J)`; `None` where the geometry is not known."""
+    if not machine.has_bodies:
         return None
+    return measure_tool_speed(machine, q, np.gradient(q, machine.period_s, axis=0))
 
 
 log = logging.getLogger(__name__)
@@ -123,7 +97,11 @@ class PlanPlayer:
     ) -> None:
         self._plan, self._machine, self._approach, self._guards = plan, machine, approach, guards
         self._level = level
-        self._tool_speed = None if guards.max_tool_speed_m_s is None else ToolSpeed(machine)
+        if guards.max_tool_speed_m_s is not None and not machine.has_bodies:
+            raise ConfigError(
+                f"collect.guards.max_tool_speed_m_s: the geometry of machine '{machine.name}' is not known; give null, or bodies "
+                "and tool_m in its file"
+            )
         count = len(plan.runs)
         self._rows = np.arange(count)
         self._travel, self._speed = machine.upper - machine.lower, machine.max_speed
@@ -234,10 +212,11 @@ class PlanPlayer:
         together = (u[:, ~exclusive] != 0).any(1)
         most = self._guards.max_command
         u = np.where(exclusive & together[:, None], 0.0, u).clip(-most, most)
-        if self._tool_speed is None:
+        limit_m_s = self._guards.max_tool_speed_m_s
+        if limit_m_s is None:
             return u
-        speed_m_s = self._tool_speed.of(q, u * self._speed)
-        scale = self._guards.max_tool_speed_m_s / np.maximum(speed_m_s, 1e-9)
+        speed_m_s = measure_tool_speed(self._machine, q, u * self._speed)
+        scale = limit_m_s / np.maximum(speed_m_s, 1e-9)
         return u * np.minimum(1.0, scale)[:, None]
 
     def _patience(self, q: np.ndarray) -> np.ndarray:
