@@ -23,6 +23,7 @@ import torch
 from actuators.contracts import PlannedRun
 from actuators.effects.simulator import EFFECTS
 from actuators.open_loop import WARM_UP_S
+from brokk_rl.commands import read_targets
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -202,7 +203,7 @@ class _RolledRun:
 def read_commands(u: np.ndarray, machine: Machine) -> np.ndarray:
     """Return commands `(…, J)` in [-1, 1] as targets (rad, m), speeds (rad/s, m/s) or torques (Nm, N)."""
     if machine.interface == "position":
-        return 0.5 * (machine.lower + machine.upper) + 0.5 * (machine.upper - machine.lower) * u
+        return read_targets(u, machine)
     return u * (machine.max_speed if machine.interface == "speed" else machine.max_force)
 
 

@@ -68,7 +68,7 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
     it = "it" if len(answer.selected) == 1 else "them"
     if closed is None:
         return f"The simulator lacks {names}.{told}", tone
-    share = f"{_format_share(closed, ' of the gap')}"
+    share = _format_share(closed)
     below = " The error is then below its floor." if closed.mean > 1.0 else ""
     return f"The simulator lacks {names}; adding {it} closes {share}.{below}{told}", tone
 
@@ -145,11 +145,11 @@ def _describe_place(answer: Answer) -> str:
     return place
 
 
-def _format_share(value: Estimate, of: str = "") -> str:
-    """Return a share in percent, with its interval where there is one."""
+def _format_share(value: Estimate) -> str:
+    """Return a share of the gap in percent, with its interval where there is one."""
     low, high = (f"{100 * bound:.0f}" for bound in value.ci95)
     interval = f" (95 %: {low} to {high} %)" if value.has_interval else ""
-    return f"{100 * value.mean:.0f} %{of}{interval}"
+    return f"{100 * value.mean:.0f} % of the gap{interval}"
 
 
 def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
