@@ -54,8 +54,9 @@ def register_options(arguments: Sequence[str]) -> None:
     for override in parse_words(arguments):
         group, names = override.key_or_group, list_names(override)
         if group in groups:
-            if isinstance(override.value(), list):
-                refuse_repeated(group, names)
+            twice = [name for name in names if names.count(name) > 1]
+            if twice and isinstance(override.value(), list):
+                raise ConfigError(f"{group}: the list names '{twice[0]}' twice; name it once")
             refuse_ambiguous({group: ",".join(names)})
             for name in names:
                 if name.startswith("@"):
@@ -66,16 +67,6 @@ def store_option(group: str, name: str, node: Any, package: str | None = None) -
     """Put an option into Hydra's store; a name with slashes is one, as that of a path."""
     *folders, stem = [part for part in name.split("/") if part]
     ConfigStore.instance().store(stem, node, "/".join([group, *folders]), package, "brokk")
-
-
-def refuse_repeated(group: str, names: Sequence[str]) -> None:
-    """Refuse a list that names an option twice: it has one place, so it would be there once."""
-    for name in names:
-        if names.count(name) > 1:
-            raise ConfigError(
-                f"{group}=[{','.join(names)}]: expected each option once, '{name}' stands there {names.count(name)} times; "
-                "name it once"
-            )
 
 
 def refuse_ambiguous(choices: Mapping[str, Any]) -> None:
@@ -159,16 +150,12 @@ def read_values(cfg: DictConfig) -> tuple[dict[str, Any], set[str]]:
         ConfigError: A value that must be given is not, or no class of a mode is named.
     """
     if "run" not in cfg:
-        raise ConfigError(
-            "there is no mode to run: expected run: <module>.<class> in its YAML file"
-        )
+        raise ConfigError("there is no mode to run: expected run: <module>.<class> in its YAML")
     if missing := OmegaConf.missing_keys(cfg) - {"session.out"}:
         raise ConfigError(explain_missing_value(min(missing)))
-    shared = set()
+    shared = set[str]()
     for _, value in registry.iterate_leaves(OmegaConf.to_container(cfg)):
-        for name in re.findall(r"\$\{(\w+)[.}]", str(value)):
-            if name in cfg:
-                shared.add(name)
+        shared |= {name for name in re.findall(r"\$\{(\w+)[.}]", str(value)) if name in cfg}
     values: Any = OmegaConf.to_container(cfg, resolve=True)
     return values, shared
 

@@ -54,7 +54,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("policy=",): ("has no value",),
     ("policy=[shipped,classical]",): ("expected one option, as in policy=shipped",),
     ("effect=backlash,lag",): ("use key=[value1,value2]",),
-    ("effect=[backlash,lag,backlash]",): ("'backlash' stands there 2 times", "name it once"),
+    ("effect=[backlash,lag,backlash]",): ("the list names 'backlash' twice", "name it once"),
     ("mode=evaluate", "task.action={kind: residual}"): ("task.action.kind=residual was asked for",),
     ("tracking=wandb,",): ("cannot be read", """'tracking="wandb,"'"""),
     ("wandb=true",): ("tracking=wandb",),
