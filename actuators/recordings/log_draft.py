@@ -180,7 +180,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
     Raises:
         RecordingError: A log cannot be read, nothing can be proposed, or no joint is ever commanded.
     """
-    clocks: Mapping[str, TimeGuess] = {}
+    clocks: dict[str, TimeGuess] = {}
     best: dict[str, tuple[JointGuess, RunSignals]] = {}
     remarks: dict[str, None] = {}
     signs = (",", ".")
@@ -192,7 +192,8 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         if run is None:
             raise RecordingError(f"{path}: no row")
         sample = read_columns(run, given)
-        clocks = {**sample.times, **clocks}
+        for table, time in sample.times.items():
+            clocks.setdefault(table, time)
         remarks |= dict.fromkeys(sample.remarks)
         for joint in sample.joints:
             if joint.name not in best or _rank(joint) > _rank(best[joint.name][0]):
