@@ -116,7 +116,7 @@ class BringupChecklist(BusAndPolicySettings):
             )
         memory = LoopMemory(machine.num_joints, commands=False)
         # The bring-up never commands: without `commands` there is no request slot at all.
-        group = ProcessGroup(memory, self.realtime)
+        group = ProcessGroup(memory, self.realtime, optional={})
         try:
             for one in companions:
                 group.start(one.name, one.target, one.arguments, one.realtime)

@@ -137,7 +137,8 @@ class CanLink:
 
     def __enter__(self) -> Self:
         can, machine = self._can, self._machine
-        self._group = group = ProcessGroup(LoopMemory(machine.num_joints, True), can.realtime)
+        memory = LoopMemory(machine.num_joints, commands=True)
+        self._group = group = ProcessGroup(memory, can.realtime, optional={})
         # Recordings are made before there is a model of this machine: no observer yet.
         # Nobody watches a page, and the operator stands at the machine.
         limits = replace(can.limits, observer=None, vigilance_s=None)

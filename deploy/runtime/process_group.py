@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -37,7 +37,7 @@ OPTIONAL = {
     "video": "the page shows no video any more",
     "log": "nothing is recorded any more",
 }
-"""Processes without which the loop goes on, and the loss that the alarm names."""
+"""Processes without which a loop goes on, and the loss that the alarm names."""
 END_ORDER = {"policy": 0, "bus": 1, "log": 3}
 """Order in which processes are asked to end; 2 for others. The bus ends after the policy, so that
 it can send zero, and the log last, when all has been written."""
@@ -53,10 +53,12 @@ class ProcessGroup:
     Attributes:
         memory: Shared by all of them.
         realtime: Whether those that ask for real-time priority get it.
+        optional: Processes without which the run goes on, and the loss that the alarm names.
     """
 
     memory: LoopMemory
     realtime: bool
+    optional: Mapping[str, str]
     _running: list[ChildProcess] = field(default_factory=list)
 
     @property
@@ -86,11 +88,11 @@ class ProcessGroup:
             self._running.remove(child)
             if child.asked_to_stop:
                 continue
-            if child.name not in OPTIONAL:
+            if child.name not in self.optional:
                 raise LinkError(
                     f"the {child.name} process has died (exit code {child.code}); its own message stands above"
                 )
-            loss = OPTIONAL[child.name]
+            loss = self.optional[child.name]
             log.error("ALARM: the %s has ended (exit code %s); %s", child.name, child.code, loss)
 
     def wait_for_state(

@@ -28,7 +28,7 @@ from deploy.runtime.detached_log import detach_logging
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.perception_process import CameraConfig
 from deploy.runtime.process import ask_for_priority, give_up_priority
-from deploy.runtime.process_group import BusAndPolicySettings, ProcessGroup
+from deploy.runtime.process_group import OPTIONAL, BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import DetectedTarget, TargetSelector
 from deploy.video.settings import VideoSettings
@@ -111,7 +111,7 @@ class DeploymentLoop(BusAndPolicySettings):
         capture = CaptureConfig(session.folder, self.dbc, machine, facts, pictures_hz)
         with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:
             memory = LoopMemory(machine.num_joints, self.commands, frame_px)
-            group = ProcessGroup(memory, self.realtime)
+            group = ProcessGroup(memory, self.realtime, OPTIONAL)
             recorder = RecordingControl(group, capture, wanted=self.record)
             try:
                 # Companions first: the loop then finds its bus in use from the beginning.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from composed import option
 
+from brokk_rl.errors import LinkError
 from brokk_rl.session import Session
 from deploy.guidance import LeverPositions
 from deploy.kernel.guard import GuardState
@@ -21,6 +23,7 @@ from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.protocol import OperatorRequest
 from deploy.recorder.capture import CaptureConfig
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
+from deploy.runtime.process_group import ProcessGroup
 from deploy.runtime.shm_layout import TEXT, LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
 
@@ -274,3 +277,13 @@ def test_a_log_that_died_is_not_started_again_in_secret(
     feed.submit(OperatorRequest("record", "on"))
     supervisor.refresh()
     assert feed.read_state().recording.on and not feed.read_state().recording.failed
+
+
+@pytest.mark.parametrize(("optional", "asked"), [({}, False), ({"log": "it"}, False), ({}, True)])
+def test_a_run_goes_on_without_an_optional_process_or_one_that_was_to_end(
+    memory: LoopMemory, optional: dict[str, str], asked: bool
+) -> None:
+    log: Any = SimpleNamespace(name="log", code=1, asked_to_stop=asked)
+    group = ProcessGroup(memory, False, optional, [log])
+    with nullcontext() if optional or asked else pytest.raises(LinkError, match="log process"):
+        group.check()
