@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from brokk_rl.checks.exercise import (
+from brokk_rl.checks import (
     NUM_ENVS,
     check_in_place,
     check_memory,

@@ -13,7 +13,7 @@ from composed import option
 from motion import roll
 
 from actuators.excite.player import NominalLink
-from brokk_rl.checks.actuator import check_actuator_model
+from brokk_rl.checks import check_actuator_model
 from brokk_rl.commands import (
     SpeedProgram,
     accept_speeds,
