@@ -71,8 +71,7 @@ def explain(error: BaseException) -> str | None:
     if isinstance(error, ConfigCompositionException):
         return _explain_bad_override(error)
     if isinstance(error, InterpolationResolutionError):
-        reason = f"{error.full_key or 'a value'}: {str(error).splitlines()[0]}"
-        return f"{reason}. A text with a dollar sign before a brace is written \\${{…}}"
+        return _explain_interpolation(error)
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark:
         mark = error.problem_mark
         return f"{mark.name}, line {mark.line + 1}: no valid YAML ({error.problem})"
@@ -86,6 +85,25 @@ def explain_missing_value(key: str) -> str:
     if "[" in key:  # an item of a list cannot be overridden
         return f"{key} has no value: fill in ??? in its file"
     return f"{key} has no default and must be given: {key}=<value>"
+
+
+def _explain_interpolation(error: InterpolationResolutionError) -> str:
+    """Explain a value that is taken from where there is none."""
+    key = error.full_key or "a value"
+    reason = str(error).splitlines()[0]
+    taken = re.search(r"key '(\w+)\.(\w+)' not found", reason)
+    for override in parse_words(sys.argv[1:]):
+        if taken and override.key_or_group == taken[1]:
+            group, name = taken.groups()
+            offered = []
+            for option in registry.list_options(group):
+                if re.search(rf"^{name}:", option.path.read_text(), re.MULTILINE):
+                    offered.append(option.name)
+            return (
+                f"{key}: expected {group}=… with a value '{name}', but {override.input_line} has "
+                f"none; {_list_options(group, '', offered)}"
+            )
+    return f"{key}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
 
 
 def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
@@ -131,7 +149,10 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
                 "\nA list and a table do not merge: take the old value away, '~<key>' '+<key>=…'"
             )
         return text
-    where, key = found[1], found[2].split("@")[0]
+    where = found[1]
+    key, at, place = found[2].partition("@")
+    if at:
+        return f"'{key}@{place}' is not chosen yet; add it by a plus: +{key}@{place}=<option>"
     if is_given_whole(sys.argv[1:]):
         return (
             f"'{key}': a configuration given by --config-name was composed already and has neither "

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 
 from brokk_rl import registry
 from brokk_rl.build import TARGET, describe_spec, drop_targets, name_class
@@ -166,8 +165,7 @@ def list_values(one: Any) -> dict[str, Any]:
 def name_target(target: str) -> str:
     """Return the name of the task's option with the class `target`, else the class itself."""
     for option in registry.list_options("task"):
-        offered = yaml.safe_load(option.path.read_text()) or {}
-        if offered.get(TARGET) == target:
+        if option.target == target:
             return option.name
     return target
 
@@ -331,11 +329,17 @@ class StoredPolicy:
         """Return `weights` of the actor by name, and the contract's `network`, `task`, `fingerprint`.
 
         Raises:
-            CheckpointError: A file is missing or corrupt, holds NaN, or is of another policy.
+            CheckpointError: A file is missing or corrupt, holds NaN, or is of another policy; an
+                ONNX file has no weights to go on with.
         """
         if self.is_checkpoint:
             content = read_checkpoint(self.file, device)
             return content | {"weights": content["actor_state_dict"]}
+        if self.file.suffix == ".onnx" or not self.contract:
+            raise CheckpointError(
+                f"policy={self.name}: expected a run folder, a checkpoint, or {WEIGHTS} with its "
+                f"{CONTRACT} in a policy folder, got {self.file.name} alone"
+            )
         weights, stamp = _read_weights(self.file)
         if stamp != self.contract["task"]["fingerprint"]:
             raise CheckpointError(

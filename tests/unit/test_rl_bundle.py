@@ -171,6 +171,12 @@ def test_a_damaged_file_is_named_with_the_way_out(
         find_policy(str(copied)).read()
 
 
+def test_a_file_of_weights_alone_is_refused(copied: Path) -> None:
+    (copied / "policy.json").unlink()
+    with pytest.raises(CheckpointError, match=r"got policy\.safetensors alone"):
+        find_policy(str(copied / "policy.safetensors")).read()
+
+
 def test_the_plant_of_a_stranger_names_no_class_but_those_of_options(copied: Path) -> None:
     path = copied / "policy.json"
     contract = json.loads(path.read_text())
