@@ -289,11 +289,13 @@ def average_seeds(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
     seeds. A rate of a single run keeps the interval over its episodes.
     """
     groups: Any = table.groupby(["policy", *columns], sort=False)
-    figures, rates = list_figures(table), list_rates(table)
-    num, mean = groups[figures].count(), groups[figures].mean()
+    figures = list_figures(table)
+    num = groups[figures].count()
+    mean = groups[figures].mean()
     half = groups[figures].sem() * stats.t.ppf(0.5 + CONFIDENCE / 2, (num - 1).where(num > 1))
-    low, high = mean - half, mean + half
-    for name in rates:
+    low = mean - half
+    high = mean + half
+    for name in list_rates(table):
         low[name] = low[name].clip(lower=0.0).fillna(groups[name + LOW].first())
         high[name] = high[name].clip(upper=1.0).fillna(groups[name + HIGH].first())
     averaged = groups.agg(seeds=("seed", list), runs=("seed", "size")).join(mean)

@@ -63,16 +63,16 @@ class Doctor:
         Raises:
             SystemExit: With code 1 if an essential part does not work.
         """
-        folder, min_free_gib = Path(self.doctor.folder), self.doctor.min_free_gib
         checks: dict[str, Callable[[], DoctorFinding]] = {
             "packages": check_packages,
             "torch": check_torch,
             "Warp": check_warp,
             "rendering": check_rendering,
-            "disk": lambda: check_disk(folder, min_free_gib),
+            "disk": lambda: check_disk(Path(self.doctor.folder), self.doctor.min_free_gib),
             "import names": check_import_names,
         }
-        rows, has_failed = [], False
+        rows = []
+        has_failed = False
         for topic, check in checks.items():
             found = _run_check(check)
             has_failed |= found.level == "fail"
@@ -122,7 +122,8 @@ def check_torch() -> DoctorFinding:
     import torch
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    threads, driver = torch.get_num_threads(), _read_driver_version()
+    threads = torch.get_num_threads()
+    driver = _read_driver_version()
     text = f"{torch.__version__}, {threads} threads on {cores} cores, "
     text += f"built for CUDA {torch.version.cuda or 'none'}, driver {driver or 'none'}"
     if torch.cuda.is_available():

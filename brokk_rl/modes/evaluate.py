@@ -92,7 +92,8 @@ def evaluate_policies(
         if key not in loops:
             # effects and followers draw from it, too
             torch.manual_seed(evaluation.seed)
-            num, own = evaluation.episodes, replace(plant, task=tasks[name])
+            num = evaluation.episodes
+            own = replace(plant, task=tasks[name])
             loop = own.build(device, num, num, evaluation.seed, starts, target)
             loop.capture()
             loops[key] = loop, loop.state_dict()

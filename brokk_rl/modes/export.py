@@ -49,8 +49,10 @@ class Export:
             ConfigError: The task cannot be deployed.
         """
         path = find_checkpoint(self.policy.path)
-        stored, cpu = find_policy(str(path)), torch.device("cpu")
-        content, description = stored.read(), describe_task(self.task)
+        stored = find_policy(str(path))
+        content = stored.read()
+        cpu = torch.device("cpu")
+        description = describe_task(self.task)
         task = self.task.build(self.machine, 1, cpu)
         task.require("deployable", NOT_DEPLOYABLE)
         groups = observe_once(task, self.machine, cpu)
@@ -60,7 +62,8 @@ class Export:
         contract["plant"] |= stored.contract.get("plant", {})
         contract["trained"] = stored.contract.get("trained", {}) | {"checkpoint": str(path)}
         contract["trained"] |= content["book"]
-        folder, answers = self.session.folder, content["answers"]
+        folder = self.session.folder
+        answers = content["answers"]
         write_policy(folder, contract, actor.state_dict())
         largest = export_onnx(folder, actor, task, self.machine, contract, answers)
         if self.machine.mjcf is not None:

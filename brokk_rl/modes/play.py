@@ -81,7 +81,8 @@ class Play(SimulatedPlant):
         session.seed_all()
         pool = max(NUM_STARTS, settings.worlds)
         loop = self.build(device, settings.worlds, pool, session.stream("starts"))
-        watch, policies = None, {}
+        watch = None
+        policies = {}
         if not isinstance(self.policy, ClassicalPolicy):
             policies[POLICY] = self.policy.build(loop, settings.seed)
         if not policies or "classical_action" in loop.task.offers:
@@ -107,7 +108,8 @@ class CheckpointWatch:
     """
 
     def __init__(self, path: str, loop: ControlLoop) -> None:
-        self._path, self._loop = path, loop
+        self._path = path
+        self._loop = loop
         self._next_s = 0.0
         self._loaded: Path | None = None
         self.note = ""

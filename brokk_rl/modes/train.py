@@ -156,7 +156,9 @@ class Train(SimulatedPlant):
 
     def _finish(self, runner: TrainingRunner) -> dict[str, Any]:
         """Write policy and curves, evaluate, export; return the content of `evaluation.json`."""
-        folder, loop, actor = self.session.folder, runner.env, runner.alg.get_policy()
+        folder = self.session.folder
+        loop = runner.env
+        actor = runner.alg.get_policy()
         contract = self._describe_policy(loop)
         book = runner.logger
         contract["trained"] |= {"env_steps": book.env_steps, "seconds": book.seconds}
@@ -167,7 +169,8 @@ class Train(SimulatedPlant):
             "classical": ClassicalPolicy(task=None),
         }
         results = evaluate_policies(self, self.evaluation, self.session, policies)
-        line, words = None, loop.task.figures
+        line = None
+        words = loop.task.figures
         if controller := results["policies"].get("classical"):
             line = controller[SUCCESS]["mean"]
             gain = describe_gain(results["policies"]["trained"][SUCCESS], controller[SUCCESS])
