@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -35,17 +35,11 @@ class NoFollower:
     """No person in between: the policy's command is given unchanged and at once."""
 
     label: ClassVar = "nobody"
+    state: ClassVar[dict[str, Any]] = {}
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NoFollowerModel:
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> NoFollower:
         """Return the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""
-        return NoFollowerModel()
-
-
-class NoFollowerModel:
-    """Gives the proposed command."""
-
-    def __init__(self) -> None:
-        self.state: dict[str, torch.Tensor] = {}
+        return self
 
     def reset(self, mask: torch.Tensor) -> None:
         """Have no memory."""

@@ -17,7 +17,8 @@ class World(Protocol):
     """Parallel physics: the machine, pushed along by its drive, beside a block with a borehole.
 
     All tensors are float32 on `device`, of fixed address, and refreshed in place by `step` and
-    `reset`.
+    `reset`. A world in which somebody can push the machine has `joint_load`, too: torque or force
+    on each joint from outside, `(N, J)`, N m or N, written in place and kept until written again.
     """
 
     num_worlds: int
@@ -63,15 +64,6 @@ class World(Protocol):
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a copy that `state_dict` returned."""
-
-
-@runtime_checkable
-class LoadedWorld(Protocol):
-    """A world in which somebody can push the machine; optional."""
-
-    joint_load: torch.Tensor
-    """Torque or force on each joint from outside, `(N, J)`, N m or N; written in place by the
-    caller, and kept until written again."""
 
 
 @runtime_checkable

@@ -188,11 +188,11 @@ class PlayPage:
                 min(max(size, dial.low), dial.high),
                 hint=f"typical: {dial.typical.tolist()}",
             )
-            self._ask_on_change(sliders[label], partial(session.turn_dial, label))
+            self._ask_on_change(sliders[label], dial.turn)
 
         def turn_all_off() -> None:
             for label, slider in sliders.items():
-                session.turn_dial(label, 0.0)
+                session.dials[label].turn(0.0)
                 slider.value = 0.0
 
         neutral.on_click(lambda _: self._ask(turn_all_off))

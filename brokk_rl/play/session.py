@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
 from brokk_rl.contracts.actuator import FollowerModel
 from brokk_rl.contracts.task import STEPS, SUCCESS, Policy
-from brokk_rl.contracts.world import LoadedWorld
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine, mask_exclusive_joints
@@ -28,8 +28,8 @@ TRACE_S = 15.0
 """Time that traces show, s. Chosen by hand: about one insertion."""
 MAX_CATCH_UP = 16
 """Control steps between two pictures at most; a computer that is too slow falls behind the clock."""
-RATE_S = 2.0
-"""Time over which the rate is measured, s. Chosen by hand."""
+NUM_RATED = 60
+"""Pictures over which the rate is measured: two seconds. Chosen by hand."""
 DISTANCE_M, HEIGHT_M = (1.6, 4.6), (0.0, 1.6)
 """Where a target may be put: distance from the slew axis and height. Chosen by hand: a block that
 is nearer would stand in the undercarriage, and the arm of a Brokk 170 reaches 5.2 m."""
@@ -145,7 +145,7 @@ class PlaySession:
         self._trace: deque[dict[str, np.ndarray]] = deque(
             maxlen=round(TRACE_S / loop.machine.period_s)
         )
-        self._clock: deque[tuple[float, int]] = deque()
+        self._clock: deque[tuple[float, int]] = deque(maxlen=NUM_RATED)
         self.endings: Counter[str] = Counter()
         self.successes = 0
         loop.begin()
@@ -158,7 +158,7 @@ class PlaySession:
     @property
     def can_push(self) -> bool:
         """True where the simulator knows loads from outside."""
-        return isinstance(self.loop.world, LoadedWorld)
+        return hasattr(self.loop.world, "joint_load")
 
     @property
     def can_move_target(self) -> bool:
@@ -240,16 +240,6 @@ class PlaySession:
         """Positions of the person's levers, `(J,)`."""
         return self._person.levers.numpy().copy()
 
-    def turn_dial(self, label: str, size: float) -> None:
-        """Give all machines an effect, in typical sizes; see `EffectDial`.
-
-        Raises:
-            ConfigError: There is no such dial.
-        """
-        if label not in self.dials:
-            raise ConfigError(f"there is no effect {label}; {list_choices(label, self.dials)}")
-        self.dials[label].turn(size)
-
     def reset(self, world: int | None = None) -> None:
         """Begin a new episode in a world, or in all, with the next step."""
         rows = slice(None) if world is None else world
@@ -267,16 +257,10 @@ class PlaySession:
         Raises:
             ConfigError: The simulator cannot do that.
         """
-        self._read_load()
+        if not self.can_push:
+            raise ConfigError("this simulator knows no loads from outside; push with sim=native")
         force = torch.as_tensor(force_n, dtype=torch.float32, device=self.loop.device)
         self._push_n[self.selected] = force, round(PUSH_S / self.machine.period_s)
-
-    def _read_load(self) -> torch.Tensor:
-        """Return the loads that the world knows, `(N, J)`."""
-        world = self.loop.world
-        if not isinstance(world, LoadedWorld):
-            raise ConfigError("this simulator knows no loads from outside; push with sim=native")
-        return world.joint_load
 
     def move_target(self, position_m: np.ndarray) -> np.ndarray:
         """Put the selected world's target, and the block with it, elsewhere; it stays there.
@@ -359,13 +343,14 @@ class PlaySession:
 
     def _apply_pushes(self) -> None:
         """Write the loads of running pushes, and take those of finished ones away."""
+        world: Any = self.loop.world
         for index, (force, left) in list(self._push_n.items()):
             if left == 0:
-                self._read_load()[index] = 0.0
+                world.joint_load[index] = 0.0
                 del self._push_n[index]
                 continue
-            tip = self._kinematics.jacobian(self.loop.world.q[index : index + 1]).tip[0]
-            self._read_load()[index] = tip.T @ force
+            tip = self._kinematics.jacobian(world.q[index : index + 1]).tip[0]
+            world.joint_load[index] = tip.T @ force
             self._push_n[index] = force, left - 1
 
     def _put_target(self, world: int, place: torch.Tensor) -> None:
@@ -411,14 +396,11 @@ class PlaySession:
         self._restarted &= ~loop.done
 
     def measure_rate(self) -> float:
-        """Return simulated seconds per second over the last `RATE_S`."""
-        clock = self._clock
-        elapsed_s = sum(row[0] for row in clock)
-        while clock and elapsed_s - clock[0][0] > RATE_S:
-            elapsed_s -= clock.popleft()[0]
+        """Return simulated seconds per second over the last pictures."""
+        elapsed_s = sum(row[0] for row in self._clock)
         if self.paused or not elapsed_s:
             return 0.0
-        return sum(row[1] for row in clock) * self.machine.period_s / elapsed_s
+        return sum(row[1] for row in self._clock) * self.machine.period_s / elapsed_s
 
 
 def _to_numpy(value: torch.Tensor) -> np.ndarray:

@@ -172,13 +172,13 @@ def test_effects_begin_off_and_a_dial_gives_them_to_all_machines(made: Callable)
     session = made()
     dial = session.dials["backlash.gap_rad"]
     assert not dial.parameters[dial.key].any()
-    session.turn_dial("backlash.gap_rad", 1.0)
+    dial.turn(1.0)
     expected = torch.as_tensor(dial.typical).expand(NUM, -1)
     torch.testing.assert_close(dial.parameters[dial.key], expected)
     session.reset()
     session.step()  # a new episode draws no other size
     torch.testing.assert_close(dial.parameters[dial.key], expected)
-    session.turn_dial("backlash.gap_rad", -5.0)
+    dial.turn(-5.0)
     assert not dial.parameters[dial.key].any()
     assert (
         made(neutral=False).dials["dead_time.dead_time_s"].parameters["dead_time.dead_time_s"].any()
