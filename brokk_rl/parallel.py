@@ -56,36 +56,31 @@ def map_parallel(
     todo = list(items)
     count = min(_workers.get(), len(todo))
     if count > 1 and sys.platform == "linux":
+        fork = multiprocessing.get_context("fork")
+        _shared.append((function, todo))
         try:
-            return _map_forked(function, todo, tell, count)
+            with (
+                ProcessPoolExecutor(count, fork, _prepare_helper) as pool,
+                warnings.catch_warnings(),
+            ):
+                # Helpers neither log nor take locks of other threads.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                return _collect(pool.map(_compute_item, range(len(todo))), todo, tell)
         except BrokenProcessPool:
             log.warning("a helper process was killed; its work is done in this process")
+        finally:
+            _shared.pop()
+    return _collect(map(function, todo), todo, tell)
+
+
+def _collect(
+    found: Iterator[Result], todo: Sequence[Item], tell: Callable[[Item, float], None]
+) -> list[Result]:
+    """Return the results of all items; `tell` hears of each item before its result is asked for."""
     results = []
     for number, item in enumerate(todo):
         tell(item, number / len(todo))
-        results.append(function(item))
-    return results
-
-
-def _map_forked(
-    function: Callable[[Any], Result],
-    todo: Sequence[Any],
-    tell: Callable[[Any, float], None],
-    count: int,
-) -> list[Result]:
-    fork = multiprocessing.get_context("fork")
-    results = []
-    _shared.append((function, todo))
-    try:
-        with ProcessPoolExecutor(count, fork, _prepare_helper) as pool, warnings.catch_warnings():
-            # Helpers neither log nor take locks of other threads.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            found = pool.map(_compute_item, range(len(todo)))
-            for number, item in enumerate(todo):
-                tell(item, number / len(todo))
-                results.append(next(found))
-    finally:
-        _shared.pop()
+        results.append(next(found))
     return results
 
 
