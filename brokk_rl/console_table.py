@@ -23,10 +23,7 @@ TableCell = str | float | Text | None
 
 
 def print_table(
-    headings: Sequence[str],
-    rows: Iterable[Sequence[TableCell]],
-    title: str | None = None,
-    caption: str | None = None,
+    headings: Sequence[str], rows: Iterable[Sequence[TableCell]], title: str | None = None
 ) -> None:
     """Print one whole table to stdout.
 
@@ -38,14 +35,11 @@ def print_table(
         rows: One cell a column; the first cell says what the row is. Columns of numbers are
             aligned at the right.
         title: Text above the table.
-        caption: Text below it.
     """
     texts = [[_format_cell(cell) for cell in row] for row in rows]
     table = Table(
         title=None if title is None else Text(title),
         title_justify="left",
-        caption=None if caption is None else Text(caption),
-        caption_justify="left",
         box=None,
         padding=(0, 2, 0, 0),
         show_header=bool(headings),

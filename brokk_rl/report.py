@@ -25,8 +25,6 @@ Tone = Literal["good", "bad", "warn", "plain"]
 """Class of a summary: good news, bad news or a warning."""
 BASE = Path(__file__).parent
 """Folder of the base template and its parts."""
-PNG = "image/png"
-PICTURE_TYPES = {".png": PNG, ".svg": "image/svg+xml", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 
 
 def render_page(template: Path, values: Mapping[str, Any]) -> str:
@@ -39,13 +37,16 @@ def embed_picture(source: Figure | Path) -> str:
     """Return a picture as an address that holds its data.
 
     Args:
-        source: A matplotlib figure, drawn as PNG, or a PNG, SVG or JPEG file.
+        source: A matplotlib figure, drawn as PNG, or a PNG file.
 
     Raises:
         StorageError: The file cannot be read.
     """
-    kind, data = _read_picture(source) if isinstance(source, Path) else (PNG, draw_png(source))
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+    try:
+        data = source.read_bytes() if isinstance(source, Path) else draw_png(source)
+    except OSError as error:
+        raise StorageError(f"cannot read picture {source}: {error.strerror or error}") from error
+    return f"data:image/png;base64,{base64.b64encode(data).decode()}"
 
 
 @cache
@@ -55,14 +56,3 @@ def _load_template(path: Path) -> Template:
         loader=FileSystemLoader(folders), autoescape=True, undefined=StrictUndefined
     )
     return environment.get_template(path.name)
-
-
-def _read_picture(path: Path) -> tuple[str, bytes]:
-    """Return media type and data of a picture file."""
-    kind = PICTURE_TYPES.get(path.suffix.lower())
-    if kind is None:
-        raise StorageError(f"picture {path}: expected one of {', '.join(PICTURE_TYPES)}")
-    try:
-        return kind, path.read_bytes()
-    except OSError as error:
-        raise StorageError(f"cannot read picture {path}: {error.strerror or error}") from error

@@ -90,9 +90,6 @@ def test_a_page_needs_nothing_from_elsewhere(read: Reader) -> None:
     assert policies and "default-src 'none'" in str(policies[0])
 
 
-def test_a_picture_that_is_none_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_text("no picture")
-    with pytest.raises(StorageError, match=r"expected one of \.png"):
-        embed_picture(tmp_path / "a.txt")
+def test_a_picture_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot read picture"):
         embed_picture(tmp_path / "missing.png")
