@@ -133,10 +133,8 @@ def list_names(override: Override) -> list[str]:
 
 def is_list_group(group: str) -> bool:
     """Return whether several options of a group may be chosen: each has a place of its own."""
-    for option in registry.list_options(group):
-        if re.search(rf"^# @package {group}\.", option.path.read_text(), re.MULTILINE):
-            return True
-    return False
+    places = [option.place or "" for option in registry.list_options(group)]
+    return any(place.startswith(f"{group}.") for place in places)
 
 
 def explain_robot(path: str) -> str:

@@ -26,7 +26,6 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.explain import explain_missing_value
 from brokk_rl.plain_files import check_yaml_size, read_plain_file
 
-PACKAGE = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
 MOST_BYTES = 1 << 20
 """Size beyond which a file holds no option."""
 EVERYWHERE = "_global_"
@@ -185,7 +184,7 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     if group == "machine" and beside.is_file():
         node["mjcf"] = str(beside.resolve())
     _drop_parts(node)
-    packages = _read_packages(group)
+    packages = {one.target or one.name: one.place for one in registry.list_options(group)}
     package = _find_package(where, group, text, node, packages)
     for place, target in registry.iterate_leaves(node):
         if place[-1] != "_target_":
@@ -233,12 +232,12 @@ def _find_package(
 ) -> str | None:
     """Return the config package of a file: as stated, else that of an option with its target."""
     used = set(packages.values())
-    if stated := PACKAGE.search(text):
-        if stated[1] not in used | {group, "_group_"} and not stated[1].startswith(f"{group}."):
+    if stated := registry.find_place(text):
+        if stated not in used | {group, "_group_"} and not stated.startswith(f"{group}."):
             raise ConfigError(
-                f"{where}: '# @package {stated[1]}' lies outside '{group}'; leave that line out"
+                f"{where}: '# @package {stated}' lies outside '{group}'; leave that line out"
             )
-        return stated[1]
+        return stated
     if "_target_" in node:
         return packages.get(str(node["_target_"]))
     named = [place[-1] for place, _ in registry.iterate_leaves(node)]
@@ -246,14 +245,3 @@ def _find_package(
     if classes and not {"_target_", "defaults"} & {*named, *node}:
         raise ConfigError(f"{where}: expected _target_: <class>; {list_choices('', classes)}")
     return EVERYWHERE if EVERYWHERE in used else None
-
-
-def _read_packages(group: str) -> dict[str, str | None]:
-    """Return the config package that each option of a group states, by its target or its name."""
-    packages = {}
-    for option in registry.list_options(group):
-        text = option.path.read_text()
-        target = re.search(r"^_target_: *([\w.]+)", text, re.MULTILINE)
-        stated = PACKAGE.search(text)
-        packages[target[1] if target else option.name] = stated[1] if stated else None
-    return packages

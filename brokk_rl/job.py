@@ -66,17 +66,14 @@ def run(cfg: DictConfig) -> float | None:
         cfg, built = policy_choice.insert_policy(cfg)
         goes_on |= policy_choice.is_going_on(cfg)
     values, shared = extensions.read_values(cfg)
-    if "session" not in values:
-        mode = build_mode(values | built, shared)
-        distributed.check_together(type(mode), sweep)
-        return mode.run()
-    folder = choose_run_folder(values)
-    if not (sweep or goes_on) and distributed.read_rank().first:
-        require_new_folder(folder)
-    built["session"] = values["session"] | {"out": str(folder)}
+    if "session" in values:
+        folder = choose_run_folder(values)
+        if not (sweep or goes_on) and distributed.read_rank().first:
+            require_new_folder(folder)
+        built["session"] = values["session"] | {"out": str(folder)}
     mode = build_mode(values | built, shared)
     distributed.check_together(type(mode), sweep)
-    return _run_in_session(mode, values, sweep, goes_on)
+    return _run_in_session(mode, values, sweep, goes_on) if "session" in values else mode.run()
 
 
 def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: bool) -> float | None:
@@ -94,7 +91,7 @@ def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: boo
     with mode.session.start(resolved, facts, resume) as record:
         objective = mode.run()
         is_number = objective is not None and math.isfinite(objective)
-        record.fields["objective"] = objective if is_number else None
+        record["objective"] = objective if is_number else None
         return objective
 
 

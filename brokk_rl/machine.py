@@ -303,18 +303,17 @@ class Machine:
             hashes[key] = hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
         return hashes
 
+    def list_differences(self, other: dict[str, str]) -> list[str]:
+        """Return the groups of fields in which the fingerprint `other` differs."""
+        return [group for group, stamp in self.fingerprint().items() if other.get(group) != stamp]
+
     def check_fingerprint(self, other: dict[str, str], what: str) -> None:
         """Refuse a fingerprint `other` of the file `what` that differs.
 
         Raises:
             CheckpointError: Groups of fields differ; the message names them.
         """
-        mine = self.fingerprint()
-        differing = []
-        for key in mine:
-            if other.get(key) != mine[key]:
-                differing.append(key)
-        if differing:
+        if differing := self.list_differences(other):
             raise CheckpointError(
                 f"{what} was made for another machine: {', '.join(differing)} differ from machine '{self.name}'. "
                 "Choose the machine it was made for (machine=…) or make it again for this one."

@@ -194,8 +194,8 @@ def _insert_plant(
 
     Return what was put in: nothing where the machine is `here`, that of the configuration.
     """
-    name, theirs = stored.contract["machine"], stored.contract["fingerprint"]
-    differing = [part for part, stamp in here.fingerprint().items() if theirs.get(part) != stamp]
+    name = stored.contract["machine"]
+    differing = here.list_differences(stored.contract["fingerprint"])
     if not differing:
         return []
     plant = stored.list_plant()

@@ -49,6 +49,26 @@ class Option:
         """Return the whole comment at the top of the file, in one line."""
         return _read_comment(self.path.read_text())
 
+    @property
+    def target(self) -> str | None:
+        """Class that its file names; `None` where it holds several, or values alone."""
+        return _find_word(r"^_target_: *([\w.]+)", self.path.read_text())
+
+    @property
+    def place(self) -> str | None:
+        """Place in the configuration that its file states; `None` for that of its group."""
+        return find_place(self.path.read_text())
+
+
+def find_place(text: str) -> str | None:
+    """Return the place in the configuration that the text of an option file states."""
+    return _find_word(r"^#\s*@package\s+(\S+)", text)
+
+
+def _find_word(pattern: str, text: str) -> str | None:
+    found = re.search(pattern, text, re.MULTILINE)
+    return found[1] if found else None
+
 
 def find_packages() -> dict[str, Path]:
     """Return the folder of each config package: this one first, then installed extensions.

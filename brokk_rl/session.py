@@ -11,7 +11,6 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
@@ -118,10 +117,11 @@ class Session:
     @contextmanager
     def start(
         self, resolved: str, facts: dict[str, Any], resume: bool = False
-    ) -> Iterator[SessionRecord]:
+    ) -> Iterator[dict[str, Any]]:
         """Make the run folder, write `resolved.yaml`, and keep `session.json` current in the block.
 
-        Only the first of several processes writes; the others keep their record in memory.
+        Only the first of several processes writes. The block gets the record, in which it may put
+        more fields.
 
         Args:
             resolved: Text of `resolved.yaml`.
@@ -132,24 +132,23 @@ class Session:
             StorageError: The folder holds a run and `resume` is false, or it cannot be written.
         """
         if not distributed.read_rank().first:
-            yield SessionRecord(self.folder)
+            yield {}
             return
         before = read_record(self.folder)
         if not resume:
             require_new_folder(self.folder)
-        fields = {
+        record = {
             "schema": 1, "outcome": "running", "objective": None, "started": _format_now(), "ended": None,
             "command": ["brokk", *sys.argv[1:]], **facts,
             "seed": self.seed, "device": self.device, "commit": describe_commit(), "versions": read_versions(), "pid": os.getpid(),
         }  # fmt: skip
         if before:
-            fields["started"] = before.get("started", fields["started"])
-            fields["resumed"] = [*before.get("resumed", []), _format_now()]
-        record = SessionRecord(self.folder, fields)
+            record["started"] = before.get("started", record["started"])
+            record["resumed"] = [*before.get("resumed", []), _format_now()]
         new_folders = list_missing_folders(self.folder)
         write_text(self.folder / RESOLVED, resolved)
-        record.write()
-        outcome = "failed"
+        write_json(self.folder / RECORD, record)
+        outcome: str | None = "failed"
         try:
             yield record
             outcome = "finished"
@@ -157,14 +156,14 @@ class Session:
             outcome = "interrupted"
             raise
         except BaseException as error:
-            record.fields["error"] = f"{type(error).__name__}: {error}"
+            record["error"] = f"{type(error).__name__}: {error}"
             if isinstance(error, BrokkError) and not before and self._remove_start(new_folders):
-                record = None  # Refused before any work: nothing stays.
+                outcome = None  # Refused before any work: nothing stays.
             raise
         finally:
-            if record:
-                record.fields |= {"outcome": outcome, "ended": _format_now()}
-                record.write()
+            if outcome:
+                record |= {"outcome": outcome, "ended": _format_now()}
+                write_json(self.folder / RECORD, record)
 
     def _remove_start(self, new_folders: Sequence[Path]) -> bool:
         """Remove what `start` made and return true, unless the run has written something."""
@@ -174,23 +173,6 @@ class Session:
             (self.folder / name).unlink()
         remove_empty_folders(new_folders)
         return True
-
-
-@dataclass
-class SessionRecord:
-    """Content of `session.json` during a run.
-
-    Attributes:
-        folder: Run folder.
-        fields: Fields of the file.
-    """
-
-    folder: Path
-    fields: dict[str, Any] = field(default_factory=dict)
-
-    def write(self) -> None:
-        """Write the file in one step."""
-        write_json(self.folder / RECORD, self.fields)
 
 
 def read_record(folder: Path) -> dict[str, Any] | None:

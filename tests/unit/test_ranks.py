@@ -67,7 +67,7 @@ def test_the_first_has_the_streams_of_one_alone_and_the_others_their_own(
 def test_only_the_first_writes_a_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told(monkeypatch, RANK=1, LOCAL_RANK=1, WORLD_SIZE=2)
     with session(tmp_path).start("", {}) as record:
-        record.fields["objective"] = 1.0
+        record["objective"] = 1.0
     assert not list(tmp_path.iterdir())
 
 
