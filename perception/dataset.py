@@ -1,6 +1,6 @@
 """Frames on disk with their masks, and the truth of rendered ones.
 
-A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m,
+A folder holds `camera.yaml` (`perception.camera`) and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m,
 NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is a pair
 `<stem>.right.png`. Truth of a rendered frame:
 
@@ -15,22 +15,20 @@ NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is 
 from __future__ import annotations
 
 import io
-import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import yaml
+from pydantic import TypeAdapter, ValidationError
 
 from brokk_rl.errors import FrameError, StorageError
-from brokk_rl.session import write_bytes, write_json, write_text
+from brokk_rl.session import write_bytes, write_json
 
 BLOCK, HOLE_MASK, ARM = 1, 2, 4
-CAMERA, COLOR, RIGHT, DEPTH, DEPTH_MM, TRUTH, MASK = (
-    "camera.yaml", ".color.png", ".right.png", ".depth.npy", ".depth.png", ".truth.json", ".mask.png",
+COLOR, RIGHT, DEPTH, DEPTH_MM, TRUTH, MASK = (
+    ".color.png", ".right.png", ".depth.npy", ".depth.png", ".truth.json", ".mask.png",
 )  # fmt: skip
 
 
@@ -57,6 +55,14 @@ class TrueCircle:
     depth_m: float
     hidden: float
     in_view: bool
+
+    @classmethod
+    def place(
+        cls, center_m: np.ndarray, axis: np.ndarray, base: np.ndarray, radius_m: float, **told: Any
+    ) -> TrueCircle:
+        """Return a circle at a place in the camera, whose pose in the base is `base`, `(4, 4)`."""
+        places = (center_m, axis, base[:3, :3] @ center_m + base[:3, 3], base[:3, :3] @ axis)
+        return cls(*(tuple(place.tolist()) for place in places), radius_m=float(radius_m), **told)
 
 
 @dataclass(frozen=True)
@@ -115,16 +121,10 @@ def read_truth(stem: Path) -> SceneTruth:
     """
     path = _build_path(stem, TRUTH)
     try:
-        told = json.loads(path.read_text())
-        circles = {}
-        for name in ("holes", "decoys"):
-            circles[name] = tuple(TrueCircle(**entry) for entry in told[name])
-        return SceneTruth(
-            told["scene"], told["conditions"], circles["holes"], circles["decoys"], told["block"]
-        )
+        return TypeAdapter(SceneTruth).validate_json(path.read_bytes())
     except FileNotFoundError as error:
         raise FrameError(f"{path}: no truth; only rendered frames have it") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except ValidationError as error:
         raise FrameError(f"{path}: not a truth file of this version ({error})") from error
 
 
@@ -148,37 +148,6 @@ def read_label(stem: Path) -> FrameLabel:
 def encode_mask(label: FrameLabel) -> np.ndarray:
     """Return the bits of the masks for the file, `(h, w)` uint8."""
     return (BLOCK * label.block + HOLE_MASK * label.hole_mask + ARM * label.arm).astype(np.uint8)
-
-
-def write_camera(
-    folder: Path,
-    matrix: np.ndarray,
-    size_px: Sequence[int],
-    base_from_camera: np.ndarray | None,
-    baseline_m: float | None,
-    dist: Sequence[float] = (),
-    disparity_std_px: float | None = None,
-    gamma: float | None = None,
-) -> None:
-    """Write `camera.yaml`; see `brokk_rl.signals.Frame`. `size_px`: columns and rows of the pictures.
-
-    Raises:
-        StorageError: it could not be written.
-    """
-    told: dict[str, Any] = {
-        "K": np.asarray(matrix).tolist(),
-        "size_px": [int(one) for one in size_px],
-        "dist": [float(value) for value in dist],
-    }
-    if baseline_m is not None:
-        told["baseline_m"] = float(baseline_m)
-    if disparity_std_px is not None:
-        told["disparity_std_px"] = float(disparity_std_px)
-    if gamma is not None:
-        told["gamma"] = float(gamma)
-    if base_from_camera is not None:
-        told["T_base_cam"] = np.asarray(base_from_camera).tolist()
-    write_text(folder / CAMERA, yaml.safe_dump(told, sort_keys=False, default_flow_style=None))
 
 
 def write_frame(

@@ -15,6 +15,7 @@ from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks,
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception import pair_check, rim_scale, search
+from perception.camera import express_in_camera
 from perception.contracts import SegmenterSpec
 from perception.ellipse.detector import ContourArcs
 from perception.pair_check import PairCheck
@@ -42,65 +43,53 @@ EXPLANATIONS = {
     **rim_scale.EXPLANATIONS,
     **consistency.EXPLANATIONS,
     "part of the picture that is block": (
-        "too little of the picture is block",
-        "Is the block in sight, the segmenter the right one?",
+        "too little of the picture is block. Is the block in sight, the segmenter the right one?"
     ),
     "ellipses of a possible size on the block": (
-        "nothing on the block looks like a rim of the right size",
-        "",
+        "nothing on the block looks like a rim of the right size."
     ),
     "pixels of the face with depth": (
-        "the face around it has hardly any depth",
-        "Too dark, too near, or no texture to match.",
+        "the face around it has hardly any depth. Too dark, too near, or no texture to match."
     ),
     "depth noise on the face, 1/m": (
-        "the face around it is no plane",
-        "Is it on the block's edge, or is the depth that noisy?",
+        "the face around it is no plane. Is it on the block's edge, or is the depth that noisy?"
     ),
     "tilt of the face, rad": (
-        "the camera sees the face at too flat an angle",
-        "Try another place for the camera.",
+        "the camera sees the face at too flat an angle. Try another place for the camera."
     ),
-    "axis ratio on the face": ("on the face it is no circle", "A shadow, a stain, or an edge."),
+    "axis ratio on the face": "on the face it is no circle. A shadow, a stain, or an edge.",
     "part of a circle on the face with a rim": (
-        "too little of a rim is seen",
-        "Something hides it: try another place for the camera.",
+        "too little of a rim is seen. Something hides it: try another place for the camera."
     ),
     "radius, m": (
-        "on the face it does not have the size of a hole",
-        "Check perception.pose.radius_m if the holes have another size.",
+        "on the face it does not have the size of a hole. Check perception.pose.radius_m if "
+        "the holes have another size."
     ),
     "brightness inside over outside": (
-        "it is not dark inside",
-        "A ring, a filled hole, or a lamp in it.",
+        "it is not dark inside. A ring, a filled hole, or a lamp in it."
     ),
     "contrast to the grain of the face": (
-        "it is hardly darker than the grain of the face",
-        "A stain or a shadow.",
+        "it is hardly darker than the grain of the face. A stain or a shadow."
     ),
     IN_DUST: (
-        "dust or haze lies over it, and no light on a wall tells it from a flat dark disc",
-        "Wait for the dust to settle, or look from a place farther aside.",
+        "dust or haze lies over it, and no light on a wall tells it from a flat dark disc. "
+        "Wait for the dust to settle, or look from a place farther aside."
     ),
     "mouth probability inside": (
-        "the network does not take it for the mouth of a hole",
-        "A flat dark disc looks like this.",
+        "the network does not take it for the mouth of a hole. A flat dark disc looks like this."
     ),
     "evidence of depth inside": (
-        "it is evenly dark, and as deep as the face",
-        "A flat dark disc looks like this.",
+        "it is evenly dark, and as deep as the face. A flat dark disc looks like this."
     ),
     "major semi-axis where it lies, px": (
-        "a hole in the face around it does not look as large or as small",
-        "Check perception.radius_m if the holes have another size.",
+        "a hole in the face around it does not look as large or as small. Check "
+        "perception.radius_m if the holes have another size."
     ),
     "candidates of a frame before it": (
-        "there are too many better candidates in the frame",
-        "Grain or clutter that looks like rims.",
+        "there are too many better candidates in the frame. Grain or clutter that looks like rims."
     ),
     "distance to a larger rim, m": (
-        "it lies within a larger rim",
-        "The far rim or the floor of a hole.",
+        "it lies within a larger rim. The far rim or the floor of a hole."
     ),
 }
 """Explanation and remedy for each `Rejection.reason`."""
@@ -167,7 +156,7 @@ class StagedFinder:
 
     def __init__(self, settings: StagedPerception) -> None:
         self.settings = settings
-        self._segmenter, self._detector = settings.segmenter.build(), settings.ellipse.build()
+        self._segmenter, self.search_every = settings.segmenter.build(), settings.search_every
         self._pose = settings.pose.build()
         self._pair = settings.pair.build() if settings.pair else None
 
@@ -211,7 +200,7 @@ class StagedFinder:
         """Return the ellipses of the whole picture, of any size, without depth; no hole is tracked."""
         ms: dict[str, float] = {}
         with _time_stage(ms, "ellipse"):
-            ellipses = self._detector.detect(convert_to_gray(frame), None, None)
+            ellipses = self.settings.ellipse.detect(convert_to_gray(frame), None, None)
         return FrameDetections([], [], ellipses, None, ms), ()
 
     def _doubt_scale(self, frame: Frame, judged: _Judged, ms: dict[str, float]) -> _Judged:
@@ -220,16 +209,11 @@ class StagedFinder:
         if s.rims is None:
             return judged
         with _time_stage(ms, "scale"):
-            found = s.rims.measure_scale(frame, self._detector, s.radius_m)
+            found = s.rims.measure_scale(frame, self.settings.ellipse, s.radius_m)
         if found is None or any(pose.score > found[1] for _, pose in judged.found):
             return judged
         reason = rim_scale.OF_DEPTH if frame.right is None else rim_scale.OF_PAIR
         return _Judged([], [*judged.rejected, Rejection("ellipse", reason, found[0], 1.0)])
-
-    @property
-    def search_every(self) -> int:
-        """Frames of which one is to be searched as a whole; see `SteeredFinder`."""
-        return self.settings.search_every
 
     def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
         """Return the holes that are still where they were; see `SteeredFinder.follow`."""
@@ -276,8 +260,16 @@ class StagedFinder:
         return again
 
     def explain(self, rejection: Rejection) -> str:
-        """Return a sentence: the refused candidate, the reason, and a remedy."""
-        return explain_rejection(rejection)
+        """Return a sentence: the refused candidate, the value and its limit, and a remedy."""
+        place = rejection.ellipse
+        subject = "the frame"
+        if place is not None:
+            subject = (
+                f"the ellipse at ({place.x:.0f}, {place.y:.0f}), {place.a:.0f} x {place.b:.0f} px"
+            )
+        value = "unknown" if math.isnan(rejection.value) else f"{rejection.value:.4g}"
+        figures = f"{rejection.reason}: {value}, limit {rejection.limit:.4g}"
+        return f"{subject}: {EXPLANATIONS.get(rejection.reason, 'it was refused.')} ({figures})"
 
     def _prepare(self, frame: Frame, ms: dict[str, float]) -> tuple[Frame, Rejection | None]:
         """Return a frame without distortion, and what is wrong with its pair."""
@@ -335,7 +327,7 @@ class StagedFinder:
         )
         ellipses, wrong_size = [], []
         for level in levels:
-            for ellipse in level.detect(self._detector, gray):
+            for ellipse in level.detect(self.settings.ellipse, gray):
                 limit_px = level.find_missed_limit(ellipse)
                 if limit_px is None:
                     ellipses.append(ellipse)
@@ -378,13 +370,10 @@ def expect_rim(hole: HolePose, frame: Frame) -> tuple[Ellipse, np.ndarray] | Non
     Returns:
         `None` where its centre is not in the picture.
     """
-    rotation, shift = np.eye(3), np.zeros(3)
-    if hole.frame == "base":
-        if frame.base_from_camera is None:
-            return None
-        rotation = frame.base_from_camera[:3, :3].T
-        shift = -rotation @ frame.base_from_camera[:3, 3]
-    center_m, axis = rotation @ hole.center_m + shift, rotation @ hole.axis
+    place = express_in_camera(hole, frame)
+    if place is None:
+        return None
+    center_m, axis, _ = place
     height, width = frame.color.shape[:2]
     if center_m[2] <= 0 or float(axis @ center_m) >= 0:
         return None
@@ -427,18 +416,6 @@ def rectify(frame: Frame) -> Frame:
         distortion=None,
         right=None,
     )
-
-
-def explain_rejection(rejection: Rejection) -> str:
-    """Return a sentence: the refused candidate, the value and its limit, and a remedy."""
-    place = rejection.ellipse
-    subject = "the frame"
-    if place is not None:
-        subject = f"the ellipse at ({place.x:.0f}, {place.y:.0f}), {place.a:.0f} x {place.b:.0f} px"
-    explanation, remedy = EXPLANATIONS.get(rejection.reason, ("it was refused", ""))
-    value = "unknown" if math.isnan(rejection.value) else f"{rejection.value:.4g}"
-    figures = f"{rejection.reason}: {value}, limit {rejection.limit:.4g}"
-    return f"{subject}: {explanation} ({figures}). {remedy}".rstrip()
 
 
 def _remove_duplicates(ellipses: Sequence[Ellipse]) -> list[Ellipse]:

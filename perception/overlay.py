@@ -13,6 +13,7 @@ from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception import dataset
+from perception.camera import express_in_camera
 
 # Colours in OpenCV's order, blue first.
 BLOCK = (255, 180, 60)
@@ -73,13 +74,10 @@ class OverlayDrawing:
 
         A hole behind the camera, or in a base frame that the camera does not know, is left out.
         """
-        rotation, shift = np.eye(3), np.zeros(3)
-        if hole.frame == "base":
-            if frame.base_from_camera is None:
-                return
-            rotation = frame.base_from_camera[:3, :3].T
-            shift = -rotation @ frame.base_from_camera[:3, 3]
-        center, axis = rotation @ hole.center_m + shift, rotation @ hole.axis
+        place = express_in_camera(hole, frame)
+        if place is None:
+            return
+        center, axis, rotation = place
         tip = center + self.axis_m * axis
         if min(center[2], tip[2]) <= 0:
             return

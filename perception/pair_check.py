@@ -28,33 +28,32 @@ RANGE = "median depth of the pair's features, m"
 SCALE = "depth by disparity over the depth told"
 EXPLANATIONS = {
     ROWS: (
-        "the rows of left and right picture do not correspond, so its depth is wrong",
-        "Rectify the pictures, or calibrate the camera pair.",
+        "the rows of left and right picture do not correspond, so its depth is wrong. Rectify "
+        "the pictures, or calibrate the camera pair."
     ),
     ORDER: (
-        "left and right picture are swapped: what they show lies farther left in the left one",
-        "Swap them: .color.png is the left one, .right.png the right one.",
+        "left and right picture are swapped: what they show lies farther left in the left one. "
+        "Swap them: .color.png is the left one, .right.png the right one."
     ),
     TURN: (
-        "the pictures are turned: their features are apart from top to bottom",
-        "Turn them so that the cameras stand side by side, and K and dist with them.",
+        "the pictures are turned: their features are apart from top to bottom. Turn them so "
+        "that the cameras stand side by side, and K and dist with them."
     ),
     FEW: (
-        "left and right picture share too few features to tell whether they are rectified",
-        "Is it the same moment, is there light, is a lens covered?",
+        "left and right picture share too few features to tell whether they are rectified. Is "
+        "it the same moment, is there light, is a lens covered?"
     ),
     UNSURE: (
-        "the shared features are too uncertain to tell whether the pair is rectified",
-        "Is there light, are the pictures sharp?",
+        "the shared features are too uncertain to tell whether the pair is rectified. Is there "
+        "light, are the pictures sharp?"
     ),
     RANGE: (
-        "what both pictures show lies at an impossible depth",
-        "K or baseline_m is wrong by a large factor: is baseline_m in m?",
+        "what both pictures show lies at an impossible depth. K or baseline_m is wrong by a "
+        "large factor: is baseline_m in m?"
     ),
     SCALE: (
-        "depth and pair disagree by this factor",
-        "A factor of 1000, 100 or 10 is the unit of depth; else K, baseline_m, or both belong to "
-        "another resolution or camera.",
+        "depth and pair disagree by this factor. A factor of 1000, 100 or 10 is the unit of "
+        "depth; else K, baseline_m, or both belong to another resolution or camera."
     ),
 }
 """Explanation and remedy for each reason."""
@@ -78,21 +77,18 @@ class PairMatches:
 
 @dataclass(frozen=True)
 class PairAlignment:
-    """Vertical disparity of a pair: `pitch_px (1 + y²) + roll_px x + focal_px y`.
+    """Vertical disparity of a pair: `pitch (1 + y²) + roll x + focal y`.
 
     `x` and `y` are coordinates at depth 1. All are what the right picture shows lower, px.
 
     Attributes:
-        pitch_px: By a turn about the x axis, or a shift of the picture; focal length times angle.
-        roll_px: By a turn about the optical axis, likewise.
-        focal_px: By another focal length.
+        numbers_px: `(pitch, roll, focal)`: by a turn about the x axis or a shift of the picture, by a
+            turn about the optical axis, and by another focal length; angles times focal length.
         rms_px: Root mean square over the matched features, less what noise alone gives.
         std_px: Standard deviation of `rms_px`.
     """
 
-    pitch_px: float
-    roll_px: float
-    focal_px: float
+    numbers_px: np.ndarray
     rms_px: float
     std_px: float
 
@@ -286,7 +282,9 @@ def fit_alignment(matches: PairMatches, frame: Frame, alike: float) -> PairAlign
     What a calibration leaves of the lenses is alike within squares of a part `alike` of the width.
     """
     shift_px = (matches.right - matches.left)[:, 1]
-    design = _build_design(frame, matches.right[:, 0], matches.right[:, 1])
+    matrix = frame.camera_matrix
+    x, y = ((matches.right - matrix[:2, 2]) / np.diag(matrix)[:2]).T
+    design = np.stack([1.0 + y**2, x, y], axis=1)
     # A hundredth of a pixel: pictures drawn without noise would leave no scale.
     precision = np.sqrt(matches.texture / np.median(matches.texture))
     square = np.floor(matches.left / (alike * frame.color.shape[1]))
@@ -296,8 +294,7 @@ def fit_alignment(matches: PairMatches, frame: Frame, alike: float) -> PairAlign
     gram = design.T @ design / len(design)
     noise = float(np.trace(gram @ cov)) if np.isfinite(cov).all() else np.inf
     rms_px = float(np.sqrt(max(float(solution @ gram @ solution) - noise, 0.0)))
-    pitch, roll, focal = (float(value) for value in solution)
-    return PairAlignment(pitch, roll, focal, rms_px, float(np.sqrt(noise)))
+    return PairAlignment(solution, rms_px, float(np.sqrt(noise)))
 
 
 def measure_depth(matches: PairMatches, frame: Frame) -> float | None:
@@ -329,10 +326,3 @@ def measure_depth_scale(matches: PairMatches, frame: Frame, least: int) -> float
     if estimate_spread(logarithm - middle) > 0.1:
         return None
     return float(np.exp(middle))
-
-
-def _build_design(frame: Frame, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    matrix = frame.camera_matrix
-    x = (columns - matrix[0, 2]) / matrix[0, 0]
-    y = (rows - matrix[1, 2]) / matrix[1, 1]
-    return np.stack([1.0 + y**2, x, y], axis=1)

@@ -18,9 +18,9 @@ from annotated_types import Ge
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
-from perception.calibrate.disparity_error import correct_depth
 from perception.pose.plane import compute_inverse_depth
-from perception.stereo import PicturePart, Stereo
+from perception.segment.window import Window
+from perception.stereo import Stereo, correct_depth
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py).
 BEHIND_M = 0.3
@@ -56,9 +56,8 @@ class PairDepth:
             return frame
         focal_px = float(frame.camera_matrix[0, 0])
         depth_m = self.stereo.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
-        if any(frame.disparity_error_px):
-            place = (frame.camera_matrix, frame.baseline_m, frame.disparity_error_px)
-            depth_m = correct_depth(depth_m, *place)
+        place = (frame.camera_matrix, frame.baseline_m, frame.disparity_error_px)
+        depth_m = correct_depth(depth_m, *place)
         return replace(frame, depth_m=depth_m, depth_shrink=self.stereo.shrink)
 
     def match_near(
@@ -97,24 +96,20 @@ class PairDepth:
         return replace(frame, depth_m=depth_m, depth_shrink=finest), face
 
 
-def _convert_to_depth(found_px: np.ndarray, frame: Frame, part: PicturePart) -> np.ndarray:
+def _convert_to_depth(found_px: np.ndarray, frame: Frame, part: Window) -> np.ndarray:
     """Return the depth of a part, m, from its disparities, without their known error."""
     assert frame.baseline_m is not None
     with np.errstate(divide="ignore", invalid="ignore"):
         found_m = float(frame.camera_matrix[0, 0]) * frame.baseline_m / found_px
-    if not any(frame.disparity_error_px):
-        return found_m
     corner = np.array([[0.0, 0.0, part.left], [0.0, 0.0, part.top], [0.0, 0.0, 0.0]])
     matrix = frame.camera_matrix - corner
     return correct_depth(found_m, matrix, frame.baseline_m, frame.disparity_error_px)
 
 
-def _build_square(
-    place: Ellipse, reach_px: float, shrink: int, height: int, width: int
-) -> PicturePart:
+def _build_square(place: Ellipse, reach_px: float, shrink: int, height: int, width: int) -> Window:
     """Return the square around a place; it begins at a pixel of the shrunk picture."""
     left = int(np.clip(place.x - reach_px, 0, width - 1)) // shrink * shrink
     top = int(np.clip(place.y - reach_px, 0, height - 1)) // shrink * shrink
     right = int(np.clip(place.x + reach_px, 1, width))
     bottom = int(np.clip(place.y + reach_px, 1, height))
-    return PicturePart(left, top, max(1, right - left), max(1, bottom - top))
+    return Window(left, top, max(1, right - left), max(1, bottom - top))

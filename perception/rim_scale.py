@@ -16,19 +16,19 @@ from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Share, spec
 from perception.ellipse import conic
-from perception.ellipse.detector import ArcDetector
+from perception.ellipse.detector import ContourArcs
 
 OF_PAIR = "size of dark rims over that of the holes, by the pair"
 OF_DEPTH = "size of dark rims over that of the holes, by depth"
 EXPLANATIONS = {
     OF_PAIR: (
-        "no rim has the size of a hole, but dark ones have it by this factor",
-        "baseline_m is too large by it, or perception.radius_m too small.",
+        "no rim has the size of a hole, but dark ones have it by this factor. baseline_m is "
+        "too large by it, or perception.radius_m too small."
     ),
     OF_DEPTH: (
-        "no rim has the size of a hole, but dark ones have it by this factor",
-        "10, 100 or 1000, or a part of it, is the unit of depth. Else K is too small by it (that of "
-        "another resolution), or perception.radius_m.",
+        "no rim has the size of a hole, but dark ones have it by this factor. 10, 100 or 1000, "
+        "or a part of it, is the unit of depth. Else K is too small by it (that of another "
+        "resolution), or perception.radius_m."
     ),
 }
 """Explanation and remedy for both reasons."""
@@ -53,7 +53,7 @@ class RimScale:
     least: Annotated[float, Ge(1)]
 
     def measure_scale(
-        self, frame: Frame, detector: ArcDetector, radius_m: float
+        self, frame: Frame, detector: ContourArcs, radius_m: float
     ) -> tuple[float, float] | None:
         """Return the size of the surest rim over that of the holes, and its score.
 
@@ -82,8 +82,7 @@ class RimScale:
         rows = np.arange(max(0, int(one.y - reach)), min(height, int(one.y + reach) + 1))
         columns = np.arange(max(0, int(one.x - reach)), min(width, int(one.x + reach) + 1))
         part = np.ix_(rows, columns)
-        row = np.array([one.x, one.y, one.a, one.b, one.theta_rad])
-        radii = conic.measure_radii(row, columns[None, :], rows[:, None])
+        radii = conic.measure_radii(conic.as_row(one), columns[None, :], rows[:, None])
         ring = (radii > RING[0]) & (radii < RING[1])
         inside = radii < 0.8
         if not ring.any() or not inside.any():

@@ -29,7 +29,6 @@ def fit_linear(
     design: np.ndarray,
     values: np.ndarray,
     floor: float,
-    start: np.ndarray | None = None,
     num_rounds: int = 6,
     cell: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -39,7 +38,6 @@ def fit_linear(
         design: `(n, k)`.
         values: `(n,)`.
         floor: Least standard deviation of the values, in their unit.
-        start: First solution, `(k,)`; `None`: the median of the values, as if all were alike.
         num_rounds: Rounds of reweighting.
         cell: Number of each value's cell, within which errors are alike, `(n,)`; `None`: each
             value has an error of its own.
@@ -49,8 +47,8 @@ def fit_linear(
         a number.
     """
     weight = np.ones(len(values))
-    # The first scale is that about a guess: gross errors would tilt a first fit.
-    away = values - (np.median(values) if start is None else design @ start)
+    # The first scale is that about the median: gross errors would tilt a first fit.
+    away = values - np.median(values)
     solution = np.zeros(design.shape[1])
     scale = floor
     for _ in range(num_rounds):

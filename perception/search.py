@@ -10,7 +10,7 @@ import numpy as np
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
 from perception.contracts import SizePrior
-from perception.ellipse.detector import ArcDetector
+from perception.ellipse.detector import ContourArcs
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py), unless a comment says
 # otherwise.
@@ -83,7 +83,7 @@ class SearchLevel:
             return float(lowest)
         return float(highest) if one.a > highest else None
 
-    def detect(self, detector: ArcDetector, gray: np.ndarray) -> list[Ellipse]:
+    def detect(self, detector: ContourArcs, gray: np.ndarray) -> list[Ellipse]:
         """Return the ellipses of the region in px of the picture `(h, w)`, whatever their size there."""
         # Only the bounding box is searched: the cost of the detector is proportional to its area.
         x, y, wide, high = cv2.boundingRect(self.region)

@@ -7,13 +7,12 @@ of Lucas and Kanade's registration (1981), with brightness and contrast free, re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import Count, Positive, spec
+from perception.segment.window import Window
 
 _SMOOTH_PX = 0.8
 """Blur of both pictures before refinement: noise would bias the gradient. Chosen by hand."""
@@ -23,16 +22,6 @@ _LARGEST_CHANGE_PX = 1.0
 """Total change from which the match was wrong. Chosen by hand."""
 _LEAST_SLOPE = 0.01
 """Least mean squared gradient for refinement, (grey levels a pixel)². Chosen by hand."""
-
-
-@dataclass(frozen=True)
-class PicturePart:
-    """A rectangle of a picture, px."""
-
-    left: int
-    top: int
-    width: int
-    height: int
 
 
 @spec
@@ -90,22 +79,17 @@ class Stereo:
         # Matching is done on grey values; colour adds time and little information.
         one = np.asarray(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY))
         other = np.asarray(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
-        part = PicturePart(0, 0, width, height)
+        whole = Window(0, 0, width, height)
         pull_px = np.float32(focal_px * baseline_m)
-        found = self._match_shrunk(one, other, part, 0.0, float(pull_px) / self.nearest_m)
+        found = self.match_part(one, other, whole, 0.0, float(pull_px) / self.nearest_m)
         # No disparity is infinitely far; the limits below remove it.
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = pull_px / found
             known = (found > 0) & (depth >= self.nearest_m) & (depth <= self.farthest_m)
-        return self._enlarge(np.where(known, depth, np.float32(np.nan)), part)
+        return np.where(known, depth, np.float32(np.nan))
 
     def match_part(
-        self,
-        left: np.ndarray,
-        right: np.ndarray,
-        part: PicturePart,
-        least_px: float,
-        largest_px: float,
+        self, left: np.ndarray, right: np.ndarray, part: Window, least_px: float, largest_px: float
     ) -> np.ndarray:
         """Return the disparities of a part of the left picture, px, float32, NaN for unknown.
 
@@ -116,17 +100,6 @@ class Stereo:
             least_px: Least disparity that is searched.
             largest_px: Largest one.
         """
-        return self._enlarge(self._match_shrunk(left, right, part, least_px, largest_px), part)
-
-    def _match_shrunk(
-        self,
-        left: np.ndarray,
-        right: np.ndarray,
-        part: PicturePart,
-        least_px: float,
-        largest_px: float,
-    ) -> np.ndarray:
-        """Return the same for the shrunk part; disparities are those of the whole pictures."""
         width, s = left.shape[1], self.shrink
         columns, rows = max(1, part.width // s), max(1, part.height // s)
         first = int(least_px / s)
@@ -156,9 +129,9 @@ class Stereo:
         found = np.where(known, found, np.nan).astype(np.float32)
         if self.refinements:
             found = self._refined(one, other, found)
-        return s * (found[:, count:] + np.float32(first))
+        return self._enlarge(s * (found[:, count:] + np.float32(first)), part)
 
-    def _enlarge(self, shrunk: np.ndarray, part: PicturePart) -> np.ndarray:
+    def _enlarge(self, shrunk: np.ndarray, part: Window) -> np.ndarray:
         """Return a map of a part in its full resolution; NaN in a last, incomplete row or column."""
         # Nearest: a mean of two surfaces is a place where nothing is.
         found = shrunk.repeat(self.shrink, 0).repeat(self.shrink, 1) if self.shrink > 1 else shrunk
@@ -202,6 +175,26 @@ class Stereo:
 
     def _mean(self, values: np.ndarray) -> np.ndarray:
         return cv2.boxFilter(values, -1, (self.refinement_px, self.refinement_px))
+
+
+def correct_depth(
+    depth_m: np.ndarray,
+    camera_matrix: np.ndarray,
+    baseline_m: float | None,
+    error_px: tuple[float, ...],
+) -> np.ndarray:
+    """Return depth, `(h, w)` float32, without an error `(c0, c1, c2)` of its disparity."""
+    if baseline_m is None or not any(error_px):
+        return depth_m
+    height, width = depth_m.shape
+    x = (np.arange(width, dtype=np.float32) - camera_matrix[0, 2]) / camera_matrix[0, 0]
+    y = (np.arange(height, dtype=np.float32) - camera_matrix[1, 2]) / camera_matrix[1, 1]
+    pull_px = camera_matrix[0, 0] * baseline_m
+    constant, across, down = error_px
+    wrong = (constant + across * x)[None, :] + (down * y)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right_px = pull_px / depth_m - wrong
+        return np.where(right_px > 0, pull_px / right_px, np.nan).astype(np.float32)
 
 
 def shrink_part(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -25,11 +25,11 @@ from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception.calibrate import transforms
+from perception.calibrate.extrinsics import CameraExtrinsics
 from perception.mount.mounts import AxesMount, CameraMount
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
-from perception.mount.occlusion import ArmShape
 from perception.render.stereo_camera import StereoRig, place_rig
-from perception.sources.simulator import SimulatedCamera, make_frame
+from perception.sources.simulator import SimulatedCamera
 
 LEAST_HINT_M = 1e-3
 """Least error of a pointed place as the choice of a view takes it: nobody points better."""
@@ -45,7 +45,6 @@ class PerceivedTarget:
         tracker: Fuses their detections from all views.
         mount: Carries the camera.
         next_view: Chooses where it looks.
-        arm: Thickness of the arm in the pictures.
         rate_hz: Frames a second.
         delay_s: From the picture to the estimate.
         window_px: Columns and rows of the picture that are rendered and searched.
@@ -59,7 +58,6 @@ class PerceivedTarget:
     tracker: TrackerSpec
     mount: AxesMount
     next_view: ExpectedCovariance
-    arm: ArmShape
     rate_hz: Positive
     delay_s: NonNegative
     window_px: tuple[Annotated[int, Ge(64)], Annotated[int, Ge(64)]]
@@ -78,9 +76,8 @@ class _Exposure:
 
     task_scene: tuple[float, ...]
     chain_m: np.ndarray
-    true_pose: np.ndarray
+    rig: StereoRig
     believed_pose: np.ndarray
-    corner_px: tuple[int, int]
     t_s: float
     seed: tuple[int, ...]
 
@@ -160,9 +157,8 @@ class WatchedHole:
         if (pixel < 0).any() or (pixel > size - 1).any():
             return None
         corner = np.clip(np.round(pixel - np.array(window) / 2), 0, size - window).astype(int)
-        return _Exposure(
-            self.task_scene, chain_m, true, believed, (int(corner[0]), int(corner[1])), t_s, seed
-        )
+        placed = place_rig(rig, true, (int(corner[0]), int(corner[1])), window)
+        return _Exposure(self.task_scene, chain_m, placed, believed, t_s, seed)
 
     def wait_for(self, holes: Sequence[HolePose] | None, t_s: float) -> None:
         """Take the holes of a picture at `t_s`, known after the delay; `None`: no sharp picture."""
@@ -196,7 +192,7 @@ class PerceivedTargets:
         self._settings, self._machine, self._seed = settings, machine, seed
         self._mount = settings.mount.build(machine)
         rig = settings.camera.rig
-        self._planner = settings.next_view.build(machine, self._mount, rig, settings.arm)
+        self._planner = settings.next_view.build(machine, self._mount, rig, settings.camera.arm)
         self._finder = settings.finder.build()
         self._attended = np.zeros(num_envs, bool)
         self._steps = np.zeros(num_envs, int)
@@ -271,7 +267,7 @@ class PerceivedTargets:
         for number in due:
             one, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             seed = (self._seed, int(number), int(self._steps[number]))
-            chain_m = self._settings.arm.trace(self._machine, q[number])
+            chain_m = self._settings.camera.arm.trace(self._machine, q[number])
             if t_s < one.arrives_s - 1e-9 or not self._is_steady(one, int(number), q):
                 one.wait_for(None, t_s)
                 continue
@@ -319,16 +315,11 @@ def _search(
     settings: PerceivedTarget, mount: CameraMount, finder: BoreholeFinder, exposure: _Exposure
 ) -> list[HolePose]:
     """Render a picture, and return the holes that are found in it, in the base frame."""
-    rig: StereoRig = settings.camera.rig
-    true = place_rig(rig, exposure.true_pose, exposure.corner_px, settings.window_px)
-    source = settings.camera.build()
-    source.show(exposure.task_scene, exposure.chain_m)
-    shot = source.shot(np.random.default_rng(exposure.seed), true)
-    frame = replace(
-        make_frame(shot, true, exposure.t_s),
-        base_from_camera=exposure.believed_pose,
-        camera_cov=mount.error.covariance,
-    )
+    noise = np.random.default_rng(exposure.seed)
+    shot = settings.camera.shoot(exposure.task_scene, exposure.chain_m, noise, exposure.rig)
+    believed = CameraExtrinsics(exposure.believed_pose, mount.error.covariance)
+    camera = exposure.rig.model.place(believed)
+    frame = camera.build_frame(shot.color, shot.depth_m, exposure.t_s, shot.right)
     try:
         return list(finder.find(frame).in_base_frame(frame).holes)
     except FrameError:  # the arm fills the picture: no depth

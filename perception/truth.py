@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from brokk_rl.contracts.vision import FrameDetections, HolePose
@@ -33,8 +31,12 @@ class TruthPerception:
         if abs(float(np.linalg.norm(self.axis_in_base)) - 1.0) > 1e-6:
             raise ConfigError(f"axis_in_base: {self.axis_in_base} is not a unit vector")
 
-    def build(self) -> TruthFinder:
-        """Return a finder that always finds this borehole."""
+    def build(self) -> TruthPerception:
+        """Return the finder, which is the spec itself."""
+        return self
+
+    def find(self, frame: Frame) -> FrameDetections:
+        """Return the borehole, whatever the frame shows."""
         hole = HolePose(
             center_m=np.array(self.center_in_base_m),
             axis=np.array(self.axis_in_base),
@@ -43,21 +45,6 @@ class TruthPerception:
             axis_cov_rad2=np.zeros((3, 3)),
             frame="base",
             score=1.0,
-            t_s=0.0,
+            t_s=frame.t_s,
         )
-        return TruthFinder(hole)
-
-
-class TruthFinder:
-    """A finder that has the answer.
-
-    Args:
-        hole: The borehole in the base frame; `None` for no hole.
-    """
-
-    def __init__(self, hole: HolePose | None) -> None:
-        self._hole = hole
-
-    def find(self, frame: Frame) -> FrameDetections:
-        """Return the borehole, whatever the frame shows."""
-        return FrameDetections([] if self._hole is None else [replace(self._hole, t_s=frame.t_s)])
+        return FrameDetections([hole])

@@ -50,7 +50,6 @@ from perception.overlay import OverlayDrawing
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
-from perception.sources.simulator import make_frame
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 VARIATIONS = {
@@ -167,7 +166,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     generator = scenes(task.seed).generator(f"scene/{task.number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
-    frame = make_frame(shot, studio.rig, 0.0)
+    frame = studio.rig.model.build_frame(shot.color, shot.depth_m, 0.0, shot.right)
     lines = []
     for option in task.options:
         finder = build_finder(option)

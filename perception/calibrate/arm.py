@@ -30,12 +30,10 @@ class LinkPoses:
         base_from_link: At the tool's tip; z along the last joint, x along the tool, `(N, 4, 4)`.
         joints: Motions of the link, in the base frame, for one unit of each joint, `(N, J, 6)`: a
             point at `p` goes by `v + w x p`.
-        tip_in_base_m: Tip of the tool, `(N, 3)`.
     """
 
     base_from_link: np.ndarray
     joints: np.ndarray
-    tip_in_base_m: np.ndarray
 
 
 def compute_link_poses(machine: Machine, q: np.ndarray) -> LinkPoses:
@@ -57,8 +55,7 @@ def compute_link_poses(machine: Machine, q: np.ndarray) -> LinkPoses:
     motions = np.concatenate(
         [np.where(hinge, np.cross(origins, axes), axes), np.where(hinge, axes, 0.0)], -1
     )
-    tip = tool.tip_in_base_m
-    return LinkPoses(transforms.make_transform(rotation, tip), motions, tip)
+    return LinkPoses(transforms.make_transform(rotation, tool.tip_in_base_m), motions)
 
 
 def build_wobble_motions(base_from_link: np.ndarray, shift_m: float, turn_rad: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from annotated_types import Ge
 from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
-from brokk_rl.progress import ItemProgress
+from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
 from perception.calibrate import arm, clock_offset, evaluation, verdict
 from perception.calibrate.disparity_error import (
@@ -21,7 +22,7 @@ from perception.calibrate.disparity_error import (
     estimate_disparity_error,
     measure_board_disparity,
 )
-from perception.calibrate.extrinsics import PoseResidual, build_calibration
+from perception.calibrate.extrinsics import build_calibration
 from perception.calibrate.hand_eye import (
     MIN_VIEWS,
     HandEyeSolution,
@@ -30,6 +31,7 @@ from perception.calibrate.hand_eye import (
     solve_hand_eye,
 )
 from perception.label.camera_pose import BoardPose, Charuco, estimate_board_pose
+from perception.sources.look import look_at_frames
 
 log = logging.getLogger(__name__)
 
@@ -114,12 +116,12 @@ class BoardCalibration:
             q = trajectory.at(one.name, one.t_s + shift_s)
             if q is None:
                 reason = f"{self.joints} has no joint positions for it"
-                refused.append(PoseResidual(one.name, None, None, reason))
+                refused.append(evaluation.describe_residual(one.name, reason))
             else:
                 known.append(one)
                 positions.append(q)
         if len(known) < MIN_VIEWS:
-            reasons = sorted({one.left_out or "" for one in refused})[:3]
+            reasons = sorted({one["left_out"] for one in refused})[:3]
             raise FrameError(
                 f"calibration: {len(known)} frames show the board where the joint positions are "
                 f"known, {MIN_VIEWS} are needed, 20 are good. Left out: "
@@ -130,20 +132,24 @@ class BoardCalibration:
             chosen = np.linspace(0, len(known) - 1, self.max_poses).round().astype(int)
             known, positions = [known[k] for k in chosen], [positions[k] for k in chosen]
         q = np.stack(positions)
-        views = self._build_views(machine, trajectory, known, q, clock)
+
+        def build_views(positions: np.ndarray) -> HandEyeViews:
+            return self._build_views(machine, trajectory, known, positions, clock)
+
+        views = build_views(q)
         solution = solve_hand_eye(views)
         assert solution is not None  # there are enough
         used = np.flatnonzero(solution.used)
         # Only poses that were used can determine the camera.
         turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
-        missing = self._check_coverage(machine, views, solution, q, float(turns[1]))
+        missing = self._check_coverage(machine, views, solution, q)
         more = {
             "T_link_board": solution.guess.link_from_board.round(9).tolist(),
             **evaluation.summarise_solution(views, solution, clock),
             "corners_px": round(float(np.median([one.pose.error_px for one in known])), 3),
             "turns_rad": turns.round(4).tolist(),
             "missing": missing,
-            "verdict": self._judge(machine, trajectory, known, q, clock, solution, missing),
+            "verdict": self._judge(machine, q, build_views, solution, missing),
         }
         pairs = [known[k].disparity for k in used]
         error = estimate_disparity_error([one for one in pairs if one is not None])
@@ -153,29 +159,23 @@ class BoardCalibration:
         camera, cov = solution.guess.base_from_camera, solution.cov[:6, :6]
         return build_calibration(machine, camera, cov, residuals, self.work_m, more)
 
-    def _find_boards(self) -> tuple[list[BoardObservation], list[PoseResidual]]:
-        """Return the boards in the frames, and the frames without one."""
-        tracker, found, refused = self.board.build(), [], []
-        with self.source.build() as source, ItemProgress("boards", source.num_frames) as progress:
-            while True:
-                progress.advance()
-                try:
-                    frame = source.read_latest()
-                    if frame is None:
-                        return found, refused
-                    corners_m, corners_px = tracker.find_corners(frame)
-                    pose = estimate_board_pose(
-                        frame, corners_m, corners_px, self.corner_px, self.max_error_px
-                    )
-                    disparity = measure_board_disparity(
-                        tracker, frame, corners_m, corners_px, pose.camera_from_board[0]
-                    )
-                    name = Path(frame.name).name
-                    found.append(BoardObservation(name, frame.t_s, pose, disparity))
-                except FrameError as error:
-                    # The message begins with the path of the frame.
-                    name = str(error).split(":")[0].split("/")[-1]
-                    refused.append(PoseResidual(name, None, None, str(error)))
+    def _find_boards(self) -> tuple[list[BoardObservation], list[dict[str, Any]]]:
+        """Return the boards in the frames, and the entries of frames without one."""
+        found, refused = [], []
+
+        def observe(frame: Frame) -> BoardObservation:
+            corners = self.board.find_corners(frame)
+            pose = estimate_board_pose(frame, *corners, self.corner_px, self.max_error_px)
+            place = pose.camera_from_board[0]
+            disparity = measure_board_disparity(self.board, frame, *corners, place)
+            return BoardObservation(Path(frame.name).name, frame.t_s, pose, disparity)
+
+        for name, one, reason in look_at_frames(self.source, "boards", observe):
+            if one is None:
+                refused.append(evaluation.describe_residual(name, reason))
+            else:
+                found.append(one)
+        return found, refused
 
     def _estimate_clock(
         self,
@@ -237,18 +237,12 @@ class BoardCalibration:
     def _judge(
         self,
         machine: Machine,
-        trajectory: arm.JointTrajectory,
-        observations: list[BoardObservation],
         q: np.ndarray,
-        clock: clock_offset.ClockEstimate | None,
+        build_views: Callable[[np.ndarray], HandEyeViews],
         solution: HandEyeSolution,
         missing: list[str],
     ) -> dict[str, Any]:
         """Return the verdict and, for a bad one, the joint that explains it; see `verdict`."""
-
-        def build_views(positions: np.ndarray) -> HandEyeViews:
-            return self._build_views(machine, trajectory, observations, positions, clock)
-
         views = build_views(q)
         zeros = {}
         for name, mean in zip(views.shared_names, solution.guess.shared, strict=True):
@@ -256,19 +250,10 @@ class BoardCalibration:
                 zeros[name] = (float(mean), self.zero_std_rad)
         alone = verdict.judge_fit(int(solution.used.sum()), len(q), solution.factor, zeros, missing)
         explanation = verdict.explain_by_joint(machine, q, views, solution, build_views)
-        otherwise = (
-            "no scale or sign of one joint explains this: look at the axes and the order of the "
-            "joints in the machine's file, and whether the joint positions belong to these frames"
-        )
-        return verdict.add_explanation(alone, explanation, otherwise).to_dict()
+        return verdict.add_explanation(alone, explanation).to_dict()
 
     def _check_coverage(
-        self,
-        machine: Machine,
-        views: HandEyeViews,
-        solution: HandEyeSolution,
-        q: np.ndarray,
-        second_turn_rad: float,
+        self, machine: Machine, views: HandEyeViews, solution: HandEyeSolution, q: np.ndarray
     ) -> list[str]:
         """Return which poses are missing; refuse poses that do not determine the camera."""
         used = np.flatnonzero(solution.used)
@@ -281,7 +266,8 @@ class BoardCalibration:
             self.least_turn_rad,
         )
         # The problem is singular: more poses of the same kind would not help.
-        if second_turn_rad < MIN_TURN_SHARE * self.least_turn_rad or len(used) < MIN_VIEWS:
+        turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
+        if turns[1] < MIN_TURN_SHARE * self.least_turn_rad or len(used) < MIN_VIEWS:
             raise FrameError(
                 "calibration: the poses do not determine where the camera is: "
                 f"{'; '.join(missing) or 'too few agree'}"

@@ -15,7 +15,7 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
-from perception.label.camera_pose import BoardTracker
+from perception.label.camera_pose import Charuco, match_corners
 from perception.robust_fit import TUKEY, compute_biweight, estimate_spread
 
 MIN_VIEWS = 8
@@ -79,7 +79,7 @@ class DisparityError:
 
 
 def measure_board_disparity(
-    tracker: BoardTracker,
+    board: Charuco,
     frame: Frame,
     corners_m: np.ndarray,
     corners_px: np.ndarray,
@@ -88,7 +88,7 @@ def measure_board_disparity(
     """Return the disparity of a board in one frame; `None` without a right picture that shows it.
 
     Args:
-        tracker: Finds the board.
+        board: The board.
         frame: A rectified frame.
         corners_m: Corners on the board, `(n, 3)`, found in the left picture.
         corners_px: The same in the left picture, `(n, 2)`.
@@ -97,22 +97,16 @@ def measure_board_disparity(
     if frame.right is None or frame.baseline_m is None or frame.distortion is not None:
         return None
     try:
-        others_m, others_px = tracker.find_corners(replace(frame, color=frame.right))
+        others_m, others_px = board.find_corners(replace(frame, color=frame.right))
     except FrameError:
         return None
-    places = {tuple(np.round(one, 6)): px for one, px in zip(others_m, others_px, strict=True)}
-    measured, chosen = [], []
-    for number, one in enumerate(corners_m):
-        other = places.get(tuple(np.round(one, 6)))
-        if other is not None:
-            measured.append(corners_px[number, 0] - other[0])
-            chosen.append(number)
-    if not chosen:
+    mine, theirs = match_corners(corners_m, others_m)
+    if not len(mine):
         return None
-    point = corners_m[chosen] @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
+    point = corners_m[mine] @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
     expected = frame.camera_matrix[0, 0] * frame.baseline_m / point[:, 2]
     x, y = (point[:, :2] / point[:, 2:]).mean(0)
-    excess = float(np.mean(np.array(measured) - expected))
+    excess = float(np.mean(corners_px[mine, 0] - others_px[theirs, 0] - expected))
     return BoardDisparity(excess, float(expected.mean()), float(x), float(y))
 
 
@@ -166,18 +160,3 @@ def _merge_rests(views: list[BoardDisparity]) -> list[BoardDisparity]:
 def _is_same_place(one: BoardDisparity, other: BoardDisparity) -> bool:
     aside = max(abs(one.x - other.x), abs(one.y - other.y))
     return aside < PLACE and abs(one.expected_px / other.expected_px - 1.0) < PLACE
-
-
-def correct_depth(
-    depth_m: np.ndarray, camera_matrix: np.ndarray, baseline_m: float, error_px: tuple[float, ...]
-) -> np.ndarray:
-    """Return depth, `(h, w)` float32, without an error `(c0, c1, c2)` of its disparity."""
-    height, width = depth_m.shape
-    x = (np.arange(width, dtype=np.float32) - camera_matrix[0, 2]) / camera_matrix[0, 0]
-    y = (np.arange(height, dtype=np.float32) - camera_matrix[1, 2]) / camera_matrix[1, 1]
-    pull_px = camera_matrix[0, 0] * baseline_m
-    constant, across, down = error_px
-    wrong = (constant + across * x)[None, :] + (down * y)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        right_px = pull_px / depth_m - wrong
-        return np.where(right_px > 0, pull_px / right_px, np.nan).astype(np.float32)

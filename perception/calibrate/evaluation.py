@@ -9,7 +9,6 @@ import numpy as np
 from brokk_rl.machine import Machine
 from perception.calibrate import transforms
 from perception.calibrate.clock_offset import ClockEstimate
-from perception.calibrate.extrinsics import PoseResidual
 from perception.calibrate.hand_eye import HandEyeSolution, HandEyeViews
 
 CLOCK_NAME = "clock"
@@ -22,18 +21,32 @@ MIN_DISTANCE_RATIO = 1.2
 """Ratio of farthest to nearest board; chosen by hand, a fifth decouples depth from focal length."""
 
 
-def list_residuals(views: HandEyeViews, solution: HandEyeSolution) -> list[PoseResidual]:
-    """Return the residual of each view, and which were left out."""
+def list_residuals(views: HandEyeViews, solution: HandEyeSolution) -> list[dict[str, Any]]:
+    """Return the residual of each view, and why it was left out, as the file has them."""
     residuals = []
     for k, name in enumerate(views.names):
-        away = solution.away[k]
-        away_m, away_rad = float(np.linalg.norm(away[:3])), float(np.linalg.norm(away[3:]))
         left_out = None
         if not solution.used[k]:
             ratio = np.sqrt(solution.distance[k] / 6.0)
             left_out = f"{ratio:.0f} times as far off as it should be"
-        residuals.append(PoseResidual(name, away_m, away_rad, left_out))
+        residuals.append(describe_residual(name, left_out, solution.away[k]))
     return residuals
+
+
+def describe_residual(
+    name: str, left_out: str | None, away: np.ndarray | None = None
+) -> dict[str, Any]:
+    """Return the file's entry on one frame.
+
+    Args:
+        name: Of the frame.
+        left_out: Why it was not used; `None` if it was.
+        away: Its residual as a small motion, `(6,)`; `None` where there is none.
+    """
+    sizes: tuple[float | None, ...] = (None, None)
+    if away is not None:
+        sizes = tuple(round(float(np.linalg.norm(part)), 6) for part in (away[:3], away[3:]))
+    return {"name": name, "away_m": sizes[0], "away_rad": sizes[1], "left_out": left_out}
 
 
 def summarise_solution(
@@ -81,13 +94,19 @@ def measure_rotation_ranges(base_from_link: np.ndarray) -> tuple[np.ndarray, np.
     return (high - low)[order], axes[order]
 
 
-def list_missing_motions(
-    base_from_link: np.ndarray, distance_m: np.ndarray, least_rad: float
+def list_missing_poses(
+    machine: Machine,
+    q: np.ndarray,
+    base_from_link: np.ndarray,
+    distance_m: np.ndarray,
+    least_rad: float,
 ) -> list[str]:
-    """Return in words which motions the poses lack; empty where they suffice.
+    """Return in words which poses of a machine to add; empty where they suffice.
 
     Args:
-        base_from_link: The link in the poses that were used, `(N, 4, 4)`.
+        machine: Names and travel of the joints.
+        q: Joint positions of the poses that were used, `(N, J)`.
+        base_from_link: The link there, `(N, 4, 4)`.
         distance_m: From the camera to the board, `(N,)`.
         least_rad: Turn that the poses need about two axes.
     """
@@ -105,27 +124,7 @@ def list_missing_motions(
             f"the board is always {distance_m.min():.1f} to {distance_m.max():.1f} m away: add "
             "poses nearer and farther, by a fifth"
         )
-    return missing
-
-
-def list_missing_poses(
-    machine: Machine,
-    q: np.ndarray,
-    base_from_link: np.ndarray,
-    distance_m: np.ndarray,
-    least_rad: float,
-) -> list[str]:
-    """Return in words which poses of a machine to add; see `list_missing_motions`.
-
-    Args:
-        machine: Names and travel of the joints.
-        q: Joint positions of the poses that were used, `(N, J)`.
-        base_from_link: The link there.
-        distance_m: From the camera to the board.
-        least_rad: Turn that the poses need about two axes.
-    """
-    missing = list_missing_motions(base_from_link, distance_m, least_rad)
-    if measure_rotation_ranges(base_from_link)[0][1] >= least_rad:
+    if turns[1] >= least_rad:
         return missing
     for joint, low, high in zip(machine.joints, q.min(0), q.max(0), strict=True):
         if joint.kind != "hinge" or high - low >= 0.5 * least_rad:

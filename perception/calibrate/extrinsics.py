@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from brokk_rl import record
 from brokk_rl.errors import FrameError
@@ -74,15 +73,9 @@ def read_calibration(path: Path, where: str) -> dict[str, Any]:
     Raises:
         FrameError: it cannot be read, is of another kind, or is not to be trusted.
     """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FrameError(
-            f"{where}: {path} cannot be read ({error}); expected calibration.yaml of "
-            "`brokk mode=calibrate`"
-        ) from error
-    is_known = isinstance(content, dict) and content.get("schema") == SCHEMA
-    is_known = is_known and "T_base_cam" in content
+    expected = "calibration.yaml of `brokk mode=calibrate`"
+    content = validation.read_mapping(path, f"{expected} by {where}")
+    is_known = content.get("schema") == SCHEMA and "T_base_cam" in content
     if not is_known or not all(
         isinstance(content.get(part), dict | None) for part in ("verdict", "disparity")
     ):
@@ -107,44 +100,11 @@ def compute_point_std_m(cov: np.ndarray, distance_m: float) -> float:
     return float(np.sqrt(np.trace(lever @ cov @ lever.T)))
 
 
-def round_to_lists(values: np.ndarray | Sequence[float], digits: int = 9) -> list[Any]:
-    """Return an array as lists of rounded numbers, for YAML."""
-    return np.round(np.asarray(values, float), digits).tolist()
-
-
-@dataclass(frozen=True)
-class PoseResidual:
-    """Residual of one pose or point.
-
-    Attributes:
-        name: Frame, time or point.
-        away_m: Size of the residual's shift, `None` where there is none.
-        away_rad: Size of its turn, `None` where there is none.
-        left_out: Why it was not used; `None` if it was.
-    """
-
-    name: str
-    away_m: float | None
-    away_rad: float | None
-    left_out: str | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain data, rounded."""
-        away_m = None if self.away_m is None else round(self.away_m, 6)
-        away_rad = None if self.away_rad is None else round(self.away_rad, 6)
-        return {
-            "name": self.name,
-            "away_m": away_m,
-            "away_rad": away_rad,
-            "left_out": self.left_out,
-        }
-
-
 def build_calibration(
     machine: Machine,
     base_from_camera: np.ndarray,
     cov: np.ndarray,
-    residuals: Sequence[PoseResidual],
+    residuals: Sequence[dict[str, Any]],
     distance_m: float,
     more: dict[str, Any],
 ) -> dict[str, Any]:
@@ -154,36 +114,34 @@ def build_calibration(
         machine: Whose base it is.
         base_from_camera: The camera, `(4, 4)`.
         cov: Covariance of a small motion of it in its own frame, `(6, 6)`.
-        residuals: Of poses or points, those left out too.
+        residuals: Of all frames; see `perception.calibrate.evaluation.describe_residual`.
         distance_m: Working distance, at which the uncertainty of a point is stated.
-        more: Entries of this kind alone.
+        more: Entries that need no uncertainty.
     """
-    used = [one for one in residuals if one.left_out is None]
+    used = [one for one in residuals if one["left_out"] is None]
+    std = np.sqrt(np.diag(cov))
+    point_std_m = round(compute_point_std_m(cov, distance_m), 6)
     return {
         "schema": SCHEMA,
         "kind": "board",
         "created": record.format_now(),
         "machine": machine.name,
-        "T_base_cam": round_to_lists(base_from_camera),
+        "T_base_cam": base_from_camera.round(9).tolist(),
         # of a small motion of the camera in its own frame: x y z in m, then turns in rad
-        "covariance": round_to_lists(cov, 15),
-        "std_m": round_to_lists(np.sqrt(np.diag(cov)[:3])),
-        "std_rad": round_to_lists(np.sqrt(np.diag(cov)[3:6])),
-        "point_std_m": {
-            "at_m": round(distance_m, 3),
-            "std_m": round(compute_point_std_m(cov, distance_m), 6),
-        },
+        "covariance": cov.round(15).tolist(),
+        "std_m": std[:3].round(9).tolist(),
+        "std_rad": std[3:].round(9).tolist(),
+        "point_std_m": {"at_m": round(distance_m, 3), "std_m": point_std_m},
         "residual": {
-            "rms_m": _compute_rms([one.away_m for one in used]),
-            "rms_rad": _compute_rms([one.away_rad for one in used]),
+            "rms_m": _compute_rms([one["away_m"] for one in used]),
+            "rms_rad": _compute_rms([one["away_rad"] for one in used]),
         },
         "num_used": len(used),
         "num_left_out": len(residuals) - len(used),
         **more,
-        "poses": [one.to_dict() for one in residuals],
+        "poses": list(residuals),
     }
 
 
-def _compute_rms(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return round(float(np.sqrt(np.mean(np.square(known)))), 6) if known else None
+def _compute_rms(values: Sequence[float]) -> float:
+    return round(float(np.sqrt(np.mean(np.square(values)))), 6)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
-from perception.label.camera_pose import BoardTracker
+from perception.label.camera_pose import Charuco, match_corners
 
 LEAST_VIEWS, LEAST_CORNERS = 8, 12
 """Views, and corners of each that both pictures show: nine numbers of each lens and six of the pair
@@ -40,23 +40,21 @@ class BoardPair:
 
 
 def find_board_pair(
-    tracker: BoardTracker, left: np.ndarray, right: np.ndarray, gamma: float
+    board: Charuco, left: np.ndarray, right: np.ndarray, gamma: float
 ) -> BoardPair | None:
     """Return the corners that two pictures, RGB `(h, w, 3)`, share; `None` for too few."""
     nothing = np.zeros(left.shape[:2], np.float32)
-    seen: list[dict[tuple[float, ...], np.ndarray]] = []
-    for picture in (left, right):
-        try:
-            frame = Frame(picture, nothing, np.eye(3), None, 0.0, gamma=gamma)
-            corners_m, corners_px = tracker.find_corners(frame)
-        except FrameError:
-            return None
-        seen.append(dict(zip(map(tuple, corners_m.round(6)), corners_px, strict=True)))
-    shared = [corner for corner in seen[0] if corner in seen[1]]
-    if len(shared) < LEAST_CORNERS:
+    frame = Frame(left, nothing, np.eye(3), None, 0.0, gamma=gamma)
+    try:
+        left_m, left_px = board.find_corners(frame)
+        right_m, right_px = board.find_corners(replace(frame, color=right))
+    except FrameError:
         return None
-    parts = [np.array(shared), *([one[corner] for corner in shared] for one in seen)]
-    return BoardPair(*(np.asarray(part, np.float32) for part in parts))
+    mine, theirs = match_corners(left_m, right_m)
+    if len(mine) < LEAST_CORNERS:
+        return None
+    parts = (left_m[mine], left_px[mine], right_px[theirs])
+    return BoardPair(*(part.astype(np.float32) for part in parts))
 
 
 def calibrate_pair(pairs: Sequence[BoardPair], size_px: tuple[int, int]) -> dict[str, Any]:

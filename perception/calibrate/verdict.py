@@ -45,6 +45,12 @@ MIN_DEVIANCE_GAIN = 50.0
 """Fall of the deviance by which a change explains the views; chance gives 15 in a hundred trials."""
 
 
+UNEXPLAINED = (
+    "no scale or sign of one joint explains this: look at the axes and the order of the joints in "
+    "the machine's file, and whether the joint positions belong to these frames"
+)
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Judgement of a calibration and its reasons.
@@ -60,21 +66,6 @@ class Verdict:
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `calibration.yaml`."""
         return {"status": self.status, "reasons": list(self.reasons)}
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """A change of the input that lets the views agree.
-
-    Attributes:
-        words: The change and what to do.
-        deviance: Of the views after it.
-        solution: The solution after it.
-    """
-
-    words: str
-    deviance: float
-    solution: HandEyeSolution
 
 
 def judge_fit(
@@ -117,8 +108,8 @@ def explain_by_joint(
     views: HandEyeViews,
     solution: HandEyeSolution,
     build_views: Callable[[np.ndarray], HandEyeViews],
-) -> Explanation | None:
-    """Return the scale or sign of one joint that explains views which do not agree.
+) -> str | None:
+    """Return the scale or sign of one joint that explains views which do not agree, in words.
 
     Args:
         machine: Names of the joints.
@@ -128,39 +119,33 @@ def explain_by_joint(
         build_views: Views of other positions.
 
     Returns:
-        The change that lowers the deviance most; `None` where none does by `MIN_DEVIANCE_GAIN`.
+        The change that lowers the deviance most; `None` where none does by `MIN_DEVIANCE_GAIN`, or
+        where it leaves a calibration that is as wrong.
     """
-    explanations = []
-    for name, words, changed in _list_joint_changes(machine, q, views):
+    least = compute_deviance(views, solution.guess) - MIN_DEVIANCE_GAIN
+    best = None
+    for words, changed in _list_joint_changes(machine, q, views):
         found = solve_hand_eye(other := build_views(changed))
-        if found is not None:
-            deviance = compute_deviance(other, found.guess)
-            explanations.append(Explanation(f"{name}: {words}", deviance, found))
-    return choose_explanation(explanations, compute_deviance(views, solution.guess))
-
-
-def choose_explanation(explanations: Sequence[Explanation], deviance: float) -> Explanation | None:
-    """Return the explanation with the least deviance.
-
-    `None` where it gains too little on `deviance`, or leaves a calibration that is as wrong.
-    """
-    best = min(explanations, key=lambda one: one.deviance, default=None)
-    if best is None or deviance - best.deviance < MIN_DEVIANCE_GAIN:
+        if found is not None and (deviance := compute_deviance(other, found.guess)) <= least:
+            least, best = deviance, (words, found)
+    if best is None:
         return None
-    used = best.solution.used
-    after = judge_fit(int(used.sum()), len(used), best.solution.factor, {}, [])
-    return None if after.status == WRONG else best
+    words, found = best
+    num_used, num_views = int(found.used.sum()), len(found.used)
+    if judge_fit(num_used, num_views, found.factor, {}, []).status == WRONG:
+        return None
+    return f"{words}: then {num_used} of {num_views} views agree"
 
 
 def _list_joint_changes(
     machine: Machine, q: np.ndarray, views: HandEyeViews
-) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield a joint's name, a change of its positions in words, and all positions after it."""
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield a change of one joint's positions in words, and all positions after it."""
     links = arm.compute_link_poses(machine, q)
     for k, name in enumerate(machine.joint_names):
         turned = q.copy()
         turned[:, k] *= -1.0
-        yield name, "its sign is reversed", turned
+        yield f"{name}: its sign is reversed", turned
         motion = (q[:, k, None] * links.joints[:, k])[:, None]
         scaled_views = replace(
             views,
@@ -174,10 +159,10 @@ def _list_joint_changes(
         factor = 1.0 + float(solution.guess.shared[-1])
         scaled = q.copy()
         scaled[:, k] *= factor
-        yield name, f"its positions are to be multiplied by {factor:.3f}", scaled
+        yield f"{name}: its positions are to be multiplied by {factor:.3f}", scaled
 
 
-def add_explanation(verdict: Verdict, explanation: Explanation | None, otherwise: str) -> Verdict:
+def add_explanation(verdict: Verdict, explanation: str | None) -> Verdict:
     """Return the verdict with the explanation as its first reason.
 
     An explanation makes a good verdict a bad one: the views say that the input is wrong.
@@ -185,16 +170,13 @@ def add_explanation(verdict: Verdict, explanation: Explanation | None, otherwise
     Args:
         verdict: By the solution alone.
         explanation: What explains the views, if anything.
-        otherwise: What to look at where a bad calibration has no explanation.
     """
     if explanation is None:
         if verdict.status != WRONG:
             return verdict
-        return Verdict(WRONG, (*verdict.reasons, otherwise))
-    used = explanation.solution.used
-    words = f"{explanation.words}: then {int(used.sum())} of {len(used)} views agree"
+        return Verdict(WRONG, (*verdict.reasons, UNEXPLAINED))
     reasons = verdict.reasons if verdict.status == WRONG else ()
-    return Verdict(WRONG, (words, *reasons))
+    return Verdict(WRONG, (explanation, *reasons))
 
 
 def check_verdict(content: Mapping[str, Any], where: str) -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from brokk_rl.contracts.vision import Ellipse
+from perception.ellipse import conic
 from perception.ellipse.edges import Edges
 from perception.ellipse.support import STROKE_PX, EllipseCandidates
 
@@ -47,16 +49,6 @@ class CandidateFit:
         return CandidateFit(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
-@dataclass(frozen=True)
-class FoundEllipse:
-    """An accepted ellipse: its row `(5,)` and the figures of `Ellipse`."""
-
-    row: np.ndarray
-    rms_px: float
-    coverage: float
-    score: float
-
-
 def measure_wholeness(coverage: np.ndarray) -> np.ndarray:
     """Return 1 at full coverage, falling to 0 at one half.
 
@@ -72,11 +64,11 @@ def is_centre_inside(ellipses: np.ndarray, edges: Edges) -> np.ndarray:
     return (x >= 0) & (y >= 0) & (x < width) & (y < height)
 
 
-def is_other_side_of_line(row: np.ndarray, others: list[FoundEllipse]) -> bool:
+def is_other_side_of_line(row: np.ndarray, others: list[Ellipse]) -> bool:
     """Return whether an ellipse and one of the others are the two edges of a thin line."""
     for other in others:
-        apart = np.abs(other.row - row)
-        areas = row[2] * row[3], other.row[2] * other.row[3]
+        apart = np.abs(conic.as_row(other) - row)
+        areas = row[2] * row[3], other.a * other.b
         is_near = apart[:2].max() < 0.5 * STROKE_PX and apart[2:4].max() < STROKE_PX
         if is_near and min(areas) > SAME_AREA * max(areas):
             return True

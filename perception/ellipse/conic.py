@@ -9,6 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from brokk_rl.contracts.vision import Ellipse
+
+
+def as_row(ellipse: Ellipse) -> np.ndarray:
+    """Return centre, semi-axes and direction of an ellipse, `(5,)`."""
+    return np.array([ellipse.x, ellipse.y, ellipse.a, ellipse.b, ellipse.theta_rad])
+
 
 def fit_ellipses(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Fit ellipses to weighted points, `(C, 5)`; a row of NaN where the points determine none.
@@ -207,30 +214,3 @@ def _evaluate_forms(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarra
     p, q = 2 * u / a, 2 * v / b
     slope[..., 0], slope[..., 1] = c * p - s * q, s * p + c * q
     return u * u + v * v - 1.0, slope
-
-
-def project_onto_plane(
-    ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the curve on the plane `m · P = 1` that a camera sees as an ellipse.
-
-    Args:
-        ellipse: In the picture, `(5,)`.
-        camera_matrix: `(3, 3)`.
-        m: The plane, `(3,)`.
-
-    Returns:
-        The centre of the curve in camera coordinates, `(3,)` m, and its semi-axes `(2,)`, NaN where
-        it is no ellipse.
-    """
-    ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
-    origin = ray / (m @ ray)
-    normal = m / np.linalg.norm(m)
-    first = np.cross(normal, [0.0, 1.0, 0.0] if abs(normal[1]) < 0.9 else [1.0, 0.0, 0.0])
-    first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
-    homography = camera_matrix @ np.column_stack([first, second, origin])
-    curve = convert_forms_to_ellipses(
-        (homography.T @ build_quadratic_forms(ellipse) @ homography)[None]
-    )[0]
-    return origin + curve[0] * first + curve[1] * second, curve[2:4]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import cv2
@@ -16,7 +17,6 @@ from perception.ellipse import edges as ellipse_edges
 from perception.ellipse import support as ellipse_support
 from perception.ellipse.candidate_fit import (
     CandidateFit,
-    FoundEllipse,
     is_centre_inside,
     is_other_side_of_line,
     measure_wholeness,
@@ -24,6 +24,42 @@ from perception.ellipse.candidate_fit import (
 from perception.ellipse.edges import Edges
 from perception.ellipse.picture_noise import estimate_noise
 from perception.ellipse.support import ANGLES, NUM_SAMPLES, EllipseCandidates
+
+# A change of these by 20 % changed no count of drawn patterns, photographs and hidden ellipses.
+PERCENTILE, NOISE, LOW = 85.0, 4.0, 0.4
+"""Upper threshold of edges: percentile of the gradient, and least value in standard deviations of
+noise; lower threshold as a part of the upper one."""
+REACH_RELATIVE = 0.03
+"""Reach of an ellipse per px of its geometric mean semi-axis."""
+FLATTEST = 0.18
+"""Least ratio of the semi-axes where the size is unknown."""
+# Each of these times 0.8 or 1.25 left every count of 8 drawn patterns, 3 pictures of hidden discs and
+# 6 negatives as it was. SMALLEST_PICTURE_PX, ROUNDING_PX, PRECISE_PX and ROUGH_PX were not varied.
+NO_ELLIPSES = np.empty((0, 5))
+SMALLEST_PICTURE_PX = 8
+"""Smallest side of a picture that can hold an ellipse with its edges."""
+FULL_ANGLE_COVERAGE = 0.6
+"""Coverage below which the limit of the angles no longer shrinks: there the waviness decides."""
+FAINT, SMALL_PX = 0.12, 6.0
+"""Least strength of an ellipse of that size, as a part of the strongest edges; it falls with the
+size. Faint stains are round all over."""
+ROUNDING_PX = 2
+"""Addition to the reach within which the nearest edge is looked up, for rounding to pixels."""
+LEAST_ARC, HALFWAY = 0.2, 0.3
+"""Part of an ellipse from which the rest can be told, and part with support after refinement."""
+PRECISE_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
+"""Rounds of refinement: the distance at which a point counts a quarter. The rougher ones serve
+where the size is known."""
+ANGLE_WEIGHT = 0.05
+"""Departure of the cosine between gradient and normal at which a point counts a quarter."""
+TAIL = 1.6
+"""Limit of the root mean square over that of the robust standard deviation of the distances."""
+TIGHT = 0.7
+"""Part of the reach that counts once the ellipse is refined."""
+SHARED = 0.4
+"""Part of its support that an ellipse may share with better ones."""
+SEARCH_SLACK = 1.5
+"""Factor on the size limits before refinement."""
 
 
 @spec
@@ -88,54 +124,6 @@ class ContourArcs:
     smallest_px: float
     prior_flattest: float
 
-    def build(self) -> ArcDetector:
-        """Return a detector."""
-        return ArcDetector(self)
-
-
-# A change of these by 20 % changed no count of drawn patterns, photographs and hidden ellipses.
-PERCENTILE, NOISE, LOW = 85.0, 4.0, 0.4
-"""Upper threshold of edges: percentile of the gradient, and least value in standard deviations of
-noise; lower threshold as a part of the upper one."""
-REACH_RELATIVE = 0.03
-"""Reach of an ellipse per px of its geometric mean semi-axis."""
-FLATTEST = 0.18
-"""Least ratio of the semi-axes where the size is unknown."""
-# Each of these times 0.8 or 1.25 left every count of 8 drawn patterns, 3 pictures of hidden discs and
-# 6 negatives as it was. SMALLEST_PICTURE_PX, ROUNDING_PX, PRECISE_PX and ROUGH_PX were not varied.
-NO_ELLIPSES = np.empty((0, 5))
-SMALLEST_PICTURE_PX = 8
-"""Smallest side of a picture that can hold an ellipse with its edges."""
-FULL_ANGLE_COVERAGE = 0.6
-"""Coverage below which the limit of the angles no longer shrinks: there the waviness decides."""
-FAINT, SMALL_PX = 0.12, 6.0
-"""Least strength of an ellipse of that size, as a part of the strongest edges; it falls with the
-size. Faint stains are round all over."""
-ROUNDING_PX = 2
-"""Addition to the reach within which the nearest edge is looked up, for rounding to pixels."""
-LEAST_ARC, HALFWAY = 0.2, 0.3
-"""Part of an ellipse from which the rest can be told, and part with support after refinement."""
-PRECISE_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
-"""Rounds of refinement: the distance at which a point counts a quarter. The rougher ones serve
-where the size is known."""
-ANGLE_WEIGHT = 0.05
-"""Departure of the cosine between gradient and normal at which a point counts a quarter."""
-TAIL = 1.6
-"""Limit of the root mean square over that of the robust standard deviation of the distances."""
-TIGHT = 0.7
-"""Part of the reach that counts once the ellipse is refined."""
-SHARED = 0.4
-"""Part of its support that an ellipse may share with better ones."""
-SEARCH_SLACK = 1.5
-"""Factor on the size limits before refinement."""
-
-
-class ArcDetector:
-    """Detector of ellipses by grouping arcs, with the settings `ContourArcs`."""
-
-    def __init__(self, settings: ContourArcs) -> None:
-        self.settings = settings
-
     def detect(
         self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
     ) -> list[Ellipse]:
@@ -146,7 +134,6 @@ class ArcDetector:
             roi: Region to search, `(h, w)` bool; `None` for everywhere.
             prior: Range of their size; `None` for any size.
         """
-        s = self.settings
         # Only the box of the region is searched: time is proportional to its area.
         left, top, width, height = (
             (0, 0, *gray.shape[::-1]) if roi is None else cv2.boundingRect(roi.view(np.uint8))
@@ -167,36 +154,26 @@ class ArcDetector:
             PERCENTILE,
             NOISE,
             LOW,
-            s.arc_points,
+            self.arc_points,
             near_px,
         )
         if not len(edges.points):
             return []
         # An arc of a large ellipse must be long; a short one fits any curvature.
-        least = max(s.arc_points, int(0.5 * limits.lowest_px))
-        edges = edges.cut(s.arc_tolerance_px, s.corner_rad, least)
+        least = max(self.arc_points, int(0.5 * limits.lowest_px))
+        edges = edges.cut(self.arc_tolerance_px, self.corner_rad, least)
         # Back to the coordinates of the whole picture.
-        shift = np.array([left, top, 0.0, 0.0, 0.0])
-        return [
-            Ellipse(
-                *map(float, one.row + shift),
-                rms_px=float(one.rms_px),
-                coverage=float(one.coverage),
-                score=float(one.score),
-            )
-            for one in self._find_on(edges, limits)
-        ]
+        return [replace(one, x=one.x + left, y=one.y + top) for one in self._find_on(edges, limits)]
 
     def _choose_blur(self, gray: np.ndarray, limits: SizePrior) -> float:
         """Return the blur before the gradient, px: in noise more, of which small rims bear little."""
-        s = self.settings
-        wanted_px = np.sqrt(estimate_noise(gray) / s.noise_levels)
-        highest_px = s.sigma_noise_px
+        wanted_px = np.sqrt(estimate_noise(gray) / self.noise_levels)
+        highest_px = self.sigma_noise_px
         if limits.lowest_px > 0:
             highest_px = min(highest_px, 0.2 * limits.lowest_px)
-        return float(np.clip(wanted_px, s.sigma_px, max(highest_px, s.sigma_px)))
+        return float(np.clip(wanted_px, self.sigma_px, max(highest_px, self.sigma_px)))
 
-    def _find_on(self, edges: Edges, limits: SizePrior) -> list[FoundEllipse]:
+    def _find_on(self, edges: Edges, limits: SizePrior) -> list[Ellipse]:
         """Return the ellipses of whole contours, single arcs and groups of arcs, the best first.
 
         Args:
@@ -222,9 +199,7 @@ class ArcDetector:
         groups = [arcs[group] for group in ellipse_edges.group_arcs(arcs, edges, (4, 3, 2))]
         # Pieces of arcs only where the size is unknown: elsewhere they add nothing but time.
         if limits.lowest_px == 0:
-            parts = np.concatenate(
-                [parts, ellipse_edges.split_arcs(arcs, self.settings.arc_points)]
-            )
+            parts = np.concatenate([parts, ellipse_edges.split_arcs(arcs, self.arc_points)])
         kinds = (spans[:, None], parts[:, None], *groups)
         seeds = np.concatenate([ellipse_edges.select_seed_points(some) for some in kinds])
         lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
@@ -295,14 +270,14 @@ class ArcDetector:
 
     def _judge(
         self, candidates: EllipseCandidates, edges: Edges, limits: SizePrior
-    ) -> list[FoundEllipse]:
+    ) -> list[Ellipse]:
         """Return the candidates with enough support of the right kind, each rim once."""
         # Sized without slack now: the refined ellipse is final.
         sized = self._is_sized(candidates.ellipses, limits, 1.0)
         candidates = candidates[sized & is_centre_inside(candidates.ellipses, edges)]
         if not len(candidates.ellipses):
             return []
-        s, slack = self.settings, self._choose_slack(limits)
+        slack = self._choose_slack(limits)
         fit = self._measure_fit(candidates, edges, slack)
         good = self._has_good_shape(fit, edges, slack)
         # Coverage, distance and angle each scale the score, so that none can make up for another.
@@ -316,14 +291,14 @@ class ArcDetector:
         good = self._has_own_edges(fit, edges, limits, slack)
         # A whole ellipse must fit well to count; of half of one its limits are nearly enough.
         share = np.maximum(np.clip(3 * fit.coverage - 1.5, 0.0, 1.0), 0.9 * fit.coverage)
-        good &= score * slack**2 >= s.score * share
+        good &= score * slack**2 >= self.score * share
         return self._choose(fit[good], score[good], edges)
 
     def _measure_fit(
         self, candidates: EllipseCandidates, edges: Edges, slack: float
     ) -> CandidateFit:
         """Return how well the edges around the candidates fit, with the limits of that."""
-        s, e = self.settings, candidates.ellipses
+        e = candidates.ellipses
         support, off, along = self._gather(candidates, edges, ANGLES, TIGHT)
         # No support has index -1, which must not count as the last edge point.
         there = support >= 0
@@ -342,16 +317,17 @@ class ArcDetector:
             off_px=off,
             rms_px=np.sqrt((off**2 * there).sum(1) / count),
             spread_px=ellipse_support.estimate_spread(np.abs(off), there),
-            spread_limit_px=slack * (s.rms_px * coverage + s.rms_relative * size * whole),
+            spread_limit_px=slack * (self.rms_px * coverage + self.rms_relative * size * whole),
             angle_rad=ellipse_support.estimate_spread(angles, there),
-            angle_limit_rad=slack * (s.angle_rms_rad * seen**1.5 + s.angle_rms_small / size * seen),
+            angle_limit_rad=slack
+            * (self.angle_rms_rad * seen**1.5 + self.angle_rms_small / size * seen),
         )
 
     def _has_good_shape(self, fit: CandidateFit, edges: Edges, slack: float) -> np.ndarray:
         """Find candidates whose support is long and close enough, and no accident, `(C,)`."""
-        s, e = self.settings, fit.candidates.ellipses
+        e = fit.candidates.ellipses
         size, whole = np.sqrt(e[:, 2] * e[:, 3]), measure_wholeness(fit.coverage)
-        good = fit.coverage >= s.coverage
+        good = fit.coverage >= self.coverage
         good &= fit.spread_px <= fit.spread_limit_px
         good &= fit.rms_px <= TAIL * fit.spread_limit_px
         good &= fit.angle_rad <= fit.angle_limit_rad
@@ -360,8 +336,8 @@ class ArcDetector:
         )
         waviness = np.hypot(
             # A fixed part for noise, and a share of the size for rims that are not quite round.
-            wave_px / (s.wave_px + s.rms_relative * size * whole),
-            wave_rad / (s.wave_rad + s.wave_small / size),
+            wave_px / (self.wave_px + self.rms_relative * size * whole),
+            wave_rad / (self.wave_rad + self.wave_small / size),
         )
         good &= waviness <= slack * (1 + whole)
         perimeter = conic.compute_perimeter(e[:, 2], e[:, 3])
@@ -369,21 +345,21 @@ class ArcDetector:
             fit.coverage,
             fit.angle_rad,
             perimeter,
-            s.angle_rad,
+            self.angle_rad,
             # The odds grow with the perimeter: a longer support is less of an accident.
         )
-        return good & (evidence >= s.evidence)
+        return good & (evidence >= self.evidence)
 
     def _has_own_edges(
         self, fit: CandidateFit, edges: Edges, limits: SizePrior, slack: float
     ) -> np.ndarray:
         """Find candidates whose edges are theirs alone: those of no spiral, heart or stain, `(C,)`."""
-        s, candidates, support, length = self.settings, fit.candidates, fit.support, fit.length
-        good = ellipse_support.measure_largest_gap(support >= 0, length) <= s.gap
+        candidates, support, length = fit.candidates, fit.support, fit.length
+        good = ellipse_support.measure_largest_gap(support >= 0, length) <= self.gap
         # An occluder explains a corner between the edge and the ellipse.
         occluded = ellipse_support.find_occluded(candidates, edges, support, length)
         purity = ellipse_support.measure_purity(edges, support, length)
-        good &= occluded | (purity >= s.purity / slack)
+        good &= occluded | (purity >= self.purity / slack)
         if limits.lowest_px == 0:
             # A known size excludes the shapes that these two gates are for.
             size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
@@ -398,11 +374,11 @@ class ArcDetector:
             )
         return good
 
-    def _choose(self, fit: CandidateFit, score: np.ndarray, edges: Edges) -> list[FoundEllipse]:
+    def _choose(self, fit: CandidateFit, score: np.ndarray, edges: Edges) -> list[Ellipse]:
         """Return the candidates that share little support with better ones."""
         # Points of a better ellipse are claimed: a second ellipse may not live on them.
         claimed = np.zeros(len(edges.points), bool)
-        found: list[FoundEllipse] = []
+        found: list[Ellipse] = []
         # A stable order, so that equal scores give the same result everywhere.
         for k in np.argsort(-score, kind="stable"):
             own = fit.support[k][fit.support[k] >= 0]
@@ -416,8 +392,8 @@ class ArcDetector:
             angles = np.arange(number) * (2 * np.pi / number)
             dense = self._gather(candidate, edges, angles)[0][0]
             claimed[dense[dense >= 0]] = True
-            judged = (float(values[k]) for values in (fit.rms_px, fit.coverage, score))
-            found.append(FoundEllipse(row, *judged))
+            judged = (values[k] for values in (fit.rms_px, fit.coverage, score))
+            found.append(Ellipse(*map(float, (*row, *judged))))
         return found
 
     def _gather(
@@ -430,7 +406,7 @@ class ArcDetector:
         """Return the support within reach; see `gather_support`."""
         reach_px = tight * self._reach(candidates.ellipses)
         return ellipse_support.gather_support(
-            candidates, edges, angles_rad, reach_px, self.settings.angle_rad
+            candidates, edges, angles_rad, reach_px, self.angle_rad
         )
 
     def _is_sized(self, ellipses: np.ndarray, limits: SizePrior, slack: float) -> np.ndarray:
@@ -441,15 +417,15 @@ class ArcDetector:
             return (
                 (a * slack >= limits.lowest_px)
                 & (a <= limits.highest_px * slack)
-                & (b * slack >= self.settings.smallest_px)
+                & (b * slack >= self.smallest_px)
                 & (b * slack >= a * self._choose_flattest(limits))
             )
 
     def _choose_flattest(self, limits: SizePrior) -> float:
-        return self.settings.prior_flattest if limits.lowest_px > 0 else FLATTEST
+        return self.prior_flattest if limits.lowest_px > 0 else FLATTEST
 
     def _choose_slack(self, limits: SizePrior) -> float:
-        return self.settings.prior_slack if limits.lowest_px > 0 else 1.0
+        return self.prior_slack if limits.lowest_px > 0 else 1.0
 
     def _select_compact(self, spans: np.ndarray, edges: Edges, limits: SizePrior) -> np.ndarray:
         """Return the spans that are neither larger nor smaller than a good part of an ellipse."""
@@ -468,7 +444,7 @@ class ArcDetector:
 
     def _limit_reach(self, size_px: np.ndarray | float) -> np.ndarray:
         """Return the reach of ellipses of a geometric mean semi-axis, px."""
-        least_px = self.settings.reach_px
+        least_px = self.reach_px
         # Proportional to the size, since rims deviate by a share of it; bounded against other
         # edges.
         return np.clip(REACH_RELATIVE * size_px, least_px, 4.0 * least_px)

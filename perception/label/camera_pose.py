@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -24,19 +23,8 @@ MAX_ERROR_RATIO = 3.0
 The poses of the arm then decide between the two.
 """
 NUM_CANDIDATES = 2
-
-
-@dataclass(frozen=True)
-class CameraPose:
-    """Pose of a camera in the world: the board's frame.
-
-    Attributes:
-        world_from_camera: `(4, 4)`, optical convention.
-        error_px: Root mean square reprojection error of the board's corners.
-    """
-
-    world_from_camera: np.ndarray
-    error_px: float
+SAME_CORNER_M = 1e-6
+"""Distance below which two corners are the same one."""
 
 
 @dataclass(frozen=True)
@@ -131,65 +119,6 @@ def _compute_pose_information(
     return rows.T @ rows + 1e-9 * np.eye(6)
 
 
-class BoardTracker:
-    """Finds a flat board in frames.
-
-    Args:
-        board: OpenCV's description of it.
-        detect: Returns corners and their numbers, as OpenCV gives them, in a grey picture.
-        min_corners: Corners that must be seen.
-        max_error_px: Largest reprojection error of a pose.
-    """
-
-    def __init__(
-        self,
-        board: Any,
-        detect: Callable[[np.ndarray], Sequence[Any]],
-        min_corners: int,
-        max_error_px: float,
-    ) -> None:
-        self._board, self._detect = board, detect
-        self._min_corners, self._max_error_px = min_corners, max_error_px
-
-    def find_corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners in the board's frame, `(n, 3)` m, and in the picture, `(n, 2)` px.
-
-        Raises:
-            FrameError: too few are seen.
-        """
-        gray = convert_to_gray(frame)
-        found, numbers = self._detect(gray)[:2]
-        count = _count_corners(found, numbers)
-        if frame.gamma != 1.0:
-            # A tone curve brightens blurred cells of small markers; dark boards have few levels of
-            # linear light. The picture in which more is seen counts.
-            light = np.rint(linearize(gray, frame.gamma)).astype(np.uint8)
-            other = self._detect(light)[:2]
-            if _count_corners(*other) > count:
-                (found, numbers), count = other, _count_corners(*other)
-        if count < self._min_corners:
-            raise FrameError(
-                f"{frame.name}: {count} corners of the board are seen, {self._min_corners} are "
-                "needed"
-            )
-        corners_m, corners_px = self._board.matchImagePoints(found, numbers)
-        return corners_m.reshape(-1, 3).astype(float), corners_px.reshape(-1, 2).astype(float)
-
-    def locate(self, frame: Frame) -> CameraPose:
-        """Return the camera's pose in the board's frame.
-
-        Raises:
-            FrameError: too few corners are seen, or they fit no pose.
-        """
-        found = estimate_board_pose(frame, *self.find_corners(frame), 0.0, self._max_error_px)
-        return CameraPose(transforms.invert(found.camera_from_board[0]), found.error_px)
-
-
-def _count_corners(found: Sequence[np.ndarray], numbers: np.ndarray | None) -> int:
-    """Return the number of corners; OpenCV gives one array for each marker, or one for all."""
-    return 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
-
-
 @spec
 class Charuco:
     """The camera's pose from a ChArUco board beside the block.
@@ -213,23 +142,61 @@ class Charuco:
     max_error_px: float
 
     def check(self) -> None:
-        _check_dictionary(self.dictionary)
+        known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
+        if self.dictionary not in known:
+            raise ConfigError(
+                f"dictionary: OpenCV has no '{self.dictionary}'; choices: {', '.join(known)}"
+            )
         if self.marker_m >= self.square_m:
             raise ConfigError(
                 f"marker_m: expected less than square_m={self.square_m}, got {self.marker_m}"
             )
 
-    def build(self) -> BoardTracker:
-        """Return a tracker."""
+    def find_corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corners in the board's frame, `(n, 3)` m, and in the picture, `(n, 2)` px.
+
+        Raises:
+            FrameError: too few are seen.
+        """
+        board = self.describe()
+        gray, detector = convert_to_gray(frame), cv2.aruco.CharucoDetector(board)
+        found, numbers = detector.detectBoard(gray)[:2]
+        if frame.gamma != 1.0:
+            # A tone curve brightens blurred cells of small markers; dark boards have few levels of
+            # linear light. The picture in which more is seen counts.
+            light = np.rint(linearize(gray, frame.gamma)).astype(np.uint8)
+            others, other_numbers = detector.detectBoard(light)[:2]
+            if _count(other_numbers) > _count(numbers):
+                found, numbers = others, other_numbers
+        if _count(numbers) < self.min_corners:
+            raise FrameError(
+                f"{frame.name}: {_count(numbers)} corners of the board are seen, {self.min_corners} "
+                "are needed"
+            )
+        corners_m, corners_px = board.matchImagePoints(found, numbers)
+        return corners_m.reshape(-1, 3).astype(float), corners_px.reshape(-1, 2).astype(float)
+
+    def locate(self, frame: Frame) -> BoardPose:
+        """Return the pose of the board in the camera.
+
+        Raises:
+            FrameError: too few corners are seen, or they fit no pose.
+        """
+        return estimate_board_pose(frame, *self.find_corners(frame), 0.0, self.max_error_px)
+
+    def describe(self) -> Any:
+        """Return OpenCV's description of the board."""
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        board = cv2.aruco.CharucoBoard(
-            (self.columns, self.rows), self.square_m, self.marker_m, markers
-        )
-        detect = cv2.aruco.CharucoDetector(board).detectBoard
-        return BoardTracker(board, detect, self.min_corners, self.max_error_px)
+        size = (self.columns, self.rows)
+        return cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, markers)
 
 
-def _check_dictionary(dictionary: str) -> None:
-    if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
-        known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-        raise ConfigError(f"dictionary: OpenCV has no '{dictionary}'; choices: {', '.join(known)}")
+def match_corners(one_m: np.ndarray, other_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows, `(k,)` each, of the corners that are in both lists, `(n, 3)` and `(m, 3)`."""
+    apart_m = np.abs(one_m[:, None] - other_m).max(2)
+    rows = np.nonzero(apart_m < SAME_CORNER_M)
+    return rows[0], rows[1]
+
+
+def _count(numbers: np.ndarray | None) -> int:
+    return 0 if numbers is None else len(numbers)

@@ -16,13 +16,14 @@ import numpy as np
 
 from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.progress import ItemProgress
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception import dataset
+from perception.calibrate import transforms
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.label.camera_pose import Charuco
 from perception.label.measured import MeasuredHole, MeasuredScene, read_measured
+from perception.sources.look import look_at_frames
 
 FRAMES, OVERLAYS = "frames", "overlays"
 LEAST_STEP_M = 0.02
@@ -81,32 +82,27 @@ class BlockLabelling:
             FrameError: no frame can be labelled.
         """
         scene = read_measured(Path(self.measured), "label.measured")
-        if scene.block_m is None:
+        if scene.block is None:
             raise ConfigError(f"label.measured={self.measured}: expected a block; add `block`")
-        tracker, entries = self.board.build(), {}
-        with self.source.build() as source, ItemProgress("masks", source.num_frames) as progress:
-            while True:
-                progress.advance()
-                try:
-                    frame = source.read_latest()
-                    if frame is None:
-                        break
-                    pose = tracker.locate(frame)
-                except FrameError as error:
-                    # The message begins with the path of the frame.
-                    name = str(error).split(":")[0].split("/")[-1]
-                    entries[name] = _describe_entry(str(error))
-                    continue
-                name = Path(frame.name).name
-                view = self._build_view(scene, scene.block_m, frame, pose.world_from_camera)
-                reason = self._find_fault(view)
-                entries[name] = _describe_entry(reason, pose.error_px, view.depth_share)
-                picture = _draw_overlay(frame, view.label, reason is None)
-                dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
-                if reason is None:
-                    truth = _build_truth(scene, frame, pose.world_from_camera, view.hidden)
-                    stem = folder / FRAMES / name
-                    dataset.write_frame(stem, frame.color, None, label=view.label, truth=truth)
+        corner_m, entries = np.array(scene.block.corner_m), {}
+        block_m = np.stack([corner_m, corner_m + scene.block.size_m])
+
+        def label(frame: Frame) -> dict[str, Any]:
+            """Write what a frame gives, and return its figures."""
+            pose, name = self.board.locate(frame), Path(frame.name).name
+            world_from_camera = transforms.invert(pose.camera_from_board[0])
+            view = self._build_view(scene, block_m, frame, world_from_camera)
+            reason = self._find_fault(view)
+            picture = _draw_overlay(frame, view.label, reason is None)
+            dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
+            if reason is None:
+                truth = _build_truth(scene, frame, pose.camera_from_board[0], view.hidden)
+                stem = folder / FRAMES / name
+                dataset.write_frame(stem, frame.color, None, label=view.label, truth=truth)
+            return _describe_entry(reason, pose.error_px, view.depth_share)
+
+        for name, entry, reason in look_at_frames(self.source, "masks", label):
+            entries[name] = entry or _describe_entry(reason)
         num_labelled = sum(entry["left_out"] is None for entry in entries.values())
         if not num_labelled:
             reasons = sorted({str(entry["left_out"]) for entry in entries.values()})
@@ -173,9 +169,9 @@ def _trace_box(bounds_m: np.ndarray, rays: np.ndarray) -> np.ndarray:
 
 def _trace_mouth(hole: MeasuredHole, eye_m: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Find rays `(h, w, 3)` that enter a hole through its rim."""
-    toward = rays @ hole.axis
+    toward = rays @ hole.outward
     facing = toward < 0
-    depth_m = (hole.center_m - eye_m) @ hole.axis / np.where(facing, toward, -1.0)
+    depth_m = (hole.center_m - eye_m) @ hole.outward / np.where(facing, toward, -1.0)
     away_m = eye_m + rays * depth_m[..., None] - hole.center_m
     return facing & (depth_m > 0) & (np.linalg.norm(away_m, axis=-1) < hole.radius_m)
 
@@ -190,26 +186,18 @@ def _remove_specks(mask: np.ndarray) -> np.ndarray:
 
 
 def _build_truth(
-    scene: MeasuredScene, frame: Frame, pose: np.ndarray, hidden: tuple[float, ...]
+    scene: MeasuredScene, frame: Frame, camera_from_board: np.ndarray, hidden: tuple[float, ...]
 ) -> SceneTruth:
     """Return the holes as a truth file has them; without a known base the board stands in for it."""
-    camera_from_board = np.linalg.inv(pose)
-    base = pose if frame.base_from_camera is None else frame.base_from_camera
+    base = frame.base_from_camera
+    if base is None:
+        base = transforms.invert(camera_from_board)
     circles = []
     for hole, part in zip(scene.holes, hidden, strict=True):
         center = camera_from_board[:3, :3] @ hole.center_m + camera_from_board[:3, 3]
-        axis = camera_from_board[:3, :3] @ hole.axis
-        circle = TrueCircle(
-            center_m=tuple(center.tolist()),
-            axis=tuple(axis.tolist()),
-            center_in_base_m=tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
-            axis_in_base=tuple((base[:3, :3] @ axis).tolist()),
-            radius_m=hole.radius_m,
-            depth_m=0.0,
-            hidden=part,
-            in_view=part < 1.0,
-        )
-        circles.append(circle)
+        axis = camera_from_board[:3, :3] @ hole.outward
+        place = (center, axis, base, hole.radius_m)
+        circles.append(TrueCircle.place(*place, depth_m=0.0, hidden=part, in_view=part < 1.0))
     return SceneTruth("real", {}, tuple(circles), (), {})
 
 

@@ -87,11 +87,7 @@ def draw_board(board: Charuco, margin_m: float) -> Figure:
         f"100 mm. board.dictionary={board.dictionary} board.columns={board.columns} "
         f"board.rows={board.rows} board.square_m={board.square_m:g} board.marker_m={board.marker_m:g}"
     )
-    sheet.text(ruler[0], 0.2 * margin_m, text, fontsize=_fit_font(text, width_m))
-    return figure
-
-
-def _fit_font(text: str, width_m: float) -> float:
-    """Return a font size, points, at which a text fits into a width."""
     # A letter is about 0.6 of its size wide; 72 points are an inch.
-    return min(10.0, 72.0 * width_m / METRES_PER_INCH / (0.6 * len(text)))
+    font_points = min(10.0, 72.0 * width_m / METRES_PER_INCH / (0.6 * len(text)))
+    sheet.text(ruler[0], 0.2 * margin_m, text, fontsize=font_points)
+    return figure

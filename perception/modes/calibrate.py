@@ -71,8 +71,7 @@ def _show(content: dict[str, Any]) -> None:
     work = content["point_std_m"]
     rows.append((f"uncertainty at {work['at_m']:g} m", f"±{1000 * work['std_m']:.1f} mm"))
     residual = content["residual"]
-    turn = "" if residual["rms_rad"] is None else f", {residual['rms_rad']:.4f} rad"
-    rows.append(("residual", f"{1000 * residual['rms_m']:.1f} mm{turn}"))
+    rows.append(("residual", f"{1000 * residual['rms_m']:.1f} mm, {residual['rms_rad']:.4f} rad"))
     rows.append(("poses", f"{content['num_used']} used, {content['num_left_out']} left out"))
     for one in content["poses"]:
         if one["left_out"]:

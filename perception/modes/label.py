@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 from brokk_rl.console_table import print_table
 from brokk_rl.session import Session, write_json
@@ -33,18 +32,12 @@ class Label:
         """
         result = self.label.label(self.session.folder)
         write_json(self.session.folder / "labels.json", result)
-        _show(result)
+        frames = result["frames"]
+        rows = []
+        for name, entry in frames.items():
+            board = entry["board_px"] and f"{entry['board_px']:.2f}"
+            share = entry["depth_share"] and f"{entry['depth_share']:.0%}"
+            rows.append((name, board, share, entry["left_out"] or ""))
+        head = ("frame", "board [px]", "depth agrees", "left out because")
+        print_table(head, rows, f"{result['num_labelled']} of {len(frames)} frames labelled")
         log.info("training.frames=%s", self.session.folder / "frames")
-
-
-def _show(result: dict[str, Any]) -> None:
-    rows = []
-    for name, entry in result["frames"].items():
-        board = None if entry["board_px"] is None else f"{entry['board_px']:.2f}"
-        share = None if entry["depth_share"] is None else f"{entry['depth_share']:.0%}"
-        rows.append((name, board, share, entry["left_out"] or ""))
-    print_table(
-        ("frame", "board [px]", "depth agrees", "left out because"),
-        rows,
-        f"{result['num_labelled']} of {len(result['frames'])} frames labelled",
-    )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal
@@ -17,24 +16,22 @@ import numpy as np
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.vision import (
     BoreholeFinder,
-    Ellipse,
     FinderSpec,
     FrameDetections,
     FrameSourceSpec,
-    HolePose,
     HoleTracker,
     Rejection,
     TrackedHole,
     TrackerSpec,
 )
 from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, spec
 from perception.contracts import SteeredFinder
 from perception.finder import StagedFinder
 from perception.overlay import OverlayDrawing
+from perception.sources.look import look_at_frames
 from perception.tracking.steered_search import SteeredSearch
 
 log = logging.getLogger(__name__)
@@ -81,18 +78,13 @@ class FrameEntry:
             "name": self.name,
             "ms": {stage: round(value, 3) for stage, value in self.found.ms.items()},
         }
-        plain["holes"] = [_describe_hole(one) for one in self.found.holes]
-        plain["rejected"] = [_describe_rejection(one) for one in self.found.rejected]
-        plain["ellipses"] = [_describe_ellipse(one) for one in self.found.ellipses]
+        for name in ("holes", "rejected", "ellipses"):
+            plain[name] = [_to_plain(asdict(one)) for one in getattr(self.found, name)]
         plain["target"] = None
         if self.target is not None:
             hole, age_s = self.target
-            plain["target"] = {
-                **_describe_hole(hole.pose),
-                "num_frames": hole.num_frames,
-                "age_s": age_s,
-                "stale": hole.stale,
-            }
+            told = {"num_frames": hole.num_frames, "age_s": age_s, "stale": hole.stale}
+            plain["target"] = _to_plain(asdict(hole.pose)) | told
         return plain
 
 
@@ -151,49 +143,25 @@ class Perceive:
         self, finder: BoreholeFinder, tracker: HoleTracker
     ) -> Iterator[tuple[FrameEntry, Frame | None]]:
         """Yield the result of each frame of the source."""
-        search = SteeredSearch(finder, tracker)
-        look = search.update
+        look = SteeredSearch(finder, tracker).update
         if self.perceive.until == "ellipses":
             if not isinstance(finder, StagedFinder):
                 raise ConfigError(
                     f"perceive.until=ellipses: expected perception=plane_conic, got {type(finder).__name__}"
                 )
             look = finder.find_ellipses
-        for name, frame, refused in self._read_frames():
-            if frame is None:
-                yield FrameEntry(name, None, None, refused), None
-                continue
-            try:
-                found, tracked = look(frame)
-            except FrameError as error:
-                log.warning("%s", error)
-                yield FrameEntry(name, None, None, str(error)), frame
-                continue
-            target = _choose_target(tracked, frame.t_s)
-            yield FrameEntry(name, found, target, None), frame
 
-    def _read_frames(self) -> Iterator[tuple[str, Frame | None, str | None]]:
-        """Yield name, frame and, in place of a frame that cannot be used, the reason."""
-        with contextlib.ExitStack() as stack:
-            source = stack.enter_context(self.source.build())
-            # A live source has no number of frames.
-            counts = [source.num_frames, self.perceive.frames]
-            total = min((count for count in counts if count is not None), default=None)
-            progress = stack.enter_context(ItemProgress("looking", total))
-            number = 0
-            while total is None or number < total:
-                name = f"{number:05d}"
-                try:
-                    frame = source.read_latest()
-                except FrameError as error:
-                    yield name, None, str(error)
-                    log.warning("%s", error)
-                else:
-                    if frame is None:
-                        return
-                    yield Path(frame.name).name or name, frame, None
-                number += 1
-                progress.reach(number)
+        def look_closely(frame: Frame) -> tuple[Frame, FrameDetections, Sequence[TrackedHole]]:
+            return frame, *look(frame)
+
+        answers = look_at_frames(self.source, "looking", look_closely, self.perceive.frames)
+        for name, answer, reason in answers:
+            if answer is None:
+                log.warning("%s", reason)
+                yield FrameEntry(name, None, None, reason), None
+            else:
+                frame, found, tracked = answer
+                yield FrameEntry(name, found, _choose_target(tracked, frame.t_s), None), frame
 
     def _write(self, folder: Path, entries: list[FrameEntry], finder: BoreholeFinder) -> None:
         """Write `holes.json` and `explain.txt`."""
@@ -201,8 +169,11 @@ class Perceive:
         write_json(folder / "holes.json", {"schema": 1, "frames": frames})
         lines = []
         for entry in entries:
-            lines.append(f"{entry.name}: {entry.refused or _count_holes(entry.found)}")
-            for rejection in entry.found.rejected if entry.found else ():
+            if entry.found is None:
+                lines.append(f"{entry.name}: {entry.refused}")
+                continue
+            lines.append(f"{entry.name}: {len(entry.found.holes)} holes")
+            for rejection in entry.found.rejected:
                 lines.append(f"  {_explain(finder, rejection)}")
         write_text(folder / "explain.txt", "\n".join(lines) + "\n")
 
@@ -249,34 +220,10 @@ def _format_target(hole: TrackedHole) -> str:
     return f"({place}) m in {hole.pose.frame}, ±{std_mm:.1f} mm, {hole.num_frames} frames{stale}"
 
 
-def _count_holes(found: FrameDetections | None) -> str:
-    count = len(found.holes) if found else 0
-    if count == 0:
-        return "no hole"
-    return "1 hole" if count == 1 else f"{count} holes"
-
-
-def _describe_hole(pose: HolePose) -> dict[str, Any]:
-    return {
-        "center_m": pose.center_m.tolist(),
-        "axis": pose.axis.tolist(),
-        "radius_m": float(pose.radius_m),
-        "cov_m2": pose.cov_m2.tolist(),
-        "axis_cov_rad2": pose.axis_cov_rad2.tolist(),
-        "frame": pose.frame,
-        "score": float(pose.score),
-    }
-
-
-def _describe_rejection(one: Rejection) -> dict[str, Any]:
-    return {
-        "stage": one.stage,
-        "reason": one.reason,
-        "value": float(one.value) if math.isfinite(one.value) else None,
-        "limit": float(one.limit) if math.isfinite(one.limit) else None,
-        "ellipse": one.ellipse and _describe_ellipse(one.ellipse),
-    }
-
-
-def _describe_ellipse(one: Ellipse) -> dict[str, float]:
-    return {name: getattr(one, name) for name in ("x", "y", "a", "b", "theta_rad", "score")}
+def _to_plain(value: Any) -> Any:
+    """Return values as JSON has them: arrays as lists, `null` for what is no number."""
+    if isinstance(value, dict):
+        return {name: _to_plain(one) for name, one in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return None if isinstance(value, float) and not math.isfinite(value) else value

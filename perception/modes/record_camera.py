@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 from brokk_rl.errors import FrameError
@@ -15,11 +15,11 @@ from brokk_rl.session import Session, write_text
 from brokk_rl.spec import Count, spec
 from perception import dataset
 from perception.calibrate.pair_lens import calibrate_pair, find_board_pair
+from perception.camera import CameraModel, RawFrame, read_camera, write_camera
 from perception.label.camera_pose import Charuco
 from perception.sources import validation
-from perception.sources.folder import read_camera, read_yaml
-from perception.sources.lens_file import PairLens, read_pair_lens
-from perception.sources.recorded import ExportedPictures, RawFrame, SourceCapture, StereoVideo
+from perception.sources.lens_file import read_pair_lens
+from perception.sources.recorded import ExportedPictures, SourceCapture, StereoVideo
 from perception.sources.ros_log import RosLog
 
 log = logging.getLogger(__name__)
@@ -61,14 +61,13 @@ class RecordCamera:
             return
         folder = self.session.folder / FOLDER
         kept = 0
-        lens: PairLens | None = None
+        camera: CameraModel | None = None
         for frame in self._read_kept():
-            if lens is None:
-                lens, extra = self._find_lens(frame)
-                distortion = tuple(lens.distortion.ravel())
-                place = (lens.matrix, lens.size_px, None, lens.baseline_m, distortion)
-                dataset.write_camera(folder, *place, *extra)
-            self._write(folder / f"{kept:05d}", frame, lens)
+            if camera is None:
+                camera = self._find_camera(frame)
+                # Where it stands is another matter: that of `mode=calibrate`.
+                write_camera(folder, replace(camera, base_from_camera=None))
+            self._write(folder / f"{kept:05d}", frame, camera)
             kept += 1
         if not kept:
             raise FrameError("record_camera: the camera gave no picture")
@@ -81,14 +80,13 @@ class RecordCamera:
 
     def _calibrate_lens(self) -> None:
         """Write the lens of both cameras, by the pairs that show the board."""
-        tracker = self.board.build()
         pairs, num_frames, size_px = [], 0, (0, 0)
         for frame in self._read_kept():
             num_frames += 1
             if frame.right is None:
                 raise FrameError(f"{frame.name}: lens=board needs pairs, got a single picture")
             size_px = frame.color.shape[1], frame.color.shape[0]
-            pair = find_board_pair(tracker, frame.color, frame.right, validation.USUAL_GAMMA)
+            pair = find_board_pair(self.board, frame.color, frame.right, validation.USUAL_GAMMA)
             if pair is not None:
                 pairs.append(pair)
         content = calibrate_pair(pairs, size_px)
@@ -99,34 +97,35 @@ class RecordCamera:
             len(pairs), num_frames, content["error_px"], path,
         )  # fmt: skip
 
-    def _find_lens(self, frame: RawFrame) -> tuple[PairLens, tuple[float | None, ...]]:
-        """Return the lens of the pictures, and deviation of the disparity and tone curve if told."""
-        size_px = frame.color.shape[1], frame.color.shape[0]
+    def _find_camera(self, frame: RawFrame) -> CameraModel:
+        """Return the camera of the pictures, by `lens` or as it tells itself."""
         if self.lens is None:
-            if frame.lens is None:
+            if frame.camera is None:
                 raise FrameError(
                     f"{frame.name}: the camera does not tell its lens; expected lens=camera.yaml, or "
                     "the factory file of the camera"
                 )
-            return frame.lens, ()
+            return frame.camera
         path = Path(self.lens)
-        content = None if path.suffix == ".conf" else read_yaml(path)
+        size_px = frame.color.shape[1], frame.color.shape[0]
+        content = (
+            None
+            if path.suffix == ".conf"
+            else validation.read_mapping(path, "the numbers of a lens")
+        )
         if content is None or "K1" in content:
-            return read_pair_lens(path, content, size_px), ()
-        model = read_camera(path)
-        where, picture = self.lens, frame.name
-        validation.check_size(model.size_px, size_px[1], size_px[0], where, picture)
-        validation.check_matrix_fits(model.matrix, size_px[1], size_px[0], where)
-        bent = np.zeros(0) if model.distortion is None else model.distortion
-        if frame.right is not None and (model.baseline_m is None or model.distortion is not None):
+            return read_pair_lens(path, content, size_px)
+        camera = read_camera(path)
+        camera.check_picture(frame.color, self.lens, frame.name)
+        is_pair = frame.right is not None
+        if is_pair and (camera.baseline_m is None or camera.distortion is not None):
             raise FrameError(
                 f"{self.lens}: a pair needs baseline_m and rectified pictures (dist 0); take the lens "
                 "of both raw cameras (K1 D1 K2 D2 R T), or capture.layout=single"
             )
-        lens = PairLens(model.matrix, bent, model.baseline_m, size_px, ())
-        return lens, (model.disparity_std_px, model.gamma)
+        return replace(camera, size_px=size_px)
 
-    def _write(self, stem: Path, frame: RawFrame, lens: PairLens) -> None:
+    def _write(self, stem: Path, frame: RawFrame, camera: CameraModel) -> None:
         """Write a frame, rectified."""
         pictures = [frame.color]
         if frame.right is not None:
@@ -135,10 +134,10 @@ class RecordCamera:
             pictures.append(frame.right)
         if frame.depth_m is not None:
             validation.check_same_size(frame.color, frame.depth_m, frame.name, "depth")
-            if lens.maps:
+            if camera.maps:
                 raise FrameError(
                     f"{frame.name}: depth belongs to the raw picture, which is rectified; record "
                     "rectified pictures, or without depth"
                 )
-        color, *right = lens.rectify(pictures, frame.name)
+        color, *right = camera.rectify(pictures, frame.name)
         dataset.write_frame(stem, color, frame.depth_m, right[0] if right else None)

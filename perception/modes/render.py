@@ -9,6 +9,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.progress import track_items
 from brokk_rl.session import Session
 from brokk_rl.spec import Count, Index, spec
+from perception import dataset
 from perception.render.frame_renderer import FrameRenderer
 
 log = logging.getLogger(__name__)
@@ -56,8 +57,8 @@ class Render:
         done = 0
         for number in track_items(numbers, "frames"):
             stem = folder / f"{number:05d}"
-            if self.studio.has(stem):
+            if dataset.is_whole(stem):
                 continue
-            self.studio.shoot(stem, scenes.view(number))
+            self.studio.shoot(stem, *scenes.compose(number))
             done += 1
         log.info("%d frames rendered, %d were there; see %s", done, len(numbers) - done, folder)

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import MinLen
@@ -18,11 +18,12 @@ from annotated_types import MinLen
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.vision import FinderSpec, FrameSourceSpec, HolePose
 from brokk_rl.errors import FrameError
-from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json
+from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.label.camera_pose import Charuco
 from perception.label.measured import MeasuredHole, read_measured
+from perception.sources.look import look_at_frames
 
 log = logging.getLogger(__name__)
 
@@ -124,34 +125,33 @@ class ScoreCamera:
         }
         content = {"schema": 1, **row, "refused": refused, "errors": [vars(one) for one in errors]}
         write_json(self.session.folder / FILE, content)
-        _show(row)
+        rows = []
+        for name, value in row.items():
+            rows.append((name, f"{value:.3g}" if isinstance(value, float) else value))
+        print_table((), rows)
         return median_m
 
     def _score_frames(
         self, holes: Sequence[MeasuredHole]
     ) -> tuple[list[tuple[list[HoleError], int]], dict[str, str]]:
         """Return errors and false holes of each frame, and why others were left out."""
-        finder, tracker = self.perception.build(), self.board.build()
-        frames: list[tuple[list[HoleError], int]] = []
-        refused: dict[str, str] = {}
-        with self.source.build() as source, ItemProgress("frames", source.num_frames) as progress:
-            number = 0
-            while True:
-                progress.reach(number)
-                number += 1
-                try:
-                    frame = source.read_latest()
-                    if frame is None:
-                        return frames, refused
-                    camera_from_board = np.linalg.inv(tracker.locate(frame).world_from_camera)
-                    # In camera coordinates, as the board tells the truth.
-                    found = finder.find(replace(frame, base_from_camera=None))
-                except FrameError as error:
-                    refused[f"{number - 1:05d}"] = str(error)
-                    continue
-                turn, shift_m = camera_from_board[:3, :3], camera_from_board[:3, 3]
-                true = [(turn @ hole.center_m + shift_m, turn @ hole.axis) for hole in holes]
-                frames.append(match_found_holes(Path(frame.name).name, found.holes, true))
+        finder = self.perception.build()
+
+        def score(frame: Frame) -> tuple[list[HoleError], int]:
+            camera_from_board = self.board.locate(frame).camera_from_board[0]
+            # In camera coordinates, as the board tells the truth.
+            found = finder.find(replace(frame, base_from_camera=None))
+            turn, shift_m = camera_from_board[:3, :3], camera_from_board[:3, 3]
+            true = [(turn @ hole.center_m + shift_m, turn @ hole.outward) for hole in holes]
+            return match_found_holes(Path(frame.name).name, found.holes, true)
+
+        frames, refused = [], {}
+        for name, one, reason in look_at_frames(self.source, "frames", score):
+            if one is None:
+                refused[name] = reason
+            else:
+                frames.append(one)
+        return frames, refused
 
 
 def match_found_holes(
@@ -186,14 +186,3 @@ def match_found_holes(
 
 def _measure_away_m(hole: HolePose, center_m: np.ndarray) -> float:
     return float(np.linalg.norm(hole.center_m - center_m))
-
-
-def _show(row: dict[str, Any]) -> None:
-    errors = []
-    for key in ("position_m_median", "position_m_p95"):
-        errors.append(None if row[key] is None else f"{1000 * row[key]:.1f} mm")
-    found = f"{row['found']} of {row['holes']}"
-    inside = f"{row['inside_3_sigma']} of {row['found']}"
-    counts = (str(row["frames"]), found, str(row["false"]))
-    head = ("kind", "session", "frames", "found", "no hole", "median", "95 %", "inside 3 σ")
-    print_table(head, [(row["kind"], row["name"], *counts, *errors, inside)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 from brokk_rl.console_table import print_table
 from brokk_rl.session import Session, write_json
@@ -37,20 +36,16 @@ class TrainPerception:
         """
         result = self.training.fit(self.session)
         write_json(self.session.folder / "training.json", result)
-        _show(result)
+        rows = []
+        for name, figures in result["conditions"].items():
+            overlaps = []
+            for part in ("block", "mouth"):
+                overlaps.append(None if figures[part] is None else f"{figures[part]:.3f}")
+            rows.append((name, figures["frames"], *overlaps))
+        head = ("condition", "frames", "overlap of blocks", "overlap of mouths")
+        print_table(head, rows, "on unseen frames")
         log.info(
             "perception/segmenter=onnx perception.segmenter.weights=%s",
             self.session.folder / "segmenter.onnx",
         )
         return result["conditions"]["all"]["mouth"]
-
-
-def _show(result: dict[str, Any]) -> None:
-    rows = []
-    for name, row in result["conditions"].items():
-        shares = []
-        for key in ("block", "mouth"):
-            shares.append(None if row[key] is None else f"{row[key]:.3f}")
-        rows.append([name, str(row["frames"]), *shares])
-    head = ("condition", "frames", "overlap of blocks", "overlap of mouths")
-    print_table(head, rows, "on unseen frames")

@@ -23,25 +23,25 @@ NEARER = "part of the inside that is nearer than the face"
 STRETCH = "focal length by the roundness of the rim"
 EXPLANATIONS = {
     RING_KNOWN: (
-        "the ring around it has hardly any depth, so that its face is not known",
-        "Too dark, too near, or no texture to match.",
+        "the ring around it has hardly any depth, so that its face is not known. Too dark, too "
+        "near, or no texture to match."
     ),
     RING_ON_FACE: (
-        "the ring around it does not lie on the plane that was taken for its face",
-        "Its surroundings are larger than the face: is the block in the mask?",
+        "the ring around it does not lie on the plane that was taken for its face. Its "
+        "surroundings are larger than the face: is the block in the mask?"
     ),
     NEARER: (
-        "its inside is nearer than the face",
-        "Something stands there, or its surroundings were taken for the face.",
+        "its inside is nearer than the face. Something stands there, or its surroundings were "
+        "taken for the face."
     ),
     STRETCH: (
-        "its rim is round only with another focal length",
-        "K is that of another resolution or lens: K over this factor would do.",
+        "its rim is round only with another focal length. K is that of another resolution or "
+        "lens: K over this factor would do."
     ),
     SIZE: (
-        "its rim is round, and by its depth of another size than the holes",
-        "baseline_m, or the unit of depth, is too large by this factor, or perception.pose.radius_m "
-        "too small; with depth from no pair, K is too small by it.",
+        "its rim is round, and by its depth of another size than the holes. baseline_m, or the "
+        "unit of depth, is too large by this factor, or perception.pose.radius_m too small; "
+        "with depth from no pair, K is too small by it."
     ),
 }
 """Explanation and remedy for each reason."""

@@ -165,7 +165,7 @@ class PlaneConicEstimator:
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is none; `frame` has no distortion."""
-        s, row = self.settings, as_row(ellipse)
+        s, row = self.settings, conic.as_row(ellipse)
         gray, light, allowed = self._prepare(frame, masks)
         self._focal.begin(frame)
         points = self._collect_support(frame, allowed, row)
@@ -247,7 +247,7 @@ class PlaneConicEstimator:
         # On the plane a circle has only three unknowns.
         circle = rim.fit_rim_circle(
             light,
-            as_row(ellipse),
+            conic.as_row(ellipse),
             frame.camera_matrix,
             face.m,
             s.radius_m,
@@ -256,11 +256,11 @@ class PlaneConicEstimator:
         )
         # What is missing of a rim is hidden, or broken off.
         seen = 0.0 if circle is None else circle.coverage
-        row = as_row(ellipse) if circle is None else circle.ellipse
+        row = conic.as_row(ellipse) if circle is None else circle.ellipse
         ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
         chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
         if seen > HALF or ellipse.coverage > WHOLE:
-            outline = row if seen > AS_MUCH * ellipse.coverage else as_row(ellipse)
+            outline = row if seen > AS_MUCH * ellipse.coverage else conic.as_row(ellipse)
             oval = self._judge_focal_length(light, frame, chart, face, outline)
             if oval is not None:
                 return replace(oval, ellipse=ellipse)
@@ -407,7 +407,8 @@ class PlaneConicEstimator:
         tilt = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         if tilt > s.tilt_rad:
             return Rejection("pose", "tilt of the face, rad", tilt, s.tilt_rad, ellipse)
-        _, axes = conic.project_onto_plane(row, frame.camera_matrix, face.m)
+        chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
+        axes = chart.flatten(row)[2:4]
         # The face is seen edge-on: the projection of the ellipse onto it is no ellipse.
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
@@ -478,11 +479,6 @@ class PlaneConicEstimator:
         if undecided and not has_parallax and (is_sure or not has_mask):
             return None
         return None if evidence >= 1.0 else refuse("evidence of depth inside", evidence, 1.0)
-
-
-def as_row(ellipse: Ellipse) -> np.ndarray:
-    """Return centre, semi-axes and direction of an ellipse, `(5,)`."""
-    return np.array([ellipse.x, ellipse.y, ellipse.a, ellipse.b, ellipse.theta_rad])
 
 
 def convert_to_gray(frame: Frame) -> np.ndarray:

@@ -83,17 +83,22 @@ class PlaneChart:
         away = rays / (rays @ self.m)[..., None] - self.origin
         return np.stack([away @ self.first, away @ self.second], -1)
 
+    @property
+    def _homography(self) -> np.ndarray:
+        return self.camera_matrix @ np.column_stack([self.first, self.second, self.origin])
+
+    def flatten(self, ellipse: np.ndarray) -> np.ndarray:
+        """Return the ellipse `(5,)` on the plane that is seen as one in the picture, NaN for none."""
+        place = self._homography
+        form = place.T @ conic.build_quadratic_forms(ellipse) @ place
+        return conic.convert_forms_to_ellipses(form[None])[0]
+
     def seen(self, circle: np.ndarray) -> np.ndarray:
         """Return the ellipse `(5,)` in the picture of a circle `(x, y, radius)`."""
         x, y, radius = circle
-        back = np.linalg.inv(
-            self.camera_matrix @ np.column_stack([self.first, self.second, self.origin])
-        )
-        return conic.convert_forms_to_ellipses(
-            (back.T @ conic.build_quadratic_forms(np.array([x, y, radius, radius, 0.0])) @ back)[
-                None
-            ]
-        )[0]
+        back = np.linalg.inv(self._homography)
+        form = back.T @ conic.build_quadratic_forms(np.array([x, y, radius, radius, 0.0])) @ back
+        return conic.convert_forms_to_ellipses(form[None])[0]
 
 
 def build_chart(origin: np.ndarray, m: np.ndarray, camera_matrix: np.ndarray) -> PlaneChart:

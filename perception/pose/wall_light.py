@@ -54,10 +54,11 @@ class WallLight:
         """
         if not abs(self.sky) <= 1.0:
             return 0.0
-        wall, disc = (
-            (mean, float(np.hypot(std, self.sky_std))) for mean, std in (WALL_SKY, DISC_SKY)
-        )
-        return _compute_log_ratio(self.sky, wall, disc)
+        log_density = []
+        for mean, own_std in (WALL_SKY, DISC_SKY):
+            std = float(np.hypot(own_std, self.sky_std))
+            log_density.append(-0.5 * ((self.sky - mean) / std) ** 2 - np.log(std))
+        return float(log_density[0] - log_density[1])
 
 
 def measure_wall_light(
@@ -104,12 +105,6 @@ def measure_wall_light(
     dust = np.column_stack([np.ones(len(pixels)), (pixels[:, :2] - (x, y)) / a])
     sky, sky_std = _fit_sky(part[inside].astype(float), dust, depths / radius_m)
     return WallLight(sky / contrast, sky_std / contrast)
-
-
-def _compute_log_ratio(value: float, wall: tuple[float, float], disc: tuple[float, float]) -> float:
-    """Return the log ratio of two normal densities, given by mean and standard deviation."""
-    log_density = [-0.5 * ((value - mean) / std) ** 2 - np.log(std) for mean, std in (wall, disc)]
-    return float(log_density[0] - log_density[1])
 
 
 def _fit_sky(values: np.ndarray, dust: np.ndarray, depths: np.ndarray) -> tuple[float, float]:

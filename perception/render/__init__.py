@@ -1,6 +1,6 @@
 """Synthetic boreholes: an analytic ray tracer and random scenes, in numpy and OpenCV, without OpenGL.
 
-Geometry and light: `solids`, `drilled_block`, `hole_light`, `materials`, `ray_tracer`,
+Geometry and light: `solids`, `drilled_block`, `materials`, `ray_tracer`,
 `stereo_camera`. Pictures of light: `camera_sensor`. Random scenes: `scene_ranges`, `scene_sampler`,
 `block_sampler`. `frame_renderer` makes frames of them.
 

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from brokk_rl.spec import Range
 from perception.render.drilled_block import FRONT, Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
-from perception.render.scene_ranges import BlockRanges, draw_integer, draw_uniform
+from perception.render.scene_ranges import BlockRanges, CountRange, draw_integer, draw_uniform
 from perception.render.solids import SolidPose, build_frame
 
 MARK_M = 0.002
@@ -47,14 +48,15 @@ def draw_block(
         discs.append(Disc(np.array([*place, half[2]]), size))
     chips = []
     for hole in holes[:num_holes]:
-        chips += _draw_chips(kind, hole, generator)
+        chips += _draw_bowls(hole, kind.chips, kind.chip_m, False, generator)
     for hole in holes[:num_holes]:
-        chips += _draw_dents(kind, hole, generator)
+        chips += _draw_bowls(hole, kind.dents, kind.dent_m, True, generator)
     rotation = build_frame(normal, turn_rad)
     first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
     pose = SolidPose(rotation, target - rotation @ first)
     materials = draw_block_materials(kind, half, holes, discs, generator)
-    return DrilledBlock(pose, half, materials, tuple(holes), tuple(chips), tuple(discs))
+    parts = (tuple(holes), tuple(chips), tuple(discs))
+    return DrilledBlock("block", pose, half, materials, *parts)
 
 
 def _scatter_discs(
@@ -91,33 +93,25 @@ def _draw_side_hole(
     return DrilledHole(center, radius, min(0.05, kind.depth_m[0]), part)
 
 
-def _draw_chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
-    """Return pieces broken off a rim: balls that cut bowls of radius `chip_m` into it."""
+def _draw_bowls(
+    hole: DrilledHole,
+    count: CountRange,
+    radius_m: Range,
+    is_dent: bool,
+    generator: np.random.Generator,
+) -> list[Chip]:
+    """Return balls that cut bowls into the face: chips broken off a rim, or dents beside it."""
     found = []
-    for _ in range(draw_integer(kind.chips, generator)):
-        angle, wide = generator.uniform(-np.pi, np.pi), draw_uniform(kind.chip_m, generator)
-        found.append(_draw_bowl(hole, angle, hole.radius_m, wide, generator))
+    for _ in range(draw_integer(count, generator)):
+        angle, wide = generator.uniform(-np.pi, np.pi), draw_uniform(radius_m, generator)
+        away = hole.radius_m
+        if is_dent:
+            # Beyond the rim, up to a hole's diameter away: a chisel that misses lands near.
+            away += wide + generator.uniform(0.0, 2.0 * hole.radius_m)
+        height = wide * float(generator.uniform(0.2, 1.5))
+        place = hole.center_m + np.array([away * np.cos(angle), away * np.sin(angle), height])
+        found.append(Chip(place, float(np.hypot(wide, height))))
     return found
-
-
-def _draw_dents(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
-    """Return bowls of radius `dent_m` that a chisel left in the face beside a rim."""
-    found = []
-    for _ in range(draw_integer(kind.dents, generator)):
-        angle, wide = generator.uniform(-np.pi, np.pi), draw_uniform(kind.dent_m, generator)
-        # Beyond the rim, up to a hole's diameter away: a chisel that misses lands near.
-        away = hole.radius_m + wide + generator.uniform(0.0, 2.0 * hole.radius_m)
-        found.append(_draw_bowl(hole, angle, away, wide, generator))
-    return found
-
-
-def _draw_bowl(
-    hole: DrilledHole, angle: float, away: float, wide: float, generator: np.random.Generator
-) -> Chip:
-    """Return a ball that cuts a bowl of radius `wide` into the face, `away` from a hole's axis."""
-    height = wide * float(generator.uniform(0.2, 1.5))
-    place = hole.center_m + np.array([away * np.cos(angle), away * np.sin(angle), height])
-    return Chip(place, float(np.hypot(wide, height)))
 
 
 def draw_block_materials(

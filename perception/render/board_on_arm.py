@@ -19,9 +19,8 @@ from perception.calibrate.arm import compute_link_poses
 from perception.calibrate.transforms import make_transform
 from perception.label.camera_pose import Charuco
 from perception.render.printed_board import build_plate
-from perception.render.scene_ranges import SceneRanges
+from perception.render.scene_ranges import Scene, SceneRanges
 from perception.render.scene_sampler import add_surroundings
-from perception.render.scene_sequence import StagedScene
 from perception.render.solids import build_rods
 from perception.render.stereo_camera import StereoRig, measure_disparity_error
 
@@ -82,21 +81,16 @@ class BoardOnArm:
                 f"{len(self.middle)} and {len(self.spread)}"
             )
 
-    def open(self, rig: StereoRig, session: Session) -> BoardScenes:
-        """Return the scenes.
-
-        Raises:
-            ConfigError: the board cannot be drawn, or is not seen.
-        """
-        return BoardScenes(self, rig, session)
-
 
 class BoardScenes:
-    """The frames of one recording; like `perception.render.scene_sequence.RandomScenes`."""
+    """The frames of one recording; like `perception.render.scene_sampler.RandomScenes`.
+
+    Raises:
+        ConfigError: the board cannot be drawn, or is not seen.
+    """
 
     def __init__(self, settings: BoardOnArm, rig: StereoRig, session: Session) -> None:
         self._settings, self._rig, self._session = settings, rig, session
-        self.base_from_camera = rig.base_from_camera
         self._camera_from_base = np.linalg.inv(rig.base_from_camera)
         self._poses: dict[int, np.ndarray] = {}
         self._link_from_board = self._attach_board()
@@ -104,8 +98,8 @@ class BoardScenes:
         inner[1:-1] = settings.zero_std_rad
         self._zeros = inner * session.generator("scene/zeros").standard_normal(len(inner))
 
-    def view(self, number: int) -> StagedScene:
-        """Return the scene at the time of frame `number`.
+    def compose(self, number: int) -> tuple[Scene, np.random.Generator]:
+        """Return the scene at the time of frame `number`, and the source of its noise.
 
         Raises:
             ConfigError: no pose shows the board.
@@ -121,11 +115,11 @@ class BoardScenes:
         scenery = self._session.generator("scene/surroundings")
         target = self._compute_board(np.array(settings.middle))[:3, 3]
         normal = -target / np.linalg.norm(target)
-        ground_m = float(self.base_from_camera[2, 3]) - GROUND_M
+        ground_m = float(self._rig.base_from_camera[2, 3]) - GROUND_M
         scene = add_surroundings(
             settings.kind, self._rig, None, solids, target, normal, scenery, ground_m
         )
-        return StagedScene(scene, self.base_from_camera, generator)
+        return scene, generator
 
     def write_records(self, folder: Path, count: int) -> None:
         """Write the recording of the joints, and the numbers that a calibration should find."""
@@ -148,7 +142,7 @@ class BoardScenes:
         record.write_recording(recording, folder / JOINTS)
         zeros = dict(zip(machine.joint_names, self._zeros.round(6).tolist(), strict=True))
         truth = {
-            "T_base_cam": self.base_from_camera.round(9).tolist(),
+            "T_base_cam": self._rig.base_from_camera.round(9).tolist(),
             "clock_s": settings.clock_s,
             "joint_zeros": zeros,
             "disparity_error_px": [round(one, 4) for one in measure_disparity_error(self._rig)],
@@ -167,7 +161,7 @@ class BoardScenes:
         x /= np.linalg.norm(x)
         turn = np.stack([x, np.cross(z, x), z], 1)
         corner = middle - turn[:, :2] @ (size_m / 2)
-        return np.linalg.inv(link) @ self.base_from_camera @ make_transform(turn, corner)
+        return np.linalg.inv(link) @ self._rig.base_from_camera @ make_transform(turn, corner)
 
     def _compute_board(self, q: np.ndarray) -> np.ndarray:
         """Return the board in the camera at true joint positions, `(4, 4)`."""

@@ -9,7 +9,7 @@ steps spread the noise over neighbours, so that it no longer averages out as tha
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -50,16 +50,6 @@ class CameraExposure:
     read_noise_e: float
     gamma: float
     vignetting: float
-
-
-class CameraProcess(Protocol):
-    """One camera of a pair: makes a picture of the light behind its lens."""
-
-    def develop(
-        self, light: np.ndarray, exposure: CameraExposure, generator: np.random.Generator
-    ) -> np.ndarray:
-        """Return the picture, RGB, `(h, w, 3)` uint8, of light, `(h, w, 3)` float32."""
-        ...
 
 
 class LinearCamera:
@@ -185,6 +175,10 @@ class MosaicCamera:
         # Edge-aware: it interpolates along edges, as the processors of cameras do.
         found = np.asarray(cv2.cvtColor(whole, cv2.COLOR_BayerRGGB2RGB_EA))
         return found.astype(np.float32) / 65535.0
+
+
+CameraProcess = LinearCamera | MosaicCamera
+"""One camera of a pair: makes a picture of the light behind its lens."""
 
 
 @spec

@@ -7,14 +7,12 @@ is in, until no cavity takes it further.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from perception.render.hole_light import compute_bounced_light
-from perception.render.materials import Material
-from perception.render.solids import Box, Hits, SolidPose, Surface
+from perception.render.solids import Box, Hits, Surface
 
 FRONT = 5
 """Part of a box that faces along +z of its pose: the face that is drilled."""
@@ -108,29 +106,15 @@ class Disc:
 
 
 @dataclass(frozen=True)
-class DrilledBlock:
+class DrilledBlock(Box):
     """A box with holes, chips and discs.
 
     Parts: six faces, wall and floor of each hole, fresh breaks, then the discs.
     """
 
-    pose: SolidPose
-    half_m: np.ndarray
-    materials: tuple[Material, ...]
     holes: tuple[DrilledHole, ...]
     chips: tuple[Chip, ...] = ()
     discs: tuple[Disc, ...] = ()
-    role: str = field(default="block")
-
-    @property
-    def box(self) -> Box:
-        """The block before anything was done to it."""
-        return Box(self.role, self.pose, self.half_m, self.materials)
-
-    @property
-    def corners_m(self) -> np.ndarray:
-        """The eight corners."""
-        return self.box.corners_m
 
     @property
     def break_part(self) -> int:
@@ -139,7 +123,7 @@ class DrilledBlock:
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
         """Return where rays meet the block, inside its holes too."""
-        t, part, _ = self.box.hit(origin, direction)
+        t, part, _ = super().hit(origin, direction)
         mouth = np.zeros(len(t), bool)
         struck = np.flatnonzero(np.isfinite(t))
         start, along = self.pose.local(
@@ -189,10 +173,9 @@ class DrilledBlock:
         flat = np.where(
             (part >= NUM_FACES) & (part >= self.break_part), FRONT, np.minimum(part, FRONT)
         ).astype(np.int16)
-        normal, uv, *_ = self.box.surface(point, flat, to_sun)
+        normal, uv, *_ = super().surface(point, flat, to_sun)
         normal = normal.copy()
         openness, sunlit = np.ones(len(part), np.float32), np.ones(len(part), bool)
-        opening, bounced = normal.copy(), np.zeros((len(part), 2), np.float32)
         local = self.pose.local_point(point)
         sun = (to_sun @ self.pose.rotation).astype(np.float32)
         for number, hole in enumerate(self.holes):
@@ -203,22 +186,13 @@ class DrilledBlock:
                 inside = _describe_inside(hole, local[rows], is_floor, sun)
                 normal[rows] = inside.normal @ self.pose.rotation.T.astype(np.float32)
                 uv[rows], openness[rows], sunlit[rows] = inside.uv_m, inside.openness, inside.sunlit
-                # Light comes in through the mouth, whatever the direction of the wall.
-                opening[rows] = (self.pose.rotation @ hole.outward).astype(np.float32)
-                last = len(self.materials) - 1
-                bright = [
-                    float(np.mean(self.materials[min(at, last)].color)) for at in (wall, floor)
-                ]
-                rise = float(sun[hole.axis] * hole.sign)
-                rings = compute_bounced_light(hole.radius_m, hole.depth_m, *bright, rise)
-                bounced[rows] = rings.at(hole.across_m(local[rows])[2], is_floor)
         for chip in self.chips:
             away = chip.center_m.astype(np.float32) - local
             on = (part == self.break_part) & (
                 np.abs(np.einsum("ij,ij->i", away, away) - chip.radius_m**2) < 1e-4 * chip.radius_m
             )
             normal[on] = (away[on] / chip.radius_m) @ self.pose.rotation.T.astype(np.float32)
-        return Surface(normal, uv, openness, sunlit, opening, bounced)
+        return Surface(normal, uv, openness, sunlit)
 
 
 def _describe_inside(

@@ -12,14 +12,14 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception import dataset
+from perception.camera import write_camera
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.render.board_on_arm import BoardOnArm, BoardScenes
 from perception.render.camera_sensor import draw_dust, take_picture
 from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
-from perception.render.scene_sampler import sample_rim
-from perception.render.scene_sequence import RandomScenes, StagedScene
+from perception.render.scene_sampler import RandomScenes, sample_rim
 from perception.render.stereo_camera import StereoRig
 from perception.stereo import Stereo
 
@@ -85,48 +85,25 @@ class FrameRenderer:
         """
         rig = self.rig
         if isinstance(self.scene, SceneRanges):
-            scenes: RandomScenes | BoardScenes = RandomScenes(self.scene, rig, session)
+            scenes = RandomScenes(self.scene, rig, session)
         else:
-            scenes = self.scene.open(rig, session)
-        dataset.write_camera(
-            folder,
-            rig.left.matrix,
-            (rig.width, rig.height),
-            scenes.base_from_camera,
-            rig.baseline_m,
-            disparity_std_px=rig.disparity_std_px,
-            gamma=rig.sensor.usual_gamma,
-        )
-        scenes.write_records(folder.parent, count)
+            scenes = BoardScenes(self.scene, rig, session)
+            scenes.write_records(folder.parent, count)
+        write_camera(folder, rig.model)
         return scenes
 
-    def has(self, stem: Path) -> bool:
-        """Return whether the frame at `stem` exists and is complete."""
-        return dataset.is_whole(stem)
-
-    def shoot(self, stem: Path, view: StagedScene) -> None:
-        """Render and write one frame; the same view makes the same files.
+    def shoot(self, stem: Path, scene: Scene, generator: np.random.Generator) -> None:
+        """Render and write one frame; the same scene and noise make the same files.
 
         Raises:
             StorageError: a file could not be written.
         """
-        shot = self.shot(view.scene, view.generator, view.base_from_camera)
+        shot = self.shot(scene, generator)
         depth = {"matched": shot.depth_m, "exact": shot.exact_depth_m, "none": None}[self.depth]
         dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
 
-    def shot(
-        self,
-        scene: Scene,
-        generator: np.random.Generator,
-        base_from_camera: np.ndarray | None = None,
-    ) -> RenderedFrame:
-        """Return the frame of a scene.
-
-        Args:
-            scene: In the left camera's coordinates.
-            generator: Source of the noise.
-            base_from_camera: Pose of the left camera, `(4, 4)`; `None` for the rig's own.
-        """
+    def shot(self, scene: Scene, generator: np.random.Generator) -> RenderedFrame:
+        """Return the frame of a scene in the left camera's coordinates, with noise of `generator`."""
         tracer = Tracer(scene.solids, scene.light, scene.sky)
         left = tracer.view(self.rig.left)
         exposure = scene.exposure
@@ -144,12 +121,11 @@ class FrameRenderer:
             depth = self.stereo.depth_m(color, partner, self.rig.focal_px, self.rig.baseline_m)
         roles = np.array([solid.role for solid in scene.solids] + ["nothing"])[left.solid]
         label = FrameLabel(roles == "block", left.mouth, roles == "arm")
-        base = self.rig.base_from_camera if base_from_camera is None else base_from_camera
-        truth = self._truth(scene, base)
+        truth = self._truth(scene)
         return RenderedFrame(color, partner, depth, left.depth_m, label, truth)
 
-    def _truth(self, scene: Scene, base: np.ndarray) -> SceneTruth:
-        block = scene.block
+    def _truth(self, scene: Scene) -> SceneTruth:
+        block, base = scene.block, self.rig.base_from_camera
         if block is None:
             return SceneTruth(self.scene.name, scene.conditions, (), (), {})
         holes, decoys = [], []
@@ -169,12 +145,11 @@ class FrameRenderer:
     ) -> TrueCircle:
         center = block.pose.point(circle.center_m)
         axis = block.pose.rotation @ circle.outward
-        return TrueCircle(
-            center_m=tuple(center.tolist()),
-            axis=tuple(axis.tolist()),
-            center_in_base_m=tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
-            axis_in_base=tuple((base[:3, :3] @ axis).tolist()),
-            radius_m=float(circle.radius_m),
+        return TrueCircle.place(
+            center,
+            axis,
+            base,
+            circle.radius_m,
             depth_m=float(circle.depth_m),
             hidden=float(hidden),
             in_view=self.rig.left.is_inside(sample_rim(block, circle), 0.0),

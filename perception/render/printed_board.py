@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from brokk_rl.errors import ConfigError
@@ -30,7 +29,8 @@ def draw_board_picture(board: Charuco) -> np.ndarray:
     Raises:
         ConfigError: the dictionary has too few markers, or the markers' edges fit no pixels.
     """
-    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    drawn = board.describe()
+    markers = drawn.getDictionary()
     needed, there = board.columns * board.rows // 2, len(markers.bytesList)
     if needed > there:
         raise ConfigError(
@@ -50,50 +50,30 @@ def draw_board_picture(board: Charuco) -> np.ndarray:
             f"board.marker_m={board.marker_m:g}: its modules fit no pixels; expected three "
             f"quarters of square_m, {0.75 * board.square_m:g}"
         )
-    drawn = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square_m, board.marker_m, markers
-    )
     return drawn.generateImage((board.columns * side, board.rows * side), marginSize=0)
 
 
+MATERIALS = (*(PAPER,) * INK, BLACK)
+
+
 @dataclass(frozen=True)
-class PrintedPlate:
+class PrintedPlate(Box):
     """A plate with a printed side; edges of the print are exact, as they are parts of the solid.
 
-    Parts: the six faces of a box, and the ink.
+    x and y of its pose are as on the print, z is away from who looks at it. Parts: the six faces of
+    a box, and the ink.
 
     Attributes:
-        role: What it is in the scene.
-        pose: Its middle; x and y as on the print, z away from who looks at it.
-        half_m: Half of its sides, `(3,)`.
         is_ink: The print, `(h, w)` bool, in the middle of the plate.
         pixel_m: Side of one of its pixels.
     """
 
-    role: str
-    pose: SolidPose
-    half_m: np.ndarray
     is_ink: np.ndarray
     pixel_m: float
 
-    @property
-    def materials(self) -> tuple[Material, ...]:
-        """Paper on all sides, and ink."""
-        return (*(PAPER,) * INK, BLACK)
-
-    @property
-    def box(self) -> Box:
-        """The plate without its print."""
-        return Box(self.role, self.pose, self.half_m, self.materials)
-
-    @property
-    def corners_m(self) -> np.ndarray:
-        """The eight corners."""
-        return self.box.corners_m
-
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
         """Return where rays meet the plate, on ink or beside it."""
-        hits = self.box.hit(origin, direction)
+        hits = super().hit(origin, direction)
         rows = np.flatnonzero(np.isfinite(hits.t) & (hits.part == PRINTED))
         start, along = self.pose.local(
             origin if origin.ndim == 1 else origin[rows], direction[rows]
@@ -107,7 +87,7 @@ class PrintedPlate:
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
         """Describe faces; ink lies on the printed one."""
-        return self.box.surface(point, np.where(part == INK, PRINTED, part), to_sun)
+        return super().surface(point, np.where(part == INK, PRINTED, part), to_sun)
 
 
 def build_plate(board: Charuco, from_board: np.ndarray, margin_m: float) -> PrintedPlate:
@@ -126,6 +106,7 @@ def build_plate(board: Charuco, from_board: np.ndarray, margin_m: float) -> Prin
         "board",
         SolidPose(from_board[:3, :3], from_board[:3, :3] @ middle + from_board[:3, 3]),
         np.array([*(size_m / 2 + margin_m), PLATE_M / 2]),
+        MATERIALS,
         picture < 128,
         float(size_m[0] / picture.shape[1]),
     )

@@ -8,7 +8,7 @@ rays where edges of solids, rims or shadows cross it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -70,19 +70,6 @@ class Pinhole:
 
 
 @dataclass(frozen=True)
-class GroundBounce:
-    """Light that the ground sends back.
-
-    Attributes:
-        up: Unit vector away from it, `(3,)`, camera coordinates.
-        brightness: Light that it sends into each direction, as `Light.ambient`.
-    """
-
-    up: np.ndarray
-    brightness: float
-
-
-@dataclass(frozen=True)
 class Light:
     """Sunlight, or a lamp far away, and light from everywhere.
 
@@ -91,47 +78,26 @@ class Light:
         sun: Its strength on a surface that faces it.
         ambient: Strength of the light from everywhere.
         shade: Solids that throw shadows though they are not seen.
-        ground: With it, light from below is that of the ground instead of the ambient one, and
-            light bounces within holes; `None`: each surface has direct light alone.
     """
 
     to_sun: np.ndarray
     sun: float
     ambient: float
     shade: tuple[Solid, ...] = ()
-    ground: GroundBounce | None = None
-
-    def compute_ambient(self, toward: np.ndarray) -> np.ndarray | float:
-        """Return the ambient light on unobstructed surfaces with normals `toward`, `(M, 3)`.
-
-        Half of sky and ground each for a wall, after the inclination (Moon and Spencer 1942).
-        """
-        if self.ground is None:
-            return self.ambient
-        below = 0.5 * (1.0 - toward @ self.ground.up.astype(np.float32))
-        return self.ambient * (1.0 - below) + self.ground.brightness * below
 
 
 @dataclass(frozen=True)
 class RenderedView:
-    """Ideal picture of a camera, without noise.
+    """What rays meet, without noise: those of a picture, `(h, w)`, or any others, `(M,)`.
 
     Attributes:
-        radiance: Linear light, `(h, w, 3)` float32.
-        depth_m: Along z, at the pixel centres, `(h, w)` float32, NaN where nothing is.
-        solid: Number of the solid at the pixel centre, `(h, w)` int16, `NOTHING` for none.
-        mouth: The ray through the pixel centre goes through the rim of a hole, `(h, w)` bool.
+        depth_m: Along z, float32; of a picture NaN where nothing is.
+        solid: Number of the solid, int16, `NOTHING` for none.
+        part: Part of the solid, int16.
+        mouth: The ray goes through the rim of a hole, bool.
+        radiance: Linear light, `(…, 3)` float32; of a picture over each pixel.
+        sunlit: Sunlight falls there, bool.
     """
-
-    radiance: np.ndarray
-    depth_m: np.ndarray
-    solid: np.ndarray
-    mouth: np.ndarray
-
-
-@dataclass(frozen=True)
-class _RayEnds:
-    """Rays' ends: depth, solid, part, through a rim, in sunlight, `(M,)` each."""
 
     depth_m: np.ndarray
     solid: np.ndarray
@@ -179,15 +145,14 @@ class Tracer:
             ys = np.arange(top, min(top + rows, camera.height), dtype=np.float64)
             pixel = np.stack(np.broadcast_arrays(columns[None], ys[:, None]), -1).reshape(-1, 2)
             bands.append(self._shoot(camera, pixel))
-        whole = _RayEnds(
-            *(
-                np.concatenate([getattr(band, name) for band in bands])
-                for name in _RayEnds.__dataclass_fields__
-            )
-        )
-        radiance = whole.radiance
+        joined = {}
+        for one in fields(RenderedView):
+            values = np.concatenate([getattr(band, one.name) for band in bands])
+            joined[one.name] = values.reshape(*size, *values.shape[1:])
+        whole = RenderedView(**joined)
+        radiance = whole.radiance.reshape(-1, 3)
         # Only pixels at edges are oversampled: everywhere else one ray is enough.
-        edges = np.flatnonzero(_find_edges(whole.label.reshape(size)).ravel())
+        edges = np.flatnonzero(_find_edges(whole.label).ravel())
         # Centres of the sub-pixels, relative to the pixel's centre.
         offsets = (
             np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5
@@ -200,20 +165,8 @@ class Tracer:
                 .mean(1)
             )
         # NaN, as a camera reports missing depth.
-        depth = np.where(whole.solid == NOTHING, np.nan, whole.depth_m).astype(np.float32)
-        return RenderedView(
-            radiance.reshape(*size, 3),
-            depth.reshape(size),
-            whole.solid.reshape(size),
-            whole.mouth.reshape(size),
-        )
-
-    def first(
-        self, origin_m: np.ndarray, direction: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return distance factor, solid and part of the first hits of rays, `(M, 3)` float32."""
-        t, solid, part, _ = self._cast(origin_m, direction, None)
-        return t, solid, part
+        whole.depth_m[whole.solid == NOTHING] = np.nan
+        return whole
 
     def _cast(
         self, origin_m: np.ndarray, direction: np.ndarray, camera: Pinhole | None
@@ -236,7 +189,7 @@ class Tracer:
                 mouth[to] = False
         return t, solid, part, mouth
 
-    def _shoot(self, camera: Pinhole, pixel: np.ndarray) -> _RayEnds:
+    def _shoot(self, camera: Pinhole, pixel: np.ndarray) -> RenderedView:
         direction = camera.rays(pixel)
         t, solid, part, mouth = self._cast(camera.origin_m, direction, camera)
         radiance = np.broadcast_to(self.sky, (len(t), 3)).copy()
@@ -249,7 +202,7 @@ class Tracer:
                 radiance[rows], lit[rows] = self._shaded(
                     thing, point[rows], part[rows], direction[rows], t[rows] / camera.focal_px
                 )
-        return _RayEnds(t, solid, part, mouth, radiance, lit)
+        return RenderedView(t, solid, part, mouth, radiance, lit)
 
     def _shaded(
         self,
@@ -273,12 +226,8 @@ class Tracer:
             # A solid's own shadow is already in the slope of its surface.
             if lit.any() and caster.solid is not thing:
                 caster.darken(point, lit)
-        toward = surface.normal * -away[:, None] if surface.opening is None else surface.opening
-        ambient = self.light.compute_ambient(toward)
-        bright = ambient * (1.0 if surface.openness is None else surface.openness)
+        bright = self.light.ambient * (1.0 if surface.openness is None else surface.openness)
         bright = bright + self.light.sun * np.where(lit, slope, 0.0)
-        if surface.bounced is not None and self.light.ground is not None:
-            bright += ambient * surface.bounced[:, 0] + self.light.sun * surface.bounced[:, 1]
         albedo = np.empty((len(part), 3), np.float32)
         # Obliquely seen texture is filtered more, but not without bound.
         size_m = pixel_m / np.sqrt(np.maximum(facing, 0.1))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
@@ -138,7 +139,6 @@ class LightRanges:
         sun: Strength of the sun or a lamp.
         ambient: Strength of the light from everywhere.
         elevation_rad: Of the sun above the ground.
-        bounces: Light comes back from the ground, and bounces within holes.
         shadows: Things out of sight that throw a shadow on the block.
         level: Light there is, relative to the level that the exposure is set for; drawn evenly on a
             logarithmic scale.
@@ -156,7 +156,6 @@ class LightRanges:
     sun: Range
     ambient: Range
     elevation_rad: Range
-    bounces: bool
     shadows: CountRange
     level: PositiveRange
     exposure: Range
@@ -204,18 +203,12 @@ def view_from(scene: Scene, camera_from_reference: np.ndarray) -> Scene:
         scene: The scene.
         camera_from_reference: Motion from the coordinates of `scene` to the new ones, `(4, 4)`.
     """
-    turn, shift_m = camera_from_reference[:3, :3], camera_from_reference[:3, 3]
-
-    def move(solid: Any) -> Any:
-        return move_solid(solid, turn, shift_m)
-
+    turn = camera_from_reference[:3, :3]
+    move = functools.partial(move_solid, turn=turn, shift_m=camera_from_reference[:3, 3])
     block = None if scene.block is None else move(scene.block)
     solids = tuple(block if solid is scene.block else move(solid) for solid in scene.solids)
     shade = tuple(move(solid) for solid in scene.light.shade)
-    ground = scene.light.ground
-    if ground is not None:
-        ground = replace(ground, up=turn @ ground.up)
-    light = replace(scene.light, to_sun=turn @ scene.light.to_sun, shade=shade, ground=ground)
+    light = replace(scene.light, to_sun=turn @ scene.light.to_sun, shade=shade)
     return replace(scene, solids=solids, block=block, light=light)
 
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from brokk_rl.session import Session
 from perception.render.block_sampler import draw_block
 from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
-from perception.render.ray_tracer import GroundBounce, Light
+from perception.render.ray_tracer import Light
 from perception.render.scene_ranges import (
     Scene,
     SceneRanges,
@@ -129,6 +131,20 @@ def compose_scene(kind: SceneRanges, rig: StereoRig, generator: np.random.Genera
     return add_surroundings(kind, rig, block, arm, target, normal, generator)
 
 
+@dataclass(frozen=True)
+class RandomScenes:
+    """Scenes that have nothing in common but their kind and the camera, drawn by the session's seed."""
+
+    kind: SceneRanges
+    rig: StereoRig
+    session: Session
+
+    def compose(self, number: int) -> tuple[Scene, np.random.Generator]:
+        """Return scene `number`, and the source of its frame's noise."""
+        generator = self.session.generator(f"scene/{number}")
+        return compose_scene(self.kind, self.rig, generator), generator
+
+
 def add_surroundings(
     kind: SceneRanges,
     rig: StereoRig,
@@ -162,7 +178,7 @@ def add_surroundings(
         solids.append(block)
     solids += arm
     solids += _draw_clutter(kind, rig, block, down, ground_m, generator)
-    light = _draw_light(kind, down, target, float(np.mean(solids[0].materials[0].color)), generator)
+    light = _draw_light(kind, down, target, generator)
     exposure, level = _draw_exposure(kind, light, normal, target, generator)
     # The sky is a little darker than its light on a surface. Chosen by hand; not searched.
     sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
@@ -304,13 +320,9 @@ def _draw_clutter(
 
 
 def _draw_light(
-    kind: SceneRanges,
-    down: np.ndarray,
-    target: np.ndarray,
-    ground_brightness: float,
-    generator: np.random.Generator,
+    kind: SceneRanges, down: np.ndarray, target: np.ndarray, generator: np.random.Generator
 ) -> Light:
-    """Return sun, sky and light from the ground, and unseen things that throw shadows on the face."""
+    """Return sun and sky, and unseen things that throw shadows on the face."""
     elevation = draw_uniform(kind.light.elevation_rad, generator)
     azimuth = generator.uniform(-np.pi, np.pi)
     frame = build_frame(-down, 0.0)
@@ -330,10 +342,7 @@ def _draw_light(
         shade.append(Box("clutter", SolidPose(beam, target + beside + 3.0 * to_sun), half, (dark,)))
     sun = draw_uniform(kind.light.sun, generator)
     ambient = draw_uniform(kind.light.ambient, generator)
-    # Open ground: shadows of block and machine are left out.
-    sent = ground_brightness * (ambient + sun * math.sin(elevation))
-    ground = GroundBounce(-down, sent) if kind.light.bounces else None
-    return Light(to_sun, sun, ambient, tuple(shade), ground)
+    return Light(to_sun, sun, ambient, tuple(shade))
 
 
 def _draw_exposure(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,18 +46,12 @@ class Surface(NamedTuple):
         openness: Part of the ambient light that arrives, `(M,)`; `None` for all of it.
         sunlit: The solid itself does not shade the point, `(M,)` bool; `None` where only the normal
             decides.
-        opening: Unit vectors towards the middle of the sky that lights the point, `(M, 3)`; `None`
-            for the normals.
-        bounced: Light that reaches the point over other places of the solid: for each unit of the
-            ambient light, and of the sun, `(M, 2)`; `None` for none.
     """
 
     normal: np.ndarray
     uv_m: np.ndarray
     openness: np.ndarray | None = None
     sunlit: np.ndarray | None = None
-    opening: np.ndarray | None = None
-    bounced: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -99,33 +93,6 @@ def build_frame(normal: np.ndarray, turn_rad: float) -> np.ndarray:
     return np.stack([cos * first + sin * second, cos * second - sin * first, normal], 1)
 
 
-class Solid(Protocol):
-    """Something that a ray can hit."""
-
-    @property
-    def role(self) -> str:
-        """`block`, `arm`, `ground` or `clutter`."""
-        ...
-
-    @property
-    def materials(self) -> tuple[Material, ...]:
-        """One for each part."""
-        ...
-
-    @property
-    def corners_m(self) -> np.ndarray | None:
-        """Points, `(K, 3)`, whose convex hull holds the solid; `None` for one without end."""
-        ...
-
-    def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Return where rays meet the solid first."""
-        ...
-
-    def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describe the surface at points, `(M, 3)`; `to_sun` is the unit vector to the light."""
-        ...
-
-
 @dataclass(frozen=True)
 class PlaneSolid:
     """A plane without end: the third axis of `pose` is its normal."""
@@ -134,6 +101,7 @@ class PlaneSolid:
     pose: SolidPose
     materials: tuple[Material, ...]
     corners_m: None = None
+    """A solid without end has none."""
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
         """Return where rays meet the plane, from either side."""
@@ -246,6 +214,10 @@ class Cylinder:
         return Surface(
             normal, np.where((part == 0)[:, None], around, local[:, :2]).astype(np.float32)
         )
+
+
+Solid = PlaneSolid | Box | Cylinder
+"""Something that a ray can hit, with a role: `block`, `arm`, `ground`, `clutter` or `board`."""
 
 
 def move_solid(solid: Any, turn: np.ndarray, shift_m: np.ndarray) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any
 
 import cv2
@@ -13,6 +13,7 @@ from annotated_types import Ge
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import Positive, spec
+from perception.camera import CameraModel
 from perception.render.camera_sensor import LinearSensor, MosaicSensor
 from perception.render.ray_tracer import Pinhole
 
@@ -110,25 +111,36 @@ class StereoRig:
     @property
     def left(self) -> Pinhole:
         """The camera in whose coordinates everything is told."""
-        return Pinhole(self.width, self.height, self.focal_px, np.zeros(3))
+        return self._make_camera(0.0)
 
     @property
     def right(self) -> Pinhole:
         """Its partner."""
-        place = self.width, self.height, self.focal_px, np.array([self.baseline_m, 0.0, 0.0])
-        return (
-            Pinhole(*place) if self.error.is_none else MisalignedPinhole(*place, self.error.draw())
-        )
+        return self._make_camera(self.baseline_m)
 
-    @property
-    def disparity_std_px(self) -> float | None:
-        """Standard deviation of the disparity's offset: 0 for a perfect pair, else not known."""
-        return 0.0 if self.error.is_none else None
+    def _make_camera(self, x_m: float) -> Pinhole:
+        """Return the camera at a place along the baseline; the left one is at 0 and has no error."""
+        place = self.width, self.height, self.focal_px, np.array([x_m, 0.0, 0.0])
+        if x_m == 0.0 or self.error.is_none:
+            return Pinhole(*place)
+        return MisalignedPinhole(*place, self.error.draw())
 
     @property
     def base_from_camera(self) -> np.ndarray:
         """Pose of the left camera in the base frame, `(4, 4)`: x right, y down, z forward."""
         return build_camera_pose(self.position_in_base_m, self.yaw_rad, self.pitch_rad)
+
+    @property
+    def model(self) -> CameraModel:
+        """The pair as its user knows it: nobody has told him an error that it has."""
+        return CameraModel(
+            self.left.matrix,
+            baseline_m=self.baseline_m,
+            size_px=(self.width, self.height),
+            base_from_camera=self.base_from_camera,
+            disparity_std_px=0.0 if self.error.is_none else None,
+            gamma=self.sensor.usual_gamma,
+        )
 
     @property
     def down_in_camera(self) -> np.ndarray:
@@ -154,16 +166,8 @@ class PlacedRig(StereoRig):
         if not self.error.is_none:
             raise ConfigError("error: a part of the picture is rendered for rig/error=none only")
 
-    @property
-    def left(self) -> Pinhole:
-        """The camera in whose coordinates everything is told."""
-        return Pinhole(self.width, self.height, self.focal_px, np.zeros(3), axis_px=self.axis_px)
-
-    @property
-    def right(self) -> Pinhole:
-        """Its partner."""
-        place_m = np.array([self.baseline_m, 0.0, 0.0])
-        return Pinhole(self.width, self.height, self.focal_px, place_m, axis_px=self.axis_px)
+    def _make_camera(self, x_m: float) -> Pinhole:
+        return replace(super()._make_camera(x_m), axis_px=self.axis_px)
 
     @property
     def base_from_camera(self) -> np.ndarray:

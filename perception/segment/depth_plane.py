@@ -14,7 +14,7 @@ from brokk_rl.contracts.vision import Masks
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
-from perception.pose.plane import DEGENERATE, compare_pair
+from perception.pose.plane import compare_pair
 
 
 def compute_sight_rays(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> np.ndarray:
@@ -81,17 +81,9 @@ class DepthPlane:
                 f"{self.min_extent_m}"
             )
 
-    def build(self) -> PlaneSegmenter:
-        """Return the segmenter."""
-        return PlaneSegmenter(self)
-
-
-class PlaneSegmenter:
-    """Finds the block's faces in the depth picture."""
-
-    def __init__(self, settings: DepthPlane) -> None:
-        self._settings = settings
-        self._tolerance = settings.num_sigma * settings.noise_per_m
+    def build(self) -> DepthPlane:
+        """Return the segmenter, which is the spec itself."""
+        return self
 
     def segment(self, frame: Frame) -> Masks:
         """Return the mask of the block; there is no hole mask.
@@ -100,19 +92,19 @@ class PlaneSegmenter:
             FrameError: too little depth is known.
         """
         height, width = frame.depth_m.shape
-        step = max(1, round(width / self._settings.width_px))
+        step = max(1, round(width / self.width_px))
         inverse, known = _shrink_depth(frame.depth_m, step)
-        if known.mean() < self._settings.min_known:
+        if known.mean() < self.min_known:
             raise FrameError(
                 f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, "
-                f"depth_plane needs {self._settings.min_known:.0%}; check the depth camera, its light "
+                f"depth_plane needs {self.min_known:.0%}; check the depth camera, its light "
                 "and its range"
             )
-        self._tolerance = self._settings.num_sigma * scale_noise(self._settings.noise_per_m, frame)
+        tolerance = self.num_sigma * scale_noise(self.noise_per_m, frame)
         rays = compute_sight_rays(frame.camera_matrix, inverse.shape, step)
         face = np.zeros(inverse.shape, np.uint8)
-        for plane in self._planes(rays, inverse, known):
-            face |= self._faces(plane, rays, inverse, known)
+        for plane in self._planes(rays, inverse, known, tolerance):
+            face |= self._faces(plane, rays, inverse, known, tolerance)
         mask = np.zeros((height, width), np.float32)
         # The last cells may be smaller ones.
         size = (min(len(face[0]) * step, width), min(len(face) * step, height))
@@ -121,26 +113,28 @@ class PlaneSegmenter:
         )
         return Masks(mask, None)
 
-    def _planes(self, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
+    def _planes(
+        self, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray, tolerance: float
+    ) -> list[np.ndarray]:
         """Return planes `n / d`, `(3,)`, the best supported first, each of pixels left by those before."""
-        settings, generator = self._settings, np.random.default_rng(self._settings.seed)
+        generator = np.random.default_rng(self.seed)
         found, rest = [], known.copy()
-        for _ in range(settings.num_planes):
+        for _ in range(self.num_planes):
             there = np.flatnonzero(rest)
-            if len(there) < settings.min_area * known.size:
+            if len(there) < self.min_area * known.size:
                 break
             trials = self._trials(rays, inverse, rest, there, generator)
-            judge = there[generator.integers(len(there), size=settings.num_samples)]
+            judge = there[generator.integers(len(there), size=self.num_samples)]
             off = trials @ rays.reshape(-1, 3)[judge].T - inverse.ravel()[judge]
-            votes = np.count_nonzero(np.abs(off) < self._tolerance, axis=1)
+            votes = np.count_nonzero(np.abs(off) < tolerance, axis=1)
             best = int(votes.argmax()) if len(votes) else 0
             if (
                 not len(votes)
-                or votes[best] / settings.num_samples * len(there) < settings.min_area * known.size
+                or votes[best] / self.num_samples * len(there) < self.min_area * known.size
             ):
                 break
-            found.append(self._refined(trials[best], rays, inverse, rest))
-            rest &= np.abs(rays @ found[-1].astype(np.float32) - inverse) >= self._tolerance
+            found.append(_refine_plane(trials[best], rays, inverse, rest, tolerance))
+            rest &= np.abs(rays @ found[-1].astype(np.float32) - inverse) >= tolerance
         return found
 
     def _trials(
@@ -152,59 +146,38 @@ class PlaneSegmenter:
         generator: np.random.Generator,
     ) -> np.ndarray:
         """Return planes through three neighbouring pixels of `rest`, at many scales, `(trials, 3)`."""
-        count, (height, width) = self._settings.num_trials, inverse.shape
+        count, (height, width) = self.num_trials, inverse.shape
         row, column = np.divmod(there[generator.integers(len(there), size=count)], width)
-        reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
+        reach = width * self.neighbourhood * generator.uniform(0.2, 1.0, count)
         shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
         corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
         corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
-        # (3 pixels, trials)
         corners = corner_rows, corner_columns
-        x, y, _ = np.moveaxis(rays[corners], -1, 0)
-        value = inverse[corners]
-        usable = rest[corners].all(0)
-        dx = x[1:] - x[0]
-        dy = y[1:] - y[0]
-        rise = value[1:] - value[0]
-        area = dx[0] * dy[1] - dx[1] * dy[0]
-        usable &= np.abs(area) > 1e-5
-        dx, dy, rise, area = dx[:, usable], dy[:, usable], rise[:, usable], area[usable]
-        across = (rise[0] * dy[1] - rise[1] * dy[0]) / area
-        down = (dx[0] * rise[1] - dx[1] * rise[0]) / area
-        return np.stack(
-            [across, down, value[0, usable] - across * x[0, usable] - down * y[0, usable]], -1
-        )
-
-    def _refined(
-        self, plane: np.ndarray, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray
-    ) -> np.ndarray:
-        """Return the least-squares plane of the pixels that agree with `plane`."""
-        # A quarter of the pixels tells it as well.
-        known = known[::2, ::2]
-        rays, inverse = rays[::2, ::2][known].astype(float), inverse[::2, ::2][known]
-        for _ in range(2):
-            inside = np.abs(rays @ plane - inverse) < self._tolerance
-            sums = rays[inside].T @ rays[inside]
-            if np.linalg.cond(sums) > DEGENERATE:
-                break
-            plane = np.linalg.solve(sums, rays[inside].T @ inverse[inside])
-        return plane
+        # (trials, 3 pixels, 3)
+        triples = np.moveaxis(rays[corners], 0, 1)
+        usable = rest[corners].all(0) & (np.abs(np.linalg.det(triples)) > 1e-5)
+        values = inverse[corners].T[usable]
+        return np.linalg.solve(triples[usable], values[..., None])[..., 0]
 
     def _faces(
-        self, plane: np.ndarray, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray
+        self,
+        plane: np.ndarray,
+        rays: np.ndarray,
+        inverse: np.ndarray,
+        known: np.ndarray,
+        tolerance: float,
     ) -> np.ndarray:
         """Return the connected pieces of a plane that can be faces of a block, `(h, w)` uint8."""
-        settings = self._settings
         excess = inverse - rays @ plane.astype(np.float32)  # > 0: nearer than the plane
-        support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
+        support = (known & (np.abs(excess) < tolerance)).astype(np.uint8)
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=4)
         large = []
         for label in range(1, count):
-            if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size:
+            if stats[label, cv2.CC_STAT_AREA] >= self.min_area * support.size:
                 large.append(label)
-        nearer = (known & (excess > self._tolerance)).astype(np.uint8)
+        nearer = (known & (excess > tolerance)).astype(np.uint8)
         nearer = np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
         pieces = [_fill_holes((labels == label).astype(np.uint8), nearer) for label in large]
         pieces = [piece for piece in pieces if piece[::2, ::2].any()]
@@ -212,15 +185,15 @@ class PlaneSegmenter:
         # Ground and wall are too large for a face. Pieces that an occluder cuts off from them must
         # also stand in front of their surroundings; a face by itself may have none in sight.
         extents_m = [_measure_extents(piece, plane, rays) for piece in pieces]
-        wide = any(extent.prod() > settings.max_extent_m**2 for extent in extents_m)
+        wide = any(extent.prod() > self.max_extent_m**2 for extent in extents_m)
         for piece, extent in zip(pieces, extents_m, strict=True):
             if self._fits(piece, extent, plane, rays) and (
-                not wide or self._front(piece, excess, known) >= settings.min_front
+                not wide or _measure_front(piece, excess, known, tolerance) >= self.min_front
             ):
                 faces |= piece
         # An arm cuts a face into pieces; the smaller ones have hardly any surroundings but the arm.
         for piece in pieces if faces.any() else ():
-            if _measure_extents(faces | piece, plane, rays).max() <= settings.max_extent_m:
+            if _measure_extents(faces | piece, plane, rays).max() <= self.max_extent_m:
                 faces |= piece
         return faces
 
@@ -228,27 +201,40 @@ class PlaneSegmenter:
         self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, rays: np.ndarray
     ) -> bool:
         """Return whether a piece of a plane has the size of a face and is turned to the camera."""
-        if (
-            extents_m.min() < self._settings.min_extent_m
-            or extents_m.max() > self._settings.max_extent_m
-        ):
+        if extents_m.min() < self.min_extent_m or extents_m.max() > self.max_extent_m:
             return False
         sums = cv2.moments(piece, binaryImage=True)
         sight = rays[round(sums["m01"] / sums["m00"]), round(sums["m10"] / sums["m00"])]
         tilt_rad = np.arccos(
             np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0)
         )
-        return bool(tilt_rad <= self._settings.max_tilt_rad)
+        return bool(tilt_rad <= self.max_tilt_rad)
 
-    def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
-        """Return the part of a piece's surroundings behind its plane, one half without evidence."""
-        near = cv2.dilate(piece, np.ones((5, 5), np.uint8))
-        far = cv2.dilate(piece, np.ones((9, 9), np.uint8))
-        ring = (far > near) & known
-        behind = np.count_nonzero(excess[ring] < -self._tolerance)
-        before = np.count_nonzero(excess[ring] > self._tolerance)
-        doubt = 0.05 * np.count_nonzero(ring) + 1.0
-        return (behind + 0.5 * doubt) / (behind + before + doubt)
+
+def _measure_front(
+    piece: np.ndarray, excess: np.ndarray, known: np.ndarray, tolerance: float
+) -> float:
+    """Return the part of a piece's surroundings behind its plane, one half without evidence."""
+    near = cv2.dilate(piece, np.ones((5, 5), np.uint8))
+    far = cv2.dilate(piece, np.ones((9, 9), np.uint8))
+    ring = (far > near) & known
+    behind = np.count_nonzero(excess[ring] < -tolerance)
+    before = np.count_nonzero(excess[ring] > tolerance)
+    doubt = 0.05 * np.count_nonzero(ring) + 1.0
+    return (behind + 0.5 * doubt) / (behind + before + doubt)
+
+
+def _refine_plane(
+    plane: np.ndarray, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray, tolerance: float
+) -> np.ndarray:
+    """Return the least-squares plane of the pixels that agree with `plane`."""
+    # A quarter of the pixels tells it as well.
+    known = known[::2, ::2]
+    rays, inverse = rays[::2, ::2][known].astype(float), inverse[::2, ::2][known]
+    for _ in range(2):
+        inside = np.abs(rays @ plane - inverse) < tolerance
+        plane = np.linalg.lstsq(rays[inside], inverse[inside], rcond=None)[0]
+    return plane
 
 
 def _shrink_depth(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -65,15 +66,6 @@ class Onnx:
         Raises:
             CheckpointError: there is no such network, or it is none of ours.
         """
-        gate = None if self.gate is None else self._open_network(self.gate, None)
-        return self._open_network(self.weights, gate)
-
-    def _open_network(self, weights: str, gate: NetworkSegmenter | None) -> NetworkSegmenter:
-        """Return one network.
-
-        Raises:
-            CheckpointError: see `build`.
-        """
         import onnxruntime
         from onnxruntime.capi.onnxruntime_pybind11_state import (
             Fail,
@@ -82,7 +74,7 @@ class Onnx:
             NoSuchFile,
         )
 
-        path = find_weights(weights)
+        path = find_weights(self.weights)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads
         try:
@@ -103,6 +95,9 @@ class Onnx:
         def infer(picture: np.ndarray) -> np.ndarray:
             return session.run(None, {"picture": picture[None]})[0][0]  # type: ignore[index]
 
+        gate = None
+        if self.gate is not None:
+            gate = replace(self, weights=self.gate, gate=None).build()
         return NetworkSegmenter(infer, size_px, self.margin, gate)
 
 

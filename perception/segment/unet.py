@@ -65,18 +65,6 @@ class UNet(nn.Module):
         return self.head(x)
 
 
-class Probabilities(nn.Module):
-    """Network that returns probabilities instead of logits."""
-
-    def __init__(self, network: UNet) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, picture: torch.Tensor) -> torch.Tensor:
-        """Return probabilities, `(B, 2, h, w)`."""
-        return torch.sigmoid(self.network(picture))
-
-
 def read_checkpoint(path: Path) -> tuple[UNet, dict[str, Any]]:
     """Return the network of a checkpoint, on the CPU and ready to use, and its header.
 

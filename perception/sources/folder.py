@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, Share, spec
 from perception import dataset
-from perception.calibrate.disparity_error import correct_depth
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
+from perception.camera import FILE, CameraModel, read_camera
 from perception.pair_check import EXPLANATIONS, PairCheck
 from perception.sources import validation
 from perception.stereo import Stereo
@@ -51,70 +49,6 @@ class FrameFolder:
     def build(self) -> FolderSource:
         """Return the source, not yet opened."""
         return FolderSource(self)
-
-
-@dataclass(frozen=True)
-class CameraModel:
-    """Content of `camera.yaml`; see `brokk_rl.signals.Frame`."""
-
-    matrix: np.ndarray
-    distortion: np.ndarray | None
-    baseline_m: float | None
-    base_from_camera: np.ndarray | None
-    cov: np.ndarray | None = None
-    disparity_std_px: float | None = None
-    disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    gamma: float = validation.USUAL_GAMMA
-    size_px: tuple[int, int] | None = None
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the mapping of a YAML file of a camera.
-
-    Raises:
-        FrameError: it is missing, or is no YAML of a mapping.
-    """
-    try:
-        told = yaml.safe_load(path.read_text())
-    except FileNotFoundError as error:
-        raise FrameError(
-            f"{path}: no such file; a camera needs it (K, size_px, dist, baseline_m, T_base_cam)"
-        ) from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FrameError(f"{path}: cannot be read as YAML ({error})") from error
-    if not isinstance(told, dict):
-        raise FrameError(
-            f"{path}: expected a mapping with K, size_px, dist, baseline_m; K is missing"
-        )
-    return told
-
-
-def read_camera(path: Path) -> CameraModel:
-    """Read `camera.yaml`.
-
-    Raises:
-        FrameError: it is missing, is no YAML, or holds impossible values.
-    """
-    told = read_yaml(path)
-    if "K" not in told:
-        raise FrameError(
-            f"{path}: expected a mapping with K, size_px, dist, baseline_m; K is missing"
-        )
-    where = str(path)
-
-    def check(name: str) -> float | None:
-        return None if told.get(name) is None else validation.check_number(told[name], where, name)
-
-    pose = told.get("T_base_cam")
-    return CameraModel(
-        validation.check_matrix(told["K"], where),
-        validation.check_distortion(told.get("dist"), where),
-        check("baseline_m"),
-        None if pose is None else validation.check_pose(pose, where),
-        disparity_std_px=check("disparity_std_px"),
-        gamma=check("gamma") or validation.USUAL_GAMMA,
-        size_px=validation.parse_size(told.get("size_px"), where),
-    )
 
 
 def read_picture(path: Path) -> np.ndarray:
@@ -153,20 +87,11 @@ class FolderSource:
 
     def __enter__(self) -> FolderSource:
         self._stems, self._next = dataset.list_stems(self._place), 0
-        path = self._place / dataset.CAMERA
-        camera = read_camera(path)
-        place = load_extrinsics(self._settings.base_from_camera, "source.base_from_camera")
-        if place.base_from_camera is not None:
-            camera = replace(camera, base_from_camera=place.base_from_camera, cov=place.cov)
-        if place.disparity_std_px is not None:
-            camera = replace(
-                camera,
-                disparity_std_px=place.disparity_std_px,
-                disparity_error_px=place.disparity_error_px,
-            )
-        if camera.base_from_camera is not None:
-            validation.check_upright(camera.base_from_camera, str(path))
-        self._camera = camera
+        path = self._place / FILE
+        extrinsics = load_extrinsics(self._settings.base_from_camera, "source.base_from_camera")
+        self._camera = read_camera(path).place(extrinsics)
+        if self._camera.base_from_camera is not None:
+            validation.check_upright(self._camera.base_from_camera, str(path))
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -188,27 +113,16 @@ class FolderSource:
         left_path = stem.with_name(stem.name + dataset.COLOR)
         right_path = stem.with_name(stem.name + dataset.RIGHT)
         color = validation.convert_color(read_picture(left_path), str(left_path))
-        height, width = color.shape[:2]
         camera = self._camera
         if camera is None:
             raise FrameError(f"{self._place}: not open; use it in a `with` block")
-        where = str(self._place / dataset.CAMERA)
-        validation.check_size(camera.size_px, height, width, where, str(left_path))
-        validation.check_matrix_fits(camera.matrix, height, width, where)
+        camera.check_picture(color, str(self._place / FILE), str(left_path))
         right = None
         if right_path.exists():
             right = validation.convert_color(read_picture(right_path), str(right_path))
             validation.check_same_size(color, right, str(right_path), "the right picture")
         depth, shrink = self._depth(stem, color, right, camera)
-        error_px, baseline_m = camera.disparity_error_px, camera.baseline_m
-        if any(error_px) and baseline_m is not None:
-            depth = correct_depth(depth, camera.matrix, baseline_m, error_px)
-        return Frame(
-            color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
-            distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem), camera_cov=camera.cov,
-            disparity_std_px=camera.disparity_std_px, disparity_error_px=error_px,
-            gamma=camera.gamma, depth_shrink=shrink,
-        )  # fmt: skip
+        return camera.build_frame(color, depth, t_s, right, str(stem), shrink)
 
     def _depth(
         self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
@@ -236,7 +150,7 @@ class FolderSource:
         if camera.baseline_m is None or camera.distortion is not None:
             raise FrameError(
                 f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in "
-                f"{dataset.CAMERA}"
+                f"{FILE}"
             )
         if self._settings.needs == "pair":
             return np.full(color.shape[:2], np.nan, np.float32), 1
@@ -246,14 +160,10 @@ class FolderSource:
         try:
             checked = validation.check_depth(matched, f"{stem}: matching left and right", least)
         except FrameError as error:
-            pair = Frame(
-                color, matched, camera.matrix, None, 0.0, right=right, baseline_m=camera.baseline_m
-            )
-            fault = self._settings.pair.find_fault(pair)
+            fault = self._settings.pair.find_fault(camera.build_frame(color, matched, 0.0, right))
             if fault is None:
                 raise
-            explanation, remedy = EXPLANATIONS[fault.reason]
-            raise FrameError(f"{stem}: {explanation}. {remedy}") from error
+            raise FrameError(f"{stem}: {EXPLANATIONS[fault.reason]}") from error
         return checked, self._settings.stereo.shrink
 
 

@@ -7,7 +7,6 @@ Three kinds of files: `camera.yaml` of rectified pictures; the factory's `.conf`
 from __future__ import annotations
 
 import configparser
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from perception.calibrate.transforms import make_transform
+from perception.camera import CameraModel
 from perception.sources import validation
 
 ZED_SIZES = {
@@ -30,48 +30,10 @@ CALIBRATION = ("K1", "D1", "K2", "D2", "R", "T")
 """Matrices of the file of a stereo calibration."""
 
 
-@dataclass(frozen=True)
-class PairLens:
-    """Lens of one or two cameras.
-
-    Attributes:
-        matrix: Camera matrix of the pictures after `rectify`, `(3, 3)`.
-        distortion: Coefficients that are left then; empty for none.
-        baseline_m: Distance of the cameras; `None` for one camera.
-        size_px: Columns and rows of the pictures.
-        maps: Maps of `cv2.remap` for the left picture, and for the right one; empty where the
-            pictures are rectified already.
-    """
-
-    matrix: np.ndarray
-    distortion: np.ndarray
-    baseline_m: float | None
-    size_px: tuple[int, int]
-    maps: tuple[Any, ...]
-
-    def rectify(self, pictures: list[np.ndarray], where: str) -> list[np.ndarray]:
-        """Return pictures `(h, w, 3)`, the left one first, without distortion and with equal rows.
-
-        Raises:
-            FrameError: they have another size than the lens was told for.
-        """
-        for picture in pictures:
-            height, width = picture.shape[:2]
-            validation.check_size(self.size_px, height, width, "the lens", where)
-        if not self.maps:
-            return pictures
-        straight = []
-        for picture, maps in zip(pictures, self.maps, strict=False):
-            straight.append(
-                np.asarray(cv2.remap(picture, maps[0], maps[1], cv2.INTER_CUBIC), np.uint8)
-            )
-        return straight
-
-
 def read_pair_lens(
     path: Path, content: dict[str, Any] | None, size_px: tuple[int, int]
-) -> PairLens:
-    """Return the lens of raw pictures of a size, by a factory file or a stereo calibration.
+) -> CameraModel:
+    """Return the camera of raw pictures of a size, by a factory file or a stereo calibration.
 
     Args:
         path: The file.
@@ -86,7 +48,7 @@ def read_pair_lens(
     else:
         cameras, turn, shift_m = _read_stereo_calibration(str(path), content, size_px)
     for matrix, _ in cameras:
-        validation.check_matrix_fits(matrix, size_px[1], size_px[0], str(path))
+        validation.check_matrix_fits(matrix, size_px[::-1], str(path))
     validation.check_number(float(np.linalg.norm(shift_m)), str(path), "baseline_m")
     (one, bent), (other, other_bent) = cameras
     # alpha 0: only pixels that both cameras show.
@@ -102,7 +64,7 @@ def read_pair_lens(
     baseline_m = float(-project_other[0, 3] / project_other[0, 0])
     if baseline_m <= 0:
         raise FrameError(f"{path}: the second camera lies left of the first; swap them")
-    return PairLens(np.asarray(project)[:, :3], np.zeros(0), baseline_m, size_px, maps)
+    return CameraModel(np.asarray(project)[:, :3], None, baseline_m, size_px, maps=maps)
 
 
 def _read_stereo_calibration(
@@ -115,7 +77,7 @@ def _read_stereo_calibration(
             f"{', '.join(missing)}; lens=board writes such a file"
         )
     told = validation.parse_size(content.get("size_px"), where)
-    validation.check_size(told, size_px[1], size_px[0], where, "the pictures")
+    validation.check_size(told, size_px[::-1], where, "the pictures")
     cameras = []
     for number in (1, 2):
         camera = f"{where}: camera {number}"

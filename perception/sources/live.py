@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,39 +10,20 @@ import numpy as np
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, Share, spec
-from perception.calibrate.disparity_error import correct_depth
 from perception.calibrate.extrinsics import CameraExtrinsics
+from perception.camera import CameraModel, RawFrame
 from perception.sources import validation
-
-
-@dataclass(frozen=True)
-class LensCalibration:
-    """Calibration of a camera: matrix `(3, 3)`, distortion or `None`, baseline in m or `None`."""
-
-    matrix: np.ndarray
-    distortion: np.ndarray | None
-    baseline_m: float | None
-
-
-@dataclass(frozen=True)
-class RawCapture:
-    """One capture: RGB, raw depth in m (0, NaN or infinite where unknown), time, right picture."""
-
-    color: np.ndarray
-    depth_m: np.ndarray
-    t_s: float
-    right: np.ndarray | None = None
 
 
 class CameraDevice(Protocol):
     """A camera's own library, behind three methods."""
 
-    def open(self) -> LensCalibration:
+    def open(self) -> CameraModel:
         """Open the camera; raises a `FrameError` when that fails."""
         ...
 
-    def capture(self, timeout_s: float) -> RawCapture | None:
-        """Wait for a new capture; `None` when there is none within the time."""
+    def capture(self, timeout_s: float) -> RawFrame | None:
+        """Wait for a new frame, with depth; `None` when there is none within the time."""
         ...
 
     @property
@@ -91,22 +71,20 @@ class LiveSource:
     ) -> None:
         self._device, self._name, self._fresh = device, name, fresh
         self._place = place
-        self._lens: LensCalibration | None = None
+        self._camera: CameraModel | None = None
         self._last_s = -np.inf
 
     def __enter__(self) -> LiveSource:
         try:
-            lens = self._device.open()
-            self._lens = LensCalibration(
-                validation.check_matrix(lens.matrix, self._name), lens.distortion, lens.baseline_m
-            )
+            self._camera = self._device.open().place(self._place)
+            validation.check_matrix(self._camera.matrix, self._name)
         except BaseException:
             self._device.close()
             raise
         return self
 
     def __exit__(self, *exc: Any) -> None:
-        self._lens = None
+        self._camera = None
         self._device.close()
 
     def read_latest(self) -> Frame | None:
@@ -115,7 +93,7 @@ class LiveSource:
         Raises:
             FrameError: no such frame came in time, or it cannot be used.
         """
-        if self._lens is None:
+        if self._camera is None:
             raise FrameError(f"{self._name}: not open; use it in a `with` block")
         left, oldest_s = self._fresh.timeout_s, None
         until = time.monotonic() + left
@@ -127,7 +105,7 @@ class LiveSource:
                 age_s = self._device.now_s() - capture.t_s
                 if age_s <= self._fresh.max_age_s:
                     self._last_s = capture.t_s
-                    return self._frame(capture, self._lens)
+                    return self._build_frame(capture, self._camera)
                 oldest_s = max(age_s, oldest_s or 0.0)
             left = until - time.monotonic()
         stale = ""
@@ -138,26 +116,9 @@ class LiveSource:
             f"{self._name}: no new frame for {self._fresh.timeout_s:g} s{stale}. Is it plugged in?"
         )
 
-    def _frame(self, capture: RawCapture, lens: LensCalibration) -> Frame:
-        validation.check_same_size(capture.color, capture.depth_m, self._name, "depth")
-        validation.check_matrix_fits(
-            lens.matrix, capture.color.shape[0], capture.color.shape[1], self._name
-        )
-        depth_m = validation.check_depth(capture.depth_m, self._name, self._fresh.least_known)
-        error_px = self._place.disparity_error_px
-        if any(error_px) and lens.baseline_m is not None:
-            depth_m = correct_depth(depth_m, lens.matrix, lens.baseline_m, error_px)
-        return Frame(
-            color=capture.color,
-            depth_m=depth_m,
-            camera_matrix=lens.matrix,
-            base_from_camera=self._place.base_from_camera,
-            camera_cov=self._place.cov,
-            disparity_std_px=self._place.disparity_std_px,
-            disparity_error_px=error_px,
-            t_s=capture.t_s,
-            distortion=lens.distortion,
-            right=capture.right,
-            baseline_m=lens.baseline_m,
-            gamma=validation.USUAL_GAMMA,
-        )
+    def _build_frame(self, raw: RawFrame, camera: CameraModel) -> Frame:
+        assert raw.depth_m is not None
+        validation.check_same_size(raw.color, raw.depth_m, self._name, "depth")
+        camera.check_picture(raw.color, self._name, self._name)
+        depth_m = validation.check_depth(raw.depth_m, self._name, self._fresh.least_known)
+        return camera.build_frame(raw.color, depth_m, raw.t_s, raw.right)

@@ -14,9 +14,8 @@ from brokk_rl.spec import Positive, spec
 from perception.mount.approach import plan_approach_motion
 from perception.mount.mounts import AxesMount
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
-from perception.mount.occlusion import ArmShape
 from perception.render.stereo_camera import place_rig
-from perception.sources.simulator import SimulatedCamera, make_frame
+from perception.sources.simulator import SimulatedCamera
 
 
 @spec
@@ -27,7 +26,6 @@ class MovingCamera:
         camera: Rig, light and scene; the arm stands where the machine's sensors say.
         mount: Carries the camera.
         next_view: Chooses where it looks.
-        arm: Thickness of the arm.
         machine: The machine.
         hint_m: Error of the place at which the hole is expected before it was seen, 1 sigma.
     """
@@ -35,7 +33,6 @@ class MovingCamera:
     camera: SimulatedCamera
     mount: AxesMount
     next_view: ExpectedCovariance
-    arm: ArmShape
     machine: Machine
     hint_m: Positive
 
@@ -47,22 +44,20 @@ class MovingCamera:
 class MovingSource:
     """An open moving camera; see `FrameSource` and `AimedSource` of `brokk_rl.contracts.vision`."""
 
+    num_frames = None
+
     def __init__(self, settings: MovingCamera) -> None:
         self._settings = settings
         self._mount = settings.mount.build(settings.machine)
         rig = settings.camera.rig
-        self._planner = settings.next_view.build(settings.machine, self._mount, rig, settings.arm)
-        self._source = settings.camera.build()
+        self._planner = settings.next_view.build(
+            settings.machine, self._mount, rig, settings.camera.arm
+        )
         self._position, self._arrives_s = self._mount.start, -np.inf
         self._q: np.ndarray | None = None
         self._choice: ViewChoice | None = None
         self._seen_s, self._num_missed, self._t_s = -np.inf, 0, 0.0
         self._count, self._is_taken = -1, False
-
-    @property
-    def num_frames(self) -> None:
-        """No end."""
-        return None
 
     def __enter__(self) -> MovingSource:
         self._count = 0
@@ -114,6 +109,7 @@ class MovingSource:
         placed = place_rig(
             rig, self._mount.locate(self._position, self._q), (0, 0), (rig.width, rig.height)
         )
-        self._source.show(s.camera.task_scene, s.arm.trace(s.machine, self._q))
-        shot = self._source.shot(np.random.default_rng((s.camera.seed, number)), placed)
-        return make_frame(shot, placed, self._t_s)
+        noise = np.random.default_rng((s.camera.seed, number))
+        chain_m = s.camera.arm.trace(s.machine, self._q)
+        shot = s.camera.shoot(s.camera.task_scene, chain_m, noise, placed)
+        return placed.model.build_frame(shot.color, shot.depth_m, self._t_s, shot.right)

@@ -11,8 +11,9 @@ import numpy as np
 from brokk_rl.errors import FrameError
 from brokk_rl.spec import spec
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
+from perception.camera import CameraModel, RawFrame
 from perception.sources import validation
-from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
+from perception.sources.live import Freshness, LiveSource
 
 
 @spec
@@ -52,7 +53,7 @@ class RealSenseDevice:
         self._pipeline: Any = None
         self._started = False
 
-    def open(self) -> LensCalibration:
+    def open(self) -> CameraModel:
         """Open the camera.
 
         Raises:
@@ -86,11 +87,10 @@ class RealSenseDevice:
         coefficients = np.array(lens.coeffs, float)
         if lens.model == rs.distortion.inverse_brown_conrady and coefficients.any():
             coefficients = invert_distortion(coefficients, matrix, size)
-        return LensCalibration(
-            matrix, validation.check_distortion(coefficients.tolist(), "RealSense camera"), None
-        )
+        bent = validation.check_distortion(coefficients.tolist(), "RealSense camera")
+        return CameraModel(matrix, bent)
 
-    def capture(self, timeout_s: float) -> RawCapture | None:
+    def capture(self, timeout_s: float) -> RawFrame | None:
         """Return the next capture, `None` when there is none in time."""
         try:
             taken = self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s)))
@@ -106,7 +106,7 @@ class RealSenseDevice:
         # unknown: the time of arrival serves then.
         own_clock = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock
         t_s = time.time() if own_clock else float(color.get_timestamp()) * 1e-3
-        return RawCapture(np.array(color.get_data(), np.uint8), values, t_s)
+        return RawFrame(np.array(color.get_data(), np.uint8), None, values, t_s)
 
     def now_s(self) -> float:
         """Return the host's time: captures are stamped by it."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -14,31 +14,12 @@ import numpy as np
 from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import FrameError
 from brokk_rl.spec import Positive, spec
+from perception.camera import CameraModel, RawFrame
 from perception.sources import validation
 from perception.sources.folder import read_picture
-from perception.sources.lens_file import PairLens
 
 NUMBER = re.compile(r"(\d+)(?!.*\d)")
 """The last number of a file's name: which frame it belongs to."""
-
-
-@dataclass(frozen=True)
-class RawFrame:
-    """Pictures of one moment.
-
-    Attributes:
-        name: Where they come from, for messages.
-        color: Left or only picture, RGB, `(h, w, 3)` uint8.
-        right: Right picture, RGB; `None` where there is none.
-        depth_m: Depth along z, `(h, w)` float32, NaN where unknown; `None` where there is none.
-        lens: The camera's own lens, which rectifies the pictures; `None` where it tells none.
-    """
-
-    name: str
-    color: np.ndarray
-    right: np.ndarray | None
-    depth_m: np.ndarray | None
-    lens: PairLens | None = None
 
 
 @spec
@@ -58,13 +39,11 @@ class SourceCapture:
             FrameError: the camera cannot be opened, or gives no frame in time.
         """
         with self.source.build() as source:
-            number = 0
-            while (frame := source.read_latest()) is not None:
-                bent = np.zeros(0) if frame.distortion is None else frame.distortion
+            for number, frame in enumerate(iter(source.read_latest, None)):
                 size_px = frame.color.shape[1], frame.color.shape[0]
-                lens = PairLens(frame.camera_matrix, bent, frame.baseline_m, size_px, ())
-                yield RawFrame(f"frame {number}", frame.color, frame.right, frame.depth_m, lens)
-                number += 1
+                lens = (frame.camera_matrix, frame.distortion, frame.baseline_m, size_px)
+                pictures = (frame.color, frame.right, frame.depth_m)
+                yield RawFrame(*pictures, frame.t_s, f"frame {number}", CameraModel(*lens))
 
 
 @spec
@@ -108,13 +87,11 @@ class StereoVideo:
                     f"capture.input={self.input}: OpenCV cannot open it; a camera may be in use, a "
                     "video may need another codec"
                 )
-            number = 0
-            while True:
+            for number in itertools.count():
                 there, picture = video.read()
                 if not there:
                     return
                 yield self._cut(f"{self.input}, frame {number}", np.asarray(picture))
-                number += 1
         finally:
             video.release()
 
@@ -122,7 +99,7 @@ class StereoVideo:
         """Return the left and the right part of a picture, blue first, as RGB."""
         color = np.ascontiguousarray(picture[..., ::-1])
         if self.layout == "single":
-            return RawFrame(name, color, None, None)
+            return RawFrame(color, name=name)
         axis = 1 if self.layout == "side_by_side" else 0
         if color.shape[axis] % 2:
             raise FrameError(
@@ -130,7 +107,7 @@ class StereoVideo:
                 f"pictures {self.layout}; expected an even number, or capture.layout=single"
             )
         left, right = np.split(color, 2, axis)
-        return RawFrame(name, np.ascontiguousarray(left), np.ascontiguousarray(right), None)
+        return RawFrame(np.ascontiguousarray(left), np.ascontiguousarray(right), name=name)
 
 
 @spec
@@ -174,9 +151,10 @@ class ExportedPictures:
             if "right" in parts:
                 right = validation.convert_color(read_picture(parts["right"]), str(parts["right"]))
             if "depth" in parts:
-                depth_m = self._read_depth(parts["depth"])
+                picture, where = read_picture(parts["depth"]), str(parts["depth"])
+                depth_m = validation.convert_png_depth(picture, where, self.depth_unit_m)
             color = validation.convert_color(read_picture(path), str(path))
-            yield RawFrame(str(path), color, right, depth_m)
+            yield RawFrame(color, right, depth_m, name=str(path))
 
     def _list_files(self, kind: str, pattern: str) -> dict[int, Path]:
         """Return files by number."""
@@ -195,14 +173,3 @@ class ExportedPictures:
         if not found:
             raise FrameError(f"capture.{kind}={pattern}: no such file in '{self.folder}'")
         return found
-
-    def _read_depth(self, path: Path) -> np.ndarray:
-        """Return a depth picture in m, NaN where it is 0."""
-        steps = read_picture(path)
-        if steps.dtype != np.uint16 or steps.ndim != 2:
-            raise FrameError(
-                f"{path}: expected a depth picture of 16 bits and one channel, got {steps.dtype} "
-                f"of shape {steps.shape}"
-            )
-        depth_m = steps.astype(np.float32) * np.float32(self.depth_unit_m)
-        return np.where(steps > 0, depth_m, np.nan).astype(np.float32)

@@ -13,9 +13,8 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from brokk_rl.spec import Positive, spec
+from perception.camera import CameraModel, RawFrame
 from perception.sources import validation
-from perception.sources.lens_file import PairLens
-from perception.sources.recorded import RawFrame
 
 CHANNELS = {
     "rgb8": (np.uint8, 3), "bgr8": (np.uint8, 3), "rgba8": (np.uint8, 4), "bgra8": (np.uint8, 4),
@@ -104,18 +103,15 @@ class RosLog:
         if "depth" in waiting:
             raw = waiting["depth"][1]
             depth_m = raw.astype(np.float32) * np.float32(0.001 if raw.dtype == np.uint16 else 1.0)
-            depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
+            depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(np.nan))
         infos = [
             lenses.get(topics[one].rsplit("/", 1)[0]) for one in ("color", "right") if one in topics
         ]
-        lens = None
+        camera = None
         if infos and infos[0] is not None:
             is_raw = "rect" not in topics["color"]
-            lens = _read_lens(infos[0], infos[1] if len(infos) > 1 else None, is_raw)
-        return RawFrame(
-            name, pictures["color"], pictures.get("right"),
-            None if depth_m is None else depth_m.astype(np.float32), lens,
-        )  # fmt: skip
+            camera = _read_lens(infos[0], infos[1] if len(infos) > 1 else None, is_raw)
+        return RawFrame(pictures["color"], pictures.get("right"), depth_m, stamp_s, name, camera)
 
 
 def decode_picture(message: Any, kind: str, topic: str) -> np.ndarray:
@@ -147,8 +143,8 @@ def decode_picture(message: Any, kind: str, topic: str) -> np.ndarray:
     return picture[..., 0] if channels == 1 else picture
 
 
-def _read_lens(left: Any, right: Any | None, is_raw: bool) -> PairLens:
-    """Return the lens of `CameraInfo` messages; those of raw pictures are rectified by them."""
+def _read_lens(left: Any, right: Any | None, is_raw: bool) -> CameraModel:
+    """Return the camera of `CameraInfo` messages; those of raw pictures are rectified by them."""
 
     def read(message: Any, *names: str) -> np.ndarray:
         name = next(name for name in names if hasattr(message, name))
@@ -163,9 +159,9 @@ def _read_lens(left: Any, right: Any | None, is_raw: bool) -> PairLens:
         baseline_m = abs(float(other[0, 3] / other[0, 0])) or None
     size_px = int(left.width), int(left.height)
     if not is_raw or not has_projection:
-        distortion = read(left, "d", "D") if is_raw else np.zeros(0)
+        distortion = read(left, "d", "D") if is_raw else None
         rectified = projection[:, :3] if has_projection and not is_raw else matrix
-        return PairLens(rectified, distortion, baseline_m, size_px, ())
+        return CameraModel(rectified, distortion, baseline_m, size_px)
     maps = []
     for message in (left, right):
         if message is not None:
@@ -176,7 +172,7 @@ def _read_lens(left: Any, right: Any | None, is_raw: bool) -> PairLens:
                     size_px, cv2.CV_32FC1,
                 )
             )  # fmt: skip
-    return PairLens(projection[:, :3], np.zeros(0), baseline_m, size_px, tuple(maps))
+    return CameraModel(projection[:, :3], None, baseline_m, size_px, maps=tuple(maps))
 
 
 def _read_messages(path: Path) -> Iterator[tuple[str, str, float, Any]]:
@@ -218,8 +214,6 @@ def _read_mcap(path: Path, store: Any) -> Iterator[tuple[str, str, float, Any]]:
                 if kind in (*IMAGES, INFO) and channel.message_encoding == "cdr":
                     found = store.deserialize_cdr(message.data, kind)
                     yield channel.topic, kind, _read_stamp_s(found), found
-        except FrameError:
-            raise
         except Exception as error:  # the library has no error of its own for a damaged file
             raise FrameError(f"{path}: cannot be read as MCAP ({error})") from error
 

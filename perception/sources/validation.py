@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from brokk_rl.errors import FrameError
 
@@ -45,13 +47,11 @@ NUMBERS = {
 def check_matrix(value: Any, where: str) -> np.ndarray:
     """Return a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
     found = parse_numbers(value, (3, 3), f"{where}: K")
-    if found[0, 0] <= 0 or found[1, 1] <= 0:
+    across_px, down_px = found[0, 0], found[1, 1]
+    is_positive = across_px > 0 and down_px > 0
+    if not is_positive or not _ASPECT[0] <= across_px / down_px <= _ASPECT[1]:
         raise FrameError(
-            f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected more than 0"
-        )
-    if not _ASPECT[0] <= found[0, 0] / found[1, 1] <= _ASPECT[1]:
-        raise FrameError(
-            f"{where}: K has focal lengths {found[0, 0]:g} and {found[1, 1]:g} px, expected them about equal"
+            f"{where}: K has focal lengths {across_px:g} and {down_px:g} px, expected more than 0 and about equal"
         )
     if (
         np.abs(found[[1, 2, 2], [0, 0, 1]]).max() > 1e-9
@@ -64,8 +64,9 @@ def check_matrix(value: Any, where: str) -> np.ndarray:
     return found
 
 
-def check_matrix_fits(camera_matrix: np.ndarray, height: int, width: int, where: str) -> None:
-    """Refuse a camera matrix that cannot be that of a picture of this size."""
+def check_matrix_fits(camera_matrix: np.ndarray, shape: tuple[int, ...], where: str) -> None:
+    """Refuse a camera matrix that cannot be that of a picture of this shape."""
+    height, width = shape[:2]
     ratio = camera_matrix[0, 0] / width
     if not _FIELD_RATIO[0] <= ratio <= _FIELD_RATIO[1]:
         raise FrameError(
@@ -102,9 +103,10 @@ def parse_size(value: Any, where: str) -> tuple[int, int] | None:
 
 
 def check_size(
-    told_px: tuple[int, int] | None, height: int, width: int, where: str, picture: str
+    told_px: tuple[int, int] | None, shape: tuple[int, ...], where: str, picture: str
 ) -> None:
     """Refuse a picture of another size than that for which the camera matrix was told."""
+    height, width = shape[:2]
     if told_px is None or told_px == (width, height):
         return
     remedy = "take the matrix of their resolution, or scale K and size_px"
@@ -213,8 +215,8 @@ def convert_color(picture: np.ndarray, where: str) -> np.ndarray:
     return np.ascontiguousarray(picture[..., 2::-1])
 
 
-def convert_png_depth(picture: np.ndarray, where: str) -> np.ndarray:
-    """Return depth in m, `(h, w)` float32 with NaN, of a picture in mm."""
+def convert_png_depth(picture: np.ndarray, where: str, unit_m: float = 0.001) -> np.ndarray:
+    """Return depth in m, `(h, w)` float32, NaN for 0, of a picture in steps of `unit_m`."""
     if picture.ndim != 2:
         raise FrameError(
             f"{where}: {picture.shape[2]} channels, expected one of 16 bits (depth in mm)"
@@ -223,7 +225,8 @@ def convert_png_depth(picture: np.ndarray, where: str) -> np.ndarray:
         raise FrameError(
             f"{where}: {picture.dtype}, expected 16 bits (depth in mm); 8 bits cannot hold depth"
         )
-    return np.where(picture > 0, picture.astype(np.float32) / 1000.0, np.float32(np.nan))
+    depth_m = picture.astype(np.float32) / np.float32(1.0 / unit_m)
+    return np.where(picture > 0, depth_m, np.float32(np.nan))
 
 
 def check_depth(values: np.ndarray, where: str, least_known: float) -> np.ndarray:
@@ -251,6 +254,21 @@ def check_same_size(one: np.ndarray, other: np.ndarray, where: str, what: str) -
             f"{where}: {what} has {other.shape[1]} x {other.shape[0]} pixels, the colour picture {one.shape[1]} x {one.shape[0]}; "
             "they must be registered pixel by pixel"
         )
+
+
+def read_mapping(path: Path, expected: str) -> dict[str, Any]:
+    """Return the content of a YAML file, empty where that is no mapping.
+
+    Raises:
+        FrameError: it cannot be read; `expected` says what it should hold.
+    """
+    try:
+        told = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FrameError(
+            f"{path}: cannot be read as YAML ({error}); expected {expected}"
+        ) from error
+    return told if isinstance(told, dict) else {}
 
 
 def parse_numbers(value: Any, shape: tuple[int, ...] | None, where: str) -> np.ndarray:

@@ -12,8 +12,9 @@ from annotated_types import Interval
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.spec import Positive, spec
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
+from perception.camera import CameraModel, RawFrame
 from perception.sources import validation
-from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
+from perception.sources.live import Freshness, LiveSource
 
 _RETRY_S = 0.005
 """Pause between two attempts to grab a frame."""
@@ -75,7 +76,7 @@ class ZedDevice:
         self._camera: Any = None
         self.has_ended = False
 
-    def open(self) -> LensCalibration:
+    def open(self) -> CameraModel:
         """Open the camera.
 
         Raises:
@@ -91,7 +92,9 @@ class ZedDevice:
         settings, init = self._settings, sl.InitParameters()
         init.camera_resolution = getattr(sl.RESOLUTION, settings.resolution)
         init.camera_fps = settings.rate_hz
-        init.depth_mode = _look_up(sl.DEPTH_MODE, settings.depth_mode, "source.depth_mode")
+        init.depth_mode = getattr(sl.DEPTH_MODE, settings.depth_mode, None)
+        if init.depth_mode is None:
+            raise FrameError(f"source.depth_mode={settings.depth_mode}: this SDK does not know it")
         init.coordinate_units = sl.UNIT.METER
         init.coordinate_system = sl.COORDINATE_SYSTEM.IMAGE  # x right, y down, z forward
         init.depth_minimum_distance = settings.nearest_m
@@ -109,21 +112,16 @@ class ZedDevice:
         self._picture, self._right, self._depth = sl.Mat(), sl.Mat(), sl.Mat()
         self._runtime = sl.RuntimeParameters()
         self._runtime.confidence_threshold = settings.confidence
-        if hasattr(self._runtime, "enable_fill_mode"):
-            self._runtime.enable_fill_mode = False
-        else:  # SDK 3
-            self._runtime.sensing_mode = sl.SENSING_MODE.STANDARD
-        information = self._camera.get_camera_information()
-        # SDK 4 moved the calibration into the configuration
-        calibration = getattr(
-            information, "camera_configuration", information
-        ).calibration_parameters
+        self._runtime.enable_fill_mode = False
+        # As SDK 4 has it; there is no SDK 3 for Python 3.11.
+        configuration = self._camera.get_camera_information().camera_configuration
+        calibration = configuration.calibration_parameters
         # Rectified pictures: the distortion in it is that of the raw ones.
         left = calibration.left_cam
         matrix = np.array([[left.fx, 0.0, left.cx], [0.0, left.fy, left.cy], [0.0, 0.0, 1.0]])
-        return LensCalibration(matrix, None, abs(float(calibration.get_camera_baseline())))
+        return CameraModel(matrix, None, abs(float(calibration.get_camera_baseline())))
 
-    def capture(self, timeout_s: float) -> RawCapture | None:
+    def capture(self, timeout_s: float) -> RawFrame | None:
         """Return the next capture, `None` when there is none in time or the recording has ended."""
         sl, until = self._sl, time.monotonic() + timeout_s
         while (status := self._camera.grab(self._runtime)) != sl.ERROR_CODE.SUCCESS:
@@ -141,7 +139,7 @@ class ZedDevice:
         color = validation.convert_color(np.asarray(self._picture.get_data()), "ZED camera")
         right = validation.convert_color(np.asarray(self._right.get_data()), "ZED camera")
         # A copy, since the SDK reuses its memory.
-        return RawCapture(color, np.array(self._depth.get_data(), np.float32), t_s, right)
+        return RawFrame(color, right, np.array(self._depth.get_data(), np.float32), t_s)
 
     def now_s(self) -> float:
         """Return the time on the SDK's clock; that of a recording stands at its pictures."""
@@ -157,9 +155,3 @@ class ZedDevice:
         camera, self._camera = self._camera, None
         if camera is not None:
             camera.close()
-
-
-def _look_up(names: Any, name: str, where: str) -> Any:
-    if not hasattr(names, name):
-        raise FrameError(f"{where}={name}: this SDK does not know it")
-    return getattr(names, name)

@@ -18,7 +18,7 @@ from safetensors.torch import save
 from brokk_rl.errors import CheckpointError
 from brokk_rl.session import write_bytes
 from perception.segment.network import PREFIX, SCHEMA
-from perception.segment.unet import CHANNELS, Probabilities, UNet
+from perception.segment.unet import CHANNELS, UNet
 
 TENSORS, ONNX = "segmenter.safetensors", "segmenter.onnx"
 TOLERANCE = 1e-3
@@ -73,7 +73,8 @@ def write_onnx(
     import onnx
     import onnxruntime
 
-    module, log = Probabilities(network).eval(), logging.getLogger("torch.onnx")
+    module = torch.nn.Sequential(network, torch.nn.Sigmoid()).eval()
+    log = logging.getLogger("torch.onnx")
     level, part = log.level, path.with_name(f".{path.name}.exported")
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter warns about its own internals

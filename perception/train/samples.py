@@ -108,12 +108,6 @@ class TrainingViews:
         """Return the chosen frames."""
         return TrainingViews(self.layers[chosen], self.conditions[chosen], self.names[chosen])
 
-    def join(self, other: TrainingViews) -> TrainingViews:
-        """Return the frames of both."""
-        layers = torch.cat([self.layers, other.layers])
-        conditions = (*self.conditions, *other.conditions)
-        return TrainingViews(layers, conditions, (*self.names, *other.names))
-
 
 class Samples:
     """Endless batches, cut and changed where the network is trained.
@@ -176,36 +170,12 @@ def cut_windows(
     return functional.avg_pool2d(seen, FINER)
 
 
-def list_frames(folders: str | Sequence[str]) -> list[Path]:
-    """Return the frames with a mask in and below folders, as sorted paths without endings.
+def list_files(folders: str | Sequence[str], endings: tuple[str, ...], where: str) -> list[Path]:
+    """Return the files in and below folders that end so, sorted; `where` names the folders.
 
     Raises:
         FrameError: a folder holds none.
     """
-    told = (
-        f"training.frames: no *{dataset.MASK}",
-        "`brokk mode=render` and `brokk mode=label` make frames with masks",
-    )
-    masks = _list_files(folders, (dataset.MASK,), *told)
-    return [path.with_name(path.name.removesuffix(dataset.MASK)) for path in masks]
-
-
-def list_pictures(folders: str | Sequence[str]) -> list[Path]:
-    """Return the pictures in and below folders, sorted.
-
-    Raises:
-        FrameError: a folder holds none.
-    """
-    told = (
-        f"training.negatives: no picture ({', '.join(PICTURES)})",
-        "expected photographs without a block",
-    )
-    return _list_files(folders, PICTURES, *told)
-
-
-def _list_files(
-    folders: str | Sequence[str], endings: tuple[str, ...], missing: str, remedy: str
-) -> list[Path]:
     found: list[Path] = []
     for folder in (folders,) if isinstance(folders, str) else folders:
         here = []
@@ -213,36 +183,44 @@ def _list_files(
             if path.name.lower().endswith(endings) and path.name[0] != ".":
                 here.append(path)
         if not here:
-            raise FrameError(f"{missing} in '{folder}' (seen from {Path.cwd()}); {remedy}")
+            raise FrameError(
+                f"{where}: no *{', *'.join(endings)} in '{folder}' (seen from {Path.cwd()}); frames "
+                "with masks come from `brokk mode=render` and `mode=label`, negatives are photographs"
+            )
         found += here
     return found
 
 
+def list_frames(folders: str | Sequence[str], where: str) -> list[Path]:
+    """Return the frames with a mask in and below folders, as paths without endings.
+
+    Raises:
+        FrameError: a folder holds none.
+    """
+    masks = list_files(folders, (dataset.MASK,), where)
+    return [path.with_name(path.name.removesuffix(dataset.MASK)) for path in masks]
+
+
 def read_views(
-    stems: Sequence[Path],
-    size_px: tuple[int, int],
-    margin: float,
-    seed: int,
-    negatives: bool = False,
+    paths: Sequence[Path], size_px: tuple[int, int], margin: float, seed: int
 ) -> TrainingViews:
-    """Read frames, some at a time, and keeps their two views.
+    """Read frames, some at a time, and keep their two views.
 
     Args:
-        stems: Frames, paths without endings; of negatives, paths of pictures.
+        paths: Frames, paths without endings; pictures without a block, paths of files.
         size_px: Width and height of the network's picture.
         margin: Room around the block in the closer view, as a part of its box, before the room to
             crop.
         seed: Of the closer view of frames without a block, which shows any part of them.
-        negatives: They are pictures without a block, which need no mask.
 
     Raises:
         FrameError: a picture or a mask cannot be read.
     """
     width, height = (round(ROOM * side) for side in size_px)
-    layers = np.empty((len(stems), len(LOOKS), 5, height, width), np.uint8)
+    layers = np.empty((len(paths), len(LOOKS), 5, height, width), np.uint8)
 
     def fill(number: int) -> str:
-        picture, known, condition = _read_frame(stems[number], negatives)
+        picture, known, condition = _read_frame(paths[number])
         generator = np.random.default_rng((seed, number))
         for look, window in enumerate(_choose_windows(known, (width, height), margin, generator)):
             layers[number, look, :3] = window.take(picture, (width, height)).transpose(2, 0, 1)
@@ -253,19 +231,20 @@ def read_views(
     cv2.setNumThreads(1)  # on each of many threads as many again would get in each other's way
     try:
         with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
-            work = pool.map(fill, range(len(stems)))
-            conditions = list(track_items(work, "reading frames", len(stems)))
+            work = pool.map(fill, range(len(paths)))
+            conditions = list(track_items(work, "reading frames", len(paths)))
     finally:
         cv2.setNumThreads(threads)
-    names = tuple(str(stem) for stem in stems)
+    names = tuple(str(path) for path in paths)
     return TrainingViews(torch.from_numpy(layers), tuple(conditions), names)
 
 
-def _read_frame(path: Path, is_negative: bool) -> tuple[np.ndarray, np.ndarray, str]:
+def _read_frame(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     """Return picture `(H, W, 3)`, shares `(H, W, 2)` and condition of one frame, or of one picture.
 
-    A negative is a picture without a block, and needs no mask.
+    A file is a picture without a block, and needs no mask.
     """
+    is_negative = path.suffix.lower() in PICTURES
     color = path if is_negative else Path(f"{path}{dataset.COLOR}")
     picture = convert_color(read_picture(color), str(color))
     if is_negative:

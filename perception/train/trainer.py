@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -19,7 +20,7 @@ from perception.segment.unet import UNet, compute_loss, read_checkpoint
 from perception.train import evaluation, export
 from perception.train import samples as training_data
 from perception.train.augmentation import Augmentation
-from perception.train.samples import Crop, Samples, TrainingViews
+from perception.train.samples import PICTURES, Crop, Samples
 
 log = logging.getLogger(__name__)
 
@@ -109,8 +110,7 @@ class _Training:
         self._device = session.torch_device()
         # Before anything random: weights, views and samples follow from the session's seed.
         session.seed_all()
-        self._train, self._unseen = self._views()
-        self._negatives = self._take_negatives()
+        self._read_views()
         self._network = self._build_network().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         # `fused` moves all weights in one kernel.
         self._optimizer = torch.optim.AdamW(
@@ -167,15 +167,16 @@ class _Training:
             network.load_state_dict(first.state_dict())
         return network
 
-    def _views(self) -> tuple[TrainingViews, TrainingViews]:
+    def _read_views(self) -> None:
+        """Read what is learned from, and what is judged by: frames, and pictures without a block."""
         settings, seed = self._settings, self._session.stream("views")
-        stems = training_data.list_frames(settings.frames)
+        stems = training_data.list_frames(settings.frames, "training.frames")
         # Frames of a run resemble each other: the last ones are set aside together.
         if settings.validation is None:
             last = max(1, len(stems) // settings.hold_out)
             stems, unseen = stems[:-last], stems[-last:]
         else:
-            unseen = training_data.list_frames(settings.validation)
+            unseen = training_data.list_frames(settings.validation, "training.validation")
             # The same frame on both sides would make the network look better than it is.
             if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
                 raise ConfigError(
@@ -184,25 +185,19 @@ class _Training:
                 )
         if not stems:
             raise ConfigError("training.frames: one frame is too few to train on and to judge by")
-        both = training_data.read_views([*stems, *unseen], settings.size_px, settings.margin, seed)
-        return both.part(slice(0, len(stems))), both.part(slice(len(stems), None))
-
-    def _take_negatives(self) -> torch.Tensor | None:
-        """Learn from most of the pictures without a block; return the others as the segmenter sees them.
-
-        Returns:
-            `(F, 2, 3, h, w)`, `None` where there are no negatives.
-        """
-        settings, seed = self._settings, self._session.stream("views")
-        if settings.negatives is None:
-            return None
-        paths = training_data.list_pictures(settings.negatives)
-        unseen = paths[:: settings.hold_out]
-        learned = [path for path in paths if path not in set(unseen)]
-        shape = settings.size_px, settings.margin, seed
-        self._train = self._train.join(training_data.read_views(learned, *shape, negatives=True))
-        quiet = training_data.read_views(unseen, *shape, negatives=True)
-        return evaluation.crop_segmenter_views(quiet, settings.size_px)[0]
+        pictures: list[Path] = []
+        if settings.negatives is not None:
+            where = "training.negatives"
+            pictures = training_data.list_files(settings.negatives, PICTURES, where)
+        quiet = pictures[:: settings.hold_out]
+        learned = [*stems, *(path for path in pictures if path not in set(quiet))]
+        paths = [*learned, *unseen, *quiet]
+        views = training_data.read_views(paths, settings.size_px, settings.margin, seed)
+        ends = len(learned), len(learned) + len(unseen)
+        self._train, self._unseen = views.part(slice(0, ends[0])), views.part(slice(*ends))
+        # As the segmenter sees them, `(F, 2, 3, h, w)`; none where there are no negatives.
+        rest = views.part(slice(ends[1], None))
+        self._negatives = evaluation.crop_segmenter_views(rest, settings.size_px)[0]
 
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         self._network.train()
@@ -272,7 +267,7 @@ class _Training:
 
     def _measure_quiet(self, network: UNet) -> float | None:
         """Return the share of unseen negatives on which the network names no block."""
-        if self._negatives is None:
+        if not len(self._negatives):
             return None
         probabilities = evaluation.predict(network, self._negatives, self._device)
         named = (probabilities[:, :, 0] > THRESHOLD).float().mean((2, 3)).amax(1)

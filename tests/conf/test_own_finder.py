@@ -21,6 +21,7 @@ from deploy.runtime.perception_process import CameraConfig
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import read_holes
 from perception import dataset
+from perception.camera import CameraModel, write_camera
 
 FINDER = Path(__file__).parents[2] / "examples/my_package/my_package/darkest.py"
 OPTION = "_target_: spots.finder.DarkestSpot\nradius_m: 0.05   # m\nstd_m: 0.05      # m, a guess\n"
@@ -37,7 +38,8 @@ def finder_spec(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Mo
 
 def test_mode_perceive_takes_it_by_name(finder_spec: Any, brokk: Callable, tmp_path: Path) -> None:
     frame, _, _ = drawn()
-    dataset.write_camera(tmp_path / "frames", K, (640, 480), np.eye(4), None)
+    camera = CameraModel(K, size_px=(640, 480), base_from_camera=np.eye(4))
+    write_camera(tmp_path / "frames", camera)
     for number in range(3):
         dataset.write_frame(tmp_path / "frames" / f"{number:05d}", frame.color, frame.depth_m)
     done = brokk("mode=perceive", "perceive.input=frames", "perception=darkest", "session.out=out")

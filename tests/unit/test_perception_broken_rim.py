@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from drawn import AXIS, CENTER, K, both_views, drawn
 
+from perception.ellipse.conic import as_row as pose_row
 from perception.pose import alignment, broken_rim, rim
-from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
 
 M = AXIS / (AXIS @ CENTER)

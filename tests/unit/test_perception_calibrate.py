@@ -23,6 +23,7 @@ from brokk_rl.record import write_recording
 from perception import dataset
 from perception.calibrate import arm, clock_offset, hand_eye, transforms, verdict
 from perception.calibrate.extrinsics import compute_point_std_m, load_extrinsics
+from perception.camera import CameraModel, write_camera
 from perception.sources.folder import FrameFolder
 
 EXACT = np.diag([0.0005, 0.0005, 0.001, 0.001, 0.001, 0.0005]) ** 2
@@ -149,7 +150,7 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     other, right = np.random.default_rng(1), np.eye(4)
     right[0, 3] = -BASELINE_M
     poses = board.posed(option("machine", "brokk170"), 16, 0, 0.002, 0.001, 0.0005)
-    dataset.write_camera(folder, board.MATRIX, (1280, 720), None, BASELINE_M)
+    write_camera(folder, CameraModel(board.MATRIX, None, BASELINE_M, (1280, 720)))
     for number, there in enumerate(poses.camera_from_board):
         dataset.write_picture(folder / f"{number:03d}.color.png", board.picture(there, chance))
         partner = board.picture(right @ there, other, -DISPARITY_ERROR_PX)
@@ -226,7 +227,7 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
     q = np.stack([np.interp(eased, np.arange(12.0), column) for column in poses.q.T], 1)
     write_recording(make_recording(machine, np.zeros_like(q), q), tmp_path / "run.parquet")
     frame_s, late_s, chance = np.arange(0.5, 11.5, 0.4), 0.12, np.random.default_rng(0)
-    dataset.write_camera(tmp_path, board.MATRIX, (1280, 720), None, None)
+    write_camera(tmp_path, CameraModel(board.MATRIX, size_px=(1280, 720)))
     there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)
     for number, link in enumerate(arm.compute_link_poses(machine, there).base_from_link):
         seen = transforms.invert(board.CAMERA) @ link @ poses.link_from_board
@@ -254,7 +255,7 @@ def judged(machine: Machine, poses: board.Posed, q: np.ndarray, seed: int) -> ve
     zeros = {n: (float(z), 0.0087) for n, z in zip(views.shared_names, found.guess.shared, strict=True)}  # fmt: skip
     alone = verdict.judge_fit(int(found.used.sum()), len(q), found.factor, zeros, [])
     why = verdict.explain_by_joint(machine, q, views, found, build_views)
-    return verdict.add_explanation(alone, why, "no joint explains it")
+    return verdict.add_explanation(alone, why)
 
 
 def test_a_right_arm_is_called_good(machine: Machine) -> None:

@@ -16,12 +16,10 @@ from drawn import K, drawn
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.signals import Frame
 from perception import dataset
-from perception.calibrate.disparity_error import (
-    correct_depth,
-    estimate_disparity_error,
-    measure_board_disparity,
-)
+from perception.calibrate.disparity_error import estimate_disparity_error, measure_board_disparity
 from perception.calibrate.extrinsics import load_extrinsics
+from perception.camera import CameraModel, write_camera
+from perception.stereo import correct_depth
 
 BASELINE_M = 0.12
 MATRIX = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
@@ -147,7 +145,7 @@ def test_cameras_take_the_error_from_the_calibration(tmp_path: Path) -> None:
     color = np.full((90, 160, 3), 128, np.uint8)
     dataset.write_frame(tmp_path / "0", color, np.full((90, 160), 2.0, np.float32))
     matrix = np.array([[88.0, 0, 79.5], [0, 88.0, 44.5], [0, 0, 1]])
-    dataset.write_camera(tmp_path, matrix, (160, 90), None, BASELINE_M)
+    write_camera(tmp_path, CameraModel(matrix, None, BASELINE_M, (160, 90)))
     folder = option("perception/source", "folder", folder=str(tmp_path), base_from_camera=str(path))
     with folder.build() as source:
         frame = source.read_latest()

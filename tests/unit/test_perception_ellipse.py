@@ -11,13 +11,14 @@ from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.extensions import load_part
 from perception.contracts import SizePrior
 from perception.ellipse import conic
+from perception.pose.rim import build_chart
 
 K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
 
 
 @pytest.fixture(scope="module")
 def detector():
-    return load_part("ellipse").build()
+    return load_part("ellipse")
 
 
 def rim(center: np.ndarray, axis: np.ndarray, radius_m: float) -> np.ndarray:
@@ -54,9 +55,11 @@ def test_a_rim_on_its_plane_is_the_circle_that_it_is() -> None:
     center, axis = np.array([0.2, 0.1, 2.0]), np.array([0.3, -0.5, -0.8])
     axis /= np.linalg.norm(axis)
     seen = conic.fit_ellipses(rim(center, axis, 0.05)[None], np.ones((1, 100)))[0]
-    found, axes = conic.project_onto_plane(seen, K, axis / (axis @ center))
-    assert found == pytest.approx(center, abs=1e-9)
-    assert axes == pytest.approx([0.05, 0.05], abs=1e-9)
+    chart = build_chart(2.0 * center, axis / (axis @ center) / 2.0, K)
+    x, y, *axes, _ = chart.flatten(seen)
+    # On a plane twice as far everything is twice as large, and the centre is the chart's origin.
+    assert [x, y] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert axes == pytest.approx([0.1, 0.1], abs=1e-9)
 
 
 @pytest.mark.parametrize(

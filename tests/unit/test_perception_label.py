@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cuboid
@@ -16,7 +15,8 @@ from brokk_rl.errors import FrameError
 from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import dataset
-from perception.label.camera_pose import CameraPose, Charuco
+from perception.camera import CameraModel, write_camera
+from perception.label.camera_pose import BoardPose, Charuco
 from perception.label.labeller import BlockLabelling
 
 EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-2.4, -0.3, 0.7))
@@ -47,14 +47,15 @@ def write_labels(views: list[cuboid.View], folder: Path, **block: list[float]) -
         dataset.write_frame(stem, view.frame.color, view.frame.depth_m)
     first = views[0].frame
     size_px = first.color.shape[1::-1]
-    dataset.write_camera(folder / "in", first.camera_matrix, size_px, None, None)
+    write_camera(folder / "in", CameraModel(first.camera_matrix, size_px=size_px))
 
-    def locate(frame: Frame) -> CameraPose:
-        return CameraPose(board_from_world @ views[int(frame.name[-2:])].world_from_camera, 0.1)
+    def locate(_: Charuco, frame: Frame) -> BoardPose:
+        pose = board_from_world @ views[int(frame.name[-2:])].world_from_camera
+        return BoardPose(np.linalg.inv(pose)[None], np.zeros((1, 6, 6)), 0.1)
 
     source = option("perception/source", "folder", folder=str(folder / "in"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Charuco, "build", lambda self: SimpleNamespace(locate=locate))
+        patch.setattr(Charuco, "locate", locate)
         labelling = BlockLabelling(
         source=source, board=load_part("board"), measured=str(folder / "measured.yaml"), noise_per_m=0.003,
         num_sigma=3.0, min_depth_share=0.5,

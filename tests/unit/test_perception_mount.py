@@ -18,7 +18,7 @@ from perception.render.scene_ranges import view_from
 from perception.target_sensor import WatchedHole
 
 RIG = option("rig", "zed_2i_1080p")
-ARM = option("target", "perceived").arm
+ARM = option("target", "perceived").camera.arm
 UP = np.array([0.0, 0.0, 1.0])
 HOLE_M = np.array([2.6, 0.0, 0.75])
 
@@ -100,8 +100,8 @@ class _Wall:
 
 
 def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:
-    source = option("perception/source", "simulator").build()
-    scene = source.compose()
+    camera = option("perception/source", "simulator")
+    scene = camera.compose(camera.task_scene, np.zeros((0, 3)))
     motion = np.linalg.inv(RIG.base_from_camera)
     seen = view_from(scene, motion @ RIG.base_from_camera)
     assert seen.block is not None and scene.block is not None

@@ -14,7 +14,6 @@ from brokk_rl.contracts.vision import HolePose
 from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import pair_check
-from perception.finder import explain_rejection
 from perception.render.stereo_camera import MisalignedPinhole, PairMisalignment
 
 PERFECT = PairMisalignment(
@@ -91,10 +90,10 @@ def test_pitch_and_roll_of_a_pair_are_measured() -> None:
 
     found = measure(pair(0.4, roll_rad))
     # 0.4 px in the middle and at the border: 1 + y² is 1.09 on average
-    assert found.pitch_px == pytest.approx(0.4 / 1.09, abs=0.03)
+    assert found.numbers_px[0] == pytest.approx(0.4 / 1.09, abs=0.03)
     # registration begins without a shift, and comes out up to an eighth short
-    assert found.roll_px == pytest.approx(528.0 * roll_rad, rel=0.125)
-    assert found.focal_px == pytest.approx(0.0, abs=0.04)
+    assert found.numbers_px[1] == pytest.approx(528.0 * roll_rad, rel=0.125)
+    assert found.numbers_px[2] == pytest.approx(0.0, abs=0.04)
     assert measure(pair(0.0, 0.0)).rms_px < 0.02
 
 
@@ -156,7 +155,7 @@ def test_a_pair_that_is_not_rectified_is_refused_and_calibration_is_asked_for() 
     (refused,) = found.rejected
     assert refused.stage == "frame"
     assert refused.value > refused.limit
-    assert "calibrate the camera pair" in explain_rejection(refused)
+    assert "calibrate the camera pair" in finder.explain(refused)
 
 
 def test_a_pair_once_found_good_stays_good_where_nothing_can_be_told() -> None:

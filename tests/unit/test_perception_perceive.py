@@ -12,13 +12,14 @@ import pytest
 from drawn import CENTER, K, drawn
 
 from perception import dataset
+from perception.camera import CameraModel, write_camera
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     place = tmp_path / "frames"
     place.mkdir()
-    dataset.write_camera(place, K, (640, 480), np.eye(4), None)
+    write_camera(place, CameraModel(K, size_px=(640, 480), base_from_camera=np.eye(4)))
     frame, masks, _ = drawn()
     label = dataset.FrameLabel(
         masks.block > 0.5, np.zeros(masks.block.shape, bool), np.zeros(masks.block.shape, bool)

@@ -11,8 +11,8 @@ from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 
 from brokk_rl.contracts.vision import HolePose, Masks, Rejection
 from perception.ellipse import conic
+from perception.ellipse.conic import as_row as pose_row
 from perception.pose import alignment, appearance, consistency, plane
-from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
 from perception.pose.wall_light import IN_DUST
 

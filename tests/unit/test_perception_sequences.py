@@ -18,7 +18,7 @@ from brokk_rl.signals import Frame
 from perception.calibrate.arm import compute_link_poses
 from perception.label.camera_pose import Charuco
 from perception.modes.score_camera import match_found_holes
-from perception.render.board_on_arm import BoardOnArm
+from perception.render.board_on_arm import BoardOnArm, BoardScenes
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.stereo_camera import StereoRig
 
@@ -32,20 +32,19 @@ def rig() -> StereoRig:
 
 def find_corners(board: Charuco, studio: FrameRenderer, scenes: Any, number: int) -> Any:
     """Returns the corners that OpenCV finds in a frame, on the board and in the picture, and the staged scene."""
-    view = scenes.view(number)
-    shot = studio.shot(view.scene, view.generator, view.base_from_camera)
-    tracker = board.build()
+    scene, generator = scenes.compose(number)
+    shot = studio.shot(scene, generator)
     frame = Frame(shot.color, shot.depth_m, studio.rig.left.matrix, None, 0.0, name="0")
-    return *tracker.find_corners(frame), view, shot
+    return *board.find_corners(frame), scene, shot
 
 
 def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path: Path) -> None:
     kind: BoardOnArm = option("scene", "board_on_arm")
-    scenes = kind.open(rig, SESSION)
+    scenes = BoardScenes(kind, rig, SESSION)
     studio = FrameRenderer(
         rig=rig, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
     )
-    corners_m, corners_px, view, _ = find_corners(kind.board, studio, scenes, 3)
+    corners_m, corners_px, scene, _ = find_corners(kind.board, studio, scenes, 3)
     assert len(corners_m) > 20
     scenes.write_records(tmp_path, 4)
     recording = record.read_recording(tmp_path / "joints.parquet", kind.machine)
@@ -55,7 +54,7 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     t_s = np.array([3, 1]) / kind.rate_hz + kind.clock_s
     q = np.stack([np.interp(t_s, recording.t_s, one) for one in recording.q.T], 1) + zeros
     link = compute_link_poses(kind.machine, q).base_from_link
-    plates: list[Any] = [scenes.view(number).scene.solids for number in (3, 1)]
+    plates: list[Any] = [scenes.compose(number)[0].solids for number in (3, 1)]
     at = [next(one.pose.center_m for one in solids if one.role == "board") for solids in plates]
     base = rig.base_from_camera
     in_base = [base[:3, :3] @ one + base[:3, 3] for one in at]
@@ -64,7 +63,7 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     # The sensors' noise of 0.5 mrad at 2 m.
     assert np.linalg.norm(predicted - in_base[1]) < 0.006
     # And the print lies on the plate: corners of squares project to where OpenCV finds them.
-    plate: Any = next(one for one in view.scene.solids if one.role == "board")
+    plate: Any = next(one for one in scene.solids if one.role == "board")
     size_m = np.array([kind.board.columns, kind.board.rows]) * kind.board.square_m
     local = corners_m - [*(size_m / 2), plate.half_m[2]]
     expected = rig.left.project(plate.pose.point(local))

@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
 from perception.pair_depth import PairDepth
-from perception.stereo import PicturePart, Stereo
+from perception.segment.window import Window
+from perception.stereo import Stereo
 
 FOCAL_PX, BASELINE_M = 1056.0, 0.12
 PULL_PX = FOCAL_PX * BASELINE_M
@@ -50,7 +51,7 @@ def make_frame(disparity: np.ndarray, coarse_px: np.ndarray, shrink: int) -> Fra
 @pytest.mark.parametrize("shrink", [1, 2])
 def test_a_part_in_a_band_is_matched_as_exactly_as_the_picture(stereo: Stereo, shrink: int) -> None:
     left, right = make_pair(SLANT)
-    part = PicturePart(200, 40, 161, 121)
+    part = Window(200, 40, 161, 121)
     found = replace(stereo, shrink=shrink).match_part(left, right, part, 25.0, 45.0)
     assert found.shape == (121, 161)
     error = (found - SLANT[40:161, 200:361])[:, :-8]
