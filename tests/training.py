@@ -54,11 +54,8 @@ def small(
     for network in ("actor", "critic"):
         runner[network]["hidden_dims"] = [16]
     budget = TrainingBudget(max_env_steps=max_env_steps, max_seconds=max_seconds)
-    return replace(
-        shipped,
-        **{"num_envs": 16, "num_starts": 64, "save_interval": 1, "runner": runner, "budget": budget}
-        | changes,
-    )
+    size: dict[str, Any] = {"num_envs": 16, "num_starts": 64, "save_interval": 1}
+    return replace(shipped, **size | {"runner": runner, "budget": budget} | changes)
 
 
 def make(

@@ -309,11 +309,8 @@ def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
     true = place(t_s) + np.array([0.0, 0.0, 0.009, 0.0, 0.0])
     tip = Kinematics(machine).pose(torch.as_tensor(true, dtype=torch.float32)).tip_in_base_m
     seen = tip.numpy() + generator.normal(0.0, 0.0015, (len(t_s), 3))
-    shown = replace(
-        record(machine, np.zeros_like(true), np.zeros_like(true)),
-        q=place(t_s - late_s).astype("f4"),
-        extra=dict(zip(TOOL_COLUMNS, seen.T, strict=True)),
-    )
+    columns = dict(zip(TOOL_COLUMNS, seen.T, strict=True))
+    shown = make_recording(machine, np.zeros_like(true), place(t_s - late_s), extra=columns)
     assert measure_clock_shift([shown], machine) == pytest.approx(late_s, abs=0.002)
 
 

@@ -118,7 +118,7 @@ def test_a_fit_recovers_the_whole_of_m5(arm: Machine, tmp_path: Path) -> None:
 
 def test_effects_of_friction_are_numbers_of_the_drive(arm: Machine) -> None:
     """A drive with the effects around it and one with their numbers move alike, to the last bit."""
-    u = 0.25 + 0.1 * np.sin(np.arange(200) / 45.0)
+    u = 0.25 + 0.1 * np.sin(np.arange(100) / 22.0)
     plain = {name: TRUE[name] for name in ("mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n")}
     drive = replace(option("actuator", "force", **plain), stribeck_m_s=TRUE["stribeck_m_s"])
     model: Any = drive.build(arm, 1, CPU)

@@ -43,11 +43,8 @@ class Glide(Probe):
     """Keeps half of the increment that it sees in the history, as a learned model might."""
 
     def step(self, history: History) -> torch.Tensor:
-        return (
-            history.q[:, -1]
-            + 0.5 * (history.q[:, -1] - history.q[:, -2])
-            + 0.5 * history.u[:, -1] * self._step
-        )
+        went = history.q[:, -1] - history.q[:, -2]
+        return history.q[:, -1] + 0.5 * (went + history.u[:, -1] * self._step)
 
 
 @cache
@@ -194,16 +191,14 @@ def test_lag_follows_the_analytic_step_response(machine: Machine) -> None:
 
 def test_backlash_of_a_moving_joint_is_closed(machine: Machine) -> None:
     model = wrapped("backlash", machine, gap_rad=0.03)
-    history = History(
-        q=0.01 * torch.arange(13.0)[None, :, None].expand(1, 13, 5), u=torch.ones(1, 13, 5)
-    )
+    q = 0.01 * torch.arange(13.0)[None, :, None].expand(1, 13, 5)
+    history = History(q=q, u=torch.ones(1, 13, 5))
     assert (model.step(history) - history.q[:, -1])[0, 0].item() == pytest.approx(FULL, abs=1e-6)
 
 
 def test_compliance_rings_as_an_oscillator_does(machine: Machine) -> None:
-    path = roll(wrapped("compliance", machine, ringing_s=0.4, damping=0.1), machine, [1.0] * 40)[
-        :, 0, 0
-    ]
+    model = wrapped("compliance", machine, ringing_s=0.4, damping=0.1)
+    path = roll(model, machine, [1.0] * 40)[:, 0, 0]
     t_s, w = 0.05 * np.arange(41), 2 * np.pi / 0.4
     ringing = w * np.sqrt(1 - 0.01)
     expected = 0.4 * t_s - 0.4 / ringing * np.exp(-0.1 * w * t_s) * np.sin(ringing * t_s)
@@ -243,12 +238,8 @@ def test_creep_sinks_at_zero_command(machine: Machine) -> None:
 
 
 def test_flow_sharing_slows_joints_in_proportion(machine: Machine) -> None:
-    model = wrapped(
-        "flow_sharing",
-        machine,
-        demand={"q3": 0.8, "q4": 0.5, "q5": 0.3, "other": 0.6},
-        joints=["q3", "q4", "q5"],
-    )
+    demand = {"q3": 0.8, "q4": 0.5, "q5": 0.3, "other": 0.6}
+    model = wrapped("flow_sharing", machine, demand=demand, joints=["q3", "q4", "q5"])
     full = torch.as_tensor(machine.max_speed * 0.05, dtype=torch.float32)
 
     def shares(level: float, *joints: int) -> list[float]:
@@ -271,19 +262,14 @@ def test_no_effect_goes_through_a_stop(machine: Machine) -> None:
         ("compliance", {"ringing_s": 0.5}),
     ):
         inner = shipped("actuator", "ideal").build(machine, 1, CPU)
-        path = roll(
-            wrapped(name, machine, inner=inner, **numbers),
-            machine,
-            [1.0] * 20 + [0.0] * 20,
-            at=near,
-        )[:, 0, 0]
-        assert path.max() <= machine.upper[0] + 1e-6
+        model = wrapped(name, machine, inner=inner, **numbers)
+        path = roll(model, machine, [1.0] * 20 + [0.0] * 20, at=near)
+        assert path[:, 0, 0].max() <= machine.upper[0] + 1e-6
 
 
 def test_quantisation_rounds_to_steps(machine: Machine) -> None:
-    got = wrapped("quantisation", machine, step_rad=0.01).measure(
-        torch.tensor([[0.104, 0.106, -0.104, 0.0, 1.0]])
-    )
+    q = torch.tensor([[0.104, 0.106, -0.104, 0.0, 1.0]])
+    got = wrapped("quantisation", machine, step_rad=0.01).measure(q)
     np.testing.assert_allclose(got[0], [0.10, 0.11, -0.10, 0.0, 1.0], atol=1e-6)
 
 
@@ -294,12 +280,9 @@ def test_sensor_noise_is_white_and_normal(machine: Machine) -> None:
     assert first[:, 1].std().item() == pytest.approx(0.001, rel=0.04)
     assert abs(first.mean().item()) < 5e-5
     assert (first[:, 0].abs() > 0.00392).float().mean().item() == pytest.approx(0.05, abs=0.012)
-    for a, b in (
-        (first[:, 0], second[:, 0]),
-        (first[:, 0], first[:, 1]),
-        (first[1:, 0], first[:-1, 0]),
-    ):
-        assert abs(torch.corrcoef(torch.stack((a, b)))[0, 1].item()) < 0.06
+    # by draws, by joints, and from one machine to the next
+    for other in (second[:, 0], first[:, 1], first[:, 0].roll(1)):
+        assert abs(torch.corrcoef(torch.stack((first[:, 0], other)))[0, 1].item()) < 0.06
 
 
 def test_bias_and_scale_are_taken_back_by_truth(machine: Machine) -> None:
@@ -341,9 +324,8 @@ def test_candidates_run_side_by_side(machine: Machine) -> None:
 def test_a_longer_link_moves_the_tool_along_it(machine: Machine) -> None:
     q = torch.zeros(1, 5)  # stretched out level: every link behind q2 points ahead
     tip_m = Kinematics(machine).pose(q).tip_in_base_m
-    model = wrapped(
-        "link_length", machine, extra_m={"q2": 0.01, "q4": -0.02, "q5": 0.005, "other": 0}
-    )
+    extra_m = {"q2": 0.01, "q4": -0.02, "q5": 0.005, "other": 0}
+    model = wrapped("link_length", machine, extra_m=extra_m)
     np.testing.assert_allclose(model.tool(tip_m, q) - tip_m, [[-0.005, 0, 0]], atol=1e-6)
     q[0, 3] = math.pi / 2  # the third arm and the tool hang down
     np.testing.assert_allclose(model.tool(tip_m, q) - tip_m, [[0.01, 0, 0.015]], atol=1e-6)

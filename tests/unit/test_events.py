@@ -63,11 +63,8 @@ def drive_into_the_ground(machine: Machine, worlds: list[Any]) -> list[list[np.n
 
 def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> None:
     world: Any = vary(NATIVE.build(machine, "cpu", None, events=FIXED))
-    world.reset(
-        torch.ones(NUM, dtype=torch.bool),
-        torch.tensor(machine.home).float().repeat(NUM, 1),
-        make_nominal_scenes(NUM),
-    )
+    home = torch.tensor(machine.home).float().repeat(NUM, 1)
+    world.reset(torch.ones(NUM, dtype=torch.bool), home, make_nominal_scenes(NUM))
     for i in range(NUM):
         edited = compile_model(machine, 0.01)
         for j, name in enumerate(machine.joint_names):

@@ -58,10 +58,9 @@ def test_a_fit_repeats_with_its_seed(machine: Machine, runs: Runs, tmp_path: Pat
 
 def test_the_same_seed_draws_the_same_windows_and_none_crosses_recordings(machine: Machine) -> None:
     parts = [recording(machine, seed, minutes=0.2) for seed in range(3)]
-    marked = [
-        dataclasses.replace(part, q=np.full_like(part.q, number))
-        for number, part in enumerate(parts)
-    ]
+    marked = []
+    for number, part in enumerate(parts):
+        marked.append(dataclasses.replace(part, q=np.full_like(part.q, number)))
     windows = TrainingWindows(marked, machine, 7, CPU)
     draws = [windows.draw(64, 0.25, torch.Generator().manual_seed(seed)) for seed in (5, 5, 6)]
     assert draws[0][0].shape == draws[0][1].shape == (5, 64, 13 + 7)

@@ -104,7 +104,7 @@ CHANGES = {
 
 
 def test_effects_on_a_drive_are_its_mass_and_friction(drive: Machine) -> None:
-    u = 0.3 * np.sin(np.arange(300) / 25.0)
+    u = 0.3 * np.sin(np.arange(150) / 12.0)
     whole = run_drive(option("actuator", "force", **TRUE).build(drive, 1, CPU), drive, u, 0.1)
     model: Any = option("actuator", "force", mass_kg=80.0).build(drive, 1, CPU)
     for kind in load_effects(drive, list(CHANGES)):

@@ -23,11 +23,8 @@ from brokk_rl.machine import Machine
 
 
 def write_lists(path: Path) -> None:
-    signals = make_signals()
-    rows = [
-        f'{t!r},"[{u!r}, {q!r}]"'
-        for t, u, q in zip(*(v.tolist() for v in signals.values()), strict=True)
-    ]
+    columns = (values.tolist() for values in make_signals().values())
+    rows = [f'{t!r},"[{u!r}, {q!r}]"' for t, u, q in zip(*columns, strict=True)]
     path.write_text("\n".join(["t,both", *rows]) + "\n")
 
 

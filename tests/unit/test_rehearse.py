@@ -23,9 +23,8 @@ class Played:
         self.found = "lag: {time_constant_s: 0.1}\n"
 
     def __call__(self, words: list[str], env: dict[str, str]) -> Self:
-        place = Path(
-            next(word for word in words if word.startswith("session.out=")).partition("=")[2]
-        )
+        out = next(word for word in words if word.startswith("session.out="))
+        place = Path(out.partition("=")[2])
         words = words[words.index("brokk_rl") :]
         self.commands[place.name] = words[1:]
         self.code = int(place.name == self.failing)
@@ -58,13 +57,8 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Played:
 def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
     played: Played, brokk: Callable[..., Done], tmp_path: Path
 ) -> None:
-    done = brokk(
-        "experiment=gap_loop",
-        "session.out=story",
-        "session.device=cpu",
-        "rl.budget.max_seconds=7",
-        "sim.native.num_worlds=3",
-    )
+    changes = ("session.device=cpu", "rl.budget.max_seconds=7", "sim.native.num_worlds=3")
+    done = brokk("experiment=gap_loop", "session.out=story", *changes)
     assert done.code == 0, done.err
     folder = tmp_path / "story"
     stages = "reference simulator policy believed changed field diagnosis retrained"

@@ -75,18 +75,12 @@ def test_whatever_is_given_is_text_and_never_markup(read: Reader) -> None:
 
 
 def test_a_page_needs_nothing_from_elsewhere(read: Reader) -> None:
-    addresses = [
-        value
-        for _, attributes in read.tags
-        for key, value in attributes.items()
-        if key in ("src", "href", "srcset")
-    ]
+    addresses, policies = [], []
+    for _, attributes in read.tags:
+        addresses += [attributes[key] for key in ("src", "href", "srcset") if key in attributes]
+        if attributes.get("http-equiv") == "Content-Security-Policy":
+            policies.append(attributes["content"])
     assert addresses and all(value and value.startswith("data:") for value in addresses)
-    policies = [
-        attributes["content"]
-        for _, attributes in read.tags
-        if attributes.get("http-equiv") == "Content-Security-Policy"
-    ]
     assert policies and "default-src 'none'" in str(policies[0])
 
 

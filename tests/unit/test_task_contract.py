@@ -138,9 +138,8 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
         "rl": make_training(),
     }
     evaluation = replace(load_part("evaluation"), episodes=4, num_recorded=1, video=False)
-    train = Train(
-        **parts, effect={}, event={}, tracking=NoTracking(), evaluation=evaluation, policy=None
-    )
+    parts |= {"effect": {}, "event": {}, "tracking": NoTracking(), "evaluation": evaluation}
+    train = Train(**parts, policy=None)
     with caplog.at_level(logging.INFO):
         assert train.run() is not None
     assert "HoldStill) has no classical controller" in caplog.text
@@ -151,13 +150,9 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
     assert report["policies"].keys() == {"trained"} and "moved" in report
     assert "success_paper" not in report
 
+    policy = TrainedPolicy(path=str(tmp_path), task=None)
     with pytest.raises(ConfigError, match="has no policy that can leave the trainer"):
-        Export(
-            session=parts["session"],
-            machine=machine,
-            task=HoldStill(),
-            policy=TrainedPolicy(path=str(tmp_path), task=None),
-        ).run()
+        Export(session=parts["session"], machine=machine, task=HoldStill(), policy=policy).run()
 
 
 def test_the_classical_policy_of_a_task_without_one_is_refused(machine: Machine) -> None:

@@ -394,11 +394,8 @@ def test_a_block_that_is_struck_gives_way_once(machine: Machine) -> None:
 def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
     """Five steps of 50 ms: commands 0.5, 0.5, -0.5 of q1 and still; 30 mm beside the hole, then inside at 0.2 s, then out again."""
     task = option("task", "borehole_insertion")
-    stage = Stage(
-        machine,
-        termination=terminations(success=None),
-        action=replace(task.action, kind="direct", scale=1.0, limits=False),
-    )
+    action = replace(task.action, kind="direct", scale=1.0, limits=False)
+    stage = Stage(machine, termination=terminations(success=None), action=action)
     stage.process.state["lowest"].fill_(-1.0)
     stage.process.state["highest"].fill_(1.0)
     script = [  # command of q1, force, tool from the target

@@ -19,11 +19,8 @@ def switch(rule: str) -> PhaseSwitch:
 
 
 def seen(reach_m: float, reach_3d_m: float, tip_z_m: float) -> Any:
-    return SimpleNamespace(
-        reach_m=torch.tensor([reach_m]),
-        reach_3d_m=torch.tensor([reach_3d_m]),
-        tip_z_m=torch.tensor([tip_z_m]),
-    )
+    numbers = {"reach_m": reach_m, "reach_3d_m": reach_3d_m, "tip_z_m": tip_z_m}
+    return SimpleNamespace(**{name: torch.tensor([value]) for name, value in numbers.items()})
 
 
 @pytest.mark.parametrize(

@@ -58,11 +58,8 @@ def test_the_first_term_counts_and_time_counts_last() -> None:
     blow, limit = ends("force_limit", largest_n=100.0), ends("joint_limit", margin=0.0)
     terms = TerminationManager({"time_limit": TIME, "blow": blow, "off": None, "limit": limit})
     assert terms.reasons == ("blow", "limit", "fault", "time_limit")
-    here = state(
-        steps=torch.tensor([10.0, 10.0, 1.0]),
-        q=torch.tensor([[2.0, 0.0], [0.0, 0.0], [2.0, 0.0]]),
-        contact_force_n=torch.tensor([200.0, 0.0, 0.0]),
-    )
+    q, force_n = torch.tensor([[2.0, 0.0], [0.0, 0.0], [2.0, 0.0]]), torch.tensor([200.0, 0.0, 0.0])
+    here = state(q, steps=torch.tensor([10.0, 10.0, 1.0]), contact_force_n=force_n)
     endings = terms.judge(here, torch.tensor([False, False, True]))
     counted = [terms.reasons[int(index)] for index in endings.reason]
     assert counted == ["blow", "time_limit", "limit"]

@@ -135,7 +135,7 @@ def test_a_limited_servo_moves_as_a_position_actuator_of_mujoco(arm: Machine) ->
 
 def test_a_limit_that_never_acts_changes_no_bit(arm: Machine) -> None:
     servo = make_servo(dead_time_s=0.03, response_s=0.04, damping=0.5, play_rad=0.01, sag_rad=0.01)
-    u = draw_levels(arm, 2)
+    u = draw_levels(arm, 2, count=6)
     plain = run_servo(servo.build(arm, 1, CPU), arm, u)
     beyond = replace(servo, limit_rad=2.0)  # targets step by 1.2 rad at most
     np.testing.assert_array_equal(run_servo(beyond.build(arm, 1, CPU), arm, u), plain)
@@ -146,7 +146,7 @@ def test_a_limit_that_never_acts_changes_no_bit(arm: Machine) -> None:
 def test_the_effect_is_the_limit_of_the_servo(arm: Machine) -> None:
     """5 % of a travel of 3 rad over a shortage of 5 is a limit of 0.03 rad; the lower limit counts."""
     servo = make_servo(response_s=0.04, damping=0.8, sag_rad=0.01, firmware_damping=0.5)
-    u = draw_levels(arm, 3)
+    u = draw_levels(arm, 3, count=6)
     inside = run_servo(replace(servo, limit_rad=0.03).build(arm, 1, CPU), arm, u)
     around = run_servo(limit_torque(servo.build(arm, 1, CPU), arm, 5.0), arm, u)
     np.testing.assert_allclose(around, inside, atol=1e-5)
