@@ -43,8 +43,6 @@ TEMPERS = (1.0, 0.5)
 """Powers of the likelihood under which a course is sought; the samples depend on each other."""
 IMPOSSIBLE = -1e9
 """Log chance of what cannot be."""
-NEIGHBOUR = 0.45
-"""Chance that a jumping delay changes by one sample only, up and down each."""
 LEAST_NATS = 5.0
 
 
@@ -122,8 +120,9 @@ def build_law(course: Course, num_delays: int) -> np.ndarray:
         chance[steps[1:-1], steps[2:]] = course.lasts
         chance[0, :2] = (1.0 - course.begins, course.begins)
     else:
-        is_near = np.abs(steps[:, None] - steps) == 1
-        chance = (1.0 - stays[:, None]) * np.where(is_near, NEIGHBOUR, 1.0 / num_delays)
+        # No frame overtakes another: a delay grows by one sample a sample at most.
+        in_order = (steps <= steps[:, None] + course.parts) & (steps != steps[:, None])
+        chance = (1.0 - stays[:, None]) * in_order / in_order.sum(1, keepdims=True)
         np.fill_diagonal(chance, stays)
     return np.where(chance > 0.0, np.log(np.maximum(chance, 1e-300)), IMPOSSIBLE)
 
