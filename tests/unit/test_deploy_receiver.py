@@ -13,6 +13,7 @@ from sender import BUS, DECISION, HOME, MACHINE, PERIODS_S, Sender
 
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
+from deploy.kernel.guard import GuardTrip
 from deploy.kernel.protection import ChannelTrust, MessageFault
 
 
@@ -33,6 +34,25 @@ def test_before_anything_came_nothing_is_known() -> None:
     times = (state.q_t_s, state.flow_t_s, state.levers_t_s, state.status_t_s, state.held_up_s)
     assert times == (0.0,) * 5 and math.isnan(state.oil_c)
     assert (state.frames, state.refused, state.lost, state.flow_number) == (0, 0, 0, 0)
+
+
+def test_a_remote_that_speaks_before_the_gateway_is_heard_and_is_not_late() -> None:
+    sender = Sender()
+    # Its dead-man is pressed, and nobody knows the gateway's clock yet.
+    sender.send("LeverState")
+    assert sender.seen().deadman and sender.state().held_up_s == 0.0
+
+
+def test_only_valve_feedback_counts_against_the_valves(sender: Sender) -> None:
+    sender.values |= {"FlowSource": 0}
+    sender.go(0.5)
+    sender.send("ValveFeedback", Flow_q1=0.5)
+    for _ in range(20):
+        sender.send("MachineStatus")
+    assert sender.seen().observed is GuardTrip.NONE
+    for _ in range(20):
+        sender.send("ValveFeedback", Flow_q1=0.5)
+    assert sender.seen().observed is GuardTrip.FLOW_UNASKED
 
 
 def test_what_was_sent_is_what_the_guard_and_the_others_see(sender: Sender) -> None:
