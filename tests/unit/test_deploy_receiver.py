@@ -200,6 +200,9 @@ def test_a_gateway_whose_clock_is_set_back_is_believed_again_after_a_press(sende
     sender.values["DeadMan"] = 0
     sender.go(0.1, late_s=late_s)
     sender.values["DeadMan"] = 1
+    sender.send("LeverState", late_s=0.3)
+    # Commands carry what the gateway said last, from this moment on.
+    assert sender.receiver.stamp_s == pytest.approx((sender.now_s + 39.7) % 65.536, abs=0.02)
     sender.go(0.1, late_s=late_s)
     seen = sender.seen()
     assert seen.joints_age_s < 0.02 and seen.status_age_s < 0.03 and seen.trusted
