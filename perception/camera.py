@@ -72,8 +72,8 @@ class CameraModel:
         if not self.maps:
             return pictures
         straight = []
-        for picture, maps in zip(pictures, self.maps, strict=False):
-            straight.append(np.asarray(cv2.remap(picture, *maps, cv2.INTER_CUBIC), np.uint8))
+        for picture, (x, y) in zip(pictures, self.maps, strict=False):
+            straight.append(np.asarray(cv2.remap(picture, x, y, cv2.INTER_CUBIC), np.uint8))
         return straight
 
     def build_frame(

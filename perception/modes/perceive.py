@@ -151,16 +151,16 @@ class Perceive:
                 )
             look = finder.find_ellipses
 
-        def look_closely(frame: Frame) -> tuple[Frame, FrameDetections, Sequence[TrackedHole]]:
-            return frame, *look(frame)
+        def search(frame: Frame) -> tuple[Frame, tuple[FrameDetections, Sequence[TrackedHole]]]:
+            return frame, look(frame)
 
-        answers = look_at_frames(self.source, "looking", look_closely, self.perceive.frames)
+        answers = look_at_frames(self.source, "looking", search, self.perceive.frames)
         for name, answer, reason in answers:
             if answer is None:
                 log.warning("%s", reason)
                 yield FrameEntry(name, None, None, reason), None
             else:
-                frame, found, tracked = answer
+                frame, (found, tracked) = answer
                 yield FrameEntry(name, found, _choose_target(tracked, frame.t_s), None), frame
 
     def _write(self, folder: Path, entries: list[FrameEntry], finder: BoreholeFinder) -> None:
