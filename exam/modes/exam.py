@@ -23,7 +23,7 @@ from brokk_rl.spec import spec
 from exam import answer_scoring, dataset, metrics, run_cases
 from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.examiner import examine_case
-from exam.generate import CASES_FOLDER, STREAMS, CaseRecorder, HalfPlan
+from exam.generate import CASES_FOLDER, STREAMS, CaseRecorder, Half, HalfPlan
 from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
 
@@ -153,7 +153,7 @@ class Exam:
             "num_cases": len(labels),
         }
         found = dataset.seal_labels(folder, {**facts, "cases": labels}, salt)
-        halves = {half: getattr(settings, half) for half in STREAMS}
+        halves: dict[Half, HalfPlan] = {half: getattr(settings, half) for half in STREAMS}
         drawn = (settings.plants, settings.roughness, self.excitation, settings.approach)
         recorder = CaseRecorder(self.machine, *drawn, halves, folder)
         recorder.write_all(questions, settings.workers)
