@@ -94,7 +94,7 @@ class ZedDevice:
         init.camera_fps = settings.rate_hz
         init.depth_mode = getattr(sl.DEPTH_MODE, settings.depth_mode, None)
         if init.depth_mode is None:
-            raise FrameError(f"source.depth_mode={settings.depth_mode}: this SDK does not know it")
+            raise FrameError(f"source.depth_mode: choose another, {settings.depth_mode} is unknown")
         init.coordinate_units = sl.UNIT.METER
         init.coordinate_system = sl.COORDINATE_SYSTEM.IMAGE  # x right, y down, z forward
         init.depth_minimum_distance = settings.nearest_m
