@@ -58,8 +58,8 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "48 simulated arms, answered once. An earlier engine had 31 of 35, 11 of 20 and 0 of 15 of other 100. No name has changed since.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 48, "servo_diagnosis", "servo",
+        "40 simulated arms, answered once. Earlier engines had 16 of 17, 4 of 10 and 0 of 7 of other 48. A bound of three effects came since; no answer has more.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 40, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
