@@ -53,7 +53,7 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "36 simulated cranes, answered once. A person drives 12 fields. An earlier engine had 10 of 17, 4 of 10 and 2 of 7 of other 48. One answer has become right since.",
+        "36 simulated cranes, answered once. A person drives 12 fields. An earlier engine had 10 of 17, 4 of 10 and 2 of 7 of other 48. The next engine got one more right; today's was not asked.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 36, "diagnosis", "valve",
     ),
     describe_exam(

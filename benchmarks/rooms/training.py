@@ -120,7 +120,7 @@ MEASUREMENTS = (
     Measurement(
         name="paper_smooth",
         title="The paper's configuration, smooth",
-        conditions="`experiment=paper_smooth`, one seed: 148 million steps, 75 s, two trainings on the GPU. *Vector alone*: five seeds whose network sees nothing else, 460 to 484 million steps each. Judged by MuJoCo C with the errors of training. The baseline is the classical controller.",
+        conditions="`experiment=paper_smooth`, one seed: 148 million steps, 75 s, beside another training. *Vector alone*: five seeds whose network sees nothing else, 460 to 484 million steps each. Judged by MuJoCo C with the errors of training. Baseline: the controller, whose command the network sees.",
         commands=(
             "brokk mode=train preset=gpu experiment=paper_smooth rl.budget.max_seconds=75 evaluation.video=false session.out={out}/trained",
             "brokk -m mode=train preset=gpu experiment=paper_smooth session.seed=1,2,3,4,5 rl.budget.max_seconds=250 'rl.runner.obs_groups={{actor:[policy],critic:[policy,guide,privileged]}}' evaluation.video=false session.out={out}/alone",

@@ -18,7 +18,7 @@ EXAMPLE = """lengths are in m, not in mm; expected YAML such as
     - {name: A, center_m: [1.120, 0.310, 0.004], axis: [0, 0, -1], radius_m: 0.05}
   block: {corner_m: [-0.20, -0.15, 0.004], size_m: [1.6, 0.9, 0.6]}   # for mode=label: least x, y, z"""
 USUAL = {"axis": (0.0, 0.0, -1.0), "radius_m": 0.05}
-"""Of a hole that does not tell it."""
+"""Axis and radius of a hole whose file gives none."""
 # Larger numbers are mm. Chosen by hand: no block is longer, and no hole wider.
 Coordinate = Annotated[float, Interval(ge=-20, le=20)]
 Side = Annotated[float, Interval(gt=0, le=20)]

@@ -88,7 +88,7 @@ class Light:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What rays meet, without noise: those of a picture, `(h, w)`, or any others, `(M,)`.
+    """Surfaces that rays meet, without noise: rays of a picture, `(h, w)`, or any others, `(M,)`.
 
     Attributes:
         depth_m: Along z, float32; of a picture NaN where nothing is.
