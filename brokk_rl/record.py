@@ -241,7 +241,7 @@ def write_recording(recording: Recording, path: Path) -> None:
 
     check_recording(recording, str(path))
     columns: dict[str, np.ndarray] = {"t_s": recording.t_s.astype(np.float64)}
-    for name, values in (_list_columns(recording) | dict(recording.extra)).items():
+    for name, values in (list_columns(recording) | dict(recording.extra)).items():
         columns[name] = np.asarray(values, dtype=np.float32)
     metadata = {
         "schema": SCHEMA,
@@ -369,13 +369,13 @@ def check_recording(recording: Recording, where: str) -> None:
             raise RecordingError(
                 f"{where}: {name} has shape {values.shape}, expected {shape} (samples, joints)"
             )
-    columns = {"t_s": recording.t_s} | _list_columns(recording)
+    columns = {"t_s": recording.t_s} | list_columns(recording)
     required = list(columns)
     for breach in check_columns(columns | dict(recording.extra), required, recording.rate_hz):
         raise RecordingError(f"{where}: {breach}")
 
 
-def _list_columns(recording: Recording) -> dict[str, np.ndarray]:
+def list_columns(recording: Recording) -> dict[str, np.ndarray]:
     """Return commands, then positions, of all joints by the names of their columns."""
     joints, units = recording.joints, recording.units
     positions = map(name_position_column, joints, units)

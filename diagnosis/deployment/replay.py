@@ -18,7 +18,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from brokk_rl.record import Recording, name_command_column, name_position_column
+from brokk_rl.record import Recording, list_columns
 from diagnosis.deployment.contract import (
     OBSERVATION_COLUMN,
     TARGET_COLUMNS,
@@ -234,7 +234,9 @@ def read_run_log(
         contract: The policy's contract.
         target_m: Target in the base frame where the log does not hold it; `None`: none is known.
     """
-    columns = _list_columns(recording)
+    columns = {"t_s": recording.t_s}
+    for name, values in (list_columns(recording) | dict(recording.extra)).items():
+        columns[name] = np.asarray(values, float)
     if target_m is not None:
         for name, value in zip(TARGET_COLUMNS, target_m, strict=True):
             columns.setdefault(name, np.full(recording.num_samples, value))
@@ -262,16 +264,6 @@ def read_run_log(
         is_measured=source.startswith(CAPTURED),
         units={name: measure_resolution(values) for name, values in columns.items()},
     )
-
-
-def _list_columns(recording: Recording) -> dict[str, np.ndarray]:
-    columns = {"t_s": recording.t_s}
-    for j, (joint, unit) in enumerate(zip(recording.joints, recording.units, strict=True)):
-        columns[name_command_column(joint)] = recording.u[:, j].astype(float)
-        columns[name_position_column(joint, unit)] = recording.q[:, j].astype(float)
-    for name, values in recording.extra.items():
-        columns[name] = np.asarray(values, float)
-    return columns
 
 
 def _read_term(term: ObservationTerm, columns: Mapping[str, np.ndarray]) -> np.ndarray:
