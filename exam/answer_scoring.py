@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from actuators.contracts import ActuatorFit
 from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_text
 from diagnosis.answer import ANSWER_FILE, parse_answer
 from exam import run_cases, score
 from exam.case_distribution import CaseDistribution
+from exam.examiner import examine_case
 from exam.generate import WITHHELD_FOLDER
 from exam.metrics import compute_metrics
 
@@ -30,19 +33,19 @@ RUN_FILE = "run.json"
 
 @dataclass(frozen=True)
 class GivenAnswer:
-    """Answer of a candidate to a case, as it was left.
+    """Answer of a candidate to a case; the fields of a line of a published file.
 
     Attributes:
         note: Seconds that it took, or the reason why there is no answer; empty where nothing was noted.
-        content: Content of its `diagnosis.json`, `None` without an answer.
-        left_out: Parts of it that are not published.
+        answer: Content of its `diagnosis.json`, `None` without one.
+        left_out: Parts of it that are not published; `None` where nothing was left out.
         labels_sha256: Hash of the labels of the exam that was answered; `None` where nobody noted it.
-        examined: The examiner's figures; see `exam.examiner.Examination`.
+        examined: The examiner's figures; see `exam.examiner.examine_case`.
     """
 
     note: Mapping[str, Any]
-    content: Mapping[str, Any] | None
-    left_out: tuple[str, ...] = ()
+    answer: Mapping[str, Any] | None
+    left_out: Sequence[str] | None = None
     labels_sha256: str | None = None
     examined: Mapping[str, Any] | None = None
 
@@ -65,10 +68,7 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
     try:
         if path.is_file():
             for row in map(json.loads, path.read_text().splitlines()):
-                found[row["case"]] = GivenAnswer(
-                    row["note"], row["answer"], tuple(row.get("left_out", ())),
-                    row.get("labels_sha256"), row.get("examined"),
-                )  # fmt: skip
+                found[row.pop("case")] = GivenAnswer(**row)
         elif path.is_dir():
             answered = read_run(path).get("labels_sha256")
             for place in filter(run_cases.is_begun, path.iterdir()):
@@ -81,7 +81,7 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
             f"exam.answers: {where}: expected {ANSWER_FILE} in a folder a case, or a line a case of a published file "
             f"({error!r}); delete what is damaged, and exam.do=run resume=<answers> answers it again"
         ) from error
-    if all(one.content is None for one in found.values()):
+    if all(one.answer is None for one in found.values()):
         raise RecordingError(f"exam.answers: {path} holds no answer to any case")
     return found
 
@@ -99,14 +99,14 @@ def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
         if note.get("error"):
             # The lines before name folders of the computer that answered.
             note["error"] = note["error"].strip().splitlines()[-1]
-        row: dict[str, Any] = {"case": case, "note": note, "answer": None}
-        if one.content is not None:
-            row["answer"] = {key: one.content[key] for key in PUBLISHED if key in one.content}
-            row["left_out"] = sorted({*one.left_out, *one.content} - {*PUBLISHED})
-        # Files from before hold neither.
-        beside = {"labels_sha256": one.labels_sha256, "examined": one.examined}
-        row |= {key: value for key, value in beside.items() if value is not None}
-        lines.append(json.dumps(row) + "\n")
+        kept = replace(one, note=note)
+        if one.answer is not None:
+            answer = {key: one.answer[key] for key in PUBLISHED if key in one.answer}
+            left_out = sorted({*(one.left_out or ()), *one.answer} - {*PUBLISHED})
+            kept = replace(kept, answer=answer, left_out=left_out)
+        # Only an answer is told where it is missing: files from before lack the rest.
+        told = {key: value for key, value in vars(kept).items() if value is not None}
+        lines.append(json.dumps({"case": case, "note": note, "answer": None} | told) + "\n")
     write_text(path, "".join(lines))
 
 
@@ -126,7 +126,7 @@ def build_table(
         if case not in given:
             continue
         one = given[case]
-        answer = None if one.content is None else parse_answer(one.content, f"case {case}")
+        answer = None if one.answer is None else parse_answer(one.answer, f"case {case}")
         row = score.score_answer(label, answer, mix.classes, shared, one.seconds, one.examined)
         scores.append(row)
     not_begun = len(labels) - len(scores)
@@ -139,7 +139,8 @@ def examine_answers(
     exam: Path,
     labels: Sequence[Mapping[str, Any]],
     folders: Mapping[str, Path],
-    examine: Callable[[str, Sequence[Path]], list[dict[str, Any]]],
+    fit: ActuatorFit,
+    machine: Machine,
     workers: int,
 ) -> dict[str, dict[str, Any]]:
     """Return the examiner's figures by case and candidate; none without withheld recordings.
@@ -148,7 +149,8 @@ def examine_answers(
         exam: Folder of the exam.
         labels: Its opened labels.
         folders: Answers of each candidate.
-        examine: Returns the figures of answers to a case.
+        fit: Fit of the examiner's simulator.
+        machine: The machine.
         workers: Processes.
     """
     cases = []
@@ -159,8 +161,8 @@ def examine_answers(
 
     def examine_begun(case: str) -> dict[str, Any]:
         begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
-        results = examine(case, [folders[name] / case for name in begun]) if begun else []
-        return dict(zip(begun, results, strict=True))
+        answers = {name: folders[name] / case for name in begun}
+        return examine_case(exam, fit, machine, case, answers) if begun else {}
 
     with ItemProgress("repairs examined", len(cases)) as progress, use_workers(workers):
         tell = lambda _, share: progress.reach(share * len(cases))  # noqa: E731

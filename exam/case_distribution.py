@@ -12,8 +12,8 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
-from exam.plants.family import UnknownFault
+from brokk_rl.spec import Count, spec
+from exam.plants.family import SEVERITY
 
 KINDS = ("none", "faint", "one", "several", "outside")
 """No gap; an effect too small to be seen; one effect; two or three; a fault outside the library."""
@@ -44,13 +44,13 @@ class EffectDistribution:
 
 @dataclass(frozen=True)
 class CaseFault:
-    """One effect of a case.
+    """One effect of a case, or its cause outside the library.
 
     Attributes:
         effect: Its name.
         joints: The joints that have it.
         size: Of typical.
-        parameters: `(J,)` by name.
+        parameters: `(J,)` by name; those of a cause are its `SEVERITY`.
         drawn: The parameters that were drawn, and so can be asked for, with the value that changes
             nothing.
     """
@@ -70,8 +70,7 @@ class CaseDesign:
         kind: See `KINDS`.
         machine_seed: Draws the machine.
         chance: Draws everything else about its recordings.
-        faults: Effects that the field has and the reference has not.
-        outside_fault: The same for a fault outside the library.
+        faults: Effects that the field has and the reference has not; of kind `outside` one cause.
         tracked: Whether the tool point is recorded.
     """
 
@@ -79,7 +78,6 @@ class CaseDesign:
     machine_seed: int
     chance: int
     faults: tuple[CaseFault, ...] = ()
-    outside_fault: UnknownFault | None = None
     tracked: bool = False
 
 
@@ -99,7 +97,7 @@ class CaseDistribution:
         troubles: How each effect is drawn; those that are not named do not occur.
     """
 
-    num_cases: int
+    num_cases: Count
     shares: dict[str, float]
     sizes: tuple[float, float]
     faint_sizes: tuple[float, float]
@@ -114,8 +112,8 @@ class CaseDistribution:
             raise ConfigError(
                 f"exam.mix.shares: expected {', '.join(KINDS)} with sum 1, got {self.shares}"
             )
-        if self.num_cases < 1 or not self.troubles:
-            raise ConfigError("exam.mix: expected num_cases of 1 or more, and some troubles")
+        if not self.troubles:
+            raise ConfigError("exam.mix.troubles: expected one or more effects, got none")
 
     def questions(
         self,
@@ -130,11 +128,11 @@ class CaseDistribution:
             kinds += [kind] * count
         effects = _cycle_shuffled(list(self.troubles), generator)
         strange = _cycle_shuffled(list(outside_faults), generator)
+        need_tool = [name for name, trouble in self.troubles.items() if trouble.needs_tool]
         found = []
         for kind in kinds:
             tracked = bool(generator.random() < self.tracked_share)
             faults: list[CaseFault] = []
-            outside_fault = None
             if kind in ("one", "faint"):
                 sizes = self.faint_sizes if kind == "faint" else self.sizes
                 faults = [self._fault(next(effects), machine, sizes, generator)]
@@ -151,12 +149,11 @@ class CaseDistribution:
                 if hidden[chosen].any():
                     chosen = self._some(np.flatnonzero(~machine.is_exclusive & ~hidden), generator)
                 has = np.isin(np.arange(machine.num_joints), chosen)
-                outside_fault = UnknownFault(name, size * has)
-            tracked = tracked or any(self.troubles[fault.effect].needs_tool for fault in faults)
+                joints = tuple(machine.joint_names[j] for j in chosen)
+                faults = [CaseFault(name, joints, size, {SEVERITY: size * has}, {})]
+            tracked = tracked or any(fault.effect in need_tool for fault in faults)
             machine_seed, chance = generator.integers(2**62, size=2).tolist()
-            found.append(
-                CaseDesign(kind, machine_seed, chance, tuple(faults), outside_fault, tracked)
-            )
+            found.append(CaseDesign(kind, machine_seed, chance, tuple(faults), tracked))
         return [found[i] for i in generator.permutation(len(found))]
 
     def list_shared(self) -> list[str]:

@@ -14,8 +14,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import format_now
@@ -25,8 +23,8 @@ from exam.case_distribution import CaseDesign
 LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
 OPENED_FILE = "labels.json"
 """The labels of an opened exam, beside its score: the same bytes."""
-PRIVATE = 0o600
-"""Mode of a file that only its owner can read."""
+OTHERS = 0o077
+"""Rights that nobody but the owner of the labels' file has."""
 
 
 def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
@@ -38,16 +36,13 @@ def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
     path = folder / LABELS_FILE
     text = json.dumps({"salt": salt, **labels}, indent=1, allow_nan=False, sort_keys=True) + "\n"
     found = hashlib.sha256(text.encode()).hexdigest()
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        if not path.exists():
-            with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT, PRIVATE), "w") as file:
-                file.write(text)
-            part.replace(path)
-        is_same = path.read_text() == text
-    except OSError as error:
-        raise StorageError(f"cannot seal the labels in {folder}: {error.strerror}") from error
-    if not is_same:
+    if not path.exists():
+        mask = os.umask(OTHERS)
+        try:
+            write_text(path, text)
+        finally:
+            os.umask(mask)
+    if path.read_text() != text:
         raise StorageError(
             f"{path} holds other labels: the exam in this folder is sealed. Go on with its own options and seed, or "
             "choose another session.out=<folder>"
@@ -99,19 +94,19 @@ def make_label(
     name: str, question: CaseDesign, machine: Machine, other_hand: bool
 ) -> dict[str, Any]:
     """Return the label of a case; `other_hand`: another hand drives the field than the reference."""
-    effects = []
+    effects, outside = [], None
     for fault in question.faults:
+        told = {"joints": list(fault.joints), "size": fault.size}
+        if question.kind == "outside":
+            outside = {"ailment": fault.effect, **told}
+            continue
         # only drawn parameters can be asked for
         parameters: dict[str, dict[str, float]] = {}
         for key in fault.drawn:
             by_joint = dict(zip(machine.joint_names, fault.parameters[key].tolist(), strict=True))
             parameters[key] = {joint: by_joint[joint] for joint in fault.joints}
-        told = {"effect": fault.effect, "joints": list(fault.joints), "size": fault.size}
-        effects.append({**told, "parameters": parameters, "nothing": fault.drawn})
-    cause, outside = question.outside_fault, None
-    if cause is not None:
-        joints = [machine.joint_names[j] for j in np.flatnonzero(cause.severity)]
-        outside = {"ailment": cause.kind, "joints": joints, "size": float(cause.severity.max())}
+        numbers = {"parameters": parameters, "nothing": fault.drawn}
+        effects.append({"effect": fault.effect, **told, **numbers})
     return {
         "case": name,
         "kind": question.kind,

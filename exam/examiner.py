@@ -4,14 +4,12 @@ The examiner fits a simulator to the reference, puts the effects of an answer ar
 freely through recordings of the changed machine that no candidate got. The floor is the error of
 the same simulator on the same machine without what the case is about, under the same commands.
 Nothing of the diagnosis is used but its effects, which are simulated as it simulates them.
-Axes: `W` windows, `K` steps, `J` joints.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from brokk_rl.machine import Machine
 from diagnosis import effect_library
 from diagnosis.case import estimate_running_s
 from diagnosis.effects_file import EFFECTS_FILE
+from diagnosis.free_runs import combine_joints
 from diagnosis.simulator_runs import EffectSimulator, cut_simulator_runs
 from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER
 
@@ -35,27 +34,6 @@ STRIDE_S = 2.5
 """Distance between two of them, s: they overlap by half."""
 MIN_GAP_RATIO = 1.05
 """Error over floor from which there is a gap to close. Chosen by hand; not searched."""
-NUM_DRAWS = 200
-"""Bootstrap draws over windows."""
-
-
-@dataclass(frozen=True)
-class Examination:
-    """The examiner's errors of one answer on the withheld part.
-
-    Attributes:
-        before: Error of the simulator without effects, over all joints.
-        after: The same with the effects of the answer.
-        floor: The same without effects, on the unchanged machine.
-        closed: Share of the gap that the effects close; `None` where there is none.
-        ci95: Its interval.
-    """
-
-    before: float
-    after: float
-    floor: float
-    closed: float | None
-    ci95: tuple[float, float] | None
 
 
 class ExaminerSimulator:
@@ -84,31 +62,19 @@ class ExaminerSimulator:
         running = estimate_running_s([*field, *withheld])[len(field) :]
         about = (machine, 0, HORIZON_S, STRIDE_S, running)
         self._runs = cut_simulator_runs(self._actuator, withheld, *about)
-        self._before = self._squares(self._runs, {})
-        self._floor = self._squares(cut_simulator_runs(self._actuator, unchanged, *about), {})
+        self._before = self._measure_error(self._runs, {})
+        without = cut_simulator_runs(self._actuator, unchanged, *about)
+        self._floor = self._measure_error(without, {})
 
-    def examine(self, effects: Mapping[str, Any]) -> Examination:
-        """Return the errors with these effects, specs by name."""
-        after = self._squares(self._runs, effects) if effects else self._before
-        draws = np.random.default_rng(0).multinomial(
-            len(after), np.full(len(after), 1.0 / len(after)), NUM_DRAWS
-        )
-        weights = np.concatenate([np.ones((1, len(after))), draws]) / len(after)
-        errors = [np.sqrt(weights @ squares) for squares in (self._before, after, self._floor)]
-        closed, interval = compute_closed(*errors)
-        return Examination(
-            before=float(errors[0][0]),
-            after=float(errors[1][0]),
-            floor=float(errors[2][0]),
-            closed=closed,
-            ci95=interval,
-        )
+    def examine(self, effects: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the errors before, after these effects (specs by name), and at the floor, and the share closed."""
+        before, floor = self._before, self._floor
+        after = self._measure_error(self._runs, effects) if effects else before
+        closed = compute_closed(before, after, floor)
+        return {"before": before, "after": after, "floor": floor, "closed": closed}
 
-    def _squares(self, runs: EffectSimulator, effects: Mapping[str, Any]) -> np.ndarray:
-        """Return the mean square error of each window over all joints, `(W,)`.
-
-        Joints count by their travel where rad and m meet.
-        """
+    def _measure_error(self, runs: EffectSimulator, effects: Mapping[str, Any]) -> float:
+        """Return the root mean square error over all windows and joints, in the unit of `choose_unit`."""
         kinds = {kind.name: kind for kind in effect_library.load_effects(self._machine)}
         chosen = []
         for name, effect in effects.items():
@@ -116,23 +82,15 @@ class ExaminerSimulator:
             around = effect.wrap(model, self._machine, 1, torch.device("cpu"))
             values = {key: value.numpy() for key, value in around.parameters.items()}
             chosen.append((kinds[name], values))
-        paths, cut = runs.simulate(chosen)[0], runs.cut
-        units = {joint.unit for joint in self._machine.joints}
-        size = self._machine.upper - self._machine.lower if len(units) > 1 else 1.0
-        return np.square((paths - cut.measured) / size).mean((1, 2))
+        apart = runs.simulate(chosen)[0] - runs.cut.measured
+        return float(combine_joints(np.square(apart).mean((0, 1), dtype=float), self._machine))
 
 
-def compute_closed(
-    before: np.ndarray, after: np.ndarray, floor: np.ndarray
-) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the closed share of a gap and its interval from errors of draws, the first as it is."""
-    if before[0] < MIN_GAP_RATIO * floor[0]:
-        return None, None
-    # in a draw the gap may vanish
-    gap = np.maximum(before - floor, (1.0 - 1.0 / MIN_GAP_RATIO) * before)
-    share = (before - after) / gap
-    low, high = np.quantile(share[1:], [0.025, 0.975])
-    return float(share[0]), (float(low), float(high))
+def compute_closed(before: float, after: float, floor: float) -> float | None:
+    """Return the share of a gap that is closed, `None` where there is none."""
+    if before < MIN_GAP_RATIO * floor:
+        return None
+    return (before - after) / (before - floor)
 
 
 def read_effects(path: Path, machine: Machine) -> dict[str, Any]:
@@ -156,15 +114,15 @@ def read_effects(path: Path, machine: Machine) -> dict[str, Any]:
 
 
 def examine_case(
-    exam: Path, fit: ActuatorFit, machine: Machine, case: str, answers: Sequence[Path]
-) -> list[dict[str, Any]]:
-    """Return the examination of each answer to a case, as plain JSON data.
+    exam: Path, fit: ActuatorFit, machine: Machine, case: str, answers: Mapping[str, Path]
+) -> dict[str, dict[str, Any]]:
+    """Return the examination of each candidate's answer to a case, as plain JSON data.
 
     `error` holds the reason where an answer could not be simulated; it then closes nothing.
     """
     simulator = ExaminerSimulator(exam, case, fit, machine)
-    found = []
-    for place in answers:
+    found = {}
+    for name, place in answers.items():
         error, effects = None, {}
         try:
             # a baseline writes no file: it repairs nothing
@@ -173,5 +131,5 @@ def examine_case(
             result = simulator.examine(effects)
         except BrokkError as failure:
             error, result = str(failure), simulator.examine({})
-        found.append({**vars(result), "error": error})
+        found[name] = {**result, "error": error}
     return found

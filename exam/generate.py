@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -135,17 +135,15 @@ class RecordingJob:
     def describe_run(self, roughness: str) -> PlantRun:
         """Return the run of the case's machine that the file holds."""
         question = self.question
-        of_field: dict[str, Any] = {}
-        if self.is_field:
-            faults = {fault.effect: fault.parameters for fault in question.faults}
-            of_field = {"day": 1, "faults": faults, "outside_fault": question.outside_fault}
+        faults = question.faults if self.is_field else ()
         return PlantRun(
             seed=question.machine_seed,
             roughness=roughness,
             chance=int(self.stream("chance").integers(2**62)),
             elapsed_s=self.elapsed_s,
+            day=int(self.is_field),
+            faults={fault.effect: fault.parameters for fault in faults},
             tracked=question.tracked,
-            **of_field,
         )
 
 
@@ -296,7 +294,7 @@ class CaseRecorder:
         self, runs: Sequence[PlantRun], u: np.ndarray, file_s: float
     ) -> np.ndarray:
         """Return the positions of the same machines without faults, `(T, N, J)`."""
-        healthy = [replace(run, faults={}, outside_fault=None, tracked=False) for run in runs]
+        healthy = [replace(run, faults={}, tracked=False) for run in runs]
         ((_, link),) = self.plants.build(self.machine, healthy, file_s)
         path = []
         with link as opened:

@@ -43,8 +43,7 @@ class CaseScore:
     """Score of one answer.
 
     Attributes:
-        case: Which case.
-        kind: Its kind; see `case_distribution.KINDS`.
+        kind: Kind of the case; see `case_distribution.KINDS`.
         truth: Effects that are there.
         named: Effects that are named, most probable first.
         stands_for: The true effect that each name stands for, equivalents included; empty for none.
@@ -61,7 +60,6 @@ class CaseScore:
         other_hand: Whether another hand drives the field than the reference.
     """
 
-    case: str
     kind: str
     truth: tuple[str, ...]
     named: tuple[str, ...]
@@ -118,7 +116,7 @@ def score_answer(
         classes: Effects that recordings of commands and positions cannot tell apart.
         of_machine: Effects that all joints have together; nobody is asked for their joints.
         seconds: Time it took.
-        examination: The examiner's own figures; see `examiner.Examination`.
+        examination: The examiner's own figures; see `examiner.examine_case`.
     """
     kind, outside = label["kind"], label["outside"]
     true = {one["effect"]: one for one in label["effects"]}
@@ -136,15 +134,13 @@ def score_answer(
         if effect == one.effect:
             numbers.extend(score_parameters(true[effect], one))
     # A verdict without names is a statement too. An effect below the noise makes `none` true.
-    if verdict == "none":
-        claims.append(Claim(read_probability(answer, verdict), kind in ("none", "faint")))
-    if verdict == "unknown":
-        claims.append(Claim(read_probability(answer, verdict), kind == "outside"))
+    right_kinds = {"none": ("none", "faint"), "unknown": ("outside",)}
+    if answer is not None and verdict in right_kinds:
+        claims.append(Claim(read_probability(answer), kind in right_kinds[verdict]))
     gap = answer.gap if answer else None
     closed = gap.closed.mean if gap and gap.closed else None
     examined = examination["closed"] if examination is not None else None
     return CaseScore(
-        case=label["case"],
         kind=kind,
         truth=tuple(true),
         named=tuple(one.effect for one in chosen),
@@ -177,12 +173,10 @@ def match_effects(
     return found
 
 
-def read_probability(answer: Answer | None, name: str) -> float:
-    """Return the probability of `none` or `unknown`; where it is not ranked, 1 or 0 by the verdict."""
-    if answer is None:
-        return 0.0
-    ranked = [one.probability for one in answer.ranking if one.effect == name]
-    return ranked[0] if ranked else float(answer.verdict == name)
+def read_probability(answer: Answer) -> float:
+    """Return the probability of a verdict without names; where it is not ranked, 1."""
+    ranked = [one.probability for one in answer.ranking if one.effect == answer.verdict]
+    return ranked[0] if ranked else 1.0
 
 
 def score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterScore]:

@@ -6,7 +6,6 @@ import json
 import logging
 import secrets
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,10 +18,9 @@ from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, describe_commit, write_json, write_text
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, spec
 from exam import answer_scoring, dataset, metrics, run_cases
 from exam.case_distribution import CaseDesign, CaseDistribution
-from exam.examiner import examine_case
 from exam.generate import CASES_FOLDER, STREAMS, CaseRecorder, Half, HalfPlan
 from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
@@ -66,7 +64,7 @@ class ExamSettings:
     do: Literal["make", "run", "score"]
     folder: str | None
     candidate: Candidate
-    workers: int
+    workers: Count
     answers: dict[str, str]
     fit: ActuatorFit
     mix: CaseDistribution
@@ -89,8 +87,6 @@ class ExamSettings:
             raise ConfigError(
                 f"exam.do={self.do}: expected +exam.answers.<name>=<folder>, a folder that exam.do=run wrote; one or several"
             )
-        if self.workers < 1:
-            raise ConfigError(f"exam.workers: expected 1 or more, got {self.workers}")
         for name in self.mix.troubles:
             if name not in self.plants.table:
                 raise ConfigError(
@@ -253,9 +249,8 @@ class Exam:
             hashes = {"labels_sha256": facts["labels_sha256"]}
             dataset.append_entry(self._folder, dataset.OPENED, hashes)
         out = self.session.folder
-        examine = partial(examine_case, self._folder, self.exam.fit, self.machine)
         examined = answer_scoring.examine_answers(
-            self._folder, labels, answers, examine, self.exam.workers
+            self._folder, labels, answers, self.exam.fit, self.machine, self.exam.workers
         )
         tables = {}
         for name, one in given.items():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,8 @@ PlantParameters = dict[str, np.ndarray]
 """Numbers of a machine by name, `(J,)` each, or `(N, J)` of several side by side."""
 FaultSizes = Mapping[str, np.ndarray]
 """Numbers of an effect by name, `(J,)`, at the value that changes nothing where a joint lacks it."""
-Row = tuple[str, Callable[[np.ndarray, np.ndarray], np.ndarray], str]
-"""Number of the plant, how it changes, and the number of the effect that it changes by."""
-Change = tuple[Row, ...] | Callable[[PlantParameters, FaultSizes], None]
-"""Rows, or a function that changes the plant's numbers in place."""
+Change = Callable[[PlantParameters, FaultSizes], None]
+"""Changes the plant's numbers in place."""
 
 
 def replace_by(own: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -42,12 +41,16 @@ COMBINE: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
 
 
 def read_faults(plant: str) -> tuple[dict[str, float], dict[str, Change]]:
-    """Return what only an effect changes, as a plant without effects has it, and the rows of each effect."""
+    """Return what only an effect changes, as a plant without effects has it, and the change of each effect."""
     told = yaml.safe_load(Path(__file__).with_name("faults.yaml").read_text())[plant]
-    changes: dict[str, Change] = {}
-    for effect, rows in told["effects"].items():
-        changes[effect] = tuple((own, COMBINE[how], size) for own, how, size in rows)
+    changes = {effect: partial(change_by, rows) for effect, rows in told["effects"].items()}
     return told["neutral"], changes
+
+
+def change_by(rows: Sequence[Sequence[str]], numbers: PlantParameters, size: FaultSizes) -> None:
+    """Change a plant's numbers by rows: the number, a way of `COMBINE`, and the number of the effect."""
+    for own, how, name in rows:
+        numbers[own] = COMBINE[how](numbers[own], size[name])
 
 
 def apply_changes(
@@ -71,10 +74,5 @@ def apply_changes(
     for effect, size in faults.items():
         if effect not in table:
             raise ConfigError(f"exam: {title} lacks '{effect}'; {list_choices(effect, table)}")
-        change = table[effect]
-        if callable(change):
-            change(found, size)
-            continue
-        for name, combine, number in change:
-            found[name] = combine(found[name], size[number])
+        table[effect](found, size)
     return found

@@ -59,32 +59,27 @@ class CommandBus:
         return np.take_along_axis(self._u, (self._seen % NUM_FRAMES)[None], 0)[0]
 
 
-class RunChance:
-    """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours.
+def draw_chance(seed: int, one: PlantParameters, steps: int) -> dict[str, np.ndarray]:
+    """Return the random numbers of one run of a machine with valves, by name.
 
-    Attributes:
-        lost: Whether the frame of each period is lost, `(T,)`.
-        queue: Delay of each frame over the mean delay of the queue, `(T,)`.
-        noise: Noise of the encoders over its standard deviation, `(T, J)`.
-        luck: Uniform numbers, `(T,)`.
-        tool: Normal numbers of the tracker, `(T, 4)`.
-        settling: Where compensators come to rest, normal, `(M, J)`.
-        phase: Uniform.
+    They are: whether the frame of each period is lost, `(T,)`; delay of each frame over the mean delay of
+    the `queue`, `(T,)`; `noise` of the encoders over its standard deviation, `(T, J)`; uniform `luck`,
+    `(T,)`; normal numbers of the tracker of the `tool`, `(T, 4)`; where compensators come to rest when
+    `settling`, normal, `(M, J)`; and one uniform `phase`, `(1,)`.
     """
-
-    def __init__(self, seed: int, one: PlantParameters, steps: int) -> None:
-        generator = np.random.default_rng([seed, 7])
-        count = len(one["loss"])
-        self.lost = draw_bursts(generator.random(steps + 1), float(one["loss"].max()))
+    generator = np.random.default_rng([seed, 7])
+    periods, count = steps + 1, len(one["loss"])
+    return {
+        "lost": draw_bursts(generator.random(periods), float(one["loss"].max())),
         # waiting times of a queue are exponential; a frame older than three means is dropped
-        self.queue = np.minimum(generator.exponential(1.0, steps + 1), 3.0)
-        shape = (steps + 1, count)
+        "queue": np.minimum(generator.exponential(1.0, periods), 3.0),
         # of a Laplace distribution the variance is twice the squared scale
-        self.noise = generator.laplace(0.0, np.sqrt(0.5), shape).astype(np.float32)
-        self.luck = generator.random(steps + 1)
-        self.tool = generator.standard_normal((steps + 1, 4)).astype(np.float32)
-        self.settling = generator.standard_normal((NUM_MOTIONS, count)).astype(np.float32)
-        self.phase = float(generator.random())
+        "noise": generator.laplace(0.0, np.sqrt(0.5), (periods, count)).astype(np.float32),
+        "luck": generator.random(periods),
+        "tool": generator.standard_normal((periods, 4)).astype(np.float32),
+        "settling": generator.standard_normal((NUM_MOTIONS, count)).astype(np.float32),
+        "phase": generator.random(1),
+    }
 
 
 def draw_bursts(luck: np.ndarray, share: float) -> np.ndarray:

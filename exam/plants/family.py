@@ -20,17 +20,8 @@ TRACKER_SPREAD = (0.0015, 0.0015, 0.0015, 0.001)
 TRACKED = ("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad")
 
 
-@dataclass(frozen=True)
-class UnknownFault:
-    """Something outside the library that a machine has.
-
-    Attributes:
-        kind: Its name in the family.
-        severity: By joint, `(J,)`: 0 not at all, 1 plainly.
-    """
-
-    kind: str
-    severity: np.ndarray
+SEVERITY = "severity"
+"""Parameter of a cause outside the library, `(J,)`: 0 not at all, 1 plainly."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +34,8 @@ class PlantRun:
         chance: Seed of the run's own chance.
         elapsed_s: Time the machine has run before.
         day: Number of the day of the run; the machine ages from day to day.
-        faults: Effects it has, by name: parameters in the library's words, `(J,)` each.
-        outside_fault: Its fault outside the library.
+        faults: Effects it has, by name: parameters in the library's words, `(J,)` each; and its causes
+            outside the library, with their `SEVERITY`.
         tracked: Whether its tool point is measured.
     """
 
@@ -54,7 +45,6 @@ class PlantRun:
     elapsed_s: float
     day: int = 0
     faults: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-    outside_fault: UnknownFault | None = None
     tracked: bool = False
 
 
@@ -81,8 +71,8 @@ class PlantBatch:
         shape = (len(self.runs), self.machine.num_joints)
         found = {cause: np.zeros(shape) for cause in causes}
         for number, run in enumerate(self.runs):
-            if run.outside_fault is not None:
-                found[run.outside_fault.kind][number] = run.outside_fault.severity
+            for cause in run.faults.keys() & found.keys():
+                found[cause][number] = run.faults[cause][SEVERITY]
         return found
 
 
@@ -96,11 +86,12 @@ class PlantLink:
 
     Args:
         batch: The runs and their machines.
-        chance: Random numbers of each run, arrays by attribute.
+        chance: Random numbers of each run by name, drawn beforehand: a run does not depend on its neighbours.
     """
 
-    def __init__(self, batch: PlantBatch, chance: Sequence[Any]) -> None:
-        self._machine, self._chance, self._k = batch.machine, chance, 0
+    def __init__(self, batch: PlantBatch, chance: Sequence[Mapping[str, np.ndarray]]) -> None:
+        self._machine, self._k = batch.machine, 0
+        self._chance = {name: np.stack([one[name] for one in chance], 1) for name in chance[0]}
         names = batch.numbers[0]
         self._n = {name: np.stack([one[name] for one in batch.numbers]) for name in names}
         self._arm: Arm | None = None  # whose tool is measured
@@ -126,17 +117,13 @@ class PlantLink:
             return {}
         tip_m, pitch_rad = self._arm.tool(self.q)
         seen = np.concatenate([tip_m, pitch_rad[:, None]], 1)
-        noise = np.stack([chance.tool[self._k] for chance in self._chance])
-        seen = np.where(self._tracked[:, None], seen + noise * TRACKER_SPREAD, np.nan)
+        noise = self._chance["tool"][self._k] * TRACKER_SPREAD
+        seen = np.where(self._tracked[:, None], seen + noise, np.nan)
         return dict(zip(TRACKED, seen.T, strict=True))
 
     def _measure(self) -> np.ndarray:
         """Return the readings of the encoders, `(N, J)`."""
         raise NotImplementedError
-
-    def _stack_chance(self, name: str) -> np.ndarray:
-        """Return random numbers of all runs, the runs on the second axis."""
-        return np.stack([getattr(one, name) for one in self._chance], 1)
 
     def __enter__(self) -> Self:
         return self
@@ -205,7 +192,8 @@ class DrawnPlants:
             numbers[name] = numbers[name] * np.exp(
                 roughness * spread * of_day.standard_normal(count)
             )
-        return make, apply_changes(numbers, run.faults, self.table, f"a machine of make '{make}'")
+        effects = {name: size for name, size in run.faults.items() if name not in self.causes}
+        return make, apply_changes(numbers, effects, self.table, f"a machine of make '{make}'")
 
     def complete(
         self, drawn: PlantParameters, machine: Machine, make: str, chance: np.random.Generator

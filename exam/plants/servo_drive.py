@@ -148,4 +148,4 @@ class DryFriction:
 
 
 FRICTIONS = {"bristle": BristleFriction, "dry": DryFriction}
-"""By make; see `servo_faults.MAKES`."""
+"""By make: bristles that bend before they slip, or dry friction of MuJoCo with a Stribeck part."""

@@ -22,10 +22,6 @@ from brokk_rl.machine import Machine
 from exam.plants.changes import FaultSizes, PlantParameters, read_faults
 from exam.plants.servo_drive import STEP_S
 
-MAKES = ("bristle", "dry")
-"""Friction of a make: bristles that bend before they slip (LuGre), or dry friction of MuJoCo with a
-Stribeck part."""
-
 COUNT_RAD = 2.0 * np.pi / 4096
 """Step of the servos' encoder: twelve bits over a turn."""
 

@@ -55,19 +55,18 @@ class ServoArm(PlantLink):
 
     def __init__(self, batch: PlantBatch) -> None:
         machine = batch.machine
-        chance = [_RunChance(run.chance, machine, batch.steps) for run in batch.runs]
-        super().__init__(batch, chance)
+        super().__init__(
+            batch, [draw_chance(run.chance, machine, batch.steps) for run in batch.runs]
+        )
         n = self._n
         self._plant = MjcfPlant(ARM, restrict_to_torques(machine))
-        self._noise, self._wander = self._stack_chance("noise"), self._stack_chance("wander")
-        self._luck = self._stack_chance("luck")
         self._causes = ServoCauses(machine, batch.place_causes(CAUSES))
-        q = np.tile(machine.home, (len(chance), 1))
+        q = np.tile(machine.home, (len(batch.runs), 1))
         self._state = self._plant.start(q, np.zeros_like(q))
         self._bus = CommandBus(n, machine.period_s)
         # the servos held their pose before; a second is more than any delay
         rest = find_rest(q, machine)
-        luck = np.ones((len(chance), 1))
+        luck = np.ones((len(q), 1))
         self._bus.send(rest, -1.0 - float(n["jitter_s"].max()), luck, 0.0 * luck, 0.0 * rest)
         self._bus.at(0.0)
         self._targets = TargetFilter(n, machine, q.copy())
@@ -90,7 +89,7 @@ class ServoArm(PlantLink):
         machine, k, causes = self._machine, self._k, self._causes
         t_s = k * machine.period_s
         u = causes.command(np.asarray(command.u, dtype=float))
-        luck = self._luck[k]
+        luck = self._chance["luck"][k]
         later_s = causes.delay_s(self._elapsed_s + t_s)
         self._bus.send(u, t_s, luck[:, :1], luck[:, 1:], later_s)
         for i in range(round(machine.period_s / STEP_S)):
@@ -109,7 +108,7 @@ class ServoArm(PlantLink):
         # the weight goes through the gear: the motor's torque of the step before stands for it
         loaded = n["load_friction"] * np.abs(self._through)
         self._through = motor
-        wander = n["coulomb_n_m"] * n["wander"] * self._wander[self._k]
+        wander = n["coulomb_n_m"] * n["wander"] * self._chance["wander"][self._k]
         extra_n_m = np.maximum(loaded + wander, 0.0) + causes.friction_n_m(q)
         lost = self._friction.torque(speed, extra_n_m)
         lost = lost + (n["viscous"] + n["added_viscous"]) * speed
@@ -123,28 +122,26 @@ class ServoArm(PlantLink):
 
     def _measure_at(self, q: np.ndarray) -> np.ndarray:
         step = self._n["step_rad"]
-        return np.round((q + self._sigma * self._noise[self._k]) / step) * step
+        return np.round((q + self._sigma * self._chance["noise"][self._k]) / step) * step
 
 
-class _RunChance:
-    """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours."""
-
-    def __init__(self, seed: int, machine: Machine, steps: int) -> None:
-        generator = np.random.default_rng([seed, 5])
-        shape = (steps + 1, machine.num_joints)
-        self.noise = generator.standard_normal(shape)
-        keep = float(np.exp(-machine.period_s / WANDER_S))
-        white = generator.standard_normal(shape) * np.sqrt(1.0 - keep * keep)
-        white[0] /= np.sqrt(1.0 - keep * keep)
-        self.wander = np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
-        self.luck = generator.random((steps + 1, 2))
+def draw_chance(seed: int, machine: Machine, steps: int) -> dict[str, np.ndarray]:
+    """Return the random numbers of one run: normal `noise` and `wander`, `(T, J)`, and uniform `luck`, `(T, 2)`."""
+    generator = np.random.default_rng([seed, 5])
+    shape = (steps + 1, machine.num_joints)
+    noise = generator.standard_normal(shape)
+    keep = float(np.exp(-machine.period_s / WANDER_S))
+    white = generator.standard_normal(shape) * np.sqrt(1.0 - keep * keep)
+    white[0] /= np.sqrt(1.0 - keep * keep)
+    wander = np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
+    return {"noise": noise, "wander": wander, "luck": generator.random((steps + 1, 2))}
 
 
 @spec
 class ServoPlants(DrawnPlants):
     """Tabletop arms of position servos in two makes of friction, each arm unique."""
 
-    makes = servo_faults.MAKES
+    makes = tuple(FRICTIONS)
     stream = "servos"
     table = servo_faults.FAULTS
     causes = CAUSES

@@ -15,7 +15,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.plants.changes import PlantParameters
-from exam.plants.electronics import CommandBus, RunChance, SteppedEncoders
+from exam.plants.electronics import CommandBus, SteppedEncoders, draw_chance
 from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
 from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
@@ -46,14 +46,11 @@ class ValveArm(PlantLink):
     ) -> None:
         chance = []
         for run, one in zip(batch.runs, batch.numbers, strict=True):
-            chance.append(RunChance(run.chance, one, batch.steps))
+            chance.append(draw_chance(run.chance, one, batch.steps))
         super().__init__(batch, chance)
         n, machine = self._n, batch.machine
-        self._lost, self._queue = self._stack_chance("lost"), self._stack_chance("queue")
-        self._noise, self._settling = self._stack_chance("noise"), self._stack_chance("settling")
-        phase, luck = np.array([one.phase for one in chance]), self._stack_chance("luck")
-        severity = batch.place_causes(CAUSES)
-        self._causes = OutsideCauses(machine, severity, phase, luck, step_s)
+        drawn = self._chance["phase"][0], self._chance["luck"]
+        self._causes = OutsideCauses(machine, batch.place_causes(CAUSES), *drawn, step_s)
         bus = {
             "transport_s": n["transport_s"],
             "jitter_s": 0.5 * n["jitter_s"],  # mean delay of the effect, whose delays are uniform
@@ -75,7 +72,7 @@ class ValveArm(PlantLink):
         return self._link
 
     def _measure(self) -> np.ndarray:
-        shown = self._encoders.read(self._stamped(), self._noise[self._k])
+        shown = self._encoders.read(self._stamped(), self._chance["noise"][self._k])
         return self._causes.show(self._k, shown)
 
     def send(self, command: Command) -> Command:
@@ -85,9 +82,8 @@ class ValveArm(PlantLink):
         run_s = self._elapsed_s + t_s
         u = causes.drive(np.asarray(command.u, dtype=float), run_s)
         # below its loss a frame is lost: 0 or 1 says which
-        self._bus.send(
-            u, t_s, np.where(self._lost[k], -1.0, 1.0)[:, None], self._queue[k][:, None], 0.0 * u
-        )
+        luck = np.where(self._chance["lost"][k], -1.0, 1.0)
+        self._bus.send(u, t_s, luck[:, None], self._chance["queue"][k][:, None], 0.0 * u)
         oil = self._n["flow"] * self._oil(run_s)
         hydraulics.take_pose(self._q, self._link)
         for i in range(round(machine.period_s / step_s)):
@@ -106,8 +102,8 @@ class ValveArm(PlantLink):
 
     def _settle(self) -> np.ndarray:
         """Return the factor on the flows by the compensators: each motion has its own rest."""
-        drawn = self._motions % len(self._settling)
-        rest = np.take_along_axis(self._settling, drawn[None], 0)[0]
+        settling = self._chance["settling"]
+        rest = np.take_along_axis(settling, self._motions[None] % len(settling), 0)[0]
         return 1.0 + self._n["settling"] * rest
 
     def _oil(self, run_s: np.ndarray) -> np.ndarray:

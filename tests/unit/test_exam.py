@@ -43,18 +43,21 @@ def test_cases_have_the_shares_effects_and_sizes_of_their_kinds(machine: Machine
     assert Counter(one.kind for one in found) == counts
     single = Counter(one.faults[0].effect for one in found if one.kind == "one")
     assert set(single.values()) <= {1, 2, 3} and len(single) >= 20
-    strange = Counter(one.outside_fault.kind for one in found if one.outside_fault)
+    strange = Counter(one.faults[0].effect for one in found if one.kind == "outside")
     assert strange == {"fading": 10, "interlock": 10}
     for one in found:
         names = {fault.effect for fault in one.faults}
-        allowed = {"faint": {1}, "one": {1}, "several": {2, 3}}.get(one.kind, {0})
+        allowed = {"none": {0}, "several": {2, 3}}.get(one.kind, {1})
         assert len(one.faults) == len(names) and len(names) in allowed
         assert not any(len(names & set(group)) > 1 for group in mix.classes)
         low, high = mix.faint_sizes if one.kind == "faint" else mix.sizes
         for fault in one.faults:
             assert low <= fault.size <= high
-            assert one.tracked or not mix.troubles[fault.effect].needs_tool
             has = np.isin(machine.joint_names, fault.joints)
+            if one.kind == "outside":
+                assert fault.parameters["severity"].tolist() == (fault.size * has).tolist()
+                continue
+            assert one.tracked or not mix.troubles[fault.effect].needs_tool
             for name, nothing in fault.drawn.items():
                 away = abs(mix.troubles[fault.effect].numbers[name][1] - nothing)
                 values = np.abs(fault.parameters[name][has] - nothing)

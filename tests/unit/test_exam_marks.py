@@ -206,7 +206,7 @@ def test_a_published_answer_says_what_it_leaves_out(tmp_path: Path) -> None:
     said = answered(chosen("lag")).to_json() | {"curves": [1.0]}
     path = tmp_path / "answers.jsonl"
     ended = GivenAnswer({"seconds": 1.0, "error": "in /home/me/run.py\nKeyError: 'x'"}, None)
-    sealed = GivenAnswer({"seconds": 1.0, "error": None}, said, (), "f00d", {"closed": 0.5})
+    sealed = GivenAnswer({"seconds": 1.0, "error": None}, said, None, "f00d", {"closed": 0.5})
     answers = {"0001": sealed, "0002": ended}
     publish_answers(answers, path)
     row, second = map(json.loads, path.read_text().splitlines())

@@ -19,7 +19,7 @@ from diagnosis.effect_library import load_effects
 from exam.plants import servo_faults
 from exam.plants.changes import PlantParameters, apply_changes
 from exam.plants.electronics import CommandBus, SteppedEncoders, draw_bursts
-from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, PlantRun, UnknownFault
+from exam.plants.family import SEVERITY, DrawnPlants, PlantBatch, PlantLink, PlantRun
 from exam.plants.hydraulics import STEP_S, SensingValves
 from exam.plants.linkage import Arm
 from exam.plants.valve_arm import ValveArm
@@ -267,8 +267,8 @@ def test_each_fault_and_cause_shows_on_the_joint_that_has_it_and_a_run_stands_al
     for effect, part in OF_FILES.items() if name == "servos" else ():
         runs[effect] = replace(well, faults={effect: {"part": part * only}})
     for cause in sorted({*plants.causes} - HEAVY):
-        runs[cause] = replace(well, outside_fault=UnknownFault(cause, 1.0 * only))
-    runs["well"] = replace(well, outside_fault=UnknownFault(plants.causes[0], 0.0 * only))
+        runs[cause] = replace(well, faults={cause: {SEVERITY: 1.0 * only}})
+    runs["well"] = replace(well, faults={plants.causes[0]: {SEVERITY: 0.0 * only}})
     u = wave(machine, 90 if name == "servos" else round(14.0 / machine.period_s))
     run_s = len(u) * machine.period_s
     side_by_side = built(plants, machine, list(runs.values()), run_s)

@@ -56,14 +56,15 @@ def test_the_examiner_believes_its_own_simulation(
         return read_effects(path, machine)
 
     nothing = simulator.examine({})
-    right, half, wrong = (simulator.examine(write(gain)) for gain in (0.6, 0.8, 1.4))
-    assert nothing.after == nothing.before and nothing.closed == 0.0
+    right, half, wrong = (
+        dict[str, Any](simulator.examine(write(gain))) for gain in (0.6, 0.8, 1.4)
+    )
+    assert nothing["after"] == nothing["before"] and nothing["closed"] == 0.0
     # an effect that changes nothing runs as none does, warm-up included
-    assert simulator.examine(write(1.0)).after == pytest.approx(nothing.before, rel=1e-4)
-    assert nothing.before > 1.5 * nothing.floor, "a joint at 0.6 of its speed is seen"
-    assert right.closed is not None and right.closed > 0.8
-    assert half.closed is not None and 0.2 < half.closed < 0.8
-    assert wrong.closed is not None and wrong.closed < 0.0
+    assert simulator.examine(write(1.0))["after"] == pytest.approx(nothing["before"], rel=1e-4)
+    assert nothing["before"] > 1.5 * nothing["floor"], "a joint at 0.6 of its speed is seen"
+    assert right["closed"] > 0.8 > half["closed"] > 0.2
+    assert wrong["closed"] < 0.0
 
 
 def test_an_effects_file_brings_no_targets_of_its_own(machine: Machine, tmp_path: Path) -> None:
@@ -82,8 +83,5 @@ def test_an_effects_file_brings_no_targets_of_its_own(machine: Machine, tmp_path
 
 
 def test_the_closed_share_is_that_worked_by_hand() -> None:
-    before, after, floor = np.array([3.0, 3.0, 5.0]), np.array([2.0, 1.0, 2.0]), np.ones(3)
-    share, interval = compute_closed(before, after, floor)
-    assert share == pytest.approx(0.5)  # (3 - 2) / (3 - 1)
-    assert interval == pytest.approx((0.75 + 0.025 * 0.25, 1.0 - 0.025 * 0.25))  # of 1 and 0.75
-    assert compute_closed(1.04 * floor, floor, floor) == (None, None)
+    assert compute_closed(3.0, 2.0, 1.0) == pytest.approx(0.5)  # (3 - 2) / (3 - 1)
+    assert compute_closed(1.04, 1.0, 1.0) is None
