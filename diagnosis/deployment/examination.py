@@ -167,7 +167,7 @@ class Deployment:
     Attributes:
         policy: The policy that should have run.
         machine: The machine.
-        others: Further policies that may have run instead, by name.
+        others: Further policies that may have run instead, by folder.
         target_m: Target where the logs do not hold it.
         is_sent: The commands in force are those that the policy's loop sent: nobody at levers.
     """

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 
 from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, Effect
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -76,25 +74,11 @@ class DoctorPolicy:
         """Return the answer; errors as in `run`."""
         asked = self.doctor
         policy = load_policy(asked.policy, self.machine)
-        others = {}
-        for name, folder in zip(name_policies(asked.others), asked.others, strict=True):
-            others[name] = load_policy(folder, self.machine)
+        others = {folder: load_policy(folder, self.machine) for folder in asked.others}
         deployment = Deployment(policy, self.machine, others, asked.target_in_base_m, asked.sent)
         recordings = record.read_recordings(asked.log, self.machine)
         seed = self.session.stream("doctor")
         return deployment.examine(recordings, self.actuator, self.effect, seed)
-
-
-def name_policies(folders: Sequence[str]) -> list[str]:
-    """Return a name for each policy folder: the last part of its path.
-
-    Raises:
-        ConfigError: Two have the same name.
-    """
-    names = [Path(folder.rpartition(":")[2]).name for folder in folders]
-    if len(set(names)) < len(names):
-        raise ConfigError(f"doctor.others: two folders have the same name: {', '.join(names)}")
-    return names
 
 
 def print_answer(found: DoctorAnswer, folder: Path) -> None:
