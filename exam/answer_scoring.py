@@ -104,7 +104,7 @@ def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
             answer = {key: one.answer[key] for key in PUBLISHED if key in one.answer}
             left_out = sorted({*(one.left_out or ()), *one.answer} - {*PUBLISHED})
             kept = replace(kept, answer=answer, left_out=left_out)
-        # Only an answer is told where it is missing: files from before lack the rest.
+        # A missing answer is told as `null`; whatever else is missing is left away.
         told = {key: value for key, value in vars(kept).items() if value is not None}
         lines.append(json.dumps({"case": case, "note": note, "answer": None} | told) + "\n")
     write_text(path, "".join(lines))

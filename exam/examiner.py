@@ -88,7 +88,7 @@ class ExaminerSimulator:
 
 def compute_closed(before: float, after: float, floor: float) -> float | None:
     """Return the share of a gap that is closed, `None` where there is none."""
-    if before < MIN_GAP_RATIO * floor:
+    if before <= MIN_GAP_RATIO * floor:
         return None
     return (before - after) / (before - floor)
 

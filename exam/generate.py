@@ -197,16 +197,12 @@ class CaseRecorder:
             jobs = []
             for number, question in questions.items():
                 jobs += self.list_jobs(number, question, half)
-            planned.append((jobs, list(map(self.plan_run, jobs))))
-        for jobs, plans in planned:
+            planned.append([(job, self.plan_run(job)) for job in jobs])
+        for files in planned:
+            jobs = [job for job, _ in files]
             runs = [job.describe_run(self.roughness) for job in jobs]
             for places, link in self.plants.build(self.machine, runs, jobs[0].plan.file_s):
-                self._record(
-                    [jobs[place] for place in places],
-                    [runs[place] for place in places],
-                    [plans[place] for place in places],
-                    link,
-                )
+                self._record([files[place] for place in places], link)
 
     def list_jobs(self, number: int, question: CaseDesign, half: Half) -> list[RecordingJob]:
         """Return the files of one half of a case."""
@@ -250,17 +246,13 @@ class CaseRecorder:
         return self.plants.draw(self.machine, run)[0]
 
     def _record(
-        self,
-        jobs: Sequence[RecordingJob],
-        runs: Sequence[PlantRun],
-        plans: Sequence[ExcitationPlan],
-        link: PlantLink,
+        self, files: Sequence[tuple[RecordingJob, ExcitationPlan]], link: PlantLink
     ) -> None:
         """Record files of one half, of machines of one make."""
+        jobs = [job for job, _ in files]
         machine, file_s = self.machine, jobs[0].plan.file_s
-        plan = ExcitationPlan(
-            runs=tuple(plan.runs[0] for plan in plans), run_s=file_s, names=tuple(self.excitations)
-        )
+        runs = tuple(plan.runs[0] for _, plan in files)
+        plan = ExcitationPlan(runs=runs, run_s=file_s, names=tuple(self.excitations))
         guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
         # a faulty machine may be slow on its ways to start poses
         player = PlanPlayer(plan, machine, self.approach, guards, level=logging.DEBUG)
@@ -269,7 +261,7 @@ class CaseRecorder:
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)
         t_s = track.t_s - track.t_s[0]
         is_withheld = jobs[0].half == "withheld"
-        unchanged = self._repeat_without_faults(runs, u, file_s) if is_withheld else None
+        unchanged = self._repeat_without_faults(jobs, u) if is_withheld else None
         for n, job in enumerate(jobs):
             motion = record.make_motion(machine, "", t_s, u[:, n], q[:, n])
             if unchanged is not None:
@@ -290,12 +282,13 @@ class CaseRecorder:
         # the same time for all cases: the time of a file tells nothing about its case
         os.utime(path, (EPOCH_S, EPOCH_S))
 
-    def _repeat_without_faults(
-        self, runs: Sequence[PlantRun], u: np.ndarray, file_s: float
-    ) -> np.ndarray:
+    def _repeat_without_faults(self, jobs: Sequence[RecordingJob], u: np.ndarray) -> np.ndarray:
         """Return the positions of the same machines without faults, `(T, N, J)`."""
-        healthy = [replace(run, faults={}, tracked=False) for run in runs]
-        ((_, link),) = self.plants.build(self.machine, healthy, file_s)
+        healthy = []
+        for job in jobs:
+            run = job.describe_run(self.roughness)
+            healthy.append(replace(run, faults={}, tracked=False))
+        ((_, link),) = self.plants.build(self.machine, healthy, jobs[0].plan.file_s)
         path = []
         with link as opened:
             for command in u:
