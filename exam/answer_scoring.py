@@ -68,7 +68,8 @@ def read_answers(path: Path) -> dict[str, GivenAnswer]:
     try:
         if path.is_file():
             for row in map(json.loads, path.read_text().splitlines()):
-                found[row.pop("case")] = GivenAnswer(**row)
+                case = row.pop("case")
+                found[case] = GivenAnswer(**row)
         elif path.is_dir():
             answered = read_run(path).get("labels_sha256")
             for place in filter(run_cases.is_begun, path.iterdir()):
