@@ -14,7 +14,7 @@ from actuators.recordings.inspection import Inspection, InspectionThresholds, in
 from actuators.recordings.recording_checks import (
     REMARK_HEAD,
     REMARKS,
-    examine_recordings,
+    list_remarks,
     tabulate_remarks,
 )
 from brokk_rl import record
@@ -63,10 +63,9 @@ class InspectionRequest:
 
 @dataclass(frozen=True)
 class InspectedFile:
-    """One file: its recording, its format breaches, and its inspection."""
+    """One file: its format breaches, and its inspection where it could be read."""
 
     path: Path
-    recording: Recording | None
     breaches: list[Breach]
     inspection: Inspection | None
 
@@ -82,21 +81,21 @@ class InspectedFile:
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain JSON data."""
-        metadata = dict(self.recording.metadata) if self.recording else {}
+        seen = self.inspection
+        recording = seen.recording if seen else None
+        metadata = recording.metadata if recording else {}
         return {
             "path": str(self.path),
-            "run": self.recording.run if self.recording else None,
-            "num_samples": self.recording.num_samples if self.recording else None,
+            "run": recording.run if recording else None,
+            "num_samples": recording.num_samples if recording else None,
             "source": metadata.get("source"),
             "created": metadata.get("created"),
             "resampled_from": metadata.get("resampled_from"),
-            "oil_c": _find_range(self.recording.extra.get("oil_c")) if self.recording else None,
+            "oil_c": _find_range(recording.extra.get("oil_c")) if recording else None,
             "breaches": [asdict(breach) for breach in self.breaches],
-            **(
-                asdict(self.inspection)
-                if self.inspection
-                else {"timing": None, "joints": None, "findings": []}
-            ),
+            "timing": seen.timing if seen else None,
+            "joints": seen.joints if seen else None,
+            "findings": [asdict(finding) for finding in seen.findings] if seen else [],
         }
 
 
@@ -119,14 +118,16 @@ class Inspect:
         paths = record.find_files(self.inspect.recordings, "recording")
         inspected = [self._look(path) for path in track_items(paths, "inspecting")]
         folder = self.session.folder
-        sound = [one.recording for one in inspected if one.recording and not one.breaches]
-        whole = [one.recording for one in inspected if one.recording]
-        remarks = examine_recordings(whole, self.machine, self.thresholds)
+        known = [one.inspection for one in inspected if one.inspection]
+        sound = [
+            one.inspection.recording for one in inspected if one.inspection and not one.breaches
+        ]
+        remarks = list_remarks(known, self.machine, self.thresholds)
         result = {
             "schema": 1,
             "machine": self.machine.name,
             "delay_s": self._delays(sound),
-            "joints": self._overall(inspected),
+            "joints": self._overall(known),
             "recordings": [one.plain() for one in inspected],
         }
         write_json(folder / "inspection.json", result)
@@ -137,9 +138,9 @@ class Inspect:
         }
         pictures: dict[str, str] = {}
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:
-            if one.recording and one.inspection:
+            if one.inspection:
                 path = folder / f"{one.path.stem}.png"
-                draw_recording(path, one.recording, self.machine, one.inspection, one.breaches)
+                draw_recording(path, self.machine, one.inspection, one.breaches)
                 pictures[one.path.name] = embed_picture(path)
         values = {
             "title": f"Recordings of {self.machine.name}",
@@ -159,9 +160,9 @@ class Inspect:
     def _look(self, path: Path) -> InspectedFile:
         recording, breaches = record.examine_recording(path, self.machine)
         if recording is None or recording.num_samples < 2:
-            return InspectedFile(path, None, breaches, None)
+            return InspectedFile(path, breaches, None)
         found = inspect_recording(recording, self.machine, self.thresholds)
-        return InspectedFile(path, recording, breaches, found)
+        return InspectedFile(path, breaches, found)
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
         """Return each joint's dead time from all sound recordings, `None` where unknown."""
@@ -172,9 +173,8 @@ class Inspect:
             return dict.fromkeys(self.machine.joint_names)
         return {name: one and one.plain() for name, one in found.items()}
 
-    def _overall(self, inspected: Sequence[InspectedFile]) -> dict[str, dict[str, float | None]]:
+    def _overall(self, known: Sequence[Inspection]) -> dict[str, dict[str, float | None]]:
         """Return figures of each joint over all recordings: extremes, medians and weighted means."""
-        known = [one.inspection for one in inspected if one.inspection]
         seconds = [max(one.timing["duration_s"] or 0.0, 1e-9) for one in known]
         table = {}
         for joint in self.machine.joints:
@@ -242,13 +242,10 @@ def _format_percent(value: float | None) -> str:
 
 
 def draw_recording(
-    path: Path,
-    recording: Recording,
-    machine: Machine,
-    inspection: Inspection,
-    breaches: Sequence[Breach],
+    path: Path, machine: Machine, inspection: Inspection, breaches: Sequence[Breach]
 ) -> None:
     """Draw commands, positions, findings (shaded) and breaches (lines) as PNG."""
+    recording = inspection.recording
     count = machine.num_joints
     figure = make_figure(14, 1.1 + 1.7 * count)
     axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]

@@ -111,11 +111,13 @@ class Inspection:
     """Contents of one recording.
 
     Attributes:
+        recording: The recording.
         timing: Rate and jitter of the file.
         joints: Ranges, shares of time, noise and sensor step of each joint, by name.
         findings: In order of time.
     """
 
+    recording: Recording
     timing: dict[str, float | None]
     joints: dict[str, dict[str, float | None]]
     findings: list[RecordingFinding]
@@ -129,7 +131,7 @@ def inspect_recording(
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
         scan = _RecordingScan(recording, machine, thresholds)
         findings = sorted(scan.find_all(), key=lambda finding: finding.row)
-        return Inspection(scan.timing(), scan.joints(), findings)
+        return Inspection(recording, scan.timing(), scan.joints(), findings)
 
 
 class _RecordingScan:

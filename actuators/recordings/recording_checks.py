@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from actuators.recordings.inspection import (
+    Inspection,
     InspectionThresholds,
     RecordingFinding,
     inspect_recording,
@@ -102,9 +103,16 @@ def examine_recordings(
     recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> list[RecordingRemark]:
     """Return all remarks about recordings of `machine`, the most severe first."""
-    inspected = []
-    for one, seen in zip(recordings, view_recordings(recordings, machine), strict=True):
-        inspected.append((seen, inspect_recording(one, machine, thresholds).findings))
+    inspections = [inspect_recording(one, machine, thresholds) for one in recordings]
+    return list_remarks(inspections, machine, thresholds)
+
+
+def list_remarks(
+    inspections: Sequence[Inspection], machine: Machine, thresholds: InspectionThresholds
+) -> list[RecordingRemark]:
+    """Return all remarks about inspected recordings of `machine`, the most severe first."""
+    viewed = view_recordings([one.recording for one in inspections], machine)
+    inspected = [(seen, one.findings) for seen, one in zip(viewed, inspections, strict=True)]
     locks = {}
     for j, name in enumerate(machine.joint_names):
         if text := _find_lock(inspected, machine, j, thresholds):
@@ -112,7 +120,7 @@ def examine_recordings(
     remarks: list[RecordingRemark] = []
     for recording, findings in inspected:
         remarks += _group_findings(recording, findings, machine, locks)
-    remarks += _check_excitation([seen for seen, _ in inspected], machine, thresholds)
+    remarks += _check_excitation(viewed, machine, thresholds)
     return sorted(
         remarks,
         key=lambda one: (ORDER.index(one.kind.severity), one.name, one.joint or "", one.recording),

@@ -19,6 +19,7 @@ from actuators.modes.inspect import InspectionRequest
 from actuators.recordings.inspection import (
     InspectionThresholds,
     RecordingFinding,
+    _RecordingScan,
     inspect_recording,
 )
 from brokk_rl import record
@@ -190,9 +191,14 @@ def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
     assert all(one.joint == "elbow" and one.row >= 495 for one in named)
 
 
-def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
-    brokk: Callable[..., object], machine: Machine, tmp_path: Path
+def test_inspect_from_the_command_lists_every_breach_and_fails_at_none_in_one_look_at_each_file(
+    brokk: Callable[..., object], machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    looks = []
+    find_all = _RecordingScan.find_all
+    monkeypatch.setattr(
+        _RecordingScan, "find_all", lambda scan: looks.append(scan) or find_all(scan)
+    )
     record.write_recording(sound(machine), tmp_path / "a.parquet")
     record.write_recording(replace(sound(machine), metadata={}), tmp_path / "b.parquet")
     table = pq.read_table(tmp_path / "b.parquet")
@@ -203,6 +209,7 @@ def test_inspect_from_the_command_lists_every_breach_and_fails_at_none(
     (tmp_path / "c.parquet").write_bytes((tmp_path / "a.parquet").read_bytes()[:-300])
     done = brokk("mode=inspect", "inspect.recordings=*.parquet", "session.out=out")
     assert done.code == 0, done.err
+    assert len(looks) == 2  # the third file is truncated
     for told in (
         "b.parquet: column 'q_q5_rad' is missing", "b.parquet: row 5, column 'u_q2': command 1.5 lies outside [-1, 1] (2 such rows",
         "b.parquet: row 90, column 'u_q2'", "c.parquet: truncated",
