@@ -64,10 +64,8 @@ def import_log(*options: str) -> tuple[Done, list[dict[str, np.ndarray]]]:
     except BrokkError as error:
         return Done(2, "", str(error)), []
     made = []
-    for group, template in (
-        ("machine", log_draft.MACHINE_TEMPLATE),
-        ("import", log_draft.MAP_TEMPLATE),
-    ):
+    templates = {"machine": log_draft.MACHINE_TEMPLATE, "import": log_draft.MAP_TEMPLATE}
+    for group, template in templates.items():
         Path(f"{group}.yaml").write_text(draft.format(template))
         made.append(extensions.load_option(group, f"@{group}.yaml"))
     machine, reader = made

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from actuators.identify import dead_time
 from actuators.motion_panels import draw_joint_track
@@ -33,8 +34,7 @@ log = logging.getLogger(__name__)
 PAGE_FILE = "inspection.html"
 TEMPLATE = Path(__file__).with_name("inspection.html.jinja")
 JOINTS = ["joint", "measured", "limits", "commanded", "at limit", "noise", "step", "dead time"]
-OVERALL = {"lowest": np.min, "highest": np.max, "fastest": np.max}
-OVERALL |= {"noise": np.median, "step": np.median}
+OVERALL = {"lowest": "min", "highest": "max", "fastest": "max", "noise": "median", "step": "median"}
 """Figure over all recordings of those that are no means."""
 FINDING, BREACH = "#e69f00", "#b00020"
 THINNEST = 0.002
@@ -175,18 +175,12 @@ class Inspect:
 
     def _overall(self, known: Sequence[Inspection]) -> dict[str, dict[str, float | None]]:
         """Return figures of each joint over all recordings: extremes, medians and weighted means."""
-        seconds = [max(one.timing["duration_s"] or 0.0, 1e-9) for one in known]
+        seconds = np.array([max(one.timing["duration_s"] or 0.0, 1e-9) for one in known])
         table = {}
         for joint in self.machine.joints:
-            entry: dict[str, float | None] = {
-                "lower_limit": joint.lower.value,
-                "upper_limit": joint.upper.value,
-            }
-            rows = [one.joints[joint.name] for one in known]
-            for key in rows[0] if rows else ():
-                values = np.array([row[key] for row in rows], dtype=float)  # None becomes NaN
-                entry[key] = _combine(key, values, np.array(seconds))
-            table[joint.name] = entry
+            limits = {"lower_limit": joint.lower.value, "upper_limit": joint.upper.value}
+            rows = pd.DataFrame([one.joints[joint.name] for one in known], dtype=float)
+            table[joint.name] = limits | {key: _combine(key, rows[key], seconds) for key in rows}
         return table
 
     def _figures(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -205,13 +199,13 @@ class Inspect:
         return JOINTS, rows
 
 
-def _combine(key: str, values: np.ndarray, seconds: np.ndarray) -> float | None:
+def _combine(key: str, values: Any, seconds: np.ndarray) -> float | None:
     """Return a figure over recordings from that of each of them, `None` where all lack it."""
-    there = np.isfinite(values)
+    there = values.notna()
     if not there.any():
         return None
     if key in OVERALL:
-        return float(OVERALL[key](values[there]))
+        return float(values.agg(OVERALL[key]))  # leaves NaN out
     return float(np.average(values[there], weights=seconds[there]))
 
 

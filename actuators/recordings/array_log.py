@@ -20,9 +20,8 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 from scipy import io as matlab
 
+from actuators.recordings.cells import convert_column, tell_column
 from actuators.recordings.log_tables import HEAD_ROWS, LogFile, LogRun, Table, Wanted
-from actuators.recordings.message_numbers import read_number
-from actuators.recordings.name_evidence import TIME_UNITS
 from brokk_rl.errors import RecordingError
 
 EPISODE = "episode_index"
@@ -58,38 +57,26 @@ class TableLog(LogFile):
         return {"": Table(self.read_columns(max_rows))}
 
     def read_columns(self, max_rows: int | None) -> dict[str, np.ndarray]:
-        """Return the columns of numbers, and those of fixed lists item by item, each `(T,)`.
-
-        NaN stands for an empty cell; times are in s.
-        """
+        """Return the columns of numbers, times, flags and lists, each `(T,)`; NaN stands for an empty cell."""
         kind = FORMATS[self.path.suffix.lower()]
         found = {}
         try:
             source = ds.dataset(self.path, format=kind)
             table = source.to_table() if max_rows is None else source.head(max_rows)
-            table = flatten_table(table)
-            for name, column in zip(table.column_names, table.columns, strict=True):
-                found |= self._split_column(name, column)
+            frame = flatten_table(table).to_pandas(ignore_metadata=True)
+            for name, cells in frame.items():
+                is_text = cells.dtype.kind == "O"
+                filled = cells.dropna()[:HEAD_ROWS] if is_text else ()
+                if is_text and filled.empty:
+                    continue
+                is_index = name.startswith(INDEX) and cells.dtype.kind == "M"
+                column, labels = "timestamp" if is_index else name, self._labels.get(name, ())
+                found |= convert_column(column, cells, tell_column(filled, "."), labels=labels)
         except FileNotFoundError as error:
             raise RecordingError(f"{self.path}: no such log") from error
         except TABLE_ERRORS as error:
             raise RecordingError(f"{self.path}: cannot be read as {kind} ({error})") from error
         return found
-
-    def _split_column(self, name: str, column: pa.ChunkedArray) -> dict[str, np.ndarray]:
-        """Return the numbers of a column by name; none for text."""
-        value = next(filter(None, column[:HEAD_ROWS].to_pylist()), None)
-        is_text = isinstance(value, str) and read_number(value) is not None
-        if is_text or _is_number(column.type):
-            is_index = name.startswith(INDEX) and pa.types.is_timestamp(column.type)
-            return {"timestamp" if is_index else name: _convert_column(column, 1)[:, 0]}
-        if not (_is_list(column.type) and _is_number(column.type.value_type) and value):
-            return {}
-        labels = self._labels.get(name, [])
-        if len({*labels}) != len(value):
-            labels = [str(item) for item in range(len(value))]
-        items = _convert_column(column, len(value)).T
-        return {f"{name}[{label}]": item for label, item in zip(labels, items, strict=True)}
 
 
 class LeRobotLog(LogFile):
@@ -257,39 +244,3 @@ def flatten_table(table: pa.Table) -> pa.Table:
 
 def _is_real(values: np.ndarray) -> bool:
     return values.dtype.kind in "fiub"
-
-
-def _is_number(kind: pa.DataType) -> bool:
-    types = pa.types
-    tests = (types.is_floating, types.is_integer, types.is_boolean, types.is_decimal)
-    return _is_time(kind) or any(test(kind) for test in tests)
-
-
-def _is_time(kind: pa.DataType) -> bool:
-    return pa.types.is_timestamp(kind) or pa.types.is_duration(kind)
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return isinstance(kind, (pa.ListType, pa.LargeListType, pa.FixedSizeListType))
-
-
-def _convert_column(column: pa.ChunkedArray, length: int) -> np.ndarray:
-    """Return numbers or lists of numbers as `(T, K)`; NaN for an empty cell.
-
-    Raises:
-        ValueError: A list has another length.
-    """
-    whole: Any = column.combine_chunks()
-    flat, is_there = whole, np.full(len(whole), True)
-    if _is_list(column.type):
-        flat, is_there = whole.flatten(), np.asarray(whole.is_valid())
-    if len(flat) != length * is_there.sum():
-        raise ValueError(f"a list of another length than {length}")
-    unit = 1.0
-    if _is_time(flat.type):
-        unit = TIME_UNITS[flat.type.unit]
-        flat = flat.cast(pa.int64())
-    numbers = flat.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
-    found = np.full((len(whole), length), np.nan)
-    found[is_there] = unit * numbers.reshape(-1, length)
-    return found

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from actuators.recordings.advice import advise, format_joints
-from actuators.recordings.clock_evidence import TimeGuess, guess_times
+from actuators.recordings.clock_evidence import guess_times
 from actuators.recordings.clocks import list_time_columns, unwrap
 from actuators.recordings.guess import GivenColumns
 from actuators.recordings.joint_evidence import (
@@ -38,70 +38,48 @@ SAME_NAME, OTHER_NAME = 3.0, -6.0
 """Log odds of a pair with one name of a joint, and of one in which a column shares it with another one."""
 
 
-@dataclass(frozen=True)
 class ColumnTable:
     """Meanings of the columns of a run.
-
-    Attributes:
-        times: Clock of each table.
-        joints: The joints.
-        remarks: What was left out or seems odd.
-        signals: Signals of the run.
-    """
-
-    times: dict[str, TimeGuess]
-    joints: list[JointGuess]
-    remarks: list[str]
-    signals: RunSignals
-
-
-def read_columns(run: LogRun, given: GivenColumns) -> ColumnTable:
-    """Return what the columns of a run are.
 
     Args:
         run: Beginning of a log, with all columns.
         given: Meanings that a person gives.
+
+    Attributes:
+        times: Clock of each table.
+        signals: Signals of the run.
+        remarks: What was left out or seems odd.
+        joints: The joints.
 
     Raises:
         RecordingError: No time, no command or no position can be proposed, or a given column is missing.
     """
-    times = guess_times(run, given)
-    finder = _PairFinder(run, given, times)
-    joints = finder.take(given.joints) if given.joints is not None else finder.find()
-    matrix = finder.correlate([one.u for one in joints], [one.q for one in joints])
-    for at, joint in enumerate(joints):
-        judge = JointJudge(joint, matrix, at, given)
-        judge.judge_kind()
-        judge.judge_motion([one.u.text for one in joints])
-        finder.check_drive(joint)
-        judge.judge_columns()
-        judge.judge_unit()
-        judge.judge_target()
-    return ColumnTable(times, joints, finder.remarks, finder.signals)
 
-
-class _PairFinder:
-    """Finds the columns of the joints of a run.
-
-    Args:
-        run: Beginning of a log, with all columns.
-        given: Meanings that a person gives.
-        times: Clock of each table.
-
-    Attributes:
-        signals: Signals of the run.
-        remarks: What was left out or seems odd.
-    """
-
-    def __init__(self, run: LogRun, given: GivenColumns, times: dict[str, TimeGuess]) -> None:
-        self._run, self._given, self._times = run, given, times
+    def __init__(self, run: LogRun, given: GivenColumns) -> None:
+        self._run, self._given = run, given
+        self.times = times = guess_times(run, given)
         self._places = index_columns({name: [*run.tables[name].columns] for name in times})
         self.signals = RunSignals(
             run, self._places, lambda name: times[name].time, True, 1.0, quiet=True
         )
         self.remarks: list[str] = []
+        self.joints = self._find() if given.joints is None else self._take(given.joints)
+        self._judge_joints()
 
-    def take(self, given: Mapping[str, tuple[str, str]]) -> list[JointGuess]:
+    def _judge_joints(self) -> None:
+        """Weigh by the numbers what the columns of each joint are."""
+        joints = self.joints
+        matrix = self._correlate([one.u for one in joints], [one.q for one in joints])
+        for at, joint in enumerate(joints):
+            judge = JointJudge(joint, matrix, at, self._given)
+            judge.judge_kind()
+            judge.judge_motion([one.u.text for one in joints])
+            self._check_drive(joint)
+            judge.judge_columns()
+            judge.judge_unit()
+            judge.judge_target()
+
+    def _take(self, given: Mapping[str, tuple[str, str]]) -> list[JointGuess]:
         """Return the joints whose columns a person gives; refuse one that is missing."""
         joints = []
         for joint, columns in given.items():
@@ -110,7 +88,7 @@ class _PairFinder:
             joints.append(JointGuess(joint, u, q, [("as given by log.joints", 5.0)]))
         return joints
 
-    def find(self) -> list[JointGuess]:
+    def _find(self) -> list[JointGuess]:
         """Return the joints with the most evidence; refuse columns that say nothing."""
         entries = self._read_entries()
         commands, positions = _choose_roles(entries)
@@ -156,7 +134,7 @@ class _PairFinder:
         """Return the columns that are neither clock nor count nor switch."""
         entries = []
         for full_name, (table, column) in self._places.items():
-            clocks = list_time_columns(self._times[table].time)
+            clocks = list_time_columns(self.times[table].time)
             is_time = any(column == one or column in re.findall(r"\w+", one) for one in clocks)
             is_time |= column.endswith("stamp") or column == self._run.tables[table].clock
             if not is_time and (WORDS["count"] | WORDS["enable"]).isdisjoint(read_words(column)):
@@ -197,7 +175,7 @@ class _PairFinder:
     ) -> list[JointGuess]:
         """Return the pairs of the assignment with the most evidence."""
         names = _weigh_names(commands, positions)
-        size = self.correlate(commands, positions).size
+        size = self._correlate(commands, positions).size
         numbers = np.vectorize(weigh_correlation)(size) + size
         numbers[[not one.is_changing for one in commands]] = -1.0  # another log may move it
         score = (
@@ -227,7 +205,7 @@ class _PairFinder:
             joints.append(JointGuess(name, u, q, [(text, weight)]))
         return joints
 
-    def correlate(
+    def _correlate(
         self, commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]
     ) -> Correlations:
         """Return how positions follow commands."""
@@ -241,7 +219,7 @@ class _PairFinder:
         moving = [one for one in entries if one.is_changing]
         if not moving:
             return []
-        size = self.correlate(moving, moving).size
+        size = self._correlate(moving, moving).size
         np.fill_diagonal(size, 0.0)
         size = np.where((size >= size.T) & (size >= CLEAR_CORRELATION), size, 0.0)
         pairs, used = [], set[int]()
@@ -260,7 +238,7 @@ class _PairFinder:
             f"{self._run.where}: {text}{advise('joints', joints=joints)}; its columns are {', '.join(self._places)}"
         )
 
-    def check_drive(self, joint: JointGuess) -> None:
+    def _check_drive(self, joint: JointGuess) -> None:
         """Add the evidence of a drive that is off by a column that says so, and remark it."""
         for full_name, (_, column) in self._places.items():
             words = read_words(column)

@@ -18,7 +18,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from actuators.recordings.clock_evidence import TimeGuess
 from actuators.recordings.clocks import put_near
-from actuators.recordings.column_assignment import read_columns
+from actuators.recordings.column_assignment import ColumnTable
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.joint_evidence import JointGuess
 from actuators.recordings.log_files import open_log
@@ -191,7 +191,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         run = next(opened.read_runs(None, SAMPLED_ROWS), None)
         if run is None:
             raise RecordingError(f"{path}: no row")
-        sample = read_columns(run, given)
+        sample = ColumnTable(run, given)
         for table, time in sample.times.items():
             clocks.setdefault(table, time)
         remarks |= dict.fromkeys(sample.remarks)

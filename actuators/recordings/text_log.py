@@ -1,9 +1,8 @@
 """Text logs: numbers, times and lists of numbers in rows, with or without a header.
 
 The layout is told from the numbers: the rows of data are those that one delimiter cuts into equally
-many numbers; the header is the last line of names before them, comments and a row of units aside. A
-list in column `positions` becomes the columns `positions[0]`, `positions[1]`, …; a time becomes seconds
-since 1970, a time of day seconds since midnight. pandas does the reading.
+many numbers; the header is the last line of names before them, comments and a row of units aside. pandas
+does the reading.
 """
 
 from __future__ import annotations
@@ -17,13 +16,12 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 import pandas as pd
 
+from actuators.recordings.cells import MISSING, CellKind, convert_column, tell_column, tell_kind
 from actuators.recordings.log_tables import LogFile, Table, Wanted
-from actuators.recordings.message_numbers import read_number
 from actuators.recordings.name_evidence import is_unit
 from brokk_rl.errors import RecordingError
 
@@ -34,25 +32,10 @@ SNIFFED_BYTES = 1 << 16
 DELIMITERS = (",", ";", "\t", " ", "|")
 COMMENT_MARKS = "#%;/!*"
 """Signs that begin a line of comment."""
-MISSING_WORDS = "nan NaN NAN na NA N/A n/a null NULL None none - --"
-MISSING = ("", *MISSING_WORDS.split())
-"""Cells without a value."""
-FLAGS = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0}
-ISO_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[+-]\d\d:?\d\d)?")
-DAY_TIME = re.compile(
-    r"\d\d?[./-](\d\d?|[A-Za-z]{3})[./-]\d{4}[T ]+\d\d?:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?"
-)
-"""Day, month, year and time of day."""
-CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?|\d\d?:\d\d[.,]\d+|\d+([.,]\d+)? (sec|min|hr)")
-"""Time of day, minutes and seconds, or a time with its unit, as MATLAB writes it."""
-NUMBER_SIGNS = str.maketrans({"D": "E", "d": "e"} | dict.fromkeys("'’\u00a0=\""))
-"""Exponents of Fortran, signs between thousands, and those of a formula of Excel, `="0.5"`."""
 FIRST_ROWS = 3
 """Rows on end from which data begin; a block of describing lines may hold some numbers too."""
 
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
-
-CellKind = Literal["number", "time", "list", "flag", "text"]
 
 
 @dataclass(frozen=True)
@@ -78,12 +61,8 @@ class TextLayout:
     @functools.cached_property
     def kinds(self) -> list[CellKind]:
         """Kinds of the columns: each that of most of its cells."""
-        found: list[CellKind] = []
-        for cells in zip(*self.samples, strict=True):
-            filled = [cell for cell in cells if cell not in MISSING]
-            counts = Counter[CellKind](tell_kind(cell, self.decimal) for cell in filled)
-            found.append(counts.most_common(1)[0][0] if counts else "number")
-        return found
+        columns = zip(*self.samples, strict=True)
+        return [tell_column(cells, self.decimal) for cells in columns]
 
 
 class TextLog(LogFile):
@@ -107,15 +86,9 @@ class TextLog(LogFile):
         Raises:
             RecordingError: The file is damaged; names the line.
         """
-        frame = self._read_cells(max_rows)
-        columns = {}
-        for at, cells in frame.items():
-            name, kind = self.layout.names[at], self.layout.kinds[at]
-            if kind != "list":
-                columns[name] = convert_cells(cells, kind, self.layout.decimal)
-                continue
-            items = convert_lists(cells, len(split_list(self.layout.samples[0][at])))
-            columns |= {f"{name}[{item}]": values for item, values in enumerate(items.T)}
+        layout, columns = self.layout, {}
+        for at, cells in self._read_cells(max_rows).items():
+            columns |= convert_column(layout.names[at], cells, layout.kinds[at], layout.decimal)
         return {"": Table(columns, find_line=self.find_line)}
 
     def find_line(self, row: int) -> tuple[int, dict[str, str]]:
@@ -192,47 +165,6 @@ class TextLog(LogFile):
         text = f"is cut off or lacks its end ({len(cells)} of {width} cells): left out"
         log.warning("%s: the last line %s", self.path, text)
         return True
-
-
-def convert_cells(cells: Any, kind: CellKind, decimal: str) -> np.ndarray:
-    """Return cells as numbers, `(T,)`; NaN for what is none."""
-    if kind == "number":
-        if cells.dtype.kind in "fiu":
-            return cells.to_numpy(dtype=float)
-        texts = cells.astype(str).map(lambda text: simplify_number(text, decimal))
-        numbers: Any = pd.to_numeric(texts, errors="coerce")
-        return numbers.to_numpy(dtype=float)
-    texts = cells.fillna("").str.strip()
-    if kind == "flag":
-        return texts.str.lower().map(FLAGS).to_numpy(dtype=float)
-    return convert_times(texts)
-
-
-def convert_lists(cells: Any, length: int) -> np.ndarray:
-    """Return lists of numbers as `(T, K)`; NaN for another cell."""
-    found = np.full((len(cells), length), np.nan)
-    for row, text in enumerate(cells.fillna("").str.strip()):
-        numbers = [read_number(part) for part in split_list(text)]
-        if len(numbers) == length and None not in numbers:
-            found[row] = numbers
-    return found
-
-
-def convert_times(texts: Any) -> np.ndarray:
-    """Return times as seconds since 1970, without a zone as if it were UTC, or as seconds of the day, `(T,)`."""
-    first = next((text for text in texts if text), "")
-    texts = texts.str.replace(",", ".", regex=False)
-    if CLOCK_TIME.fullmatch(first):
-        whole = "00:" + texts if first.count(":") == 1 else texts
-        elapsed: Any = pd.to_timedelta(whole, errors="coerce")
-        return elapsed.dt.total_seconds().to_numpy(dtype=float)
-    is_iso = ISO_TIME.fullmatch(first) is not None
-    form: Any = (
-        {"format": "ISO8601"} if is_iso else {"dayfirst": "/" not in first, "format": "mixed"}
-    )
-    stamps: Any = pd.to_datetime(texts, utc=True, errors="coerce", **form)
-    elapsed = stamps - pd.Timestamp(0, tz="UTC")
-    return (elapsed / pd.Timedelta(seconds=1)).to_numpy(dtype=float)
 
 
 def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayout:
@@ -367,31 +299,3 @@ def split_line(line: str, delimiter: str) -> list[str]:
         return line.split()
     cells = next(csv.reader([line.strip("\r\n")], delimiter=delimiter, skipinitialspace=True), [])
     return [cell.strip() for cell in cells]
-
-
-def simplify_number(text: str, decimal: str) -> str:
-    """Return a number as Python writes it; signs between thousands are told where a decimal sign follows."""
-    plain = text.strip().translate(NUMBER_SIGNS)
-    other = "," if decimal == "." else "."
-    if re.fullmatch(rf"[-+]?\d{{1,3}}(\{other}\d{{3}})+\{decimal}\d+", plain):
-        plain = plain.replace(other, "")
-    return plain.replace(decimal, ".")
-
-
-def tell_kind(text: str, decimal: str) -> CellKind:
-    """Return the kind of a cell; an empty cell counts as a number that is missing."""
-    if text.startswith("[") and text.endswith("]"):
-        return "text" if None in map(read_number, split_list(text)) else "list"
-    if any(form.fullmatch(text) for form in (ISO_TIME, DAY_TIME, CLOCK_TIME)):
-        return "time"
-    if text.lower() in FLAGS:
-        return "flag"
-    plain = simplify_number(text, decimal)
-    is_number = text in MISSING or read_number(plain) is not None
-    return "number" if is_number else "text"
-
-
-def split_list(text: str) -> list[str]:
-    """Return the items of a list in a cell."""
-    inner = text.strip("[]").strip()
-    return re.split(r"\s*,\s*|\s+", inner) if inner else []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -82,8 +81,7 @@ def test_a_log_is_split_at_its_gaps_and_its_pieces_share_the_run(
     tmp_path: Path, excavator: Machine, reader: ColumnMap, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = [*lines(8.0, 0.0), *lines(6.0, 30.0), *lines(2.0, 60.0)]
-    with caplog.at_level(logging.WARNING):
-        pieces = reader.read(logged(tmp_path, rows), excavator)
+    pieces = reader.read(logged(tmp_path, rows), excavator)
     assert [round(piece.duration_s) for piece in pieces] == [8, 6]
     assert {piece.run for piece in pieces} == {"dig"}
     assert "1 pieces shorter than 5 s left out" in caplog.text
@@ -98,8 +96,7 @@ def test_a_last_line_that_a_crash_cut_off_is_left_out_and_said(
     tmp_path: Path, excavator: Machine, reader: ColumnMap, caplog: Any, tail: str, end: str
 ) -> None:
     whole = reader.read(logged(tmp_path, lines()), excavator)
-    with caplog.at_level(logging.WARNING):
-        cut = reader.read(logged(tmp_path, [*lines(), tail], end=end), excavator)
+    cut = reader.read(logged(tmp_path, [*lines(), tail], end=end), excavator)
     assert cut[0].num_samples == whole[0].num_samples
     assert "the last line is cut off" in caplog.text
 

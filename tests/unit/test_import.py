@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from conftest import Done
@@ -76,8 +77,6 @@ def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
     assert drafted["period_s"] == pytest.approx(1 / RATE_HZ)
     assert drafted["dead_time_s"] == pytest.approx(LAG / RATE_HZ, abs=0.021)
     (path,) = Path("out/recordings").iterdir()
-    import pyarrow.parquet as pq
-
     table = pq.read_table(path)
     # the command is the target itself: -1 and 1 are the ends of the travel
     assert {joint["command"] for joint in drafted["joints"]} == {"position"}
@@ -174,8 +173,6 @@ def test_columns_that_no_name_tells_are_given_with_the_torque_that_they_set(
     done = brokk("mode=convert", *options, "session.out=out")
     assert done.code == 0, done.err
     assert "actuator=force actuator.mass_kg=" in done.out
-    import pyarrow.parquet as pq
-
     (path,) = Path("out/recordings").iterdir()
     u = pq.read_table(path)["u_slide"].to_numpy()
     np.testing.assert_allclose(u, volts[: len(u)] / np.abs(volts).max(), atol=1e-4)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -192,13 +193,8 @@ def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
 
 
 def test_inspect_from_the_command_lists_every_breach_and_fails_at_none_in_one_look_at_each_file(
-    brokk: Callable[..., object], machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    brokk: Callable[..., object], machine: Machine, tmp_path: Path
 ) -> None:
-    looks = []
-    find_all = _RecordingScan.find_all
-    monkeypatch.setattr(
-        _RecordingScan, "find_all", lambda scan: looks.append(scan) or find_all(scan)
-    )
     record.write_recording(sound(machine), tmp_path / "a.parquet")
     record.write_recording(replace(sound(machine), metadata={}), tmp_path / "b.parquet")
     table = pq.read_table(tmp_path / "b.parquet")
@@ -207,9 +203,11 @@ def test_inspect_from_the_command_lists_every_breach_and_fails_at_none_in_one_lo
     table = table.set_column(table.column_names.index("u_q2"), "u_q2", [u]).drop_columns("q_q5_rad")
     pq.write_table(table, tmp_path / "b.parquet")
     (tmp_path / "c.parquet").write_bytes((tmp_path / "a.parquet").read_bytes()[:-300])
-    done = brokk("mode=inspect", "inspect.recordings=*.parquet", "session.out=out")
+    real = _RecordingScan.find_all
+    with patch.object(_RecordingScan, "find_all", autospec=True, side_effect=real) as look:
+        done = brokk("mode=inspect", "inspect.recordings=*.parquet", "session.out=out")
     assert done.code == 0, done.err
-    assert len(looks) == 2  # the third file is truncated
+    assert look.call_count == 2  # the third file is truncated
     for told in (
         "b.parquet: column 'q_q5_rad' is missing", "b.parquet: row 5, column 'u_q2': command 1.5 lies outside [-1, 1] (2 such rows",
         "b.parquet: row 90, column 'u_q2'", "c.parquet: truncated",

@@ -161,15 +161,15 @@ def test_a_delay_beyond_the_longest_lag_is_never_sure() -> None:
     assert "No guess is unsure" not in done.out
 
 
-@pytest.mark.parametrize("kind", ["index", "durations", "decimals"])
+@pytest.mark.parametrize("kind", ["index", "durations", "decimals", "texts"])
 def test_columns_of_parquet_of_every_kind_are_read(kind: str) -> None:
     rows = make_rows()
     stamps = pd.to_datetime(1_700_000_000_000 + rows[:, 0] * 1000.0, unit="ms")
     frame = pd.DataFrame(rows[:, 1:], columns=NAMES[1:])
+    times = {"index": stamps, "durations": stamps - stamps[0], "texts": stamps.astype(str)}
+    frame.insert(0, "time", times.get(kind, rows[:, 0]))
     if kind == "index":
-        frame.index = stamps
-    else:
-        frame.insert(0, "time", stamps - stamps[0] if kind == "durations" else rows[:, 0])
+        frame = frame.set_index("time").rename_axis(None)
     if kind == "decimals":
         frame["hip_pos_rad"] = frame["hip_pos_rad"].map(lambda value: Decimal(f"{value:.6f}"))
     frame.to_parquet("a.parquet")
