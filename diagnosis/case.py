@@ -78,10 +78,6 @@ def load_case(folder: Path, machine: Machine) -> GapCase:
         RecordingError: a part is missing, or a recording cannot be used (another machine, NaN,
             gaps, …).
     """
-    if not folder.is_dir():
-        raise RecordingError(
-            f"diagnosis.case={folder}: there is no such folder (seen from {Path.cwd()})"
-        )
     parts = {name: folder / name for name in ("reference", "field")}
     for name, part in parts.items():
         if not any(part.glob("*.parquet")):

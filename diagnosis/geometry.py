@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase
 from diagnosis.effect_library import DetectedEffect, EffectType
+from diagnosis.engine.sizes import SIGMAS
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SECONDS = 40
@@ -42,21 +43,6 @@ errors of 139 practice cases 19 are named with 0.3, 23 with this, 25 with 0; non
 
 
 @dataclass(frozen=True)
-class SetFit:
-    """Least-squares fit of a set of errors.
-
-    Attributes:
-        gain: Gain in log likelihood.
-        sizes: Size of each number, as a difference from neutral, `(P,)`.
-        covariance: Of the sizes, `(P, P)`.
-    """
-
-    gain: float
-    sizes: np.ndarray
-    covariance: np.ndarray
-
-
-@dataclass(frozen=True)
 class _GeometryNumber:
     """A number of an effect on one joint; `None`: of the whole machine."""
 
@@ -70,22 +56,10 @@ class _GeometryNumber:
         return abs(self.kind.size_on(self.name, self.joint))
 
 
-@dataclass(frozen=True, eq=False)
-class _GeometryError:
-    """One error: the numbers of an effect on one joint or of the whole machine; `columns` `(D, P)` per unit."""
-
-    numbers: tuple[_GeometryNumber, ...]
-    columns: np.ndarray
-
-    @property
-    def kind(self) -> EffectType:
-        """The effect."""
-        return self.numbers[0].kind
-
-    def is_large(self, sizes: np.ndarray) -> bool:
-        """Return whether a size is large enough to be named."""
-        typical = [number.typical for number in self.numbers]
-        return bool((np.abs(sizes) >= MIN_SIZE * np.array(typical)).any())
+_GeometryError = tuple[_GeometryNumber, ...]
+"""The numbers of an effect on one joint or of the whole machine."""
+_FittedSizes = Mapping[_GeometryNumber, Sequence[float]]
+"""Size and standard deviation of each number, as a difference from neutral."""
 
 
 def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
@@ -109,32 +83,25 @@ def find_geometry_errors(
     reference = case.reference if is_tracked(case.reference, machine) else ()
     geometric = [kind for kind in kinds if _is_geometric(kind)]
     points = _TrackedPoints(reference, case.field, machine, geometric)
-    if not points.errors:
-        return []
-    everything = np.concatenate([cause.columns for cause in points.errors], 1)
-    left = points.off - everything @ np.linalg.lstsq(everything, points.off, rcond=1e-9)[0]
-    size_m = max(MIN_NOISE_M, float(np.std(left)))
-    gains: dict[tuple[_GeometryError, ...], float] = {(): 0.0}
-    worth = dict(gains)
-    for count in range(1, MAX_ERRORS + 1):
+    gains, worth = {}, {}
+    for count in range(MAX_ERRORS + 1):
         for some in combinations(points.errors, count):
-            columns = np.concatenate([cause.columns for cause in some], 1)
-            gains[some] = _solve(_join_numbers(some), columns, points.off, size_m).gain
-            num_names = len({cause.kind for cause in some})
+            num_names = len({error[0].kind for error in some})
+            gains[some] = points.measure_gain(some)
             worth[some] = gains[some] - price * count - name_price * num_names
     named = max(worth, key=worth.__getitem__)
-    fit = points.refine(named, size_m)
-    # The part behind the last error is empty.
-    sizes = np.split(fit.sizes, np.cumsum([len(cause.numbers) for cause in named]))
-    named = tuple(cause for cause, own in zip(named, sizes, strict=False) if cause.is_large(own))
-    fit = points.refine(named, size_m)
+    sizes = points.refine(named)
+    named = tuple(error for error in named if _is_large(error, sizes))
+    sizes = points.refine(named)
     found = []
-    for kind in dict.fromkeys(cause.kind for cause in named):
-        rest = tuple(cause for cause in named if cause.kind is not kind)
-        gain = gains[named] - gains[rest]
-        without = [w for some, w in worth.items() if all(one.kind is not kind for one in some)]
-        joints, parameters = _describe_numbers(kind, _join_numbers(named), fit, machine)
-        net = worth[named] - max(without)
+    for kind in dict.fromkeys(error[0].kind for error in named):
+        own = [number for error in named for number in error if number.kind is kind]
+        joints, parameters = _describe_numbers(own, sizes, machine)
+        rest = tuple(error for error in named if error[0].kind is not kind)
+        without = [
+            net for some, net in worth.items() if all(error[0].kind is not kind for error in some)
+        ]
+        net, gain = worth[named] - max(without), gains[named] - gains[rest]
         found.append(DetectedEffect(kind, joints, parameters, net, gain))
     return found
 
@@ -144,20 +111,24 @@ def _is_geometric(kind: EffectType) -> bool:
     return kind.target.side in sides and kind.target.smooth and not kind.target.stochastic
 
 
+def _is_large(error: _GeometryError, sizes: _FittedSizes) -> bool:
+    """Return whether an error is large enough to be named."""
+    return any(abs(sizes[number][0]) >= MIN_SIZE * number.typical for number in error)
+
+
 def _describe_numbers(
-    kind: EffectType, numbers: Sequence[_GeometryNumber], fit: SetFit, machine: Machine
+    numbers: Sequence[_GeometryNumber], sizes: _FittedSizes, machine: Machine
 ) -> tuple[np.ndarray, dict[str, dict[str, Estimate]]]:
     """Return which joints have an effect, `(J,)` bool, and its numbers by name and joint or `machine`."""
     joints = np.zeros(machine.num_joints, dtype=bool)
     parameters: dict[str, dict[str, Estimate]] = {}
-    errors = np.sqrt(np.diag(fit.covariance))
-    for number, size, error in zip(numbers, fit.sizes, errors, strict=True):
-        if number.kind is kind:
-            mean, half = float(kind.numbers[number.name].none + size), 1.96 * float(error)
-            joint = "machine" if number.joint is None else machine.joint_names[number.joint]
-            own = parameters.setdefault(number.name, {})
-            own[joint] = Estimate(mean, (mean - half, mean + half))
-            joints[slice(None) if number.joint is None else number.joint] = True
+    for number in numbers:
+        size, deviation = sizes[number]
+        mean, half = number.kind.numbers[number.name].none + size, SIGMAS * deviation
+        joint = "machine" if number.joint is None else machine.joint_names[number.joint]
+        own = parameters.setdefault(number.name, {})
+        own[joint] = Estimate(mean, (mean - half, mean + half))
+        joints[slice(None) if number.joint is None else number.joint] = True
     return joints, parameters
 
 
@@ -177,6 +148,7 @@ class _TrackedPoints:
     Attributes:
         off: Errors of the tool points, `(D,)`, m, those of the reference first.
         errors: Errors of geometry and encoders that move a tool point at all, other than as is left out.
+        size_m: Standard deviation of what no error explains, m.
     """
 
     def __init__(
@@ -193,16 +165,38 @@ class _TrackedPoints:
         both = np.concatenate([known_q, self._q])
         ways_of_both = np.asarray(linalg.block_diag(known_ways, ways))
         moved = []
-        for numbers in _list_numbers(kinds, machine):
+        for numbers in _list_errors(kinds, machine):
             moved.append((numbers, self._differentiate(numbers, np.zeros(len(numbers)), both)))
         drawn = [columns for _, columns in moved] if reference else []
         self._shared = linalg.orth(np.concatenate([ways_of_both, *drawn], 1))
         self.off = self._remove_shared(np.concatenate([known_off, off]))
-        self.errors = []
-        for numbers, columns in moved:
+        self.errors: list[_GeometryError] = []
+        kept = [np.zeros((len(self.off), 0))]
+        for error, columns in moved:
             left = self._change_field(columns[self._num_known :])
             if np.abs(left).max() > 1e-6:
-                self.errors.append(_GeometryError(numbers, left))
+                self.errors.append(error)
+                kept.append(left)
+        columns = np.concatenate(kept, 1)
+        explained = columns @ np.linalg.pinv(columns, rcond=1e-9) @ self.off
+        self.size_m = max(MIN_NOISE_M, float(np.std(self.off - explained)))
+        numbers = list(chain.from_iterable(self.errors))
+        self._place = {number: place for place, number in enumerate(numbers)}
+        self._normal, self._gradient = self._form_normal(columns, self.off)
+
+    def _form_normal(self, columns: np.ndarray, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normal matrix `(P, P)` and the gradient `(P,)` of least squares."""
+        # Instruments err together for a while: a sample a second counts as a third of one.
+        weight = 1.0 / self.size_m**2 / 3.0
+        return weight * columns.T @ columns, weight * columns.T @ off
+
+    def measure_gain(self, causes: Sequence[_GeometryError]) -> float:
+        """Return the gain in log likelihood of a set of errors, to first order."""
+        numbers = list(chain.from_iterable(causes))
+        places = [self._place[number] for number in numbers]
+        normal, gradient = self._normal[np.ix_(places, places)], self._gradient[places]
+        sizes = np.linalg.solve(normal + _form_prior(numbers), gradient)
+        return float(gradient @ sizes - 0.5 * sizes @ normal @ sizes)
 
     def _remove_shared(self, off: np.ndarray) -> np.ndarray:
         """Return errors `(D, …)` without what lies along the ways, and what both sides may share."""
@@ -238,39 +232,26 @@ class _TrackedPoints:
         none = np.zeros((self._num_known, *moved.shape[1:]))
         return self._remove_shared(np.concatenate([none, moved]))
 
-    def refine(self, causes: Sequence[_GeometryError], size_m: float) -> SetFit:
-        """Return the fit of a set of errors as they act on the machine, by Gauss's and Newton's method."""
-        numbers = _join_numbers(causes)
-        fit = SetFit(0.0, np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers))))
+    def refine(self, causes: Sequence[_GeometryError]) -> _FittedSizes:
+        """Return the numbers of a set of errors as they act on the machine, by Gauss's and Newton's method."""
+        numbers = list(chain.from_iterable(causes))
+        sizes, covariance = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
         for _ in range(NUM_ROUNDS if numbers else 0):
-            columns = self._change_field(self._differentiate(numbers, fit.sizes, self._q))
-            moved = self._change_field(self._displace(numbers, fit.sizes, self._q))
-            straight = self.off - moved + columns @ fit.sizes
-            fit = _solve(numbers, columns, straight, size_m)
-        return fit
+            columns = self._change_field(self._differentiate(numbers, sizes, self._q))
+            moved = self._change_field(self._displace(numbers, sizes, self._q))
+            normal, gradient = self._form_normal(columns, self.off - moved + columns @ sizes)
+            covariance = np.linalg.inv(normal + _form_prior(numbers))
+            sizes = covariance @ gradient
+        pairs = np.stack([sizes, np.sqrt(np.diag(covariance))], 1).tolist()
+        return dict(zip(numbers, pairs, strict=True))
 
 
-def _join_numbers(causes: Sequence[_GeometryError]) -> list[_GeometryNumber]:
-    return [number for cause in causes for number in cause.numbers]
+def _form_prior(numbers: Sequence[_GeometryNumber]) -> np.ndarray:
+    """Return the inverse covariance of a normal prior, three typical sizes wide, `(P, P)`."""
+    return np.diag([1.0 / (3.0 * number.typical) ** 2 for number in numbers])
 
 
-def _solve(
-    numbers: Sequence[_GeometryNumber], columns: np.ndarray, off: np.ndarray, size_m: float
-) -> SetFit:
-    """Return the sizes by least squares with a normal prior."""
-    typical = np.array([number.typical for number in numbers])
-    # Instruments err together for a while: a sample a second counts as a third of one.
-    normal = columns.T @ columns / size_m**2 / 3.0 + np.diag(1.0 / (3.0 * typical) ** 2)
-    covariance = np.linalg.inv(normal)
-    sizes = covariance @ (columns.T @ off) / size_m**2 / 3.0
-    left = off - columns @ sizes
-    gain = float((off @ off - left @ left) / 2.0 / size_m**2 / 3.0)
-    return SetFit(gain, sizes, covariance)
-
-
-def _list_numbers(
-    kinds: Sequence[EffectType], machine: Machine
-) -> list[tuple[_GeometryNumber, ...]]:
+def _list_errors(kinds: Sequence[EffectType], machine: Machine) -> list[_GeometryError]:
     """Return the numbers of each effect on each joint, or on the whole machine."""
     found = []
     for kind in kinds:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,6 +19,9 @@ SIZES = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0, 7.0)
 SHAPES = (0.35, 0.6, 1.0, 1.7)
 """Values of a number that only shapes an effect, over the typical one."""
 DAMPINGS = (1e-4, 1e-2, 0.3, 10.0)
+
+NumberTrials = Mapping[tuple[int, str], np.ndarray]
+"""Values of some numbers for each candidate, by place of the effect and name, `(C, J)` or `(C, 1)`."""
 
 
 @dataclass(frozen=True)
@@ -112,35 +116,36 @@ class NumberSlopes:
     """Errors of free runs as linear functions of the numbers of effects.
 
     Attributes:
+        effects: The effects.
         spots: Place of the effect and name of each number, `P` of them.
         steps: Finite difference of each number, `(J,)` or `(1,)`.
         errors: What is new in each error, `(E, J)`.
         changes: What a step of each number adds to it, `(P, E, J)`.
     """
 
+    effects: Sequence[GrownEffect]
     spots: Sequence[tuple[int, str]]
     steps: Sequence[np.ndarray]
     errors: np.ndarray
     changes: np.ndarray
 
-    def _list_unknowns(self, effects: Sequence[GrownEffect]) -> list[tuple[int, np.ndarray]]:
-        """Return the unknowns: place of the number, and the joints that have it together."""
+    @cached_property
+    def _unknowns(self) -> list[tuple[int, np.ndarray]]:
+        """The `U` unknowns: place of the number, and the joints that have it together."""
         found = []
         for number, (place, _) in enumerate(self.spots):
-            joints = np.flatnonzero(effects[place].joints)
+            joints = np.flatnonzero(self.effects[place].joints)
             together = [joints] if len(self.steps[number]) == 1 else joints[:, None]
             found += [(number, some) for some in together]
         return found
 
-    def _form_normal(
-        self, unknowns: Sequence[tuple[int, np.ndarray]]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _form_normal(self) -> tuple[np.ndarray, np.ndarray]:
         """Return normal matrix and gradient of all unknowns, in steps.
 
         Errors count by the inverse of their size, as those of a Laplace distribution do.
         """
-        columns = np.zeros((len(unknowns), *self.errors.shape))
-        for place, (number, joints) in enumerate(unknowns):
+        columns = np.zeros((len(self._unknowns), *self.errors.shape))
+        for place, (number, joints) in enumerate(self._unknowns):
             columns[place][:, joints] = self.changes[number][:, joints]
         size = np.abs(self.errors)
         scale = np.maximum(size.mean(0), 1e-12)
@@ -148,36 +153,32 @@ class NumberSlopes:
         normal = np.einsum("aej,bej->ab", weighted, columns)
         return normal, -np.einsum("aej,ej->a", weighted, self.errors)
 
-    def list_steps(self, effects: Sequence[GrownEffect]) -> dict[tuple[int, str], np.ndarray]:
-        """Return the numbers after a step with each of `DAMPINGS`, `(C, J)` or `(C, 1)` each."""
-        unknowns = self._list_unknowns(effects)
-        normal, gradient = self._form_normal(unknowns)
+    def _spread(self, moves: np.ndarray) -> NumberTrials:
+        """Return what moves of the unknowns, in steps, `(C, U)`, add to each number."""
+        found = {}
+        for spot, step in zip(self.spots, self.steps, strict=True):
+            found[spot] = np.zeros((len(moves), len(step)))
+        for move, (number, joints) in zip(moves.T, self._unknowns, strict=True):
+            step = self.steps[number]
+            own = joints if len(step) > 1 else [0]
+            found[self.spots[number]][:, own] = move[:, None] * step[own]
+        return found
+
+    def list_steps(self) -> NumberTrials:
+        """Return the numbers after a step with each of `DAMPINGS`."""
+        normal, gradient = self._form_normal()
         moves = []
         for damping in DAMPINGS:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-9)
             moves.append(np.linalg.solve(damped, gradient))
         found = {}
-        for place, name in self.spots:
-            found[place, name] = np.repeat(effects[place].values[name][None], len(moves), 0)
-        for move, (number, joints) in zip(np.transpose(moves), unknowns, strict=True):
-            own = self._choose_columns(number, joints)
-            found[self.spots[number]][:, own] += move[:, None] * self.steps[number][own]
-        return {spot: effects[spot[0]].kind.clipped(spot[1], rows) for spot, rows in found.items()}
-
-    def estimate_deviations(
-        self, effects: Sequence[GrownEffect]
-    ) -> dict[tuple[int, str], np.ndarray]:
-        """Return the standard error of each number, `(J,)` or `(1,)`, all fitted together."""
-        unknowns = self._list_unknowns(effects)
-        normal, _ = self._form_normal(unknowns)
-        variance = np.diag(np.linalg.pinv(normal + 1e-9 * np.eye(len(normal))))
-        found = {
-            spot: np.zeros_like(step) for spot, step in zip(self.spots, self.steps, strict=True)
-        }
-        for own_variance, (number, joints) in zip(variance, unknowns, strict=True):
-            own = self._choose_columns(number, joints)
-            found[self.spots[number]][own] = np.sqrt(own_variance) * np.abs(self.steps[number][own])
+        for (place, name), added in self._spread(np.stack(moves)).items():
+            one = self.effects[place]
+            found[place, name] = one.kind.clipped(name, one.values[name] + added)
         return found
 
-    def _choose_columns(self, number: int, joints: np.ndarray) -> np.ndarray:
-        return joints if len(self.steps[number]) > 1 else np.zeros(1, int)
+    def estimate_deviations(self) -> dict[tuple[int, str], np.ndarray]:
+        """Return the standard error of each number, `(J,)` or `(1,)`, all fitted together."""
+        normal, _ = self._form_normal()
+        variance = np.diag(np.linalg.pinv(normal + 1e-9 * np.eye(len(normal))))
+        return {spot: np.abs(one[0]) for spot, one in self._spread(np.sqrt(variance)[None]).items()}

@@ -201,7 +201,7 @@ def estimate_numbers(
     search: SimulatorSearch, effects: Sequence[GrownEffect], machine: Machine
 ) -> list[dict[str, dict[str, Estimate]]]:
     """Return the numbers of each effect with 95 % intervals, by name and joint (or `machine`)."""
-    deviations = search.whole.linearise(effects).estimate_deviations(effects)
+    deviations = search.whole.linearise(effects).estimate_deviations()
     found = []
     for place, one in enumerate(effects):
         numbers: dict[str, dict[str, Estimate]] = {}

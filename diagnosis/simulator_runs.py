@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from brokk_rl.record import Recording
 from diagnosis.case import estimate_running_s
 from diagnosis.effect_library import EffectType, EffectValues
 from diagnosis.free_runs import WindowedRuns
+from diagnosis.grown_effects import GrownEffect, NumberSlopes, NumberTrials
 
 INTERVAL_S = 0.25
 """Time between two errors that count, on the reference of `actuators.scales`, s: as in the engine."""
@@ -33,6 +35,8 @@ MEMORIES = (0.0, 0.3, 0.6, 0.8, 0.9, 0.96)
 """Shares of an error in the next one that are tried."""
 LEAST_DEVIATION = 1e-6
 """Smallest deviation of an error, over the travel: rounding of single precision."""
+STEP = 0.05
+"""Finite difference, of the typical size."""
 BATCH_ROWS = 1536
 """Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
 
@@ -187,26 +191,49 @@ def cut_simulator_runs(
 
 
 class FreeRunLikelihood:
-    """Log likelihood of the errors of free runs, joint by joint.
+    """Log likelihood of the errors of free runs with effects, joint by joint.
 
     Each error keeps a share of the one before, and has a Laplace distribution whose deviation grows
     with the motion. Share and deviation are those that make the errors likeliest, for each
     candidate its own.
 
     Args:
-        cut: The windows.
-        machine: The machine.
+        runs: The simulator in some windows.
+        factor: Windows of the field for each of them.
     """
 
-    def __init__(self, cut: FreeRunWindows, machine: Machine) -> None:
+    def __init__(self, runs: EffectSimulator, factor: float = 1.0) -> None:
+        self.runs, self._factor = runs, factor
+        cut, machine = runs.cut, runs.machine
         steps = cut.measured.shape[1]
         every = max(1, round(scale_time(machine, INTERVAL_S) / machine.period_s))
         self._ends = np.arange(min(every, steps) - 1, steps, every)
         self._start = cut.q[:, cut.num_before - 1]
         # Errors of a speed or a force add up over a run, those of a position do not.
         self._adds_up = machine.interface != "position"
-        self.floor = LEAST_DEVIATION * (machine.upper - machine.lower)
+        self._floor = LEAST_DEVIATION * (machine.upper - machine.lower)
         self._measured = self._reduce(cut.measured)
+        self.settle(())
+
+    def settle(self, effects: Sequence[GrownEffect]) -> None:
+        """Let the deviation of the errors be that beside effects, and new candidates be put beside these."""
+        self._effects = effects
+        self._deviation = self._weigh_motion(self.simulate(effects))
+
+    def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
+        """Return free runs with effects, `(W, K, J)`."""
+        return self._simulate_trials(effects, {})[0]
+
+    def _simulate_trials(self, effects: Sequence[GrownEffect], trials: NumberTrials) -> np.ndarray:
+        """Return free runs with trials of some numbers, `(C, W, K, J)`."""
+        count = len(next(iter(trials.values()))) if trials else 1
+        given = []
+        for place, one in enumerate(effects):
+            values = one.repeat(count)
+            for name in values:
+                values[name] = trials.get((place, name), values[name])
+            given.append((one.kind, values))
+        return self.runs.simulate(given, count)
 
     def _reduce(self, paths: np.ndarray) -> np.ndarray:
         """Return what counts of paths `(…, W, K, J)`, `(…, W, I, J)`."""
@@ -219,7 +246,7 @@ class FreeRunLikelihood:
         """Return the beginnings of paths `(…, W, 1, J)`."""
         return np.broadcast_to(self._start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
 
-    def weigh_motion(self, paths: np.ndarray) -> np.ndarray:
+    def _weigh_motion(self, paths: np.ndarray) -> np.ndarray:
         """Return the deviation of each error of simulated `paths` `(W, K, J)` over that at rest, `(W, I, J)`."""
         ends = paths[:, self._ends]
         moved = np.abs(np.diff(ends, axis=1, prepend=self._lead(ends)))
@@ -228,47 +255,76 @@ class FreeRunLikelihood:
         for j in range(paths.shape[2]):
             columns = np.stack([np.ones(size[..., j].size), moved[..., j].ravel()], 1)
             (rest, share), _ = nnls(columns, size[..., j].ravel())
-            rest = max(rest, float(self.floor[j]))
+            rest = max(rest, float(self._floor[j]))
             found[..., j] = 1.0 + share / rest * moved[..., j]
         return found
 
-    def weigh(
-        self, paths: np.ndarray, deviation: np.ndarray, used: np.ndarray | None = None
+    def _measure_errors(
+        self, effects: Sequence[GrownEffect], trials: NumberTrials, used: np.ndarray | None
     ) -> np.ndarray:
-        """Return the log likelihood of paths `(C, W, K, J)`, nats, `(C, J)`.
+        """Return the errors of free runs over their relative deviation, `(C, W, I, J)`."""
+        paths = self._simulate_trials(effects, trials)
+        errors = (self._measured - self._reduce(paths)) / self._deviation
+        return errors if used is None else errors[:, used]
+
+    def _weigh_memories(self, errors: np.ndarray) -> np.ndarray:
+        """Return the log likelihood of errors with each of `MEMORIES`, nats, `(M, C, J)`."""
+        count = errors.shape[1] * errors.shape[2]
+        found = []
+        for memory in MEMORIES:
+            mean = np.abs(_subtract_memory(errors, memory)).sum((1, 2)) / count + self._floor
+            # The determinant of the memory.
+            fresh = 0.5 * errors.shape[1] * np.log(1.0 - memory**2)
+            found.append(fresh - count * np.log(mean))
+        return np.stack(found)
+
+    def weigh(
+        self,
+        effects: Sequence[GrownEffect],
+        trials: NumberTrials = MappingProxyType({}),
+        used: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the log likelihood with trials of some numbers, nats, `(C, J)`.
 
         Args:
-            paths: Free runs of each candidate.
-            deviation: Relative deviation of each error, `(W, I, J)`.
+            effects: The effects.
+            trials: Numbers of theirs.
             used: Windows that count, `(W,)` bool; `None`: all.
         """
-        errors = (self._measured - self._reduce(paths)) / deviation
-        if used is not None:
-            errors = errors[:, used]
-        count = errors.shape[1] * errors.shape[2]
-        best = np.full((len(paths), paths.shape[3]), -np.inf)
-        for memory in MEMORIES:
-            mean = np.abs(_subtract_memory(errors, memory)).sum((1, 2)) / count + self.floor
-            fresh = 0.5 * errors.shape[1] * np.log(1.0 - memory**2)
-            best = np.maximum(best, fresh - count * np.log(mean))
-        return best
+        return self._weigh_memories(self._measure_errors(effects, trials, used)).max(0)
 
-    def subtract_memory(
-        self, paths: np.ndarray, deviation: np.ndarray, used: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return what is new in each error of paths `(C, W, K, J)`, `(C, W, I, J)`; the first decides on the memory."""
-        errors = (self._measured - self._reduce(paths)) / deviation
-        if used is not None:
-            errors = errors[:, used]
-        found = np.empty_like(errors)
-        sizes = []
-        for memory in MEMORIES:
-            mean = np.abs(_subtract_memory(errors[:1], memory)).mean((0, 1, 2)) + self.floor
-            # The determinant of the memory, over the number of errors.
-            sizes.append(np.log(mean) - 0.5 * np.log(1.0 - memory**2) / errors.shape[2])
-        for j, place in enumerate(np.argmin(sizes, 0)):
-            found[..., j] = _subtract_memory(errors[..., j : j + 1], MEMORIES[place])[..., 0]
-        return found
+    def weigh_candidates(self, kind: EffectType, candidates: EffectValues) -> np.ndarray:
+        """Return what candidates of an effect earn beside those that are there, nats, `(C, J)`."""
+        first = {name: rows[0] for name, rows in candidates.items()}
+        every = np.ones(self.runs.machine.num_joints, dtype=bool)
+        beside = [*self._effects, GrownEffect(kind, first, every, 0.0)]
+        trials = {(len(self._effects), name): rows for name, rows in candidates.items()}
+        return self._factor * (self.weigh(beside, trials) - self.weigh(self._effects))
+
+    def linearise(
+        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
+    ) -> NumberSlopes:
+        """Return the slopes of all errors over all numbers."""
+        spots, steps = [], []
+        for place, one in enumerate(effects):
+            for name, value in one.values.items():
+                # At an upper end the difference is taken downwards.
+                most = one.kind.limits(name)[1]
+                step = STEP * np.abs(one.kind.size(name)) * np.ones_like(value)
+                spots.append((place, name))
+                steps.append(np.where(value + step > most, -step, step))
+        trials = {}
+        for number, (place, name) in enumerate(spots):
+            rows = np.repeat(effects[place].values[name][None], 1 + len(spots), 0)
+            rows[1 + number] += steps[number]
+            trials[place, name] = rows
+        errors = self._measure_errors(effects, trials, used)
+        fresh = np.empty_like(errors)
+        # The memory without any step counts for all.
+        for j, best in enumerate(self._weigh_memories(errors[:1]).argmax(0)[0]):
+            fresh[..., j] = _subtract_memory(errors[..., j : j + 1], MEMORIES[best])[..., 0]
+        fresh = fresh.reshape(len(fresh), -1, fresh.shape[-1])
+        return NumberSlopes(effects, spots, steps, fresh[0], fresh[1:] - fresh[0])
 
 
 def _subtract_memory(errors: np.ndarray, memory: float) -> np.ndarray:

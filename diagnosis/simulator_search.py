@@ -7,18 +7,16 @@ Axes: `C` candidates, `W` windows, `J` joints.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from diagnosis.effect_library import EffectType, EffectValues, list_shared_effects
 from diagnosis.engine.decide import JOINT_NATS, JOINT_SHARE, LEAST_NATS, SECOND_SHARE
-from diagnosis.grown_effects import GrownEffect, NumberSlopes, list_candidates
+from diagnosis.grown_effects import GrownEffect, list_candidates
 from diagnosis.simulator_runs import EffectSimulator, FreeRunLikelihood
 
-STEP = 0.05
-"""Finite difference, of the typical size."""
 ROUNDS = 30
 """Steps of Levenberg and Marquardt at most, by which all numbers are fitted together: those of a mass
 and its friction trade against each other."""
@@ -59,14 +57,14 @@ class SimulatorSearch:
         ]
         self.shared = shared
         count = len(runs.row)
-        self.whole = WindowView(runs, 1.0)
+        self.whole = FreeRunLikelihood(runs)
         """All windows of the field."""
         self._views = []
         for one in (runs, reference):
             if one is not None:
                 most = len(one.row)
                 some = np.unique(np.linspace(0, most - 1, min(most, MAX_WINDOWS)).astype(int))
-                self._views.append(WindowView(one.select(some), count / len(some)))
+                self._views.append(FreeRunLikelihood(one.select(some), count / len(some)))
         self.rivals: list[GrownEffect] = []
         """All effects beside the simulator alone, the best first."""
 
@@ -118,7 +116,7 @@ class SimulatorSearch:
 
     def _weigh(self, effects: Sequence[GrownEffect]) -> float:
         """Return the log likelihood with effects, less the price of their numbers, nats."""
-        nats = float(self.whole.weigh_numbers(effects, {}, None).sum())
+        nats = float(self.whole.weigh(effects).sum())
         return nats - JOINT_NATS * sum(one.count_numbers() for one in effects)
 
     def fit(
@@ -126,11 +124,10 @@ class SimulatorSearch:
     ) -> list[GrownEffect]:
         """Return the effects with all numbers fitted together to the windows `used`, `(W,)` bool."""
         found = list(effects)
-        best = float(self.whole.weigh_numbers(found, {}, used).sum())
+        best = float(self.whole.weigh(found, used=used).sum())
         for _ in range(rounds if found else 0):
-            slopes = self.whole.linearise(found, used)
-            trials = slopes.list_steps(found)
-            gains = self.whole.weigh_numbers(found, trials, used).sum(1)
+            trials = self.whole.linearise(found, used).list_steps()
+            gains = self.whole.weigh(found, trials, used).sum(1)
             top = int(np.argmax(gains))
             if gains[top] < best + LEAST_GAIN:
                 break
@@ -139,83 +136,6 @@ class SimulatorSearch:
                 one = found[place]
                 found[place] = replace(one, values={**one.values, name: rows[top]})
         return found
-
-
-class WindowView:
-    """Some windows, and the likelihood of the simulator with effects there.
-
-    Args:
-        runs: The windows.
-        factor: Windows of the field for each of them.
-    """
-
-    def __init__(self, runs: EffectSimulator, factor: float) -> None:
-        self.runs = runs
-        self._factor = factor
-        self._likelihood = FreeRunLikelihood(runs.cut, runs.machine)
-        self.settle(())
-
-    def settle(self, effects: Sequence[GrownEffect]) -> None:
-        """Let the deviation of the errors be that beside effects, and new candidates be put beside these."""
-        self._effects = effects
-        self.deviation = self._likelihood.weigh_motion(self.simulate(effects))
-
-    def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
-        """Return free runs with effects, `(W, K, J)`."""
-        return self._simulate_numbers(effects, {})[0]
-
-    def weigh_candidates(self, kind: EffectType, candidates: EffectValues) -> np.ndarray:
-        """Return what candidates of an effect earn beside those that are there, nats, `(C, J)`."""
-        count = len(next(iter(candidates.values())))
-        beside = [(one.kind, one.repeat(count)) for one in self._effects]
-        paths = self.runs.simulate([*beside, (kind, candidates)], count)
-        known = self._likelihood.weigh(self.simulate(self._effects)[None], self.deviation)
-        return self._factor * (self._likelihood.weigh(paths, self.deviation) - known)
-
-    def linearise(
-        self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
-    ) -> NumberSlopes:
-        """Return the slopes of all errors over all numbers."""
-        spots, steps = [], []
-        for place, one in enumerate(effects):
-            for name, value in one.values.items():
-                # At an upper end the difference is taken downwards.
-                most = one.kind.limits(name)[1]
-                step = STEP * np.abs(one.kind.size(name)) * np.ones_like(value)
-                spots.append((place, name))
-                steps.append(np.where(value + step > most, -step, step))
-        trials = {}
-        for number, (place, name) in enumerate(spots):
-            rows = np.repeat(effects[place].values[name][None], 1 + len(spots), 0)
-            rows[1 + number] += steps[number]
-            trials[place, name] = rows
-        paths = self._simulate_numbers(effects, trials)
-        errors = self._likelihood.subtract_memory(paths, self.deviation, used)
-        errors = errors.reshape(len(errors), -1, errors.shape[-1])
-        return NumberSlopes(spots, steps, errors[0], errors[1:] - errors[0])
-
-    def _simulate_numbers(
-        self, effects: Sequence[GrownEffect], trials: Mapping[tuple[int, str], np.ndarray]
-    ) -> np.ndarray:
-        """Return free runs `(C, W, K, J)` with trials `(C, J)` or `(C, 1)` of some numbers."""
-        count = len(next(iter(trials.values()))) if trials else 1
-        given = []
-        for place, one in enumerate(effects):
-            values = one.repeat(count)
-            for name in values:
-                values[name] = trials.get((place, name), values[name])
-            given.append((one.kind, values))
-        return self.runs.simulate(given, count)
-
-    def weigh_numbers(
-        self,
-        effects: Sequence[GrownEffect],
-        trials: Mapping[tuple[int, str], np.ndarray],
-        used: np.ndarray | None,
-    ) -> np.ndarray:
-        """Return the log likelihood with trials of some numbers, `(C, J)`."""
-        paths = self._simulate_numbers(effects, trials)
-        return self._likelihood.weigh(paths, self.deviation, used)
 
 
 def _count_moved(kind: EffectType, candidates: EffectValues) -> np.ndarray:

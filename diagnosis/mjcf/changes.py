@@ -1,6 +1,6 @@
 """Findings of a diagnosis as changes of an MJCF file: each changed element has a comment that names its finding.
 
-A finding is an effect with its numbers by joint. What MJCF has no element for is returned by name.
+What MJCF has no element for is returned by name.
 """
 
 from __future__ import annotations
@@ -17,23 +17,8 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
-from diagnosis.closure import Estimate
+from diagnosis.answer import Selected
 from diagnosis.mjcf.plant import MjcfPlant, limit_force_range
-
-
-@dataclass(frozen=True)
-class JointFinding:
-    """An effect on one joint.
-
-    Attributes:
-        effect: Its name, such as `dead_time`.
-        joint: The joint.
-        sizes: Size of each number, in its own unit.
-    """
-
-    effect: str
-    joint: str
-    sizes: Mapping[str, Estimate]
 
 
 @dataclass(frozen=True)
@@ -63,12 +48,12 @@ class _Editor:
     """One joint and its drive in a spec, with the record of their changes."""
 
     def __init__(
-        self, spec: Any, plant: MjcfPlant, machine: Machine, finding: JointFinding
+        self, spec: Any, plant: MjcfPlant, machine: Machine, finding: Selected, joint: str
     ) -> None:
-        place = machine.joint_names.index(finding.joint)
+        place = machine.joint_names.index(joint)
         self.finding, self.machine, self.place = finding, machine, place
         self.unit = {name: float(row[place]) for name, row in plant.read_references().items()}
-        self.joint = spec.joint(finding.joint)
+        self.joint = spec.joint(joint)
         self.drive = spec.actuators[int(plant.drives[place])]
         self.is_limited = bool(plant.model.actuator_forcelimited[plant.drives[place]])
         self.timestep_s = float(plant.model.opt.timestep)
@@ -76,7 +61,7 @@ class _Editor:
 
     def list_sizes(self, number: str) -> list[float]:
         """Return a number of the finding and the ends of its interval, if it has one."""
-        size = self.finding.sizes.get(number)
+        size = self.finding.parameters.get(number, {}).get(self.joint.name)
         if size is None:
             return [0.0]
         return [size.mean, *(size.ci95 if size.has_interval else ())]
@@ -90,7 +75,7 @@ class _Editor:
         setattr(owner, attribute, row if held.ndim else float(row[0]))
         name = f"{attribute}[{index}]" if held.ndim else attribute
         interval = (min(values[1:]), max(values[1:])) if len(values) > 1 else None
-        told = (self.finding.effect, self.finding.joint, element, name)
+        told = (self.finding.effect, self.joint.name, element, name)
         self.changes.append(MjcfChange(*told, before, float(values[0]), interval))
 
     def write(
@@ -108,7 +93,7 @@ class _Editor:
 
 
 def write_changed_mjcf(
-    source: Path, machine: Machine, findings: Sequence[JointFinding], path: Path
+    source: Path, machine: Machine, findings: Sequence[Selected], path: Path
 ) -> tuple[list[MjcfChange], dict[str, str]]:
     """Write the file with its changes; return them, and the reason for each effect that has none.
 
@@ -128,11 +113,11 @@ def write_changed_mjcf(
         if rule is None or interface not in INTERFACES.get(finding.effect, (interface,)):
             left[finding.effect] = REASONS.get(finding.effect, NO_ELEMENT)
             continue
-        editor = _Editor(spec, plant, machine, finding)
-        reason = rule(editor)
-        if reason:
-            left[f"{finding.effect} on {finding.joint}"] = reason
-        changes += editor.changes
+        for joint in finding.joints or machine.joint_names:
+            editor = _Editor(spec, plant, machine, finding, joint)
+            if reason := rule(editor):
+                left[f"{finding.effect} on {joint}"] = reason
+            changes += editor.changes
     spec.compile()
     write_text(path, _comment(spec.to_xml(), source, changes, left))
     return changes, left
@@ -254,7 +239,7 @@ def _add_lag(to: _Editor) -> str | None:
 
 
 def _add_sag(to: _Editor) -> str | None:
-    if "load_rad" in to.finding.sizes:
+    if "load_rad" in to.finding.parameters:
         return "the sag follows the weight; lower kp instead"
     lower, upper = (limit[to.place] for limit in (to.machine.lower, to.machine.upper))
     stiffness = float(to.drive.gainprm[0])

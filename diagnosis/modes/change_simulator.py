@@ -84,13 +84,8 @@ class ChangeSimulator:
         """Write the changed MJCF; return what was done."""
         from diagnosis.mjcf import changes as mjcf_changes  # MuJoCo is not in every installation
 
-        findings = []
-        for one in given.selected:
-            for joint in one.joints or self.machine.joint_names:
-                sizes = {name: row[joint] for name, row in one.parameters.items() if joint in row}
-                findings.append(mjcf_changes.JointFinding(one.effect, joint, sizes))
         changed = self.session.folder / MJCF_FILE
-        changes, left = mjcf_changes.write_changed_mjcf(path, self.machine, findings, changed)
+        changes, left = mjcf_changes.write_changed_mjcf(path, self.machine, given.selected, changed)
         return {"changes": [asdict(one) for one in changes], "not_in_the_file": left}
 
 

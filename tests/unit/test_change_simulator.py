@@ -18,7 +18,7 @@ from brokk_rl.session import Session
 from diagnosis import api, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Selected
 from diagnosis.closure import Estimate
-from diagnosis.mjcf.changes import JointFinding, write_changed_mjcf
+from diagnosis.mjcf.changes import write_changed_mjcf
 from diagnosis.mjcf.plant import MjcfPlant
 from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
 from diagnosis.simulator_runs import cut_simulator_runs
@@ -29,6 +29,12 @@ DELAY_S, FRICTION_NM = 0.06, 0.5
 def estimate(value: float, half: float) -> Estimate:
     """Returns a number with its interval."""
     return Estimate(value, (value - half, value + half))
+
+
+def name_effect(name: str, sizes: dict[str, dict[str, Estimate]]) -> Selected:
+    """Returns an effect on the joints that its numbers name."""
+    joints = tuple(next(iter(sizes.values())))
+    return Selected(effect=name, joints=joints, probability=0.9, parameters=sizes, gap_closed=None)
 
 
 def name_effects() -> Answer:
@@ -43,10 +49,8 @@ def name_effects() -> Answer:
     closed = {"dead_time": 0.7, "joint_friction": 0.2, "backlash": 0.05}
     selected = []
     for name, numbers in parameters.items():
-        (values,) = numbers.values()
         part = estimate(closed[name], 0.05)
-        one = Selected(effect=name, joints=tuple(values), probability=0.9, parameters=numbers, gap_closed=part)  # fmt: skip
-        selected.append(one)
+        selected.append(replace(name_effect(name, numbers), gap_closed=part))
     return replace(NOTHING, verdict="effects", selected=tuple(selected), reason="test")
 
 
@@ -126,10 +130,11 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
     kinds = {kind.name: kind for kind in known}
     for name, numbers in CHANGES:
         kind = kinds[name]
-        sizes = {number: estimate(value, 0.0) for number, value in numbers.items()}
-        findings = [JointFinding(name, joint, sizes) for joint in machine.joint_names]
+        sizes: dict[str, Any] = {}
+        for number, value in numbers.items():
+            sizes[number] = dict.fromkeys(machine.joint_names, estimate(value, 0.0))
         changed = tmp_path / "changed.xml"
-        assert write_changed_mjcf(source, machine, findings, changed)[1] == {}
+        assert write_changed_mjcf(source, machine, [name_effect(name, sizes)], changed)[1] == {}
         values = {name: np.full((1, 2), value) for name, value in numbers.items()}
         with_effect = simulate(source, [(kind, values)])
         left = with_effect - simulate(changed, [])
@@ -147,7 +152,7 @@ def test_a_lower_range_of_the_file_stays(tmp_path: Path) -> None:
     """60 Nm/rad times 5 % of 3 rad are 9 Nm: a shortage of 2 is a limit of 4.5 Nm."""
     machine, source = make_machine("shoulder", "elbow"), tmp_path / "arm.xml"
     source.write_text(ARM.replace('kv="4"', 'kv="4" forcerange="-3 20"'))
-    finding = JointFinding("drive_limit", "shoulder", {"shortage": Estimate(2.0, (1.5, 3.0))})
+    finding = name_effect("drive_limit", {"shortage": {"shoulder": Estimate(2.0, (1.5, 3.0))}})
     changes, left = write_changed_mjcf(source, machine, [finding], tmp_path / "changed.xml")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "changed.xml"))
     assert left == {} and model.actuator_forcerange.tolist() == [[-3.0, 4.5], [0.0, 0.0]]
