@@ -178,7 +178,7 @@ class _TrackedPoints:
                 self.errors.append(error)
                 kept.append(left)
         columns = np.concatenate(kept, 1)
-        explained = columns @ np.linalg.pinv(columns, rcond=1e-9) @ self.off
+        explained = columns @ np.linalg.lstsq(columns, self.off, rcond=1e-9)[0]
         self.size_m = max(MIN_NOISE_M, float(np.std(self.off - explained)))
         numbers = list(chain.from_iterable(self.errors))
         self._place = {number: place for place, number in enumerate(numbers)}
