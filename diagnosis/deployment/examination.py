@@ -347,7 +347,8 @@ def _describe_named(one: FittedDistortion, result: StageResult, log: RunLog) -> 
     """Return a mistake with its number."""
     distortion, number = one.distortion, one.value
     inside = result.departed[(result.departed >= one.begin) & (result.departed <= one.end)]
-    text = distortion.text.format(value=f"{number:.4g}")
+    # Not `format`: names of columns and folders may hold braces.
+    text = distortion.text.replace("{value}", f"{number:.4g}")
     parameters = {distortion.parameter: number} if distortion.parameter else {}
     if distortion.parameter == "row":
         parameters = {"since_s": float(log.t_s[int(number)])}

@@ -187,8 +187,7 @@ def test_a_mistake_without_a_name_gets_none(policy: LoadedPolicy, machine: Machi
 
 def test_a_target_out_of_the_training_is_the_task(policy: LoadedPolicy, machine: Machine) -> None:
     found = ask(policy, run_loop(policy, machine, target_m=(5.5, 0.3, 0.8)), machine)
-    assert found.verdict == "task"
-    assert "target.distance" in found.reason
+    assert found.verdict == "task" and "target.distance" in found.reason
 
 
 @pytest.mark.parametrize(("margin_rad", "verdict"), [(0.05, "nothing"), (-0.05, "task")])
@@ -206,36 +205,41 @@ def test_only_the_pose_at_the_start_is_part_of_the_task(
 
 def test_a_log_without_the_target_cannot_tell(policy: LoadedPolicy, machine: Machine) -> None:
     found = ask(policy, replace(run_loop(policy, machine), extra={}), machine)
-    assert found.verdict == "cannot_tell"
-    assert "target_x_m" in found.reason
+    assert found.verdict == "cannot_tell" and "target_x_m" in found.reason
 
 
-def lengthen(recording: Recording) -> Recording:
-    longer = dict(recording.extra) | {"obs_43": np.zeros(NUM_ROWS, np.float32)}
-    return replace(recording, extra=longer)
-
-
-def answer_otherwise(recording: Recording) -> Recording:
-    rng = np.random.default_rng(6)
-    wrong = dict(recording.extra)
-    for name in recording.joints:
-        wrong[f"advice_{name}"] = rng.uniform(-1, 1, NUM_ROWS).astype(np.float32)
-    return replace(recording, extra=wrong)
+LONGER = {"obs_43": np.zeros(NUM_ROWS, np.float32)}
 
 
 @pytest.mark.parametrize(
     ("change", "kind", "field"),
     [
         (lambda one: replace(one, rate_hz=10.0, t_s=one.t_s * 2), "rate", "loop"),
-        (lengthen, "network", "observation"),
-        (answer_otherwise, "network", "network"),
+        (lambda one: replace(one, extra={**one.extra, **LONGER}), "network", "observation"),
     ],
 )
-def test_another_rate_and_another_network_are_told(
+def test_another_rate_and_another_length_are_told(
     policy: LoadedPolicy, machine: Machine, change: Any, kind: str, field: str
 ) -> None:
     found = ask(policy, change(run_loop(policy, machine, detail="observation")), machine)
     assert (found.findings[0].kind, found.findings[0].field) == (kind, field)
+
+
+class Backwards:
+    """A network that takes its numbers in reverse."""
+
+    def __init__(self, policy: LoadedPolicy) -> None:
+        self.answer = lambda vectors: policy.network.answer(vectors[:, ::-1])
+
+
+def test_another_network_is_told_and_named_if_given(policy: LoadedPolicy, machine: Machine) -> None:
+    other = LoadedPolicy(policy.contract, Backwards(policy))  # type: ignore[arg-type]
+    recording = run_loop(other, machine, detail="observation")
+    (unnamed,) = ask(policy, recording, machine).findings
+    given = Deployment(policy, machine, {"runs/{old}": other})
+    (named,) = given.examine([recording], None, {}, 0).findings
+    assert "another network" in unnamed.text and named.text == "the network is that of runs/{old}"
+    assert (unnamed.kind, unnamed.field) == (named.kind, named.field) == ("network", "network")
 
 
 def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy, machine: Machine) -> None:
