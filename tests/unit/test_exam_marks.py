@@ -136,7 +136,7 @@ def test_the_figures_of_a_table_are_those_worked_by_hand() -> None:
     assert found["joints"]["value"] == pytest.approx(4 / 5)
     assert found["exact_set"]["value"] == 0.5
     assert found["false_alarms_none"]["value"] == 0.5 and found["false_alarms_none"]["of"] == 2
-    assert found["unknown_recall"]["value"] == 1.0
+    assert found["unknown_recall"]["value"] == 1.0 and table()[-1].claims == (Claim(0.8, True),)
     assert found["by_effect"] == {
         "backlash": {"right": 0, "wrong": 2, "missed": 0},
         "creep": {"right": 1, "wrong": 0, "missed": 2},
