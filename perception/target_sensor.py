@@ -27,7 +27,7 @@ from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception.calibrate import transforms
 from perception.calibrate.extrinsics import CameraExtrinsics
 from perception.mount.mounts import AxesMount, CameraMount
-from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
+from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewPlanner
 from perception.render.stereo_camera import StereoRig, place_rig
 from perception.sources.simulator import SimulatedCamera
 
@@ -86,10 +86,7 @@ class WatchedHole:
     """The camera of one environment: its mount, its tracker and what is known.
 
     Attributes:
-        position: Position of the mount, `(A,)`.
-        arrives_s: Time from which its pictures are used.
-        num_missed: Last pictures from this position in which nothing was found.
-        choice: The last choice of a view, `None` before the first.
+        planner: Where the camera looks.
         hole: The tracked hole, `None` before the first detection.
         history: Of each frame, whether it showed a hole, and the error of the tracked one, m;
             `None` before the first.
@@ -99,10 +96,12 @@ class WatchedHole:
         self,
         settings: PerceivedTarget,
         mount: CameraMount,
+        planner: ViewPlanner,
         task_scene: np.ndarray,
         generator: np.random.Generator,
     ) -> None:
         self._settings, self._mount, self._generator = settings, mount, generator
+        self.planner = planner
         self.task_scene = tuple(float(value) for value in task_scene)
         self.true_m = np.array(self.task_scene[:3])
         self._hint_m = self.true_m + settings.hint_m * generator.standard_normal(3)
@@ -110,9 +109,6 @@ class WatchedHole:
         self._shared = mount.error.draw(generator, "shared")
         self._view = mount.error.draw(generator, "view")
         self._waiting: deque[tuple[float, Sequence[HolePose] | None, float]] = deque()
-        self.position, self.arrives_s = mount.start.copy(), 0.0
-        self.num_missed = 0
-        self.choice: ViewChoice | None = None
         self.hole: TrackedHole | None = None
         self.history: list[tuple[bool, float | None]] = []
 
@@ -128,13 +124,10 @@ class WatchedHole:
         std_m = max(self._settings.hint_m, LEAST_HINT_M)
         return HoleBelief.expect(self._hint_m, self.task_scene[5], std_m)
 
-    def move(self, choice: ViewChoice, t_s: float) -> None:
-        """Send the mount to a chosen view."""
-        self.choice = choice
-        if choice.view.is_moving:
-            self.position, self.arrives_s = choice.position, t_s + choice.view.travel_s
+    def aim(self, plan_q: np.ndarray, t_s: float) -> None:
+        """Choose the next view by the arm's planned motion, `(T, J)`, and send the mount there."""
+        if self.planner.aim(self.believe(), plan_q, t_s).is_moving:
             self._view = self._mount.error.draw(self._generator, "view")
-            self.num_missed = 0
 
     def expose(
         self,
@@ -146,8 +139,8 @@ class WatchedHole:
     ) -> _Exposure | None:
         """Return the picture to take, `None` where the hole is out of the picture."""
         rig, window = self._settings.camera.rig, self._settings.window_px
-        believed = self._mount.locate(self.position, measured_q)
-        true = self._mount.locate(self.position, q)
+        believed = self._mount.locate(self.planner.position, measured_q)
+        true = self._mount.locate(self.planner.position, q)
         true = transforms.apply_motion(transforms.apply_motion(true, self._shared), self._view)
         away_m = np.linalg.inv(believed) @ np.append(self.center_m, 1.0)
         if away_m[2] < self._settings.camera.stereo.nearest_m:
@@ -168,8 +161,8 @@ class WatchedHole:
         """Hand to the tracker what has become known by now."""
         while self._waiting and self._waiting[0][0] <= now_s + 1e-9:
             _, holes, t_s = self._waiting.popleft()
-            if holes is not None and t_s >= self.arrives_s - 1e-9:
-                self.num_missed = 0 if holes else self.num_missed + 1
+            if holes is not None and t_s >= self.planner.arrives_s - 1e-9:
+                self.planner.num_missed = 0 if holes else self.planner.num_missed + 1
             tracked = self._tracker.update(holes or (), t_s)
             near = []
             for hole in tracked:
@@ -191,8 +184,6 @@ class PerceivedTargets:
     ) -> None:
         self._settings, self._machine, self._seed = settings, machine, seed
         self._mount = settings.mount.build(machine)
-        rig = settings.camera.rig
-        self._planner = settings.next_view.build(machine, self._mount, rig, settings.camera.arm)
         self._finder = settings.finder.build()
         self._attended = np.zeros(num_envs, bool)
         self._steps = np.zeros(num_envs, int)
@@ -208,7 +199,9 @@ class PerceivedTargets:
         for number in np.flatnonzero(mask):
             stream = (self._seed, int(number), int(self._episodes[number]))
             generator = np.random.default_rng(stream)
-            one = WatchedHole(self._settings, self._mount, start["scene"][number], generator)
+            s, scene = self._settings, start["scene"][number]
+            place = (self._machine, self._mount, s.camera.rig, s.camera.arm)
+            one = WatchedHole(s, self._mount, s.next_view.build(*place), scene, generator)
             if len(self.watched) <= number:
                 self.watched.append(one)
             else:
@@ -268,7 +261,7 @@ class PerceivedTargets:
             one, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             seed = (self._seed, int(number), int(self._steps[number]))
             chain_m = self._settings.camera.arm.trace(self._machine, q[number])
-            if t_s < one.arrives_s - 1e-9 or not self._is_steady(one, int(number), q):
+            if t_s < one.planner.arrives_s - 1e-9 or not self._is_steady(one, int(number), q):
                 one.wait_for(None, t_s)
                 continue
             exposure = one.expose(q[number], measured_q[number], chain_m, t_s, seed)
@@ -287,7 +280,9 @@ class PerceivedTargets:
         """Return whether the arm does not swing the camera faster than a picture allows."""
         if self._before is None or self._steps[number] == 0:
             return True
-        poses = self._mount.locate(one.position, np.stack([self._before[number], q[number]]))
+        poses = self._mount.locate(
+            one.planner.position, np.stack([self._before[number], q[number]])
+        )
         if poses.ndim == 2:
             return True
         cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1.0) / 2.0
@@ -303,12 +298,11 @@ class PerceivedTargets:
         planned = plan(target_m, s.num_times, step_s)
         for number in due:
             one, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
-            if t_s >= one.arrives_s - 1e-9:  # one motion at a time
+            if t_s >= one.planner.arrives_s - 1e-9:  # one motion at a time
                 plan_q = planned[number]
                 if one.hole is None:  # the machine rests until the hole was seen
                     plan_q = np.repeat(q[number][None], s.num_times, 0)
-                choice = self._planner.choose(one.believe(), one.position, plan_q, one.num_missed)
-                one.move(choice, t_s)
+                one.aim(plan_q, t_s)
 
 
 def _search(

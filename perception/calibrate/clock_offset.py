@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from perception.calibrate import transforms
-
 log = logging.getLogger(__name__)
 
 # All numbers below were chosen by hand.
@@ -75,9 +73,11 @@ def estimate_clock_offset(
     first = first[frame_s[later[first]] - frame_s[first] <= MAX_GAP_S]
     begin, end = frame_s[first], frame_s[later[first]]
     # the size of the turn alone: the rotation between the two frames is not known yet
-    seen = _compute_angles(turns[first], turns[later[first]]) / (end - begin)
-    link = Slerp(recording_s, Rotation.from_matrix(link_turns))
-    arm_speeds = _compute_angles(link_turns[:-1], link_turns[1:]) / np.diff(recording_s)
+    board = Rotation.from_matrix(turns)
+    seen = (board[first].inv() * board[later[first]]).magnitude() / (end - begin)
+    arm = Rotation.from_matrix(link_turns)
+    link = Slerp(recording_s, arm)
+    arm_speeds = (arm[:-1].inv() * arm[1:]).magnitude() / np.diff(recording_s)
     believed = seen <= MAX_SPEED_RATIO * float(arm_speeds.max()) + 1e-9
     begin, end, seen = begin[believed], end[believed], seen[believed]
     if len(seen) < MIN_SPEEDS:
@@ -112,16 +112,10 @@ def _correlate_speeds(
     """Return the correlation of the link's speeds with those seen; -1 where it is undefined."""
     if len(seen_rad_s) < MIN_SPEEDS:
         return -1.0
-    begin, end = link(begin_s + shift_s).as_matrix(), link(end_s + shift_s).as_matrix()
-    speed = _compute_angles(begin, end) / (end_s - begin_s)
+    begin, end = link(begin_s + shift_s), link(end_s + shift_s)
+    speed = (begin.inv() * end).magnitude() / (end_s - begin_s)
     scale = speed.std() * seen_rad_s.std()
     if not scale > 1e-9:
         return -1.0
     product = (speed - speed.mean()) * (seen_rad_s - seen_rad_s.mean())
     return float(np.mean(product / scale))
-
-
-def _compute_angles(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the angles between rotations, `(N,)` rad."""
-    relative = np.swapaxes(start, 1, 2) @ end
-    return np.linalg.norm(transforms.compute_rotation_vectors(relative), axis=1)

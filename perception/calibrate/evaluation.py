@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from brokk_rl.machine import Machine
-from perception.calibrate import transforms
 from perception.calibrate.clock_offset import ClockEstimate
 from perception.calibrate.hand_eye import HandEyeSolution, HandEyeViews
 
@@ -86,8 +86,8 @@ def measure_rotation_ranges(base_from_link: np.ndarray) -> tuple[np.ndarray, np.
         `(3,)` rad from the 5th to the 95th percentile, and the axes in the base frame as rows,
             `(3, 3)`.
     """
-    middle = transforms.find_nearest_rotation(base_from_link[:, :3, :3].sum(0))
-    vectors = transforms.compute_rotation_vectors(base_from_link[:, :3, :3] @ middle.T)
+    poses = Rotation.from_matrix(base_from_link[:, :3, :3])
+    vectors = (poses * poses.mean().inv()).as_rotvec()
     axes = np.linalg.svd(vectors - vectors.mean(0), full_matrices=False)[2]
     low, high = np.percentile(vectors @ axes.T, RANGE_PERCENT, axis=0)
     order = np.argsort(low - high)

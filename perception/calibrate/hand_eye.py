@@ -161,7 +161,7 @@ def generate_starts(
 
 def _invert_estimate(rotation: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
     """Return the inverse of a transform whose rotation is orthonormal but for rounding."""
-    nearest = transforms.find_nearest_rotation(rotation)
+    nearest = Rotation.from_matrix(rotation).as_matrix()
     return transforms.invert(transforms.make_transform(nearest, np.ravel(shift_m)))
 
 

@@ -51,9 +51,3 @@ def build_cross_matrices(vector: np.ndarray) -> np.ndarray:
     matrix[..., 1, 0], matrix[..., 1, 2] = z, -x
     matrix[..., 2, 0], matrix[..., 2, 1] = -y, x
     return matrix
-
-
-def find_nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to a matrix, `(3, 3)`, in the Frobenius norm (Kabsch, 1976)."""
-    left, _, right = np.linalg.svd(matrix)
-    return left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right

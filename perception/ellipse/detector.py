@@ -157,7 +157,7 @@ class ContourArcs:
             self.arc_points,
             near_px,
         )
-        if not len(edges.points):
+        if edges is None:
             return []
         # An arc of a large ellipse must be long; a short one fits any curvature.
         least = max(self.arc_points, int(0.5 * limits.lowest_px))

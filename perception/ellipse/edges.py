@@ -109,8 +109,8 @@ def detect_edges(
     low: float,
     least: int,
     near_px: int,
-) -> Edges:
-    """Return the edges of a picture.
+) -> Edges | None:
+    """Return the edges of a picture, `None` where there are none.
 
     The thresholds adapt to dark and hazy pictures. The upper one is the given percentile of the
     gradient, at least `noise` times the gradient of noise, and at least 1 grey level a pixel.
@@ -134,7 +134,7 @@ def detect_edges(
     some = np.s_[::2, ::2] if magnitude.size < MANY else np.s_[::4, ::4]
     looked = magnitude[some].ravel() if roi is None else magnitude[some][roi[some]]
     if not looked.size:
-        return _make_empty_edges(gray.shape)
+        return None
     ranks = [round(part / 100.0 * (looked.size - 1)) for part in (50.0, percentile)]
     median, upper = np.partition(looked, ranks)[ranks]
     # The median gradient is nearly all noise, since edges are rare.
@@ -154,10 +154,10 @@ def detect_edges(
         if len(c) >= least:
             contours.append(c)
     if not contours:
-        return _make_empty_edges(gray.shape)
+        return None
     pixels, spans = _chain_pixels(contours, gray.shape, least)
     if not len(pixels):
-        return _make_empty_edges(gray.shape)
+        return None
     points, directions = _refine_points(pixels, gx, gy, magnitude)
     # Strength of the pixel, not of the refined place: ratios of it are compared only roughly.
     strength = magnitude[pixels[:, 1], pixels[:, 0]]
@@ -343,21 +343,6 @@ def _interpolate(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
     top = flat.take(here) * (1 - fx) + flat.take(here + 1) * fx
     bottom = flat.take(here + width) * (1 - fx) + flat.take(here + width + 1) * fx
     return top * (1 - fy) + bottom * fy
-
-
-def _make_empty_edges(shape: tuple) -> Edges:
-    empty = np.empty((0, 2))
-    run = np.empty(0, int)
-    return Edges(
-        empty,
-        empty,
-        np.empty(0),
-        np.full(shape, -1, np.int32),
-        NO_SPANS,
-        NO_SPANS,
-        run,
-        np.empty(0),
-    )
 
 
 NUM_SEEDS = 28

@@ -65,19 +65,6 @@ class HoleBelief:
         return cls(pose.center_m, pose.axis, pose.radius_m, own_m2)
 
 
-@dataclass(frozen=True)
-class ViewChoice:
-    """A chosen view and the reasons.
-
-    Attributes:
-        position: Position of the mount, `(A,)`.
-        view: Where it looks, and why; `is_moving` where it is another one than the present.
-    """
-
-    position: np.ndarray
-    view: CameraView
-
-
 @spec
 class ExpectedCovariance:
     """Choose the view with the smallest expected variance of the hole's centre.
@@ -115,12 +102,20 @@ class ExpectedCovariance:
     def build(
         self, machine: Machine, mount: CameraMount, rig: StereoRig, arm: ArmShape
     ) -> ViewPlanner:
-        """Return the planner of a camera on a mount."""
+        """Return the planner of a camera on a mount, which is at its start."""
         return ViewPlanner(self, machine, mount, rig, arm)
 
 
 class ViewPlanner:
-    """Planner that chooses the view with the smallest `ExpectedCovariance` of the hole."""
+    """A camera on its mount, moved to the view with the smallest `ExpectedCovariance` of the hole.
+
+    Attributes:
+        position: Position of the mount, `(A,)`.
+        arrives_s: Time from which pictures are used.
+        num_missed: Last frames from this position in which nothing was found: something hides the hole
+            that the plan does not know.
+        view: The last choice, `None` before the first.
+    """
 
     def __init__(
         self,
@@ -132,30 +127,29 @@ class ViewPlanner:
     ) -> None:
         self.settings = settings
         self._machine, self._mount, self._rig, self._arm = machine, mount, rig, arm
+        self.position, self.arrives_s = mount.start.copy(), -np.inf
+        self.num_missed = 0
+        self.view: CameraView | None = None
 
-    def choose(
-        self, hole: HoleBelief, present: np.ndarray, plan_q: np.ndarray, num_missed: int = 0
-    ) -> ViewChoice:
-        """Return the next view.
+    def aim(self, hole: HoleBelief, plan_q: np.ndarray, t_s: float) -> CameraView:
+        """Choose the next view and go there.
 
         Args:
             hole: The hole.
-            present: Present position of the mount, `(A,)`.
             plan_q: Joint positions of the arm at `num_times` times from now to `horizon_s`,
                 `(T, J)`.
-            num_missed: Last frames from the present view in which nothing was found: something hides
-                the hole that the plan does not know.
+            t_s: Time of the choice.
         """
         s, mount = self.settings, self._mount
-        positions = np.concatenate([present[None], mount.views])
-        travel_s = mount.compute_travel_s(present, positions)
+        positions = np.concatenate([self.position[None], mount.views])
+        travel_s = mount.compute_travel_s(self.position, positions)
         poses = mount.locate(positions[:, None], plan_q[None])
         poses = np.broadcast_to(poses, (len(positions), len(plan_q), 4, 4))
         times_s = np.linspace(0.0, s.horizon_s, len(plan_q))
         found = self.predict_detection(hole, poses, plan_q)
         seen = (found * (times_s >= travel_s[:, None])).mean(1)
         # The present view may be one of the mount's own, too.
-        seen[(positions == present).all(-1)] *= BELIEF_AFTER_MISS**num_missed
+        seen[(positions == self.position).all(-1)] *= BELIEF_AFTER_MISS**self.num_missed
         variance_m2 = self._predict_variance(hole, poses, s.rate_hz * s.horizon_s * seen)
         std_m = np.sqrt(variance_m2)
         # Of views that are as good, the one that has the hole in the middle.
@@ -165,7 +159,7 @@ class ViewPlanner:
         best = int(np.argmax(np.where(is_good, ahead, -np.inf)))
         if std_m[best] > (1.0 - s.improvement) * std_m[0]:
             best = 0
-        view = CameraView(
+        self.view = CameraView(
             name=mount.describe(positions[best]),
             is_moving=best > 0,
             travel_s=float(travel_s[best]),
@@ -175,7 +169,10 @@ class ViewPlanner:
             std_m=float(std_m[best]),
             std_before_m=float(std_m[0]),
         )
-        return ViewChoice(positions[best], view)
+        if best > 0:
+            self.position, self.arrives_s = positions[best], t_s + self.view.travel_s
+            self.num_missed = 0
+        return self.view
 
     def predict_detection(
         self, hole: HoleBelief, poses: np.ndarray, plan_q: np.ndarray

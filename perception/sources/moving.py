@@ -13,7 +13,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception.mount.approach import plan_approach_motion
 from perception.mount.mounts import AxesMount
-from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
+from perception.mount.next_view import ExpectedCovariance, HoleBelief
 from perception.render.stereo_camera import place_rig
 from perception.sources.simulator import SimulatedCamera
 
@@ -53,10 +53,8 @@ class MovingSource:
         self._planner = settings.next_view.build(
             settings.machine, self._mount, rig, settings.camera.arm
         )
-        self._position, self._arrives_s = self._mount.start, -np.inf
         self._q: np.ndarray | None = None
-        self._choice: ViewChoice | None = None
-        self._seen_s, self._num_missed, self._t_s = -np.inf, 0, 0.0
+        self._seen_s, self._t_s = -np.inf, 0.0
         self._count, self._is_taken = -1, False
 
     def __enter__(self) -> MovingSource:
@@ -71,12 +69,12 @@ class MovingSource:
         self._t_s = t_s
         if q is None or not np.isfinite(q).all():
             return None
-        self._q, s = q, self._settings
-        if t_s < self._arrives_s:  # one motion at a time
-            return None if self._choice is None else self._choice.view
+        self._q, s, planner = q, self._settings, self._planner
+        if t_s < planner.arrives_s:  # one motion at a time
+            return planner.view
         seen_s = -np.inf if hole is None else hole.seen_s
         if self._is_taken:
-            self._num_missed = 0 if seen_s > self._seen_s else self._num_missed + 1
+            planner.num_missed = 0 if seen_s > self._seen_s else planner.num_missed + 1
         self._seen_s, self._is_taken = seen_s, False
         scene = s.camera.task_scene
         belief = HoleBelief.expect(np.array(scene[:3]), scene[5], s.hint_m)
@@ -84,11 +82,7 @@ class MovingSource:
             belief = HoleBelief.take(hole)
         step_s = s.next_view.horizon_s / (s.next_view.num_times - 1)
         plan_q = plan_approach_motion(s.machine, q, belief.center_m, s.next_view.num_times, step_s)
-        self._choice = self._planner.choose(belief, self._position, plan_q, self._num_missed)
-        if self._choice.view.is_moving:
-            self._position = self._choice.position
-            self._arrives_s, self._num_missed = t_s + self._choice.view.travel_s, 0
-        return self._choice.view
+        return planner.aim(belief, plan_q, t_s)
 
     def read_latest(self) -> Frame:
         """Return a frame of the present scene from the present view.
@@ -101,14 +95,13 @@ class MovingSource:
             raise FrameError("moving camera: not open; use it in a `with` block")
         if self._q is None:
             raise FrameError("moving camera: the machine's positions are not known yet")
-        if self._t_s < self._arrives_s:
+        if self._t_s < self._planner.arrives_s:
             raise FrameError("moving camera: on its way, its pictures are not used")
         s, number = self._settings, self._count
         self._count, self._is_taken = number + 1, True
         rig = s.camera.rig
-        placed = place_rig(
-            rig, self._mount.locate(self._position, self._q), (0, 0), (rig.width, rig.height)
-        )
+        pose = self._mount.locate(self._planner.position, self._q)
+        placed = place_rig(rig, pose, (0, 0), (rig.width, rig.height))
         noise = np.random.default_rng((s.camera.seed, number))
         chain_m = s.camera.arm.trace(s.machine, self._q)
         shot = s.camera.shoot(s.camera.task_scene, chain_m, noise, placed)

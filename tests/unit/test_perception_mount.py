@@ -81,7 +81,7 @@ def test_the_next_view_sees_a_hole_that_the_arm_will_hide(machine: Machine) -> N
     q = np.array([0.0, -0.6, 1.2, 0.8, 0.3])
     between = (mount.locate(mount.start, q)[:3, 3] + 3 * HOLE_M) / 4
     planner._arm = _Wall(between)
-    view = planner.choose(believe(), mount.start, np.stack([q] * 7)).view
+    view = planner.aim(believe(), np.stack([q] * 7), 0.0)
     assert view.is_moving
     assert view.seen_before_s == 0.0 and view.seen_s > 3.0
     assert view.std_m < view.std_before_m
@@ -121,20 +121,21 @@ def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself(
 ) -> None:
     mount, planner = plan(machine, "mast")
     q = np.stack([machine.home] * 7)
-    before = planner.choose(believe(), mount.start, q, num_missed=0)
-    after = planner.choose(believe(), mount.start, q, num_missed=8)
-    assert not before.view.is_moving
-    assert after.view.is_moving and not np.array_equal(after.position, mount.start)
+    assert not planner.aim(believe(), q, 0.0).is_moving
+    planner.num_missed = 8
+    view = planner.aim(believe(), q, 3.0)
+    assert view.is_moving and not np.array_equal(planner.position, mount.start)
+    assert (planner.num_missed, planner.arrives_s) == (0, 3.0 + view.travel_s)
 
 
 def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) -> None:
-    mount, planner = plan(machine, "mast")
     for q1 in (-1.2, 0.0, 1.2):
+        mount, planner = plan(machine, "mast")
         q = machine.home.copy()
         q[0] = q1
-        chosen = planner.choose(believe(), mount.start, np.stack([q] * 7))
-        ahead = mount.locate(chosen.position, q)[:3, 2]
-        camera_m = mount.locate(chosen.position, q)[:3, 3]
+        planner.aim(believe(), np.stack([q] * 7), 0.0)
+        ahead = mount.locate(planner.position, q)[:3, 2]
+        camera_m = mount.locate(planner.position, q)[:3, 3]
         away = HOLE_M - camera_m
         bearing = np.arctan2(away[1], away[0]) - np.arctan2(ahead[1], ahead[0])
         assert abs(np.angle(np.exp(1j * bearing))) < 0.5
@@ -142,9 +143,9 @@ def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) ->
 
 def watch(machine: Machine) -> WatchedHole:
     settings = replace(option("target", "perceived"), delay_s=0.35, hint_m=0.03)
-    mount = settings.mount.build(machine)
+    mount, planner = plan(machine, "mast")
     scene = np.array([*HOLE_M, 0.0, 1.0, 0.05])
-    return WatchedHole(settings, mount, scene, np.random.default_rng(0))
+    return WatchedHole(settings, mount, planner, scene, np.random.default_rng(0))
 
 
 def detect(center_m: np.ndarray) -> HolePose:
@@ -173,7 +174,7 @@ def test_a_picture_that_was_not_taken_is_no_miss(machine: Machine) -> None:
     for t_s, holes in ((0.0, ()), (0.5, None), (1.0, ())):
         eye.wait_for(holes, t_s)
     eye.learn(2.0)
-    assert eye.num_missed == 2
+    assert eye.planner.num_missed == 2
     eye.wait_for([detect(HOLE_M)], 2.0)
     eye.learn(3.0)
-    assert eye.num_missed == 0
+    assert eye.planner.num_missed == 0
