@@ -73,8 +73,8 @@ def estimate_clock_offset(
     first = first[frame_s[later[first]] - frame_s[first] <= MAX_GAP_S]
     begin, end = frame_s[first], frame_s[later[first]]
     # the size of the turn alone: the rotation between the two frames is not known yet
-    board = Rotation.from_matrix(turns)
-    seen = (board[first].inv() * board[later[first]]).magnitude() / (end - begin)
+    start, stop = Rotation.from_matrix(turns[first]), Rotation.from_matrix(turns[later[first]])
+    seen = (start.inv() * stop).magnitude() / (end - begin)
     arm = Rotation.from_matrix(link_turns)
     link = Slerp(recording_s, arm)
     arm_speeds = (arm[:-1].inv() * arm[1:]).magnitude() / np.diff(recording_s)
