@@ -6,11 +6,10 @@ camera coordinates are those of `brokk_rl.contracts.vision`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
-from brokk_rl.contracts.vision import FrameDetections, HolePose, Masks, Rejection
+from brokk_rl.contracts.vision import Masks
 from brokk_rl.signals import Frame
 
 
@@ -35,22 +34,4 @@ class SegmenterSpec(Protocol):
 
     def build(self) -> Segmenter:
         """Return a segmenter."""
-        ...
-
-
-@runtime_checkable
-class SteeredFinder(Protocol):
-    """Optional abilities of a finder: words for `explain.txt`, and to look at known holes alone."""
-
-    def explain(self, rejection: Rejection) -> str:
-        """Return a sentence: the refused candidate, the reason, and a remedy."""
-        ...
-
-    @property
-    def search_every(self) -> int:
-        """Frames of which one is to be searched as a whole."""
-        ...
-
-    def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
-        """Return those of some holes, seen before, that are still where they were."""
         ...

@@ -216,7 +216,7 @@ class StagedFinder:
         return _Judged([], [*judged.rejected, Rejection("ellipse", reason, found[0], 1.0)])
 
     def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
-        """Return the holes that are still where they were; see `SteeredFinder.follow`."""
+        """Return those of some holes, seen before, that are still where they were."""
         s = self.settings
         ms: dict[str, float] = {}
         frame, fault = self._prepare(frame, ms)

@@ -28,7 +28,6 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, spec
-from perception.contracts import SteeredFinder
 from perception.finder import StagedFinder
 from perception.overlay import OverlayDrawing
 from perception.sources.look import look_at_frames
@@ -200,7 +199,7 @@ class Perceive:
 
 def _explain(finder: BoreholeFinder, rejection: Rejection) -> str:
     """Return a refusal in words: the finder's own if it has any."""
-    if isinstance(finder, SteeredFinder):
+    if isinstance(finder, StagedFinder):
         return finder.explain(rejection)
     value, limit = f"{rejection.value:.4g}", f"{rejection.limit:.4g}"
     return f"{rejection.stage}: {rejection.reason} is {value}, limit {limit}"

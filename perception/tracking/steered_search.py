@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from brokk_rl.contracts.vision import BoreholeFinder, FrameDetections, HoleTracker, TrackedHole
 from brokk_rl.signals import Frame
-from perception.contracts import SteeredFinder
+from perception.finder import StagedFinder
 
 
 class SteeredSearch:
     """A finder that its tracker steers.
 
     Args:
-        finder: Finds holes; it is steered if it is a `SteeredFinder`.
+        finder: Finds holes; it is steered if it is a `StagedFinder`.
         tracker: Follows them over the frames.
     """
 
@@ -35,7 +35,7 @@ class SteeredSearch:
     def _look(self, frame: Frame) -> FrameDetections:
         finder = self._finder
         known = [hole.pose for hole in self._known if hole.confirmed and not hole.stale]
-        if not isinstance(finder, SteeredFinder) or not known:
+        if not isinstance(finder, StagedFinder) or not known:
             return finder.find(frame)
         self._num_followed += 1
         if self._num_followed < finder.search_every:
