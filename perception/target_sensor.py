@@ -201,7 +201,8 @@ class PerceivedTargets:
             generator = np.random.default_rng(stream)
             s, scene = self._settings, start["scene"][number]
             place = (self._machine, self._mount, s.camera.rig, s.camera.arm)
-            one = WatchedHole(s, self._mount, s.next_view.build(*place), scene, generator)
+            planner = ViewPlanner(s.next_view, *place)
+            one = WatchedHole(s, self._mount, planner, scene, generator)
             if len(self.watched) <= number:
                 self.watched.append(one)
             else:

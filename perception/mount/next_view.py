@@ -99,12 +99,6 @@ class ExpectedCovariance:
         if not 0 <= self.visible[0] < self.visible[1] <= 1:
             raise ConfigError(f"visible: expected 0 <= lowest < highest <= 1, got {self.visible}")
 
-    def build(
-        self, machine: Machine, mount: CameraMount, rig: StereoRig, arm: ArmShape
-    ) -> ViewPlanner:
-        """Return the planner of a camera on a mount, which is at its start."""
-        return ViewPlanner(self, machine, mount, rig, arm)
-
 
 class ViewPlanner:
     """A camera on its mount, moved to the view with the smallest `ExpectedCovariance` of the hole.

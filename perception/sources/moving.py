@@ -13,7 +13,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception.mount.approach import plan_approach_motion
 from perception.mount.mounts import AxesMount
-from perception.mount.next_view import ExpectedCovariance, HoleBelief
+from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewPlanner
 from perception.render.stereo_camera import place_rig
 from perception.sources.simulator import SimulatedCamera
 
@@ -50,8 +50,8 @@ class MovingSource:
         self._settings = settings
         self._mount = settings.mount.build(settings.machine)
         rig = settings.camera.rig
-        self._planner = settings.next_view.build(
-            settings.machine, self._mount, rig, settings.camera.arm
+        self._planner = ViewPlanner(
+            settings.next_view, settings.machine, self._mount, rig, settings.camera.arm
         )
         self._q: np.ndarray | None = None
         self._seen_s, self._t_s = -np.inf, 0.0

@@ -12,7 +12,7 @@ from composed import every, option
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
-from perception.mount.next_view import HoleBelief
+from perception.mount.next_view import HoleBelief, ViewPlanner
 from perception.mount.occlusion import Capsules, compute_visible_share, sample_circle
 from perception.render.scene_ranges import view_from
 from perception.target_sensor import WatchedHole
@@ -29,8 +29,7 @@ def believe(std_m: float = 0.01) -> HoleBelief:
 
 def plan(machine: Machine, name: str, **fields: Any) -> tuple[Any, Any]:
     mount = option("perception/mount", name, **fields).build(machine)
-    chooser = load_part("next_view")
-    return mount, chooser.build(machine, mount, RIG, ARM)
+    return mount, ViewPlanner(load_part("next_view"), machine, mount, RIG, ARM)
 
 
 @every("perception/mount")
