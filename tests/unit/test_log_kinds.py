@@ -312,10 +312,10 @@ def test_what_is_given_is_weighed_like_a_guess() -> None:
 def test_a_drive_that_is_off_is_said_with_its_times() -> None:
     rows = make_rows()
     rows[300:450, 4] = rows[300, 4]
-    enable = np.ones(len(rows))
-    enable[300:450] = 0.0
-    write_text("a.csv", np.column_stack([rows, enable]), (*NAMES, "knee_torque_enable"))
-    done = try_draft("log.input=a.csv")
+    frame = pd.DataFrame(rows, columns=NAMES).assign(knee_torque_enable="on")
+    frame.loc[300:449, "knee_torque_enable"] = "off"
+    frame.to_json("a.jsonl", orient="records", lines=True)
+    done = try_draft("log.input=a.jsonl")
     assert "knee: its drive is off in 25% of the rows, first at 6.00 s, last at 8.98 s" in done.out
 
 
