@@ -34,6 +34,7 @@ from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis import own_simulator
 from diagnosis import report as diagnosis_report
 from diagnosis.answer import Outcome
 from diagnosis.case import GapCase
@@ -255,9 +256,7 @@ def _load_simulator(simulator: str | Path | Actuator | Callable[..., Any] | None
                 "there, and call yours in it"
             )
         simulator = f"{simulator.__module__}:{simulator.__qualname__}"
-    if isinstance(simulator, str | Path) and (
-        ":" in str(simulator) or str(simulator).endswith(".xml")
-    ):
+    if isinstance(simulator, str | Path) and own_simulator.is_named_in(str(simulator)):
         return replace(_load_option("actuator", "own"), source=str(simulator))
     return _load_option("actuator", simulator)
 

@@ -44,6 +44,11 @@ TRIAL_TOLERANCE = 1e-9
 """Largest difference between a function called for two states at once and one by one, or twice."""
 
 
+def is_named_in(simulator: str) -> bool:
+    """Return whether a simulator is one's own: `module:function`, or an MJCF file."""
+    return ":" in simulator or simulator.endswith(".xml")
+
+
 @spec
 class OwnSimulator:
     """A simulator of the user: a function or an MJCF file, run unchanged.

@@ -19,7 +19,7 @@ import yaml
 from brokk_rl.errors import RecordingError
 from brokk_rl.report import Tone, render_page
 from brokk_rl.session import write_text
-from diagnosis import answer, effects_file, report
+from diagnosis import answer, effects_file, own_simulator, report
 from diagnosis.answer import Answer
 from diagnosis.deployment.page import PAGE_FILE, REMEDIES
 from diagnosis.story import HANDED_ON_FOLDER
@@ -141,11 +141,6 @@ def format_rate(share: SuccessRate) -> str:
     return f"{100 * share['mean']:.0f} % ({low:.0f} to {high:.0f})"
 
 
-def is_own_simulator(simulator: str) -> bool:
-    """Return whether a simulator is one's own: `module:function`, or an MJCF file."""
-    return ":" in simulator or simulator.endswith(".xml")
-
-
 def read_result(folder: Path, policy: str, simulator: str) -> WhyResult:
     """Return what the stages have left in a run folder so far."""
     doctor = json.loads((folder / DOCTOR / "doctor.json").read_text())
@@ -199,7 +194,7 @@ def list_changes(result: WhyResult) -> list[NextStep]:
     if not result.has_effects:
         return changes
     machine, simulator = _name_machine(result), result.simulator
-    if is_own_simulator(simulator):
+    if own_simulator.is_named_in(simulator):
         text = "Put the effects into your simulator, and train in it again. This writes them as ranges and changes:"
         command = (
             f"brokk mode=change_simulator {machine} simulator={simulator} changes.diagnosis={result.folder / DIAGNOSIS} "

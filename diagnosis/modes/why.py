@@ -23,7 +23,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
-from diagnosis import report, why_answer
+from diagnosis import own_simulator, report, why_answer
 from diagnosis.deployment.contract import load_policy
 from diagnosis.own_simulator import OwnSimulator
 from diagnosis.story import HANDED_ON_FOLDER, StoryStage, run_story, write_groups
@@ -107,7 +107,7 @@ class Why:
 
     @property
     def _is_own(self) -> bool:
-        return why_answer.is_own_simulator(self.simulator)
+        return own_simulator.is_named_in(self.simulator)
 
     def _build_own(self) -> OwnSimulator:
         return replace(self.own, source=self.simulator)
