@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from actuators.identify.signals import delay_signal, discretise_loop
 from actuators.recordings.split import group_by_run
 from brokk_rl.commands import read_targets
 from brokk_rl.errors import RecordingError
@@ -187,22 +188,6 @@ class ServoLoops:
         return left
 
 
-def discretise_loop(w: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return numerator and denominator of a second-order loop under targets that are held for a step.
-
-    Its response to a unit step at one and two steps fixes the numerator; scipy's `cont2discrete` gives the
-    same, by a matrix exponential.
-    """
-    root = w * np.sqrt(complex(1.0 - damping**2) + 1e-12)
-    t_s = step_s * np.arange(1, 3)
-    phase = root * t_s
-    falling = np.exp(-damping * w * t_s) * (np.cos(phase) + damping * w / root * np.sin(phase))
-    first, second = 1.0 - falling.real
-    poles = np.exp((-damping * w + 1j * root * np.array([1, -1])) * step_s)
-    denominator = np.real(np.poly(poles))
-    return np.array([0.0, first, second + denominator[1] * first - first]), denominator
-
-
 def _search_curves(
     runs: Sequence[Sequence[Recording]], joint: int, grid_s: np.ndarray, machine: Machine
 ) -> tuple[np.ndarray, float, float] | None:
@@ -252,11 +237,3 @@ def _compute_moments(
         features = np.concatenate([delayed, moved[now, None]], 1)
         found.append(features.T @ features)
     return np.stack(found)
-
-
-def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
-    """Return `u` `(T, …)` later by a fractional number of samples, its mean over each period."""
-    whole = int(np.floor(periods + 5e-7))
-    part = periods - whole
-    known = np.concatenate([np.repeat(u[:1], whole + 1, 0), u])
-    return (1.0 - part) * known[1 : len(u) + 1] + part * known[: len(u)]

@@ -6,7 +6,7 @@ import copy
 import logging
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from actuators.models.machine_tensors import MachineTensors
 from actuators.models.network import JointNetworks, Mlp
 from actuators.recordings.inspection import estimate_step
 from actuators.recordings.split import COMMANDED, list_sources
-from brokk_rl.errors import BrokkError, ConfigError, RecordingError
+from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
@@ -36,17 +36,17 @@ BEYOND_DEAD_BAND = 0.1
 
 @spec
 class NetworkFit:
-    """Actuator networks, fitted by free runs (`rollout`) or single steps (`one_step`, the paper).
+    """Actuator networks, fitted by single steps and then by free runs.
 
     Attributes:
         name: Name of the model in tables and of its checkpoint.
-        loss: `rollout` or `one_step`.
         width: Units a joint in each of the two hidden layers.
         quiet: Increments up to this size are none (rad or m in a control period); `null`: the noise
             of the resting sensor, estimated from the recordings joint by joint.
         one_step_updates: Updates on single steps, before the free runs.
         one_step_batch: Windows a joint in each of them.
-        horizons_s: Horizons of the free runs, one after another.
+        horizons_s: Horizons of the free runs, one after another; none: single steps only, as in the
+            paper.
         updates: Updates at each of the horizons.
         batch: Windows a joint in each of them.
         learning_rate: Of Adam, at the start; falls along a cosine.
@@ -59,7 +59,6 @@ class NetworkFit:
     """
 
     name: str
-    loss: Literal["rollout", "one_step"]
     width: Count
     quiet: float | None
     one_step_updates: int
@@ -73,10 +72,6 @@ class NetworkFit:
     validate_every: Count
     validation_s: float
     patience: Count
-
-    def check(self) -> None:
-        if self.loss == "rollout" and not self.horizons_s:
-            raise ConfigError("horizons_s: loss=rollout needs at least one horizon")
 
     def fit(self, task: FitTask) -> Mlp:
         """Fit to `train`, keep the best weights on `validation`, write `<name>.safetensors` and `<name>.yaml`.
@@ -93,7 +88,7 @@ class NetworkFit:
         facts = {
             "width": self.width,
             "sources": list_sources(task.train),
-            "fit": {"loss": self.loss, "seed": task.seed, "device": task.device.type},
+            "fit": {"horizons_s": self.horizons_s, "seed": task.seed, "device": task.device.type},
             "validation_rmse": dict(zip(machine.joint_names, errors, strict=True)),
         }
         path = task.folder / f"{self.name}.safetensors"
@@ -131,7 +126,7 @@ class _NetworkFitting:
         held = TrainingWindows(task.validation, machine, steps, device, purpose)
         self._held = held.draw(VALIDATED, 0.2, self._generator)
         self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
-        for horizon_s in config.horizons_s if config.loss == "rollout" else ():
+        for horizon_s in config.horizons_s:
             self._stages.append(_HorizonStage(horizon_s, config.updates, config.batch))
 
     def run(self) -> None:
@@ -337,14 +332,6 @@ SETTLED = 3
 has died away."""
 
 
-def measure_commanded_each_way_s(recordings: Sequence[Recording]) -> np.ndarray:
-    """Return for how long each joint is commanded forth and back, s, shape `(2, J)`."""
-    both = []
-    for r in recordings:
-        both.append(np.stack([(r.u > COMMANDED).sum(0), (r.u < -COMMANDED).sum(0)]) / r.rate_hz)
-    return np.sum(both, 0)
-
-
 def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
     """Check that each joint is commanded long enough each way.
 
@@ -352,10 +339,11 @@ def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
         RecordingError: a joint is hardly commanded, in figures.
     """
     lacking = []
-    found = measure_commanded_each_way_s(recordings)
-    for name, (forth_s, back_s) in zip(machine.joint_names, found.T.tolist(), strict=True):
-        if min(forth_s, back_s) < NEEDED_S:
-            lacking.append(f"{name} {forth_s / 60:.1f} min forth and {back_s / 60:.1f} min back")
+    forth_s = np.sum([(one.u > COMMANDED).sum(0) / one.rate_hz for one in recordings], 0)
+    back_s = np.sum([(one.u < -COMMANDED).sum(0) / one.rate_hz for one in recordings], 0)
+    for name, forth, back in zip(machine.joint_names, forth_s, back_s, strict=True):
+        if min(forth, back) < NEEDED_S:
+            lacking.append(f"{name} {forth / 60:.1f} min forth and {back / 60:.1f} min back")
     if lacking:
         raise RecordingError(
             f"too little data: {'; '.join(lacking)} commanded (|u| > {COMMANDED:g}) in the {len(recordings)} recordings to fit to, "

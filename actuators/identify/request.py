@@ -11,7 +11,7 @@ from annotated_types import Ge
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import Count, Positive, spec
+from brokk_rl.spec import Positive, spec
 
 
 @spec
@@ -27,8 +27,6 @@ class Identification:
         hold_out: One part in so many is kept from the fit to stop it by, and another one to judge
             by (without `test`).
         stride_s: Distance between the beginnings of two free runs.
-        threads: CPU threads for the fit; the networks are so small that one is fastest, above all
-            beside other work.
     """
 
     recordings: str | tuple[str, ...]
@@ -36,7 +34,6 @@ class Identification:
     folds: Annotated[int, Ge(2)] | None
     hold_out: Annotated[int, Ge(3)]
     stride_s: Positive
-    threads: Count
 
     def check(self) -> None:
         if self.folds is not None and self.test is not None:

@@ -10,7 +10,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -166,8 +166,8 @@ def build_results(
     horizons_s: Sequence[float],
     resampling: np.random.Generator,
     delaying: np.random.Generator,
-) -> tuple[dict[str, Any], list[VerdictSentence], FreeRunScores]:
-    """Return `identification.json`, the verdict, and the errors behind them.
+) -> tuple[dict[str, Any], FreeRunScores]:
+    """Return `identification.json` with its verdict, and the errors behind them.
 
     Args:
         machine: The machine.
@@ -204,9 +204,8 @@ def build_results(
     result["missing"] = {f"{h:g}": reason for h in HORIZONS_S if h not in horizons_s}
     result["delay_s"] = {joint: delay and delay.plain() for joint, delay in delays.items()}
     result["data"] = _describe_data(stages, fitted_to, judged, scores)
-    findings = write_verdict(result, machine)
-    result["verdict"] = [{"tone": finding.tone, "text": finding.text} for finding in findings]
-    return result, findings, scores
+    result["verdict"] = [asdict(sentence) for sentence in write_verdict(result, machine)]
+    return result, scores
 
 
 def _tabulate_errors(

@@ -13,8 +13,9 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from actuators.contracts import FitTask
-from actuators.identify.dead_time import LONGEST_S, RESOLUTION_S, ServoLoops, discretise_loop
+from actuators.identify.dead_time import LONGEST_S, RESOLUTION_S, ServoLoops
 from actuators.identify.option_file import estimate_standard_errors, write_numbers
+from actuators.identify.signals import apply_play, discretise_loop
 from actuators.models.servo import Servo
 from actuators.open_loop import WARM_UP_S
 from brokk_rl.commands import read_targets
@@ -154,13 +155,3 @@ class _JointRuns:
             seen = np.interp(places, np.arange(len(fine)) / self._num_steps, followed)
             errors.append((seen - q)[self._skip :])
         return np.concatenate(errors)
-
-
-def apply_play(target: np.ndarray, width: float) -> np.ndarray:
-    """Return targets `(T,)` behind a play operator of a width, which begins in its middle."""
-    held, found = target[0], np.empty(len(target))
-    low, high = target - 0.5 * width, target + 0.5 * width
-    for row in range(len(target)):
-        held = min(max(held, low[row]), high[row])
-        found[row] = held
-    return found

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 
 from actuators.contracts import FitTask
-from actuators.identify.dead_time import delay_signal, estimate_dead_times
+from actuators.identify.dead_time import AT_STOP, estimate_dead_times
 from actuators.identify.option_file import write_numbers
+from actuators.identify.signals import apply_play, delay_signal, lag_signal
 from actuators.models.valve import PoseFeatures, ValveActuator
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
@@ -124,12 +124,16 @@ class _ValveRuns:
                 f"too little data: none of the {len(recordings)} recordings lasts long enough to fit to"
             )
         features = PoseFeatures(machine, torch.device("cpu"))
-        self._played = [_apply_plays(one.u.astype(float)) for one in used]
-        self._pose = []
+        self._played: list[np.ndarray] = []
+        self._pose: list[np.ndarray] = []
         for one in used:
+            u = one.u.astype(float)
+            # each width of `PLAYS`, `(P, T, J)`
+            plays = [np.apply_along_axis(apply_play, 0, u, width) for width in PLAYS]
+            self._played.append(np.stack(plays))
             self._pose.append(features.features(torch.as_tensor(one.q)).numpy().astype(float))
         way, free = [], []
-        margin = 0.005 * (machine.upper - machine.lower)
+        margin = AT_STOP * (machine.upper - machine.lower)
         for one in used:
             q = one.q.astype(float)
             way.append(self._sum(np.diff(q, axis=0, append=q[-1:])))
@@ -290,24 +294,6 @@ class _ValveRuns:
         """Sum steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""
         count = len(steps) // WIDTH
         return steps[: count * WIDTH].reshape(count, WIDTH, *steps.shape[1:]).sum(1)[self._skip :]
-
-
-def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.ndarray:
-    """Return a first-order lag of `u` `(T, …)`, as it stands at the end of each period."""
-    if time_constant_s < 1e-4:
-        return u
-    kept = np.exp(-period_s / time_constant_s)
-    return lfilter([1.0 - kept], [1.0, -kept], u, axis=0, zi=kept * u[:1])[0]
-
-
-def _apply_plays(u: np.ndarray) -> np.ndarray:
-    """Return the play operator of each of `PLAYS` on `u` `(T, J)`, `(P, T, J)`."""
-    out, now = np.empty((len(PLAYS), *u.shape)), np.repeat(u[:1], len(PLAYS), 0)
-    half = PLAYS[:, None] / 2
-    for t in range(len(u)):
-        now = np.minimum(np.maximum(now, u[t] - half), u[t] + half)
-        out[:, t] = now
-    return out
 
 
 def _compute_pump_share(demand: np.ndarray, opening: np.ndarray) -> np.ndarray:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -19,7 +18,6 @@ from actuators.identify.results import (
     HORIZONS_S,
     LINEAR,
     FitStage,
-    VerdictSentence,
     build_results,
     fit_or_restore,
     list_recordings,
@@ -97,15 +95,15 @@ class Identify:
                 stage.cut = self._cut(stage, horizons_s or HORIZONS_S[:1])
         models = {self.fit.name: self.fit, **self.baselines}
         device = self.session.torch_device()
-        with _limit_threads(self.identify.threads):
-            for stage in stages:
-                for name in models if stage.cut else (self.fit.name,):
-                    is_kept = name == self.fit.name
-                    folder = stage.folder if is_kept else stage.folder / "baselines" / name
-                    stage.fitted[name] = fit_or_restore(
-                        stage, name, models[name], folder, self.machine, device
-                    )
-        result, findings, scores = build_results(
+        torch.set_num_threads(1)  # the networks are small: threads would only wait for each other
+        for stage in stages:
+            for name in models if stage.cut else (self.fit.name,):
+                is_kept = name == self.fit.name
+                folder = stage.folder if is_kept else stage.folder / "baselines" / name
+                stage.fitted[name] = fit_or_restore(
+                    stage, name, models[name], folder, self.machine, device
+                )
+        result, scores = build_results(
             self.machine, self.fit.name, stages, horizons_s,
             self.session.generator("resample"), self.session.generator("delay"),
         )  # fmt: skip
@@ -113,7 +111,7 @@ class Identify:
         folder = self.session.folder
         write_json(folder / "identification.json", result)
         page.write_page(folder, result, scores)
-        _print_results(result, findings, folder)
+        _print_results(result, folder)
         return result["overall"][self.fit.name][f"{horizons_s[-1]:g}"]["percent"]
 
     def _check_resume(self) -> None:
@@ -186,18 +184,7 @@ class Identify:
         return open_loop.cut_windows(judged, self.machine, horizons_s[-1], stride_s, horizons_s[0])
 
 
-@contextmanager
-def _limit_threads(count: int) -> Iterator[None]:
-    """Limit torch to `count` CPU threads within the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(min(count, before))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder: Path) -> None:
+def _print_results(result: Mapping, folder: Path) -> None:
     horizons = list(result["overall"][result["model"]])
     table: list[list[TableCell]] = []
     for joint, models in (*result["joints"].items(), ("all joints", result["overall"])):
@@ -218,7 +205,7 @@ def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder:
         table,
         "error at the end of free runs on unseen runs (RMSE, rad or m; last rows: % of travel)",
     )
-    for finding in findings:
-        if finding is findings[0] or finding.tone in ("bad", "warn"):
-            print_text(finding.text, TONES[finding.tone])
+    for number, sentence in enumerate(result["verdict"]):
+        if number == 0 or sentence["tone"] in ("bad", "warn"):
+            print_text(sentence["text"], TONES[sentence["tone"]])
     print_text(f"report: {folder / page.PAGE}")

@@ -71,7 +71,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def identify(
     machine: Machine, out: Path, folder: Path, fit: Any, resume: bool = False, **options: Any
 ) -> Identify:
-    settings = {"recordings": f"{folder}/*", "hold_out": 3, "stride_s": 1.0, "threads": 1}
+    settings = {"recordings": f"{folder}/*", "hold_out": 3, "stride_s": 1.0}
     settings |= dict.fromkeys(("test", "folds")) | options
     return Identify(
         session=Session(out=str(out), seed=0, device="cpu"), machine=machine, fit=fit,

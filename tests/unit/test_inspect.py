@@ -224,7 +224,7 @@ def test_inspect_from_the_command_lists_every_breach_and_fails_at_none_in_one_lo
         assert Path(f"out/{name}.png").stat().st_size > 1000
 
 
-IDENTIFICATION = {"test": None, "folds": None, "hold_out": 6, "stride_s": 2.0, "threads": 1}
+IDENTIFICATION = {"test": None, "folds": None, "hold_out": 6, "stride_s": 2.0}
 
 
 @pytest.mark.parametrize(

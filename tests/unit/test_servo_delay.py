@@ -9,7 +9,8 @@ import pytest
 from arm import make_machine
 from scipy.signal import cont2discrete
 
-from actuators.identify.dead_time import discretise_loop, estimate_dead_times
+from actuators.identify.dead_time import estimate_dead_times
+from actuators.identify.signals import discretise_loop
 from brokk_rl.record import Recording
 
 RATE_HZ = 50.0
