@@ -71,12 +71,11 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def identify(
     machine: Machine, out: Path, folder: Path, fit: Any, resume: bool = False, **options: Any
 ) -> Identify:
-    settings = {"recordings": f"{folder}/*", "hold_out": 3, "stride_s": 1.0}
-    settings |= dict.fromkeys(("test", "folds")) | options
+    own = {"recordings": f"{folder}/*", "test": None, "folds": None, "hold_out": 3, "stride_s": 1.0}
     return Identify(
         session=Session(out=str(out), seed=0, device="cpu"), machine=machine, fit=fit,
         baselines={"hold": option("fit", "hold"), "arx": option("fit", "arx")},
-        identify=Identification(**settings), resume=str(out) if resume else None,
+        identify=Identification(**own | options), resume=str(out) if resume else None,
     )  # fmt: skip
 
 
