@@ -106,6 +106,16 @@ def find_geometry_errors(
     return found
 
 
+def measure_scatter_growth(case: GapCase, kinds: Sequence[EffectType]) -> float:
+    """Return how much more tool points scatter about any law of geometry than on the reference; 1 where it is not known."""
+    sides = (case.reference, case.field)
+    if not all(is_tracked(side, case.machine) for side in sides):
+        return 1.0
+    geometric = [kind for kind in kinds if _is_geometric(kind)]
+    before, now = (_TrackedPoints((), side, case.machine, geometric) for side in sides)
+    return now.size_m / before.size_m
+
+
 def _is_geometric(kind: EffectType) -> bool:
     sides = ("kinematics", "measurement")
     return kind.target.side in sides and kind.target.smooth and not kind.target.stochastic

@@ -49,6 +49,8 @@ SLOPE_S = 0.4
 """Time over which the velocity of a tool point is taken."""
 CLOCK_ERROR_S, CLOCK_ERROR = 0.001, 0.05
 """Standard error of that shift, s and over it; five cases with one show 1.00 to 1.07 of it."""
+SCATTERING = frozenset({"clock_offset", "quantisation", "sensor_noise"})
+"""Effects by which tool points scatter about any law of the encoders."""
 UNNAMED_PROBABILITY = 0.8
 """Probability of a verdict that names no effect; chosen by hand."""
 NATS_OF_HALF = 20.0
@@ -103,6 +105,10 @@ class Diagnosis(ABC):
     def size(self, one: EffectFinding, proof: RepairProof) -> tuple[str, SizesByName]:
         """Return the name of an effect in the registry, and its sizes."""
 
+    def name(self, one: EffectFinding) -> str:
+        """Return the name of an effect in the registry."""
+        return one.name
+
     def run(self, tell: ProgressCallback) -> Outcome:
         """Return the outcome; `tell` receives the name and the progress of each step."""
         machine = self.case.machine
@@ -115,6 +121,9 @@ class Diagnosis(ABC):
         proof, verdict, detected = found.proof, found.verdict, self.detected
         named = {j for one in proof.findings for j in one.joints}
         told = accept_named_joints(told, name_joints(sorted(named), machine))
+        names = {one.kind.name for one in detected} | {self.name(one) for one in proof.findings}
+        if not names & SCATTERING:
+            told.append(gates.judge_scatter(geometry.measure_scatter_growth(self.case, self.kinds)))
         if failed := gates.list_failures(told):
             proof, detected = found.prove_nothing(), []
         elif proof.findings or verdict == "none":
@@ -203,12 +212,16 @@ class ReferenceDiagnosis(Diagnosis):
         known = {kind.name for kind in self.kinds} - {one.kind.name for one in detected}
         findings = []
         for one in decision.named if decision.verdict == "effects" else ():
-            if self._name(one) in known:
+            if self.name(one) in known:
                 findings.append(one)
         prove = partial(EngineProof, case, decider, generator=self.generator)
+        proof = prove(findings=findings)
+        # A false further effect may spoil the free runs with the true first one.
+        while len(proof.findings) > 1 and gates.list_failures(proof.judge()):
+            proof = prove(findings=proof.findings[:-1])
         return SearchResult(
             verdict=decision.verdict,
-            proof=prove(findings=findings),
+            proof=proof,
             prove_nothing=partial(prove, findings=()),
             rivals=decision.rivals,
             otherwise=_explain(decision, self.case.machine),
@@ -218,7 +231,7 @@ class ReferenceDiagnosis(Diagnosis):
     def size(self, one: EffectFinding, proof: RepairProof) -> tuple[str, SizesByName]:
         """Return the name of an effect in the registry, and its sizes."""
         assert isinstance(proof, EngineProof), "the search made it"
-        name, machine = self._name(one), self.case.machine
+        name, machine = self.name(one), self.case.machine
         if name == "clock_offset":
             return name, {"offset_s": dict.fromkeys(machine.joint_names, self._clock)}
         if name == "quantisation":
@@ -227,8 +240,8 @@ class ReferenceDiagnosis(Diagnosis):
         (kind,) = [kind for kind in self.kinds if kind.name == name]
         return name, describe_numbers(kind, proof.sizes[one.effect], one.hold, machine)
 
-    def _name(self, one: EffectFinding) -> str:
-        # The engine simulates a clock that is late as a dead time of all joints.
+    def name(self, one: EffectFinding) -> str:
+        """Return the name of an effect in the registry: a late clock is simulated as a dead time of all joints."""
         is_clock = self.clock_late_s != 0.0 and one.name == "dead_time"
         return "clock_offset" if is_clock else one.name
 

@@ -6,8 +6,9 @@ Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,10 +20,8 @@ from brokk_rl.commands import view_recordings
 from diagnosis import sensors
 from diagnosis.case import GapCase, select_rows
 from diagnosis.closure import MIN_RESTORED, Estimate, Gap, Gate, RivalError
-from diagnosis.engine.decide import Decider, EffectFinding
-from diagnosis.engine.holds import hold_commands
+from diagnosis.engine.decide import Decider, EffectFinding, apply_findings
 from diagnosis.engine.proof import Floor, list_windows, run_free
-from diagnosis.engine.rows import Row
 from diagnosis.engine.side import choose_stride, measure_units
 from diagnosis.engine.sizes import SizedRow, fit_rows, size_finding
 from diagnosis.free_runs import (
@@ -237,10 +236,10 @@ class EngineProof(RepairProof):
         self._field = evidence.field
         self._healthy = [base.numbers for base in evidence.bases]
         self.floor = Floor(evidence.reference, evidence.bases, horizon_s)
-        self.sizes: dict[str, dict[int, SizedRow]] = {}
+        self.sizes: dict[str, dict[int, SizedRow]] = {one.effect: {} for one in findings}
         """Rows of each effect in the registry's form, by joint."""
-        self._rows = self._fit_rows(None)
-        self._halves = [self._fit_rows(self._list_used(half)) for half in (0, 1)]
+        self._fitted = self._fit(None)
+        self._halves = [self._fit(self._list_used(half)) for half in (0, 1)]
 
     @property
     def measured(self) -> np.ndarray:
@@ -278,48 +277,30 @@ class EngineProof(RepairProof):
         used[self.windows.rows[self.half == half]] = False
         return used
 
-    def _fit_rows(self, used: np.ndarray | None) -> dict[str, dict[int, Row]]:
-        """Return the rows of each named effect, one fitted beside the others, to the samples `used`."""
-        numbers, side = list(self._healthy), self._field
-        found: dict[str, dict[int, Row]] = {}
+    def _fit(self, used: np.ndarray | None) -> list[EffectFinding]:
+        """Return the named effects with rows fitted one beside the others, to the samples `used`."""
+        numbers, side = self._healthy, self._field
+        found = []
         for finding in self.findings:
-            found[finding.effect] = {}
-            if finding.hold is not None:
-                side = hold_commands(side, finding.hold.delays)
-                self.sizes[finding.effect] = {}
-                continue
-            joints = self._decider.evidence.view_field(numbers, side, used)
-            if used is None:
-                self.sizes[finding.effect] = size_finding(finding, joints)
-            found[finding.effect] = fit_rows(finding, joints)
-            numbers = self._apply(numbers, found[finding.effect])
-        return found
-
-    def _apply(self, numbers: Sequence[np.ndarray], rows: Mapping[int, Row]) -> list[np.ndarray]:
-        """Return the numbers of all joints with an effect."""
-        found = list(numbers)
-        for j, row in rows.items():
-            found[j] = self._field.model.change(found[j], [row])[0]
+            fitted = finding
+            if finding.hold is None:
+                joints = self._decider.evidence.view_field(numbers, side, used)
+                fitted = replace(finding, rows=fit_rows(finding, joints))
+                if used is None:
+                    self.sizes[finding.effect] = size_finding(finding, joints)
+            found.append(fitted)
+            numbers, side = apply_findings([fitted], numbers, side)
         return found
 
     def _simulate(self, effects: frozenset[str], half: int) -> np.ndarray:
-        side = self._field
-        for finding in self.findings:
-            if finding.effect in effects and finding.hold is not None:
-                side = hold_commands(side, finding.hold.delays)
-        numbers = list(self._healthy)
-        for name in effects:
-            numbers = self._apply(numbers, self._halves[half][name])
+        some = [one for one in self._halves[half] if one.effect in effects]
+        numbers, side = apply_findings(some, self._healthy, self._field)
         return run_free(side, self.windows, numbers)
 
     @cached_property
     def floor_squares(self) -> np.ndarray:
         """Mean squares at the floor in each draw, `(1 + B, J)`."""
-        numbers, side = list(self._healthy), self._field
-        for finding in self.findings:
-            numbers = self._apply(numbers, self._rows[finding.effect])
-            if finding.hold is not None:
-                side = hold_commands(side, finding.hold.delays)
+        numbers, side = apply_findings(self._fitted, self._healthy, self._field)
         joints = self._decider.evidence.view_field(numbers, side)
         return self.weights @ self.floor.foresee(self.windows, joints)
 

@@ -221,14 +221,8 @@ class Decider:
         self, numbers: Sequence[np.ndarray], finding: EffectFinding, field: Side | None = None
     ) -> list[FieldJoint]:
         """Return the joints of the field with an effect."""
-        model, changed = self.evidence.field.model, []
-        for j, values in enumerate(numbers):
-            row = finding.rows.get(j)
-            changed.append(values if row is None else model.change(values, [row])[0])
         side = self.evidence.field if field is None else field
-        if finding.hold is not None:
-            side = hold_commands(side, finding.hold.delays)
-        return self.evidence.view_field(changed, side)
+        return self.evidence.view_field(*apply_findings([finding], numbers, side))
 
     def _is_further(self, first: EffectFinding, further: EffectFinding) -> bool:
         """Return whether a further effect earns enough beside the first."""
@@ -246,6 +240,19 @@ class Decider:
             for name, nats in self.generic.weigh(joint).items():
                 total[name] = total.get(name, 0.0) + max(nats - JOINT_NATS, 0.0)
         return total
+
+
+def apply_findings(
+    findings: Sequence[EffectFinding], numbers: Sequence[np.ndarray], side: Side
+) -> tuple[list[np.ndarray], Side]:
+    """Return the numbers `(P,)` of all joints of a side, and the side, with effects."""
+    changed = list(numbers)
+    for one in findings:
+        for j, row in one.rows.items():
+            changed[j] = side.model.change(changed[j], [row])[0]
+        if one.hold is not None:
+            side = hold_commands(side, one.hold.delays)
+    return changed, side
 
 
 def _find_strongest(groups: Mapping[str, float]) -> tuple[str, float]:

@@ -146,14 +146,9 @@ class RowEvidence:
         """Gain of each row on each part of the reference, nats a second, of each joint `(parts, C)`."""
         return [self._price_joint(j) for j in range(self.reference.num_joints)]
 
-    def can_have(self, joint: int) -> np.ndarray:
-        """Return which rows a joint can have, `(C,)` bool."""
-        is_loaded = np.abs(self.reference.loads[joint]).max() > 1e-3
-        return (self.names != "load_dependence") | is_loaded
-
     def _price_joint(self, joint: int) -> np.ndarray:
         base, side = self.bases[joint], self.reference
-        tried = self.can_have(joint)
+        tried = np.ones(len(self.every), dtype=bool)
         for name in np.unique(self.names):
             # Every second size is enough for the largest gain.
             if name not in SHARED:
@@ -192,12 +187,7 @@ class RowEvidence:
 
     def weigh_rows(self, joints: Sequence[FieldJoint]) -> dict[str, dict[int, JointRow]]:
         """Return the best row of each effect on each joint, by effect and joint."""
-        tables = []
-        for joint in joints:
-            gains = np.full(len(self.every), -99.0)
-            some = np.flatnonzero(self.can_have(joint.joint))
-            gains[some] = joint.score([self.every[place] for place in some])
-            tables.append(gains)
+        tables = [joint.score(self.every) for joint in joints]
         found: dict[str, dict[int, JointRow]] = {}
         for name in dict.fromkeys(self.names.tolist()):
             places = np.flatnonzero(self.names == name)

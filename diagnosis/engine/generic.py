@@ -9,6 +9,7 @@ Axes: `T` samples, `K` columns, `N` increments.
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
 from diagnosis.engine.evidence import FieldJoint, RowEvidence
@@ -106,14 +107,7 @@ def _view_others(
 
 def _shift(values: np.ndarray, by: int) -> np.ndarray:
     """Return `values` `(T,)` later by some samples, 0 where none are known."""
-    found = np.zeros_like(values)
-    if by > 0:
-        found[by:] = values[:-by]
-    elif by < 0:
-        found[:by] = values[-by:]
-    else:
-        found[:] = values
-    return found
+    return ndimage.shift(values, by, order=0)
 
 
 def compute_evidence(

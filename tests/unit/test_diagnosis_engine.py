@@ -64,6 +64,7 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
     assert found["where"] == {"joints": {"q3": PLACE}, "regimes": regimes, "stage": "actuation"}
     experiment = {"excitation": "a dial gauge", "separates": ["backlash", "lag"]}
     assert found["next_experiment"] == experiment
+    assert propose_measurement(said().selected) == said().next_experiment
     assert found["ranking"] == [{"effect": "backlash", "joints": ["q3"], "probability": 0.97}]
     assert answer.read_answer(path) == said()
     path.write_text(json.dumps(found | {"schema": 2}))
@@ -72,21 +73,15 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
 
 
 def test_rivals_share_what_the_first_name_leaves(machine: Machine) -> None:
-    rivals = [EffectFinding("backlash", (2,), 90.0)]
     # Of one name in two forms the better one counts.
-    for name, nats in (("lag", 60.0), ("stiction", 45.0), ("lag", 44.0), ("creep", -1.0)):
-        rivals.append(EffectFinding(name, (2,), nats))
+    earned = (("backlash", 90.0), ("lag", 60.0), ("stiction", 45.0), ("lag", 44.0), ("creep", -1.0))
+    rivals = [EffectFinding(name, (2,), nats) for name, nats in earned]
     found = rank_effects(said().selected, rivals, "effects", machine)
     # Of 0.03, as e to 1, since 15 nats lie between them.
     shares = {"backlash": 0.97, "lag": 0.03 / (1 + np.exp(-1)), "stiction": 0.03 / (1 + np.e)}
     assert {one.effect: one.probability for one in found} == pytest.approx(shares)
     assert [one.effect for one in found] == list(shares)
     assert [one.effect for one in rank_effects((), (), "none", machine)] == ["none"]
-
-
-def test_what_would_decide_is_the_next_experiment() -> None:
-    assert propose_measurement(said().selected) == said().next_experiment
-    assert propose_measurement(()) is None
 
 
 def test_training_takes_the_found_effects_as_they_are(

@@ -100,6 +100,14 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
     found = find(machine, reference, tracked(sound, machine, 2 * bias, 0.05, 8))
     (roll,) = [one.parameters["roll_rad"]["machine"] for one in found if len(one.parameters) == 2]
     assert roll.ci95[0] <= 0.05 <= roll.ci95[1]
+    # A zero leaves a law of geometry, an encoder that loses a tenth of each step forth does not.
+    q = biased.q.copy()
+    q[:, 3] -= 0.1 * np.cumsum(np.maximum(np.gradient(q[:, 3]), 0.0))
+    fields = (biased, dataclasses.replace(biased, q=q))
+    cases = [GapCase(machine, [reference], [field]) for field in fields]
+    kinds = effect_library.load_effects(machine)
+    unmoved, slipping = (geometry.measure_scatter_growth(case, kinds) for case in cases)
+    assert slipping > 10.0 and unmoved == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine: Machine) -> None:
@@ -129,14 +137,11 @@ def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) ->
 
 def test_a_lattice_that_motion_blurs_in_the_reference_is_no_coarse_sensor(machine: Machine) -> None:
     """The reference is brought to another rate, so that only its rests lie on the lattice of its encoder."""
-    coarse = []
-    for seed in (0, 1):
-        one = swept(machine, 300.0, seed)
-        coarse.append(dataclasses.replace(one, q=np.round(one.q / 0.0037) * 0.0037))
-    fine = swept(machine, 300.0, 0)
-    moved = np.abs(np.gradient(coarse[0].q, axis=0)) > 0.0
-    blurred = dataclasses.replace(coarse[0], q=np.where(moved, fine.q, coarse[0].q))
-    field = stack_side([coarse[1]], machine)
+    fine, other = (swept(machine, 300.0, seed) for seed in (0, 1))
+    shown, field_q = (np.round(one.q / 0.0037) * 0.0037 for one in (fine, other))
+    moved = np.abs(np.gradient(shown, axis=0)) > 0.0
+    blurred = dataclasses.replace(fine, q=np.where(moved, fine.q, shown))
+    field = stack_side([dataclasses.replace(other, q=field_q)], machine)
     assert find_lattice(field, stack_side([fine], machine), 2) > 0.0
     assert find_lattice(field, stack_side([blurred], machine), 2) == 0.0
 
@@ -145,5 +150,4 @@ def test_an_encoder_whose_scale_is_off_is_no_coarser_than_before(machine: Machin
     before, after = (swept(machine, 300.0, seed) for seed in (0, 1))
     reference = dataclasses.replace(before, q=np.round(before.q / 0.0015) * 0.0015)
     field = dataclasses.replace(after, q=1.02 * np.round(after.q / 0.0015) * 0.0015)
-    sides = stack_side([field], machine), stack_side([reference], machine)
-    assert find_lattice(*sides, 2) == 0.0
+    assert find_lattice(stack_side([field], machine), stack_side([reference], machine), 2) == 0.0
