@@ -8,18 +8,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from actuators.excite.player import Sample
+from actuators.excite.player import DONE, INSIDE, PLAY, Sample
 from actuators.excite.schedule import ExcitationPlan
 from actuators.motion_panels import draw_joint_track
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, draw_grid, make_figure, save_figure
 
-BEFORE, PLAYING, AWAY, AFTER = range(4)
-"""On the way to the start of a segment and resting there; in its program; brought home meanwhile;
-after the last one."""
-STAGE = np.array([BEFORE, BEFORE, PLAYING, AWAY, AWAY, AFTER])
-"""By phase of the runner."""
 INCHES_A_ROW, STRIP_INCHES, WIDTH_INCHES = 1.65, 1.0, 17.0
 """Height of a joint and of the strip of segments, and width of the picture; chosen by hand."""
 LETTER = 0.0075
@@ -33,7 +28,7 @@ class PlanTrack:
         t_s: Time, `(T,)`.
         q: Positions, `(T, N, J)`.
         u: Commands, `(T, N, J)`.
-        stage: `BEFORE`, `PLAYING`, `AWAY` or `AFTER`, `(T, N)`.
+        phase: Phase of the player, `APPROACH`, `REST`, …, `(T, N)`.
         segment: Number of the segment, `(T, N)`.
         extra: Further measurements of the link, each `(N, T)`.
     """
@@ -43,7 +38,7 @@ class PlanTrack:
         self.t_s = np.array([sample.t_s for sample in kept])
         self.q = np.stack([sample.q for sample in kept])
         self.u = np.stack([sample.u for sample in kept])
-        self.stage = STAGE[np.stack([sample.phase for sample in kept])]
+        self.phase = np.stack([sample.phase for sample in kept])
         self.segment = np.stack([sample.segment for sample in kept])
         self.extra: dict[str, np.ndarray] = {}
         for name in kept[0].extra:
@@ -51,10 +46,10 @@ class PlanTrack:
 
     def list_actions(self, run: int) -> list[tuple[int, int]]:
         """Return first sample and end of each way and each program of a run, in order."""
-        stage, segment = self.stage[:, run], self.segment[:, run]
-        changes = np.diff(segment * 2 + (stage != BEFORE))
-        edges = [0, *(np.flatnonzero(changes) + 1).tolist(), len(stage)]
-        return [(begin, end) for begin, end in pairwise(edges) if stage[begin] != AFTER]
+        phase, segment = self.phase[:, run], self.segment[:, run]
+        changes = np.diff(segment * 2 + (phase >= PLAY))
+        edges = [0, *(np.flatnonzero(changes) + 1).tolist(), len(phase)]
+        return [(begin, end) for begin, end in pairwise(edges) if phase[begin] != DONE]
 
 
 def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> dict[str, Any]:
@@ -74,7 +69,7 @@ def _summarise_run(
     run: tuple[Segment, ...], track: PlanTrack, n: int, machine: Machine
 ) -> list[dict[str, Any]]:
     """Return the segments of one run; one that finds no time has no `start_s`."""
-    period_s, inside, found = machine.period_s, np.isin(track.stage[:, n], (PLAYING, AWAY)), []
+    period_s, inside, found = machine.period_s, INSIDE[track.phase[:, n]], []
     for i, segment in enumerate(run):
         rows = np.flatnonzero((track.segment[:, n] == i) & inside)
         entry = {
@@ -143,7 +138,7 @@ def _draw_segments(
         segment = plan.runs[0][track.segment[begin, 0]]
         name = segment.name
         color = colors.get(name.split("_")[0], GREY)
-        if track.stage[begin, 0] == BEFORE:
+        if track.phase[begin, 0] < PLAY:
             name, color = "", "white"
         start, stop = minutes[begin], minutes[min(end, len(minutes) - 1)]
         for axis in axes:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from composed import option
 
-from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
 from actuators.excite.player import (
+    PLAY,
     CommandGuards,
     NominalLink,
     PlanPlayer,
@@ -86,7 +86,7 @@ def test_a_program_is_played_unchanged_from_its_start_pose(
     runs = [[constant({}, 1.0, s, u=u)] for s, u in zip(start, programs, strict=True)]
     track = played(runs, machine, approach)
     for n, (segment,) in enumerate(runs):
-        inside = track.stage[:, n] == plan_report.PLAYING
+        inside = track.phase[:, n] == PLAY
         assert (track.u[inside, n] == segment.u).all()
         assert find_shares(machine, track.q[inside, n][0] - segment.start).max() <= 0.04
 
@@ -101,11 +101,11 @@ def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
         runs.append([constant({}, 1.0, start, name=f"a_{i}") for i, start in enumerate(starts)])
     track = played(runs, machine, approach, link=NominalLink(with_speed(machine, scale), 5))
     assert not caplog.records
-    assert (track.stage[-1] == plan_report.PLAYING).any()
+    assert (track.phase[-1] == PLAY).any()
     assert track.segment[-1].tolist() == [2] * 5
     for n in range(5):
         for i in range(3):
-            is_played = track.stage[:, n] == plan_report.PLAYING
+            is_played = track.phase[:, n] == PLAY
             begin = np.flatnonzero((track.segment[:, n] == i) & is_played)[0]
             assert find_shares(machine, track.q[begin, n] - runs[n][i].start).max() < 0.05
 
@@ -141,7 +141,7 @@ def test_inward_turns_a_joint_back_until_its_program_passes_zero(
     u[:, 4] = 0.8
     u[400:, 4] = -0.8
     track = played([[constant({}, 0.0, machine.home, u=u)]], machine, approach)
-    inside = track.stage[:, 0] == plan_report.PLAYING
+    inside = track.phase[:, 0] == PLAY
     sent = track.u[inside, 0, 4]
     assert set(np.abs(sent)) == {0.8}
     assert (np.diff(sent) != 0).sum() <= 3, "no chatter at the stop"
@@ -155,14 +155,14 @@ def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(
     # Drives into the stop, then slowly back.
     u[:, 2] = np.where(np.arange(2000) // 500 % 2 == 0, 0.9, -0.2)
     track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine, approach)
-    stage = track.stage[:, 0]
-    begin = np.flatnonzero(stage != plan_report.BEFORE)[0]
-    away = np.flatnonzero(stage == plan_report.AWAY) - begin
+    phase = track.phase[:, 0]
+    begin = np.flatnonzero(phase >= PLAY)[0]
+    away = np.flatnonzero(phase > PLAY) - begin
     assert 100 < away[0] < 200, "1.4 rad from home to the margin at 0.9 * 0.26 rad/s"
     back = away[np.flatnonzero(np.diff(away) > 1)[0]] + 1
     assert back == 500 and track.u[begin + 500, 0, 2] == -0.2
     assert abs(track.q[begin + 499, 0, 2] - machine.home[2]) < 0.1
-    assert (stage != plan_report.BEFORE).sum() == 2000, "a segment lasts as long as its program"
+    assert (phase >= PLAY).sum() == 2000, "a segment lasts as long as its program"
 
 
 def test_commands_keep_to_the_largest(machine: Machine, approach: Approach) -> None:
@@ -181,7 +181,7 @@ def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(
     fast, guarded = (predict_tool_speed(machine, track.q[:, 0]) for track in (free, slow))
     assert fast is not None and guarded is not None
     assert fast.max() > 0.8 and 0.35 < guarded.max() < 0.42
-    u = slow.u[(slow.stage[:, 0] == plan_report.PLAYING), 0]
+    u = slow.u[(slow.phase[:, 0] == PLAY), 0]
     assert u[:, 3] == pytest.approx(0.5 * u[:, 0]) and u[:, 0].max() < 1.0
 
 
@@ -207,7 +207,7 @@ def test_an_approach_that_does_not_arrive_is_given_up_and_said(
 ) -> None:
     start = machine.home + 0.8 * (np.arange(machine.num_joints) == 3)
     track = played([[constant({0: 0.3}, 1.0, start)]], machine, approach, link=Stuck(machine, 1))
-    assert (track.u[track.stage[:, 0] == plan_report.PLAYING, 0, 0] == 0.3).all()
+    assert (track.u[track.phase[:, 0] == PLAY, 0, 0] == 0.3).all()
     assert "start of a_00 given up, out of place: q4" in caplog.text
 
 
