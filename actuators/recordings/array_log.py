@@ -67,7 +67,7 @@ class TableLog(LogFile):
             for name, cells in frame.items():
                 is_text = cells.dtype.kind == "O"
                 filled = cells.dropna()[:HEAD_ROWS] if is_text else ()
-                if is_text and filled.empty:
+                if is_text and len(filled) == 0:
                     continue
                 is_index = name.startswith(INDEX) and cells.dtype.kind == "M"
                 column, labels = "timestamp" if is_index else name, self._labels.get(name, ())
