@@ -48,17 +48,17 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "60 simulated machines, answered once. A person drives 29 fields. Its false accusations changed the engine since.",
+        "60 simulated machines, answered once. A person drives 35 fields. An earlier engine had 15 of 21, 5 of 12 and 3 of 9 of other 60.",
         "exam_plants=valves exam_recording=operators", 60, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "36 simulated cranes, answered once. A person drives 12 fields. An earlier engine had 10 of 17, 4 of 10 and 2 of 7 of other 48. The next engine got one more right; today's was not asked.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 36, "diagnosis", "valve",
+        "48 simulated cranes, answered once. A person drives 22 fields. Earlier engines had 11 of 13, 1 of 7 and 0 of 5 of other 36, and 10 of 17, 4 of 10 and 2 of 7 of other 48.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 48, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "40 simulated arms, answered once. Earlier engines had 16 of 17, 4 of 10 and 0 of 7 of other 48. A bound of three effects came since; no answer has more.",
+        "40 simulated arms, answered once. Earlier engines had 14 of 14, 3 of 8 and 0 of 6 of other 40, and 16 of 17, 4 of 10 and 0 of 7 of other 48.",
         "machine=so101 exam_plants=servos exam_mix=servos", 40, "servo_diagnosis", "servo",
     ),
     Measurement(
