@@ -1,4 +1,4 @@
-"""What a model does to a command, for a whole recording at once: delay, lag, play and a loop of second order."""
+"""Delay, lag, play and a second-order loop, each applied to a whole recording at once."""
 
 import numpy as np
 from scipy.signal import lfilter

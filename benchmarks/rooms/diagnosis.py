@@ -53,12 +53,12 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "48 simulated cranes, answered once. A person drives 22 fields. Earlier engines had 11 of 13, 1 of 7 and 0 of 5 of other 36, and 10 of 17, 4 of 10 and 2 of 7 of other 48.",
+        "48 simulated cranes, answered once. A person drives 22 fields. An earlier engine had 11 of 13, 1 of 7 and 0 of 5 of other 36.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 48, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "40 simulated arms, answered once. Earlier engines had 14 of 14, 3 of 8 and 0 of 6 of other 40, and 16 of 17, 4 of 10 and 0 of 7 of other 48.",
+        "40 simulated arms, answered once. An earlier engine had 14 of 14, 3 of 8 and 0 of 6 of other 40.",
         "machine=so101 exam_plants=servos exam_mix=servos", 40, "servo_diagnosis", "servo",
     ),
     Measurement(

@@ -38,7 +38,7 @@ SAME_JOINT_SHARE = 0.5
 """Least share of the first where both share a joint."""
 MAX_SIMULATED = 3
 """Most simulated effects that are named together: of four third ones on 60 practice cases with several effects three
-were there. Where frames jitter more than the engine can follow, it went on to six, of which one was there."""
+were there. Without a bound a case whose frames jitter much was given six, of which one was there."""
 HELD_NATS = 60.0
 """Least gain of held commands, which follow whatever is left."""
 SHOWN_NATS = 1e3
