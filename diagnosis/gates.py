@@ -38,10 +38,6 @@ EXCESS_QUANTILE = 0.99
 MAX_RIVAL_RATIO = 1.5
 """Error over that of a rival fitted to the field, above which something is left to find: on 15
 unchanged practice machines the ratio is 1.46 at most, and 1.12 on all but one."""
-MAX_LEVELS = 200
-"""Distinct positions in the field up to which a sensor is coarse: it stays at its steps, and equal
-samples are no freeze (effect `quantisation`). A 12-bit encoder visits a thousand or more."""
-
 MAX_SCATTER_GROWTH = 3.0
 """Scatter of tool points about any law of geometry, over that of the reference, above which encoders slip. In 168
 practice cases it is 0.9 to 1.17, with a clock that is late or a sensor that is noisy or coarse up to 12, and with a
@@ -71,9 +67,6 @@ def judge_recordings(
     for name, limit in MAX_REMARK_SHARES.items():
         shares = measure_shares(name, remarks, field)
         usual = measure_shares(name, known, reference)
-        if name in ("frozen sensor", "jumps"):
-            coarse = find_coarse_sensors(field, machine)
-            shares = {joint: share for joint, share in shares.items() if joint not in coarse}
         beyond = {joint: share - usual.get(joint, 0.0) for joint, share in shares.items()}
         joint = max(beyond, key=beyond.__getitem__, default="")
         share = max(beyond.get(joint, 0.0), 0.0)
@@ -102,16 +95,6 @@ def measure_shares(
     return found
 
 
-def find_coarse_sensors(recordings: Sequence[Recording], machine: Machine) -> set[str]:
-    """Return the joints whose sensors show few distinct positions."""
-    q = np.concatenate([recording.q for recording in recordings])
-    found = set()
-    for name, column in zip(machine.joint_names, q.T, strict=True):
-        if len(np.unique(column)) <= MAX_LEVELS:
-            found.add(name)
-    return found
-
-
 def _judge_limits(recordings: Sequence[Recording], machine: Machine) -> Gate:
     q = np.concatenate([recording.q for recording in recordings])
     over = np.maximum(q - machine.upper, machine.lower - q) / (machine.upper - machine.lower)
@@ -130,7 +113,7 @@ def judge_scatter(growth: float) -> Gate:
     text = f"tool points scatter {growth:.1f} times as much about any law of the encoders as on the reference"
     passed = growth <= MAX_SCATTER_GROWTH
     if not passed:
-        text = f"{text}; look for an encoder that slips"
+        text = f"{text}; look for an encoder that slips or shows coarse steps"
     return Gate("encoders_slip", passed, growth, MAX_SCATTER_GROWTH, text)
 
 

@@ -26,6 +26,9 @@ CODE_REPEATS = 5
 STEP_QUANTILE = 0.05
 """Neighbouring values of a coarse sensor lie one step apart or, where those between were not
 visited often, several."""
+LATTICE_SHARE, LATTICE_ERROR = 0.9, 0.05
+"""So many gaps between neighbouring values of a coarse sensor are whole steps, but for such a part of one: of
+random gaps every tenth is."""
 HELD_TARGET = 1e-4
 """Speed of a target, as a part of full speed, below which it is held: above the rounding of float32. A
 servo follows a slow target, where a valve stays closed under a small command."""
@@ -385,12 +388,21 @@ def find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
 
 
 def estimate_step(q: np.ndarray) -> float:
-    """Return the step of a coarse sensor from repeated values, NaN if they are few."""
+    """Return the step of a coarse sensor, NaN for a fine one.
+
+    Repeated values are its steps, also in a log that was brought to another rate. A joint that hardly rests
+    has few of these; then all values must lie whole steps apart.
+    """
     values, counts = np.unique(q[np.isfinite(q)], return_counts=True)
     codes = values[counts >= CODE_REPEATS]
-    if len(codes) < 10 or counts[counts >= CODE_REPEATS].sum() < 0.3 * len(q):
+    if len(codes) >= 10 and counts[counts >= CODE_REPEATS].sum() >= 0.3 * len(q):
+        return float(np.quantile(np.diff(codes), STEP_QUANTILE))
+    if len(values) < 10:
         return np.nan
-    return float(np.quantile(np.diff(codes), STEP_QUANTILE))
+    gaps = np.diff(values)
+    step = float(np.quantile(gaps, STEP_QUANTILE))
+    off = np.abs(gaps / step - np.round(gaps / step))
+    return step if np.quantile(off, LATTICE_SHARE) < LATTICE_ERROR else np.nan
 
 
 def _to_json_number(value: Any) -> float | None:

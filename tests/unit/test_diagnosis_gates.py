@@ -57,18 +57,6 @@ def test_what_the_reference_shows_as_often_forbids_no_telling(machine: Machine) 
         assert found["unlogged_input"].passed is passes
 
 
-def test_a_coarse_sensor_is_not_frozen(machine: Machine) -> None:
-    fine = recording(machine)
-    for levels, passes in ((200, True), (201, False)):
-        q = fine.q.copy()
-        q[:, 2] = np.arange(len(q)) % levels / levels
-        field = [replace(fine, q=q)]
-        assert ("q3" in gates.find_coarse_sensors(field, machine)) is passes
-        frozen = [remark("frozen sensor", "q3", 0.8)]
-        found = by_name(gates.judge_recordings(frozen, [], field, [], machine))
-        assert found["frozen_sensor"].passed is passes
-
-
 def test_limits_that_the_recordings_leave_are_told(machine: Machine) -> None:
     plain = recording(machine)
     travel = machine.upper - machine.lower

@@ -77,6 +77,23 @@ def test_the_step_of_a_coarse_sensor_is_found(
     assert coarse.joints["q3"]["step"] == pytest.approx(0.004, rel=0.01)
 
 
+def test_a_joint_that_rests_at_few_places_has_its_step_and_is_not_frozen(
+    machine: Machine, thresholds: InspectionThresholds
+) -> None:
+    whole = sound(machine)
+    at_s = np.arange(len(whole.q)) * PERIOD_S
+    u, q = np.zeros_like(whole.u), whole.q.copy()
+    moves = (at_s >= 20.0) & (at_s < 22.0)
+    u[moves, 2] = 0.6
+    q[:, 2] = machine.home[2] + 0.15 * np.clip(at_s - 20.5, 0.0, 2.0) ** 2
+    fine = inspect_recording(replace(whole, u=u, q=q), machine, thresholds)
+    assert fine.joints["q3"]["step"] is None
+    q[:, 2] = np.round(q[:, 2] / 0.006) * 0.006
+    coarse = inspect_recording(replace(whole, u=u, q=q), machine, thresholds)
+    assert coarse.joints["q3"]["step"] == pytest.approx(0.006, rel=0.01)
+    assert not [one for one in coarse.findings if one.name == "frozen sensor"]
+
+
 Arrays = tuple[np.ndarray, np.ndarray, Machine]
 
 
