@@ -40,6 +40,15 @@ def swept(machine: Machine, seconds: float, seed: int, noise: float = 3e-4) -> R
     return make_recording(machine, u, q, f"{seed}")
 
 
+def test_the_noise_of_a_sensor_is_told_from_its_motion(machine: Machine) -> None:
+    slow = machine.home + np.outer(0.1 * np.sin(0.02 * np.arange(1800)), np.ones(5))
+    sigma = np.array([0.0003, 0.001, 0.002, 0.0005, 0.004])
+    noise = sigma * np.random.default_rng(0).standard_normal(slow.shape)
+    noisy, clean = (make_recording(machine, 0.0 * q, q, "slow") for q in (slow + noise, slow))
+    assert sensors.estimate_sensor_noise([noisy]) == pytest.approx(sigma, rel=0.15)
+    assert sensors.estimate_sensor_noise([clean]).max() < 1e-6
+
+
 def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine) -> None:
     reference, field = [swept(machine, 100.0, seed) for seed in (0, 1, 2)], swept(machine, 100.0, 3)
     q = field.q.copy()

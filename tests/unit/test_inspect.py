@@ -68,30 +68,20 @@ def test_its_figures_are_those_it_was_made_with(
     assert seen.joints["q1"]["commanded"] == 0.0
 
 
-def test_the_step_of_a_coarse_sensor_is_found(
+def test_the_step_of_a_coarse_sensor_is_found_and_is_no_freeze(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     whole = sound(machine)
-    coarse_q = np.round(whole.q / 0.004) * np.float32(0.004)
-    coarse = inspect_recording(replace(whole, q=coarse_q), machine, thresholds)
-    assert coarse.joints["q3"]["step"] == pytest.approx(0.004, rel=0.01)
-
-
-def test_a_joint_that_rests_at_few_places_has_its_step_and_is_not_frozen(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    whole = sound(machine)
-    at_s = np.arange(len(whole.q)) * PERIOD_S
-    u, q = np.zeros_like(whole.u), whole.q.copy()
-    moves = (at_s >= 20.0) & (at_s < 22.0)
-    u[moves, 2] = 0.6
-    q[:, 2] = machine.home[2] + 0.15 * np.clip(at_s - 20.5, 0.0, 2.0) ** 2
-    fine = inspect_recording(replace(whole, u=u, q=q), machine, thresholds)
-    assert fine.joints["q3"]["step"] is None
-    q[:, 2] = np.round(q[:, 2] / 0.006) * 0.006
-    coarse = inspect_recording(replace(whole, u=u, q=q), machine, thresholds)
-    assert coarse.joints["q3"]["step"] == pytest.approx(0.006, rel=0.01)
-    assert not [one for one in coarse.findings if one.name == "frozen sensor"]
+    rests = whole.q.copy()
+    rests[:, 2] = 0.15 * np.clip(np.arange(len(rests)) * PERIOD_S - 20.5, 0.0, 2.0) ** 2
+    for q, step in ((whole.q, 0.004), (rests, 0.006)):
+        coarse = replace(whole, q=np.round(q / step) * step)
+        seen = inspect_recording(coarse, machine, thresholds)
+        assert seen.joints["q3"]["step"] == pytest.approx(step, rel=0.01)
+        assert "frozen sensor" not in [finding.kind for finding in seen.findings]
+    assert (
+        inspect_recording(replace(whole, q=rests), machine, thresholds).joints["q3"]["step"] is None
+    )
 
 
 Arrays = tuple[np.ndarray, np.ndarray, Machine]
