@@ -1,19 +1,20 @@
-"""Inverse dynamics of joints commanded by force: mass, friction and offset by least squares.
+"""Inverse dynamics of joints commanded by force: mass, friction and weight by least squares.
 
-The force is linear in mass, viscous and Coulomb friction and offset. Accelerations and speeds are
-derivatives of the positions after a low-pass filter without phase; force and regressors then go through a
-second one, the same for both, as in Gautier, Janot and Vandanjon, "A New Closed-Loop Output Error Method for
-Parameter Identification of Robot Dynamics", 2013, section II. A logged force is averaged over each period.
+The force is linear in mass, viscous and Coulomb friction and offset, and on a hinge in sine and cosine of
+the angle as well, by which its weight changes; not in friction that depends on speed and load (BAM's M2, M3
+and M5 in motion). All numbers are fitted at once: friction is never negative, so that a joint without a
+kind of it gets 0.
 
-Mass, viscous and Coulomb friction and offset are always fitted. The terms beyond them are tried one after
-the other, by nonlinear least squares on the samples in motion. A term is taken where parts of the
-recordings that it was not fitted to are predicted better by more than chance.
+Accelerations and speeds are derivatives of the positions after a low-pass filter without phase; force and
+regressors then go through a second one, the same for both, as in Gautier, Janot and Vandanjon, "A New
+Closed-Loop Output Error Method for Parameter Identification of Robot Dynamics", 2013, section II. A logged
+force is averaged over each period.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,8 @@ from actuators.contracts import FitTask
 from actuators.identify.option_file import estimate_standard_errors, write_numbers
 from actuators.models.force_drive import ForceDrive
 from actuators.models.friction import LOADS, STRIBECK_SPEED, compute_dry_friction
-from actuators.models.machine_tensors import read_pose
 from actuators.models.parameters import expand_per_joint
-from brokk_rl.errors import ConfigError, RecordingError, list_choices
+from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.spec import Positive, spec
@@ -36,6 +36,19 @@ EDGE_S = 0.3
 """Time at either end of a recording that is left out: filters begin and end there."""
 STANDSTILL = 0.01
 """Speed over the machine's `max_speed` below which a joint counts as standing."""
+LEAST_ROWS = 20
+"""Fewest rows after decimation for the numbers with standard errors."""
+ALWAYS: tuple[str, ...] = ("mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n")
+WEIGHT: tuple[str, ...] = ("pose_sin_n", "pose_cos_n")
+"""Numbers of a hinge. The weight of a sliding joint does not change over its travel."""
+FRICTION: tuple[str, ...] = ("stribeck_n", "stribeck_m_s", "motor_load", "outside_load")
+"""Numbers of friction that depends on speed and load. Of a sliding joint both loads are one number: a
+weight that never changes does not tell them apart."""
+SIGNED: tuple[str, ...] = ("offset_n", *WEIGHT)
+BOUNDS = {"stribeck_m_s": (0.1, 10.0), "motor_load": (0.0, 1.0), "outside_load": (0.0, 1.0)}
+"""Bounds of numbers over their sizes, that of `stribeck_m_s` is `STRIBECK_SPEED`; 0 and more for the others."""
+START_SHARE, START_LOAD = 0.1, 0.05
+"""Where further friction begins: a part of the Coulomb friction, and of the load."""
 
 
 @spec
@@ -47,20 +60,14 @@ class ForceFit:
         actuator: The model; its dead time is kept.
         motion_hz: Cut-off of the filter on positions, above what the joint can do.
         force_hz: Cut-off of the filter on force and regressors; rows are kept at twice its rate.
-        terms: Terms that may be taken beside mass, viscous and Coulomb friction and offset, of
-            `TERMS`.
     """
 
     name: str
     actuator: ForceDrive
     motion_hz: float
     force_hz: Positive
-    terms: tuple[str, ...]
 
     def check(self) -> None:
-        for term in self.terms:
-            if term not in TERMS:
-                raise ConfigError(f"terms: '{term}' is no term; {list_choices(term, TERMS)}")
         if self.force_hz > self.motion_hz:
             raise ConfigError(
                 f"force_hz: expected motion_hz={self.motion_hz} or less, got {self.force_hz}"
@@ -90,21 +97,21 @@ class ForceFit:
         )
         least = 4 * round(EDGE_S / machine.period_s)
         long = [one for one in task.recordings if one.num_samples >= least]
-        found = {}
-        for j, joint in enumerate(machine.joint_names):
+        if not long:
+            raise RecordingError(
+                f"too little data: none of {len(task.recordings)} recordings has {least * machine.period_s:g} s or more"
+            )
+        has_hinge = any(joint.kind == "hinge" for joint in machine.joints)
+        fitted = (*ALWAYS, *(WEIGHT if has_hinge else ()), *FRICTION)
+        numbers = {name: np.zeros(machine.num_joints) for name in fitted}
+        errors = {name: np.full(machine.num_joints, np.nan) for name in numbers}
+        for j in range(machine.num_joints):
             motions = [self._read_motion(machine, one, j, delays_s[j]) for one in long]
-            found[joint] = fit_drive(machine, j, motions, self.terms)
-        tried = {joint: one.tried for joint, one in found.items()}
-        numbers, errors = {}, {}
-        for name in dict.fromkeys(key for one in found.values() for key in one.value):
-            # joints that lack a term of another one
-            off = STRIBECK_SPEED * machine.max_speed * (name == "stribeck_m_s")
-            pairs = zip(found.values(), off, strict=True)
-            numbers[name] = np.array([one.value.get(name, none) for one, none in pairs])
-            errors[name] = np.array([one.error.get(name, np.nan) for one in found.values()])
-        return write_numbers(
-            task.folder, self.name, self.actuator, machine, numbers, errors, terms=tried
-        )
+            found, error = fit_drive(machine, j, motions)
+            for name in fitted:
+                numbers[name][j] = found.get(name, 0.0)
+                errors[name][j] = error.get(name, np.nan)
+        return write_numbers(task.folder, self.name, self.actuator, machine, numbers, errors)
 
     def _read_motion(
         self, machine: Machine, recording: Recording, j: int, delay_s: float
@@ -117,46 +124,13 @@ class ForceFit:
         # A command that is held over a period acts at its middle.
         force = np.interp(rows, rows + 0.5 + delay_s / period_s, force * machine.max_force[j])
         speed = np.gradient(q, period_s)
-        edge = round(EDGE_S / period_s)
-        moves = np.abs(speed) > STANDSTILL * machine.max_speed[j]
+        away = q - 0.5 * (machine.upper[j] + machine.lower[j])
         acceleration = np.gradient(speed, period_s)
-        return DriveMotion(q, speed, acceleration, force, self.force_hz, period_s, edge, moves)
-
-
-ALWAYS: tuple[str, ...] = ("mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n")
-LINEAR: tuple[str, ...] = (*ALWAYS, "pose_sin_n", "pose_cos_n")
-TERMS: dict[str, tuple[str, ...]] = {
-    "pose": ("pose_sin_n", "pose_cos_n"),
-    "stribeck": ("stribeck_n", "stribeck_m_s"),
-    "load": ("motor_load",),
-    "direction": ("outside_load",),
-}
-"""Numbers of each term. Without the first they are those of BAM's models M2, M3 and M5 in motion."""
-NEEDS = {"direction": {"pose", "load"}}
-"""Terms without which another is not tried. A weight that never changes tells no direction."""
-FITTED_LOADS = ("motor_load", "outside_load")
-"""The second one equals the first until it is fitted itself."""
-NEUTRAL = dict.fromkeys((*LINEAR, "stribeck_n", *LOADS), 0.0) | {
-    "stribeck_m_s": 1.0,
-    "stribeck_power": 1.0,
-}
-"""Numbers of terms that are not taken."""
-LEAST_ROWS = 20
-"""Fewest rows after decimation for four numbers with standard errors."""
-MAX_SAMPLES = 40_000
-"""Samples of a joint from which terms are fitted, whole recordings evenly taken: more take minutes."""
-NUM_FOLDS = 8
-"""Parts of each recording of which one at a time is withheld."""
-LEAST_SCORE = 2.0
-"""Standard errors by which a term must lower the squared error on withheld parts."""
-LEAST_SHARE = 0.1
-"""Part of the squared error on withheld parts that a term must take away. By hand: on the linear drive EMPS
-a weight over the travel takes 0.03, and its authors publish none; true terms take 0.3 and more."""
-FOLD_STEPS = 5
-"""Evaluations of a fit without one part; it begins at the fit to all parts, which is near."""
-BOUNDS = dict.fromkeys(FITTED_LOADS, (0.0, 1.0)) | {"stribeck_m_s": (0.1, 10.0)}
-BOUNDS |= dict.fromkeys(("offset_n", "pose_sin_n", "pose_cos_n"), (-np.inf, np.inf))
-"""Bounds of numbers over their sizes, that of `stribeck_m_s` is `STRIBECK_SPEED`; 0 and more for the others."""
+        columns = [acceleration, speed, np.sign(speed), np.ones_like(q)]
+        if machine.joints[j].kind == "hinge":
+            columns += [np.sin(away), np.cos(away) - 1.0]
+        moves = np.abs(speed) > STANDSTILL * machine.max_speed[j]
+        return DriveMotion(np.stack(columns, 1), force, moves, self.force_hz, period_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,31 +138,40 @@ class DriveMotion:
     """Motion of a joint in one recording, and what its motor did.
 
     Attributes:
-        q: Positions, `(T,)`.
-        speed: Speeds.
-        acceleration: Accelerations.
-        force: Forces of the motor, N or Nm.
-        force_hz: Cut-off of the filter on forces.
-        period_s: Control period.
-        edge: Samples at either end that are left out.
+        regressors: What the linear numbers `ALWAYS`, and `WEIGHT` on a hinge, are multiplied by, `(T, F)`.
+        force: Forces of the motor, N or Nm, `(T,)`.
         moves: Whether the joint moves, `(T,)` bool. Other samples are left out: where a joint stands,
             friction is any force up to its largest.
+        force_hz: Cut-off of the filter on forces.
+        period_s: Control period.
     """
 
-    q: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray
+    regressors: np.ndarray
     force: np.ndarray
+    moves: np.ndarray
     force_hz: float
     period_s: float
-    edge: int
-    moves: np.ndarray
 
     def filter(self, values: np.ndarray) -> np.ndarray:
         """Return values `(T, …)` in motion, without their faster parts, at twice the rate of the cut-off, `(R, …)`."""
         values = values * (self.moves if values.ndim == 1 else self.moves[:, None])
-        inside = slice(self.edge, -self.edge, max(1, round(0.5 / (self.force_hz * self.period_s))))
+        edge = round(EDGE_S / self.period_s)
+        inside = slice(edge, -edge, max(1, round(0.5 / (self.force_hz * self.period_s))))
         return filter_low_pass(values, 2, self.force_hz, self.period_s)[inside]
+
+    def filter_friction(self, numbers: dict[str, float], max_force: float) -> np.ndarray:
+        """Return the dry friction beyond Coulomb's at all rows, N or Nm, `(R,)`."""
+        value = {name: torch.tensor(0.0) for name in ("coulomb_n", *LOADS)}
+        value["stribeck_power"] = torch.tensor(1.0)
+        value |= {name: torch.tensor(numbers[name], dtype=torch.float64) for name in FRICTION[:3]}
+        outside = numbers.get("outside_load", numbers["motor_load"])
+        value["outside_load"] = torch.tensor(outside, dtype=torch.float64)
+        linear = (*ALWAYS, *WEIGHT)[: self.regressors.shape[1]]
+        weight = self.regressors[:, 3:] @ [numbers[name] for name in linear[3:]]
+        speed, motor = torch.from_numpy(self.regressors[:, 1]), torch.from_numpy(self.force)
+        full = torch.tensor(max_force, dtype=torch.float64)
+        dry = compute_dry_friction(value, speed, motor, torch.from_numpy(weight), full)
+        return self.filter(self.regressors[:, 2] * dry.numpy())
 
 
 def filter_low_pass(values: np.ndarray, order: int, cut_hz: float, period_s: float) -> np.ndarray:
@@ -198,194 +181,53 @@ def filter_low_pass(values: np.ndarray, order: int, cut_hz: float, period_s: flo
     return np.ascontiguousarray(filtfilt(numerator, denominator, values, axis=0))
 
 
-@dataclass(frozen=True)
-class DriveNumbers:
-    """Numbers of a joint.
-
-    Attributes:
-        value: By name.
-        error: Standard errors.
-        tried: Terms in the order in which they were tried: whether each is taken, the part of the squared
-            error that it takes away where it is fitted (`fitted_share`), and where that is enough, on
-            withheld parts (`withheld_share`) with its standard error.
-    """
-
-    value: dict[str, float]
-    error: dict[str, float]
-    tried: list[dict[str, Any]]
-
-
 def fit_drive(
-    machine: Machine, j: int, motions: Sequence[DriveMotion], terms: Sequence[str]
-) -> DriveNumbers:
-    """Return the numbers of joint `j` that predict the force of its motor.
-
-    Args:
-        machine: The machine.
-        j: The joint.
-        motions: Its recordings.
-        terms: Terms of `TERMS` that may be taken.
+    machine: Machine, j: int, motions: Sequence[DriveMotion]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the numbers of joint `j` that predict the force of its motor, and their standard errors.
 
     Raises:
-        RecordingError: the recordings are too short, or the joint never moves.
+        RecordingError: the recordings are too short, or the motion does not tell the numbers.
     """
-    whole = [replace(one, moves=np.ones_like(one.moves)) for one in motions]
-    fit = _JointRegression(machine, j, whole)
-    found = fit.solve(ALWAYS, fit.start())
-    tried: list[dict[str, Any]] = []
-    samples = sum(len(one.q) for one in motions)
-    few = motions[:: max(1, round(samples / MAX_SAMPLES))]
-    if terms and sum(one.moves.sum() for one in few) > 0:
-        moving = _JointRegression(machine, j, few)
-        names = _choose_terms(moving, terms, tried)
-        if names != ALWAYS:
-            fit, found = moving, moving.solve(names, moving.start() | found)
-    error = fit.estimate_errors(found)
-    for told in (found, error):
-        if "motor_load" in told:
-            told.setdefault("outside_load", told["motor_load"])
-    return DriveNumbers(found, error, tried)
-
-
-def _choose_terms(
-    fit: _JointRegression, terms: Sequence[str], tried: list[dict[str, Any]]
-) -> tuple[str, ...]:
-    """Return the names with the terms that withheld parts speak for, the best first; append to `tried`."""
-    names, taken = ALWAYS, set[str]()
-    known = fit.solve(names, fit.start())
-    before = fit.withhold(known)
-    while True:
-        best: tuple[float, str, dict[str, float], np.ndarray] | None = None
-        for term in terms:
-            if term in taken or not NEEDS.get(term, set()) <= taken:
-                continue
-            found = fit.solve((*names, *TERMS[term]), {**fit.start(), **known})
-            fitted_share = 1.0 - fit.measure(found) / fit.measure(known)
-            row: dict[str, Any] = {"term": term, "taken": False, "fitted_share": fitted_share}
-            tried.append(row)
-            if row["fitted_share"] < LEAST_SHARE:
-                continue
-            after = fit.withhold(found)
-            less = (before - after) / before.sum()
-            share, error = float(less.sum()), float(np.sqrt(len(less)) * less.std(ddof=1))
-            row |= {"withheld_share": share, "standard_error": error}
-            if share > max(LEAST_SHARE, LEAST_SCORE * error) and (best is None or share > best[0]):
-                best = share, term, found, after
-        if best is None:
-            return names
-        _, term, known, before = best
-        next(row for row in reversed(tried) if row["term"] == term)["taken"] = True
-        taken.add(term)
-        names = (*names, *TERMS[term])
-
-
-class _JointRegression:
-    """The force of one joint in its recordings, as a function of the drive's numbers; arguments of `fit_drive`."""
-
-    def __init__(self, machine: Machine, j: int, motions: Sequence[DriveMotion]) -> None:
-        self._motions, name = motions, machine.joint_names[j]
-        self._max_speed = float(machine.max_speed[j])
-        slides = torch.tensor(machine.joints[j].kind == "slide")
-        middle = torch.tensor(0.5 * (machine.upper[j] + machine.lower[j]))
-        half = torch.tensor(0.5 * (machine.upper[j] - machine.lower[j]))
-        columns, forces, folds = [np.zeros((0, len(LINEAR)))], [np.zeros(0)], [np.zeros(0, int)]
-        self._poses = []
-        for one in motions:
-            sin, cos = read_pose(torch.from_numpy(one.q), middle, half, slides)
-            self._poses.append((sin.numpy(), cos.numpy() - 1.0))
-            sign, ones = np.sign(one.speed), np.ones_like(one.q)
-            own = [one.acceleration, one.speed, sign, ones, *self._poses[-1]]
-            columns.append(one.filter(np.stack(own, 1)))
-            forces.append(one.filter(one.force))
-            folds.append(np.arange(len(forces[-1])) * NUM_FOLDS // max(1, len(forces[-1])))
-        self._x, self._y = np.concatenate(columns), np.concatenate(forces)
-        self._fold, self._lengths = np.concatenate(folds), [len(one) for one in forces]
-        if len(self._y) < LEAST_ROWS:
-            raise RecordingError(
-                f"too little data: {len(self._y)} rows of joint {name} after filtering, {LEAST_ROWS} or more are needed"
-            )
-        always = self._x[:, : len(ALWAYS)]
-        size = np.sqrt(np.square(always).mean(0))
-        if (size[:3] < 1e-12).any():
-            raise RecordingError(f"joint {name} never moves: nothing tells its mass and friction")
-        found, _, rank, _ = np.linalg.lstsq(always / size, self._y, rcond=1e-6)
-        if rank < len(ALWAYS):
-            raise RecordingError(
-                f"joint {name}: its motion does not tell mass, friction and offset apart; record accelerations both ways"
-            )
-        self._least_squares = dict(zip(ALWAYS, (found / size).tolist(), strict=True))
-        force = float(np.sqrt(np.square(self._y).mean()))
-        sizes = np.append(force / size, [force, force])
-        self._size = dict(zip(LINEAR, sizes.tolist(), strict=True))
-        self._size |= {"stribeck_n": force, "stribeck_m_s": STRIBECK_SPEED * self._max_speed}
-        self._full = torch.tensor(float(machine.max_force[j]), dtype=torch.float64)
-        self._size |= dict.fromkeys(FITTED_LOADS, 1.0)
-
-    def start(self) -> dict[str, float]:
-        """Return numbers to begin at: those by linear least squares, a tenth of the friction for other terms."""
-        some = 0.1 * abs(self._least_squares["coulomb_n"])
-        found = dict.fromkeys(("pose_sin_n", "pose_cos_n"), 0.0)
-        found |= {"stribeck_n": some, "stribeck_m_s": self._size["stribeck_m_s"]}
-        return found | dict.fromkeys(FITTED_LOADS, 0.05) | self._least_squares
-
-    def solve(
-        self,
-        names: Sequence[str],
-        start: dict[str, float],
-        rows: np.ndarray | None = None,
-        steps: int | None = None,
-    ) -> dict[str, float]:
-        """Return the numbers `names` that fit `rows` best, by nonlinear least squares within their bounds."""
-        use = slice(None) if rows is None else rows
-        size = np.array([self._size[name] for name in names])
-        low, high = np.array([BOUNDS.get(name, (0.0, np.inf)) for name in names]).T * size
-        found = least_squares(
-            lambda x: self._predict(dict(zip(names, x, strict=True)))[use] - self._y[use],
-            np.clip([start[name] for name in names], low + 1e-9 * size, high),
-            bounds=(low, high),
-            x_scale=size,
-            max_nfev=steps,
+    joint, max_force = machine.joint_names[j], float(machine.max_force[j])
+    regressors = np.concatenate([one.filter(one.regressors) for one in motions])
+    forces = [one.filter(one.force) for one in motions]
+    force = np.concatenate(forces)
+    if len(force) < LEAST_ROWS:
+        raise RecordingError(
+            f"too little data: {len(force)} rows of joint {joint} after filtering, {LEAST_ROWS} or more are needed"
         )
-        return dict(zip(names, found.x.tolist(), strict=True))
-
-    def withhold(self, found: dict[str, float]) -> np.ndarray:
-        """Return the squared error on each part that the same numbers, fitted without it, leave, `(NUM_FOLDS,)`."""
-        errors = []
-        for fold in range(NUM_FOLDS):
-            apart = self._fold == fold
-            without = self.solve(tuple(found), found, ~apart, FOLD_STEPS)
-            errors.append(np.square(self._predict(without) - self._y)[apart].sum())
-        return np.array(errors)
-
-    def measure(self, found: dict[str, float]) -> float:
-        """Return the squared error on all rows."""
-        return float(np.square(self._predict(found) - self._y).sum())
-
-    def estimate_errors(self, found: dict[str, float]) -> dict[str, float]:
-        """Return the standard errors of the numbers."""
-        names = tuple(found)
-        errors = estimate_standard_errors(
-            lambda x: self._predict(dict(zip(names, x, strict=True))) - self._y,
-            np.array([*found.values()]),
-            1e-4 * np.array([self._size[name] for name in names]),
-            self._lengths,
+    size = np.sqrt(np.square(regressors).mean(0))
+    if (size < 1e-12).any():
+        raise RecordingError(f"joint {joint} never moves: nothing tells its mass and friction")
+    start, _, rank, _ = np.linalg.lstsq(regressors / size, force, rcond=1e-6)
+    if rank < len(size):
+        raise RecordingError(
+            f"joint {joint}: its motion does not tell mass, friction and weight apart; record accelerations both ways"
         )
-        return dict(zip(names, errors.tolist(), strict=True))
+    linear = (*ALWAYS, *WEIGHT)[: len(size)]
+    names = (*linear, *(FRICTION if len(linear) > len(ALWAYS) else FRICTION[:3]))
+    mean_force = float(np.sqrt(np.square(force).mean()))
+    sizes = dict.fromkeys(names, 1.0) | dict(zip(linear, mean_force / size, strict=True))
+    sizes |= {"stribeck_n": mean_force, "stribeck_m_s": STRIBECK_SPEED * machine.max_speed[j]}
+    begin = dict.fromkeys(names, START_LOAD) | dict(zip(linear, start / size, strict=True))
+    begin["stribeck_n"] = START_SHARE * abs(begin["coulomb_n"])
+    begin["stribeck_m_s"] = sizes["stribeck_m_s"]
+    bounds = dict.fromkeys(names, (0.0, np.inf)) | dict.fromkeys(SIGNED, (-np.inf, np.inf)) | BOUNDS
+    scale = np.array([sizes[name] for name in names])
+    low, high = np.array([bounds[name] for name in names]).T * scale
 
-    def _predict(self, numbers: dict[str, float]) -> np.ndarray:
-        """Return the force of the motor at all rows, N or Nm."""
-        linear = self._x @ [numbers.get(name, 0.0) for name in LINEAR]
-        return linear if numbers.keys() <= set(LINEAR) else linear + self._filter_dry(numbers)
+    def compute_errors(x: np.ndarray) -> np.ndarray:
+        numbers = dict(zip(names, x.tolist(), strict=True))
+        friction = [one.filter_friction(numbers, max_force) for one in motions]
+        return regressors @ x[: len(linear)] + np.concatenate(friction) - force
 
-    def _filter_dry(self, numbers: dict[str, float]) -> np.ndarray:
-        """Return the dry friction beyond Coulomb's at all rows."""
-        given = {**NEUTRAL, **numbers, "coulomb_n": 0.0}
-        given["outside_load"] = numbers.get("outside_load", given["motor_load"])
-        value = {name: torch.tensor(one, dtype=torch.float64) for name, one in given.items()}
-        parts = []
-        for motion, (sin, cos) in zip(self._motions, self._poses, strict=True):
-            weight = given["offset_n"] + given["pose_sin_n"] * sin + given["pose_cos_n"] * cos
-            speed, motor = torch.from_numpy(motion.speed), torch.from_numpy(motion.force)
-            dry = compute_dry_friction(value, speed, motor, torch.from_numpy(weight), self._full)
-            parts.append(motion.filter(np.sign(motion.speed) * dry.numpy()))
-        return np.concatenate(parts)
+    x0 = np.clip([begin[name] for name in names], low + 1e-9 * scale, high)
+    x = least_squares(compute_errors, x0, bounds=(low, high), x_scale=scale).x
+    error = estimate_standard_errors(compute_errors, x, 1e-4 * scale, [len(one) for one in forces])
+    found = dict(zip(names, x.tolist(), strict=True))
+    errors = dict(zip(names, error.tolist(), strict=True))
+    if "outside_load" not in found:
+        found["outside_load"] = found["motor_load"]
+        errors["outside_load"] = errors["motor_load"]
+    return found, errors

@@ -86,7 +86,11 @@ def test_mass_friction_and_offset_are_read_off_a_controllers_log(
     fitted = option("fit", "force").fit(FitTask(drive, logs, [], tmp_path))
     for name, value in TRUE.items():
         assert getattr(fitted, name)["carriage"] == pytest.approx(value, rel=0.05), name
+    for name in ("stribeck_n", "motor_load", "outside_load"):
+        assert getattr(fitted, name)["carriage"] == pytest.approx(0.0, abs=0.01), name
     assert (tmp_path / "force.yaml").is_file()
+    with pytest.raises(RecordingError, match="none of 0 recordings"):
+        option("fit", "force").fit(FitTask(drive, [], [], tmp_path))
     still = replace(logs[0], q=np.full_like(logs[0].q, 0.1))
     with pytest.raises(RecordingError, match="carriage never moves"):
         option("fit", "force").fit(FitTask(drive, [still], [], tmp_path))
