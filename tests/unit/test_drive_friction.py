@@ -102,7 +102,6 @@ def test_a_fit_tells_friction_under_load_from_friction_without(
     fitted.build(arm, 1, CPU)
 
 
-@pytest.mark.slow
 def test_a_fit_recovers_the_whole_of_m5(arm: Machine, tmp_path: Path) -> None:
     budget = pendulum.compute_bam_friction(BAM)
     logs = [pendulum.log_pendulum(arm, budget, 0.08, seed, 15.0) for seed in range(3)]
