@@ -13,9 +13,10 @@ DELAYS_S = ("0.1", "0.3", "0.5")
 EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=false"
 BEHIND = "follower=person evaluation.episodes=256"
 POLICY_CODE = (
-    "tasks", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects",
+    "tasks/*.py", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects",
     "actuators/weights", "conf/task", "conf/machine", "conf/actuator", "conf/effect",
 )  # fmt: skip
+SHIPPED_CODE = (*POLICY_CODE, "tasks/policies/borehole_insertion")
 TRAINING_CODE = (*POLICY_CODE, "brokk_rl/rl", "conf/rl", "conf/preset", "conf/experiment")
 
 
@@ -66,7 +67,7 @@ MEASUREMENTS = (
         title="The policy that ships",
         conditions="The shipped policy and the classical controller (baseline) from the same random starts, one seed, MuJoCo C. An episode lasts 20 s. Boreholes, their errors, dead time and effects are random. The policy learned from nothing, on one H200 in 694 million steps on the level `flat`; the seed of the starts chose nothing.",
         commands=evaluate_each("actuator", PLANTS),
-        code=POLICY_CODE,
+        code=SHIPPED_CODE,
         read=lambda folder: read_evaluations(folder, "plant"),
         where="two cores, 3 min",
     ),
@@ -75,7 +76,7 @@ MEASUREMENTS = (
         title="The policy that ships, on circuits to which nothing was fitted",
         conditions="Nothing was fitted to these plants. The baseline is the classical controller, from the same 256 starts.",
         commands=evaluate_each("actuator", CIRCUITS, "evaluation.episodes=256"),
-        code=POLICY_CODE,
+        code=SHIPPED_CODE,
         read=lambda folder: read_evaluations(folder, "plant"),
         where="two cores, 4 min",
     ),
@@ -88,7 +89,7 @@ MEASUREMENTS = (
             *evaluate_each("task", LEVELS, "policy=shipped evaluation.episodes=256"),
             f"{EVALUATE} policy=classical ~rivals.classical task=slanted evaluation.episodes=256 session.out={{out}}/slanted",
         ),
-        code=POLICY_CODE,
+        code=SHIPPED_CODE,
         read=lambda folder: read_evaluations(folder, "task"),
         where="two cores, 3 min",
     ),
@@ -136,7 +137,7 @@ MEASUREMENTS = (
         commands=evaluate_each(
             "follower.delay_s", DELAYS_S, "policy=tasks:policies/behind_a_person", BEHIND
         ),
-        code=POLICY_CODE,
+        code=(*POLICY_CODE, "tasks/policies/behind_a_person"),
         read=lambda folder: read_evaluations(folder, "delay of the person, s"),
         where="two cores, 8 min",
     ),
