@@ -20,7 +20,7 @@ from brokk_rl.sim.scene import make_nominal_scenes
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "examples" / "run_policy.py"
-POLICIES = ("borehole_insertion", "behind_a_person")
+POLICIES = ("borehole_insertion", "behind_a_person", "unidentified_machine")
 
 
 @pytest.fixture(scope="module")

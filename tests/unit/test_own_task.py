@@ -73,7 +73,7 @@ def test_a_policy_restores_the_behaviour_and_leaves_the_conditions(shallow: Path
 
 def test_advice_is_restored(machine: Machine) -> None:
     advised = own_task(insertion(), str(SHIPPED.with_name("behind_a_person")))
-    assert advised.advice.delay_s == (0.2, 0.4) and advised.classical.straight is False
+    assert advised.advice.delay_s == (0.1, 0.5) and advised.classical.straight is False
     assert advised.build(machine, 1, CPU).control.encoder.size == 198
 
 
