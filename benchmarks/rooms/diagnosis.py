@@ -48,17 +48,17 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "60 simulated machines, answered once. A person drives 35 fields. An earlier engine had 15 of 21, 5 of 12 and 3 of 9 of other 60.",
-        "exam_plants=valves exam_recording=operators", 60, "diagnosis", "valve",
+        "40 simulated machines, answered once. A person drives 21 fields.",
+        "exam_plants=valves exam_recording=operators", 40, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "48 simulated cranes, answered once. A person drives 22 fields. An earlier engine had 11 of 13, 1 of 7 and 0 of 5 of other 36.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 48, "diagnosis", "valve",
+        "30 simulated cranes, answered once. A person drives 17 fields.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 30, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "40 simulated arms, answered once. An earlier engine had 14 of 14, 3 of 8 and 0 of 6 of other 40.",
+        "40 simulated arms, answered once.",
         "machine=so101 exam_plants=servos exam_mix=servos", 40, "servo_diagnosis", "servo",
     ),
     Measurement(

@@ -9,7 +9,6 @@ from measurement import Measurement, Table, load_json
 from rooms.training import TRAINING_CODE
 
 RATES = "brokk mode=bench preset=gpu bench.num_envs=[4096,16384,65536] bench.seconds=0.5 bench.iterations=8 rl.num_starts=4096"
-BENCH = "brokk mode=bench preset=gpu bench.num_envs=[16384] session.out={out}/"
 
 
 def read_rates(folder: Path) -> Table:
@@ -29,22 +28,6 @@ def read_rates(folder: Path) -> Table:
     return rows
 
 
-def read_scaling(folder: Path) -> Table:
-    """Return the rates of one, two and four GPUs, and the share of so many times one."""
-    rows: Table = []
-    rates = {}
-    for num_gpus in (1, 2, 4):
-        path = folder / f"{num_gpus}/benchmark.json"
-        rates[num_gpus] = load_json(path)["train_env_steps_per_s"]
-        row = {
-            "GPUs": num_gpus,
-            "training, 1e6 control steps/s": round(rates[num_gpus] / 1e6, 2),
-            "of n times one": round(rates[num_gpus] / (num_gpus * rates[1]), 3),
-        }
-        rows.append(row)
-    return rows
-
-
 MEASUREMENTS = (
     Measurement(
         name="rates",
@@ -57,18 +40,5 @@ MEASUREMENTS = (
         code=TRAINING_CODE,
         read=read_rates,
         where="one GPU of 80 GB, 5 min",
-    ),
-    Measurement(
-        name="scaling",
-        title="Several GPUs",
-        conditions="One policy on one, two and four GPUs, 16,384 worlds on each, not fused. The baseline is one GPU.",
-        commands=(
-            f"{BENCH}1",
-            f"torchrun --nproc-per-node=2 .venv/bin/{BENCH}2",
-            f"torchrun --nproc-per-node=4 .venv/bin/{BENCH}4",
-        ),
-        code=TRAINING_CODE,
-        read=read_scaling,
-        where="four GPUs of one computer, 10 min",
     ),
 )

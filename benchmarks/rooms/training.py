@@ -84,7 +84,7 @@ MEASUREMENTS = (
     Measurement(
         name="unidentified_machine",
         title="A policy for machines that nobody identified",
-        conditions="The policy learned with the wide library of effects, behind a simulated person and where 5 kN end an episode: 300 s on one H200, one seed; of seven such trainings it was chosen by the last three of these plants, to which nothing was fitted. The baseline is the classical controller, from the same 256 starts.",
+        conditions="It learned with the wide library of effects, behind a simulated person, and where 5 kN end an episode: 300 s on one H200, one seed, chosen of seven trainings by the last three plants, to which nothing was fitted. The baseline is the classical controller, from the same 256 starts.",
         commands=evaluate_each(
             "actuator", (*PLANTS, *CIRCUITS), f"policy={UNIDENTIFIED} evaluation.episodes=256"
         ),
@@ -145,7 +145,7 @@ MEASUREMENTS = (
     Measurement(
         name="guided_person",
         title="A simulated person follows the advice",
-        conditions="The policy that ships for a person and the classical controller (baseline), from the same 256 starts, one seed; an episode lasts 40 s. The policy commands alone, and sees what the controller computes. It assumes 0.1 to 0.5 s of delay, and that the person moves two to four levers at once and keeps each for 0.65 s. No real person took part.",
+        conditions="The policy that ships for a person and the classical controller (baseline), from the same 256 starts, one seed; an episode lasts 40 s. The policy commands alone, and sees what the controller computes. It assumes 0.1 to 0.5 s of delay and two to four levers at once. No real person took part.",
         commands=evaluate_each(
             "follower.delay_s", DELAYS_S, "policy=tasks:policies/behind_a_person", BEHIND
         ),
