@@ -61,8 +61,8 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "40 simulated arms, answered once.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 40, "servo_diagnosis", "servo",
+        "24 simulated arms, answered once. Other 24, whose withheld recordings were lost: 7 of 8 named first, 1 of 5 exact, 0 of 4, 4 of 5 unknown.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 24, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
