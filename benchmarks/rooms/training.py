@@ -14,8 +14,8 @@ EVALUATE = "brokk mode=evaluate session.device=cpu sim=native evaluation.video=f
 UNIDENTIFIED = "tasks:policies/unidentified_machine"
 BEHIND = "follower=person evaluation.episodes=256"
 POLICY_CODE = (
-    "tasks/*.py", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models", "actuators/effects",
-    "actuators/weights", "conf/task", "conf/machine", "conf/actuator", "conf/effect",
+    "tasks/*.py", "tasks/scenes", "brokk_rl/sim", "brokk_rl/kinematics.py", "actuators/models",
+    "actuators/effects", "actuators/weights", "conf/task", "conf/machine", "conf/actuator", "conf/effect",
 )  # fmt: skip
 SHIPPED_CODE = (*POLICY_CODE, "tasks/policies/borehole_insertion")
 TRAINING_CODE = (*POLICY_CODE, "brokk_rl/rl", "conf/rl", "conf/preset", "conf/experiment")
