@@ -52,9 +52,9 @@ STOPS_FACTOR = 4.0
 SLOW_RATE = 3.5
 """A rate of the command above this, full strokes a second, is ageing of the pilot stage."""
 OUTSIDE_NATS = 45.0
-"""What a row outside the library earns, or a flexible column more than the best effect, where the cause is unknown. The
-row must also earn `LEAST_NATS` more than the best effect: of 346 opened cases, 15 with a cause outside the library and
-two others have such a row. With 18 nats more as the only condition it was 16 and eight."""
+"""The cause is unknown where a row outside the library earns more than this, or flexible columns earn so much more than
+the best effect. The row must also earn `LEAST_NATS` more than that effect: of 346 opened cases, 15 with a cause outside
+the library and two others have such a row. With 18 nats more as the only condition it was 16 and eight."""
 
 HELD = frozenset({"frame_loss", "delay_jitter"})
 WHOLE = SHARED | HELD | {"thermal_all"}
@@ -248,8 +248,8 @@ def judge_first(
 
     Args:
         best: The best effect of the library.
-        outside_nats: What the best row outside the library earns.
-        generic_nats: What the best group of flexible columns earns.
+        outside_nats: Gain of the best row outside the library.
+        generic_nats: Gain of the best group of flexible columns.
     """
     most = max(best.nats, 0.0)
     least = max(most + LEAST_NATS, OUTSIDE_NATS)
