@@ -28,10 +28,8 @@ JOINT_NATS = 6.0
 """Cost of each joint of an effect; for its size and its form."""
 JOINT_SHARE = 0.1
 """A joint that earns less, of what the best joint earns, does not have the effect."""
-BESIDES_NATS = {"load_dependence": 12.0, "compliance": 30.0}
-"""Further cost of an effect. Pose explains nearly the same as load. A person's short reversals excite the
-mass of a heavy joint, a test programme does not: unchanged machines of a make with such joints earned up to
-48 nats of compliance, joints of other makes with air in the oil 60 to 3,500."""
+LOAD_NATS = 12.0
+"""Further cost of a dependence on load: pose explains nearly the same."""
 SECOND_SHARE = 0.03
 """A further effect earns so much of the first at least: a first one is never quite of the right form."""
 SAME_JOINT_SHARE = 0.5
@@ -49,8 +47,6 @@ MOSTLY = 0.8
 STARTS_LIMIT = 1.15
 """Held commands delay starts and stops alike; what helps starts so much more is no held command."""
 STOPS_FACTOR = 4.0
-SLOW_RATE = 3.5
-"""A rate of the command above this, full strokes a second, is ageing of the pilot stage."""
 OUTSIDE_NATS = 45.0
 """The cause is unknown where a row outside the library earns more than this, or flexible columns earn so much more than
 the best effect. The row must also earn `LEAST_NATS` more than that effect: of 346 opened cases, 15 with a cause outside
@@ -145,7 +141,7 @@ class Decider:
         outside = [one for one in rivals if one.effect in self.outside]
         library = [one for one in rivals if one.effect not in self.outside]
         groups = self._weigh_generic(joints)
-        strongest = _find_strongest(groups)
+        strongest = max(groups.items(), key=lambda group: group[1], default=("", 0.0))
         if coarse:
             shown.append(EffectFinding("quantisation", tuple(coarse), SHOWN_NATS))
         named = list(shown)
@@ -272,14 +268,6 @@ def apply_findings(
     return changed, side
 
 
-def _find_strongest(groups: Mapping[str, float]) -> tuple[str, float]:
-    """Return the group that earns most, and how much, nats; nothing where no joint was asked."""
-    if not groups:
-        return "", 0.0
-    name = max(groups, key=groups.__getitem__)
-    return name, groups[name]
-
-
 def _add_up(effect: str, rows: Mapping[int, JointRow]) -> EffectFinding:
     """Return an effect with the joints that it pays on."""
     if effect in SHARED or effect == "thermal_all":
@@ -292,11 +280,8 @@ def _add_up(effect: str, rows: Mapping[int, JointRow]) -> EffectFinding:
         if net > 0.0:
             nets[j] = net
     total = sum(nets.values())
-    total -= BESIDES_NATS.get(effect, 0.0)
-    if effect == "rate_limit" and nets:
-        fastest = min(1.0 / rows[j].row.size for j in nets)
-        if fastest > SLOW_RATE:
-            total = 0.0
+    if effect == "load_dependence":
+        total -= LOAD_NATS
     most = max(nets.values(), default=0.0)
     joints = tuple(j for j, net in nets.items() if net >= JOINT_SHARE * most)
     return EffectFinding(effect, joints, total, {j: rows[j].row for j in joints})

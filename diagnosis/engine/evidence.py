@@ -107,16 +107,17 @@ class FieldJoint:
         return compute_gain(squares, self.squares, self.count)
 
     def refine(self, row: Row) -> tuple[float, Row]:
-        """Return gain and row where the size and the shape of a row fit best."""
+        """Return gain and row where the size and the shape of a row fit best, searched in turn."""
         best = (-np.inf, row)
-        for factors, shapes in ((FIRST_FACTORS, SHAPE_FACTORS), (SECOND_FACTORS, SHAPE_FACTORS)):
-            tried = [best[1].resize(factor) for factor in factors]
-            if len(row.sizes) < len(row.changes):
-                tried += [best[1].resize(1.0, shape) for shape in shapes]
-            gains = self.score(tried)
-            top = int(np.argmax(gains))
-            if gains[top] > best[0]:
-                best = (float(gains[top]), tried[top])
+        for factors in (FIRST_FACTORS, SECOND_FACTORS):
+            searches = [(row.sizes, factors)]
+            searches += [(place, SHAPE_FACTORS) for place in row.shapes]
+            for places, tried_factors in searches:
+                tried = [best[1].resize(factor, places) for factor in tried_factors]
+                gains = self.score(tried)
+                top = int(np.argmax(gains))
+                if gains[top] > best[0]:
+                    best = (float(gains[top]), tried[top])
         return best
 
 

@@ -186,7 +186,8 @@ def _build_bank(
         error = np.diff(side.q[:, j], append=side.q[-1, j]) - steps
         error[:, side.ends - 1] = 0.0
         likelihood = -0.5 * np.minimum(error**2 / variance, MAX_SQUARE)
-        late_s = sum(row[model.place[name]] for name in ("delay_s", *model.lags))
+        late_s = row[model.place["delay_s"]]
+        late_s += sum(share * row[model.place[name]] for name, share in model.lags.items())
         late = int(late_s / side.period_s)
         share = late_s / side.period_s - late
         mixed = (1.0 - share) * likelihood[:, late:-1] + share * likelihood[:, late + 1 :]
@@ -222,6 +223,9 @@ def _build_target_bank(
         lost = side.u[:, j] - held.u[:, j] - _undo_pulse(error, pulse, ratio)
         left = _undo_pulse(known, pulse, ratio)
         variance = float(np.mean(np.clip(left, *np.quantile(left, (0.01, 0.99))) ** 2))
+        # A delay between two states is off by up to half their distance.
+        change = side.u[:, j] - delay_commands(side.u[:, j], np.ones(len(bank)))
+        variance = variance + np.square(change / parts) / 12.0
         for d in range(1, num_delays):
             missing = side.u[:, j] - delay_commands(side.u[:, j], np.full(len(bank), d / parts))
             bank[:, d] += (lost * missing - 0.5 * missing**2) / variance
@@ -287,10 +291,15 @@ def _weigh_samples(side: Side) -> np.ndarray:
     return squares / max(float(squares.sum()), 1e-12)
 
 
-def _price_course(delays: np.ndarray, law: np.ndarray, parts: int) -> float:
-    """Return the log prior of a course, against no delay at all."""
+def _price_course(delays: np.ndarray, law: np.ndarray, parts: int, usual: float) -> float:
+    """Return the log prior of a course, against a log chance `usual` of each sample that is not late.
+
+    Each sample of a servo's error counts, and a machine whose frames come in time never has a late one.
+    A valve's errors add up, so that far fewer of its increments are independent: there the course is
+    held against no delay under the same law.
+    """
     states = np.rint(delays * parts).astype(int)
-    return float((law[states[:-1], states[1:]] - law[0, 0]).sum())
+    return float((law[states[:-1], states[1:]] - usual).sum())
 
 
 class HeldCommands:
@@ -344,9 +353,11 @@ class HeldCommands:
             for joint in joints:
                 path = held.simulate(joint.joint, joint.numbers)[0]
                 left = joint.residual - (joint.measure(path).astype(float) - joint.increments)
-                own = _share_gain(joint.projection, joint.residual, left, joint.count)
+                count = joint.count * (1.0 if side.model.integrates else joint.measure.interval)
+                own = _share_gain(joint.projection, joint.residual, left, count)
                 gains[: len(own)] += own
-            prior = _price_course(delays, law, course.parts)
+            usual = law[0, 0] if side.model.integrates else 0.0
+            prior = _price_course(delays, law, course.parts, usual)
             yield course, float(gains.sum()) + prior, delays, gains
 
 

@@ -95,7 +95,7 @@ class JointModel:
         rows: Effects of the library in each form and size.
         outside_rows: Causes outside the library.
         plain_forms: Numbers of the rows that are effects of the registry as they stand.
-        lags: Numbers that delay the motion behind a command.
+        lags: Numbers that delay the motion behind a command, and by how much of their value.
         courses: Laws by which commands are held.
         late: Numbers that are known better once all joints are fitted, with the values before.
         substep_s: Longest step of the simulation.
@@ -109,7 +109,7 @@ class JointModel:
     rows: tuple[Row, ...]
     outside_rows: tuple[Row, ...]
     plain_forms: frozenset[tuple[str, ...]]
-    lags: tuple[str, ...]
+    lags: Mapping[str, float]
     courses: tuple[Course, ...]
     late: Mapping[str, float]
     substep_s: float

@@ -156,18 +156,22 @@ def simulate_path(
     mean_speed = half * (numbers[c, Place.SPEED_OUT] + numbers[c, Place.SPEED_IN])
     band_out = wp.max(numbers[c, Place.BAND_OUT], zero)
     band_in = wp.max(numbers[c, Place.BAND_IN], zero)
-    motion = _approach(step_s, numbers[c, Place.MOTION_LAG_S])
     late = _approach(step_s, numbers[c, Place.SPEED_LAG_S])
     pumping = _approach(step_s, numbers[c, Place.PUMP_LAG_S])
     play = wp.max(numbers[c, Place.PLAY], zero)
-    omega = numbers[c, Place.OMEGA_RAD_S]
-    ringing_s = half * step_s
-    rounds = wp.int32(2)
-    if omega > zero:
-        # Twelve steps a radian keep the explicit ringing stable and within one per cent.
-        rounds = wp.max(wp.int32(2), int(wp.ceil(step_s * omega * wp.float64(6.0))))
-        ringing_s = step_s / wp.float64(rounds)
-    smooth = zero
+    # One step of the ringing, exact for a speed that is constant over it; without ringing all at once.
+    omega = one
+    damped = zero
+    cosine = zero
+    sine = zero
+    if numbers[c, Place.RINGING_S] > zero:
+        omega = wp.float64(2.0 * wp.pi) / numbers[c, Place.RINGING_S]
+        damped = numbers[c, Place.DAMPING] * omega
+        swing = omega * wp.sqrt(one - numbers[c, Place.DAMPING] * numbers[c, Place.DAMPING])
+        fade = wp.exp(-damped * step_s)
+        cosine = fade * wp.cos(swing * step_s)
+        sine = fade * wp.sin(swing * step_s) / swing
+    sag = numbers[c, Place.WEIGHT_RAD_S2] / (omega * omega)
     slow = zero
     ring = zero
     ring_rate = zero
@@ -184,7 +188,6 @@ def simulate_path(
         if begins[k] != begin:
             is_first = wp.int32(1)
             begin = begins[k]
-            smooth = zero
             slow = zero
             ring = zero
             ring_rate = zero
@@ -291,8 +294,7 @@ def simulate_path(
                     -numbers[c, Place.TOP_SHARE] * numbers[c, Place.SPEED_IN],
                     numbers[c, Place.TOP_SHARE] * numbers[c, Place.SPEED_OUT],
                 )
-            smooth += motion * (speed - smooth)
-            slow += late * (smooth - slow)
+            slow += late * (speed - slow)
             speed = slow
             if numbers[c, Place.SLIP] != zero and wp.abs(speed) > numbers[c, Place.SLIP_ABOVE]:
                 speed *= one - numbers[c, Place.SLIP]
@@ -315,16 +317,12 @@ def simulate_path(
                         speed = zero
             if is_shut:
                 speed += numbers[c, Place.CREEP] + numbers[c, Place.CREEP_BY_LOAD] * load[k]
-            if omega > zero:
-                if numbers[c, Place.SAG] != zero and is_first == 0:
-                    speed += numbers[c, Place.SAG] * (load[k] - load[k - 1]) / period_s
-                for _ in range(rounds):
-                    ring_rate += ringing_s * (
-                        omega * omega * (speed - ring)
-                        - wp.float64(2.0) * numbers[c, Place.DAMPING] * omega * ring_rate
-                    )
-                    ring += ringing_s * ring_rate
-                speed = ring
+            if sag != zero and is_first == 0:
+                speed += sag * (load[k] - load[k - 1]) / period_s
+            off = ring - speed
+            ring = speed + (cosine + damped * sine) * off + sine * ring_rate
+            ring_rate = (cosine - damped * sine) * ring_rate - omega * omega * sine * off
+            speed = ring
             if stops[k] > 0 and speed > zero:
                 speed = zero
             if stops[k] < 0 and speed < zero:

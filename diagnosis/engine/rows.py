@@ -35,12 +35,21 @@ class Row:
         """The size, in the unit of the first number that it changes."""
         return self.changes[self.sizes[0]][2]
 
-    def resize(self, factor: float, shape: float = 1.0) -> Row:
-        """Return the same row `factor` times as large, its other values `shape` times as large."""
-        changes = []
-        for place, (name, how, value) in enumerate(self.changes):
-            by = factor if place in self.sizes else _limit_shape(name, shape)
-            changes.append((name, how, _limit(name, value * by)))
+    @property
+    def shapes(self) -> list[tuple[int]]:
+        """Places of the changes that are searched one by one beside the size."""
+        found = []
+        for place, (name, _, value) in enumerate(self.changes):
+            if place not in self.sizes and name not in FIXED and value != 0.0:
+                found.append((place,))
+        return found
+
+    def resize(self, factor: float, places: tuple[int, ...] = ()) -> Row:
+        """Return the same row with the changes at some places, or its size, `factor` times as large."""
+        changes = list(self.changes)
+        for place in places or self.sizes:
+            name, how, value = changes[place]
+            changes[place] = (name, how, _limit(name, value * factor))
         return Row(self.effect, tuple(changes), self.sizes)
 
 
@@ -52,16 +61,13 @@ FIXED = frozenset(
         "thermal_grows",
         "slip_above",
         "load_alone",
+        "load_constant",
         "sector_place",
     }
 )
 """Numbers that choose a form; no size of them is searched."""
 CEILINGS = {"stop_ratio": 0.97, "damping": 0.7, "thermal_s": 700.0, "firmware_damping": 1.0}
 FLOORS = {"thermal_s": 30.0}
-
-
-def _limit_shape(name: str, factor: float) -> float:
-    return 1.0 if name in FIXED or name == "load_constant" else factor
 
 
 def _limit(name: str, value: float) -> float:

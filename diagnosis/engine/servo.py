@@ -117,7 +117,7 @@ SERVO = JointModel(
             ("shortage", "firmware_damping"),
         }
     ),
-    lags=("pilot_lag_s", "response_s", "response_s", "command_lag_s"),  # damped critically: twice
+    lags={"pilot_lag_s": 1.0, "command_lag_s": 1.0, "response_s": 2.0},  # damped critically
     late={"dry": 0.0, "static_ratio": 0.0, "load_dry": 0.0},
     courses=(
         Course("frame_loss", 0.03, 0.1),

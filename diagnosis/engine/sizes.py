@@ -203,7 +203,7 @@ def translate(row: Row, joint: int, machine: Machine) -> dict[str, float]:
         start = values["start_command"]
         return {"start": start, "stop": start * values["stop_ratio"]}
     if effect == "compliance":
-        return {"ringing_s": 2.0 * np.pi / values["omega_rad_s"], "damping": values["damping"]}
+        return {"ringing_s": values["ringing_s"], "damping": values["damping"]}
     if effect == "thermal_drift":
         side = "change" if "thermal_grows" in values else "cold_change"
         return {side: values["thermal_share"], "time_s": values["thermal_s"]}

@@ -109,16 +109,22 @@ def pure_numbers(**values: float) -> np.ndarray:
     return numbers
 
 
-def test_a_delayed_lag_is_that_of_scipy(two_joints: Machine) -> None:
+LAG_SYSTEM = ([1.0], [0.4, 1.0, 0.0])  # 1 / s (0.4 s + 1)
+RINGING_SYSTEM = ([1.0], [1.0, 0.4, 1.0, 0.0])
+RINGING = {"ringing_s": 2.0 * np.pi, "damping": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "system"), [({"speed_lag_s": 0.4}, LAG_SYSTEM), (RINGING, RINGING_SYSTEM)]
+)
+def test_a_late_joint_is_that_of_scipy(two_joints: Machine, numbers: Any, system: Any) -> None:
     u = make_commands(20.0, 0)
-    side = make_side(two_joints, u)
-    path = side.simulate(0, pure_numbers(delay_s=0.3, speed_lag_s=0.4))[0]
-    # SciPy integrates path' = v, v' = (u - v) / 0.4 under commands held over each period.
+    path = make_side(two_joints, u).simulate(0, pure_numbers(delay_s=0.3, **numbers))[0]
+    # SciPy integrates path' = v under commands held over each period.
     fine = 10
     t = np.arange(len(u) * fine) / (RATE_HZ * fine)
     held = np.repeat(u[:, 0], fine)
     late = np.concatenate([np.zeros(round(0.3 * RATE_HZ * fine)), held])[: len(held)]
-    system = ([[0.0, 1.0], [0.0, -2.5]], [[0.0], [2.5]], [[1.0, 0.0]], [[0.0]])
     _, expected, _ = lsim(system, late, t, interp=False)
     # Two steps a period integrate the lag; their mean lies half a step beside the exact one.
     assert np.abs(path - expected[::fine, ...].ravel()).max() < 0.02
@@ -174,7 +180,7 @@ def test_the_nuisance_is_a_covariance() -> None:
 def test_a_resized_form_stays_where_its_effect_is_defined() -> None:
     # a valve that stops sticking only above where it began is none
     row = Row("stiction", (("start_command", "add", 0.2), ("stop_ratio", "add", 0.5)))
-    larger = row.resize(3.0, shape=3.0)
+    larger = row.resize(3.0).resize(3.0, (1,))
     assert larger.size == pytest.approx(0.6)
     assert larger.changes[1][2] < 1.0
 
