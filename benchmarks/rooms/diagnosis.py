@@ -51,17 +51,17 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "40 simulated machines, answered once. A person drives 21 fields.",
+        "40 simulated machines, answered once. A person drives 20 fields.",
         "exam_plants=valves exam_recording=operators", 40, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "30 simulated cranes, answered once. A person drives 17 fields.",
+        "30 simulated cranes, answered once. A person drives 13 fields.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 30, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "24 simulated arms, answered once. Other 24, whose withheld recordings were lost: 7 of 8 named first, 1 of 5 exact, 0 of 4, 4 of 5 unknown.",
+        "24 simulated arms, answered once.",
         "machine=so101 exam_plants=servos exam_mix=servos", 24, "servo_diagnosis", "servo",
     ),
     Measurement(
