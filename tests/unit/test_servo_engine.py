@@ -170,7 +170,6 @@ def test_weight_pulls_a_joint_from_its_target() -> None:
     assert off == pytest.approx(0.05 * side.load[joint, -1], rel=1e-2)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lost", "late_s", "named"),
     [(0.0, 0.0, []), (0.2, 0.0, ["frame_loss"]), (0.0, 0.08, ["delay_jitter"])],

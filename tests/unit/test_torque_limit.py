@@ -228,7 +228,6 @@ def record_limited(arm: Machine, seed: int, limit_n_m: float, seconds: float) ->
     return make_motion(arm, f"{seed}", arm.period_s * np.arange(count), u, q)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("limit_n_m", [1.3, 100.0])
 def test_a_withheld_limit_is_named(arm: Machine, tmp_path: Any, limit_n_m: float) -> None:
     """The weight of the elbow is 0.37 Nm; a drive without a limit has no gap."""
