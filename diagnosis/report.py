@@ -118,7 +118,7 @@ def describe_edit(one: Selected) -> str:
     return (
         f"Not identified: without {effect} the repaired simulator's error rises by "
         f"{100 * one.edit['restored']:.0f} % of this effect's part; "
-        f"{100 * MIN_RESTORED:.0f} % or more are expected."
+        f"{100 * MIN_RESTORED:.0f} % or more are expected, and an interval that is above 0."
     )
 
 

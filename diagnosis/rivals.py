@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from actuators.open_loop import FreeRunWindows
-from brokk_rl.parallel import map_parallel
 from diagnosis.free_runs import BLOCK_WINDOWS
 
 # Chosen by hand; not searched.
@@ -65,7 +64,7 @@ def run_arx(cut: FreeRunWindows) -> np.ndarray:
             found[fold == out] = trials[best][fold == out]
         return found
 
-    return np.stack(map_parallel(run, range(cut.q.shape[2])), -1)
+    return np.stack([run(j) for j in range(cut.q.shape[2])], -1)
 
 
 @dataclass(frozen=True, eq=False)

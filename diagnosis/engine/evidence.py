@@ -141,6 +141,8 @@ class RowEvidence:
         self.nuisances = [estimate_nuisance(reference, j, self.bases[j]) for j in joints]
         self.steps = np.zeros(reference.num_joints)
         self.noises = np.zeros(reference.num_joints)
+        self._viewed: dict[tuple[int, int, bytes], FieldJoint] = {}
+        self._weighed: dict[FieldJoint, tuple[np.ndarray, dict[str, JointRow]]] = {}
 
     @cached_property
     def parts(self) -> list[np.ndarray]:
@@ -176,46 +178,64 @@ class RowEvidence:
         field: Side | None = None,
         used: np.ndarray | None = None,
     ) -> list[FieldJoint]:
-        """Return the joints of the field with these numbers `(P,)` each, seen in the samples `used` `(T,)`."""
+        """Return the joints of the field with these numbers `(P,)` each, seen in the samples `used` `(T,)`.
+
+        A joint that an effect leaves as it is is the same object again.
+        """
         side = self.field if field is None else field
         found = []
         for j, row in enumerate(numbers):
-            base, nuisance = self.bases[j], self.nuisances[j]
-            found.append(
-                FieldJoint(side, j, base, nuisance, row, self.steps[j], self.noises[j], used)
-            )
+            key = (id(side), j, row.tobytes())
+            joint = self._viewed.get(key)
+            if joint is None or used is not None:
+                base, nuisance = self.bases[j], self.nuisances[j]
+                step, noise = self.steps[j], self.noises[j]
+                joint = FieldJoint(side, j, base, nuisance, row, step, noise, used)
+            if used is None:
+                self._viewed[key] = joint
+            found.append(joint)
         return found
 
     def weigh_rows(self, joints: Sequence[FieldJoint]) -> dict[str, dict[int, JointRow]]:
         """Return the best row of each effect on each joint, by effect and joint."""
-        tables = [joint.score(self.every) for joint in joints]
+        weighed = [self._weigh_joint(joint) for joint in joints]
+        tables = [gains for gains, _ in weighed]
         found: dict[str, dict[int, JointRow]] = {}
         for name in dict.fromkeys(self.names.tolist()):
-            places = np.flatnonzero(self.names == name)
             if name in SHARED:
+                places = np.flatnonzero(self.names == name)
                 found[name] = self._weigh_shared(places, joints, tables)
                 continue
             found[name] = {}
-            for joint, gains in zip(joints, tables, strict=True):
-                best = places[np.argmax(gains[places])]
-                if gains[best] < LOSS_LIMIT:
-                    continue
-                gain, row = float(gains[best]), self.every[best]
-                if gain > WORTH_REFINING:
-                    gain, row = joint.refine(row)
-                seconds = joint.count * joint.measure.interval * self.field.period_s
-                most = np.maximum(self.parts[joint.joint][:, places].max(1) * seconds, 0.0)
-                found[name][joint.joint] = JointRow(row, gain, float(most.max()))
+            for joint, (_, rows) in zip(joints, weighed, strict=True):
+                if name in rows:
+                    found[name][joint.joint] = rows[name]
         return found
+
+    def _weigh_joint(self, joint: FieldJoint) -> tuple[np.ndarray, dict[str, JointRow]]:
+        """Return the gains of all rows on a joint `(C,)`, and the best row of each effect of its own."""
+        if joint in self._weighed:
+            return self._weighed[joint]
+        gains = joint.score(self.every)
+        seconds = joint.count * joint.measure.interval * self.field.period_s
+        found = {}
+        for name in dict.fromkeys(self.names.tolist()):
+            places = np.flatnonzero(self.names == name)
+            best = places[np.argmax(gains[places])]
+            if name in SHARED or gains[best] < LOSS_LIMIT:
+                continue
+            gain, row = float(gains[best]), self.every[best]
+            if gain > WORTH_REFINING:
+                gain, row = joint.refine(row)
+            most = float(self.parts[joint.joint][:, places].max())
+            found[name] = JointRow(row, gain, max(most * seconds, 0.0))
+        self._weighed[joint] = (gains, found)
+        return gains, found
 
     def weigh_common(self, name: str, joints: Sequence[FieldJoint]) -> dict[int, JointRow]:
         """Return the rows of an effect with the same size on all joints."""
         places = np.flatnonzero(self.names == name)
-        tables = []
-        for joint in joints:
-            gains = np.full(len(self.every), -99.0)
-            gains[places] = joint.score([self.every[place] for place in places])
-            tables.append(gains)
+        tables = [self._weigh_joint(joint)[0] for joint in joints]
         return self._weigh_shared(places, joints, tables)
 
     def _weigh_shared(

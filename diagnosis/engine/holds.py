@@ -223,9 +223,6 @@ def _build_target_bank(
         lost = side.u[:, j] - held.u[:, j] - _undo_pulse(error, pulse, ratio)
         left = _undo_pulse(known, pulse, ratio)
         variance = float(np.mean(np.clip(left, *np.quantile(left, (0.01, 0.99))) ** 2))
-        # A delay between two states is off by up to half their distance.
-        change = side.u[:, j] - delay_commands(side.u[:, j], np.ones(len(bank)))
-        variance = variance + np.square(change / parts) / 12.0
         for d in range(1, num_delays):
             missing = side.u[:, j] - delay_commands(side.u[:, j], np.full(len(bank), d / parts))
             bank[:, d] += (lost * missing - 0.5 * missing**2) / variance

@@ -48,7 +48,6 @@ def repeat_number(count: int, number: JointNumber) -> list[JointNumber]:
 
 
 COMMAND_NAMES = (
-    "delay_s",
     "slope_time_s",
     "command_lag_s",
     "pilot_lag_s",
@@ -59,7 +58,7 @@ COMMAND_NAMES = (
     "crosstalk",
     "crosstalk_joint",
 )
-"""Numbers on the way of the command; every model begins with them."""
+"""Numbers on the way of the command to the spool; every model begins with them."""
 
 
 @dataclass(frozen=True)

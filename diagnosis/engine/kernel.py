@@ -35,30 +35,6 @@ def _approach(step_s: wp.float64, time_s: wp.float64) -> wp.float64:
     return wp.float64(1.0) - wp.exp(-step_s / time_s)
 
 
-@wp.func
-def _read_command(
-    commands: wp.array2d[wp.float64],
-    joint: int,
-    begin: int,
-    before: wp.float64,
-    at: wp.float64,
-    step: wp.float64,
-) -> wp.float64:
-    """Return the mean command from time `at` on over one sub-step, in samples; `before` before the recording."""
-    first = int(wp.floor(at))
-    second = int(wp.floor(at + step))
-    a = before
-    b = before
-    if first >= begin:
-        a = commands[first, joint]
-    if second >= begin:
-        b = commands[second, joint]
-    share = wp.float64(0.0)
-    if second > first:
-        share = (at + step - wp.float64(second)) / step
-    return a + share * (b - a)
-
-
 @wp.kernel(enable_backward=False)
 def simulate_spool(
     commands: wp.array2d[wp.float64],
@@ -70,13 +46,10 @@ def simulate_spool(
     numbers: wp.array2d[wp.float64],
     spool: wp.array2d[wp.float32],
 ):
-    """Simulate the spool of each command path, `(D, T S)`; a target was there before the recording."""
+    """Simulate the spool of each command path without its delay, `(D, T S)`, at the end of each sub-step."""
     d = wp.tid()
-    one = wp.float64(1.0)
     zero = wp.float64(0.0)
-    step = one / wp.float64(substeps)
-    step_s = period_s * step
-    delay = numbers[d, Place.DELAY_S] / period_s
+    step_s = period_s / wp.float64(substeps)
     opening = _approach(step_s, numbers[d, Place.PILOT_LAG_S])
     closing_s = (
         numbers[d, Place.PILOT_LAG_S] * wp.exp(numbers[d, Place.LOG_CLOSING_RATIO])
@@ -91,31 +64,24 @@ def simulate_spool(
     width = wp.max(numbers[d, Place.HYSTERESIS], zero)
     crosstalk = numbers[d, Place.CROSSTALK]
     other = int(numbers[d, Place.CROSSTALK_JOINT])
-    before = zero
-    other_before = zero
     limited = zero
     lagged = zero
     pilot = zero
     follower = zero
     held = zero
-    begin = wp.int32(0)
+    begin = wp.int32(-1)
     for k in range(commands.shape[0]):
-        if begins[k] != begin or k == 0:
+        command = commands[k, joint]
+        command += crosstalk * (commands[k, other] - command * wp.float64(1 - integrates))
+        if begins[k] != begin:
             begin = begins[k]
-            if integrates == 0:
-                before = commands[begin, joint]
-                other_before = commands[begin, other]
-            limited = before + crosstalk * (other_before - before * wp.float64(1 - integrates))
+            # A target was there before the recording.
+            limited = command * wp.float64(1 - integrates)
             lagged = limited
             pilot = limited
             follower = limited
             held = limited
         for i in range(substeps):
-            at = wp.float64(k) + wp.float64(i) * step - delay
-            command = _read_command(commands, joint, begin, before, at, step)
-            if crosstalk != zero:
-                leaked = _read_command(commands, other, begin, other_before, at, step)
-                command += crosstalk * (leaked - command * wp.float64(1 - integrates))
             limited += wp.clamp(command - limited, -slope, slope)
             lagged += lagging * (limited - lagged)
             rate = opening
@@ -125,6 +91,33 @@ def simulate_spool(
             follower += second * (pilot - follower)
             held = wp.clamp(held, follower - width, follower + width)
             spool[d, k * substeps + i] = wp.float32(held)
+
+
+@wp.func
+def _open(before: wp.float64, now: wp.float64, band: wp.float64) -> wp.float64:
+    """Return the mean opening behind the band while a spool moves from `before` to `now`.
+
+    The opening at the end of a step would make the path a stepped function of lags and bands.
+    """
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    if wp.max(before, now) <= band:
+        return zero
+    first = wp.max(before - band, zero)
+    last = wp.max(now - band, zero)
+    mean = half * (first + last)
+    if first == zero and last > zero:
+        mean *= last / (now - before)
+    if last == zero and first > zero:
+        mean *= first / (before - now)
+    return mean
+
+
+@wp.func
+def _shape_flow(opened: wp.float64, curve: wp.float64, bend: wp.float64) -> wp.float64:
+    """Return the flow through an opening over that of a full one: a line with two curvatures."""
+    rest = wp.float64(1.0) - opened
+    return opened * (wp.float64(1.0) + curve * rest + bend * rest * (wp.float64(0.5) - opened))
 
 
 @wp.kernel(enable_backward=False)
@@ -145,17 +138,25 @@ def simulate_path(
     path: wp.array2d[wp.float32],
     flow: wp.array2d[wp.float32],
 ):
-    """Integrate the speed behind the spool `which` of each candidate to a path, `(C, T)`; keep its demand of flow."""
+    """Integrate the speed behind the spool `which` of each candidate to a path, `(C, T)`; keep its demand of flow.
+
+    Sub-steps begin and end with the delayed ones of the spool, so that no change of a command lies
+    within one, and the path is a smooth function of the delay.
+    """
     c = wp.tid()
     one = wp.float64(1.0)
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     step = one / wp.float64(substeps)
     step_s = period_s * step
-    source = which[c]
-    mean_speed = half * (numbers[c, Place.SPEED_OUT] + numbers[c, Place.SPEED_IN])
+    delay = numbers[c, Place.DELAY_S] / step_s
+    delay_steps = int(wp.floor(delay))
+    share = one - (delay - wp.float64(delay_steps))
     band_out = wp.max(numbers[c, Place.BAND_OUT], zero)
     band_in = wp.max(numbers[c, Place.BAND_IN], zero)
+    per_stroke_out = one / (one - band_out)
+    per_stroke_in = one / (one - band_in)
+    per_speed = wp.float64(2.0) / (numbers[c, Place.SPEED_OUT] + numbers[c, Place.SPEED_IN])
     late = _approach(step_s, numbers[c, Place.SPEED_LAG_S])
     pumping = _approach(step_s, numbers[c, Place.PUMP_LAG_S])
     play = wp.max(numbers[c, Place.PLAY], zero)
@@ -179,6 +180,7 @@ def simulate_path(
     out = zero
     volume = zero
     pump = zero
+    x_before = zero
     direction = zero
     moving = wp.int32(0)
     stuck = wp.int32(1)
@@ -195,9 +197,9 @@ def simulate_path(
             out = zero
             volume = zero
             pump = zero
+            x_before = zero
             moving = wp.int32(0)
             stuck = wp.int32(1)
-        path[c, k] = wp.float32(out)
         asked = zero
         by_pose = one
         load_out = one
@@ -217,7 +219,10 @@ def simulate_path(
                 fading = one - fading
             warm *= one + numbers[c, Place.THERMAL_SHARE] * fading
         for i in range(substeps):
-            x = wp.float64(spool[source, k * substeps + i])
+            x = zero
+            at = k * substeps + i - delay_steps - 1
+            if at >= begin * substeps:
+                x = wp.float64(spool[which[c], at])
             if numbers[c, Place.POSE_PULL] != zero and wp.abs(x) > wp.float64(0.03):
                 x += numbers[c, Place.POSE_PULL] * poses[k, 0]
             if numbers[c, Place.STROKE] > zero:
@@ -231,34 +236,21 @@ def simulate_path(
                     moving = wp.int32(1)
                 else:
                     x = zero
-            opened = zero
+            opened_out = per_stroke_out * _open(x_before, x, band_out)
+            opened = per_stroke_in * _open(-x_before, -x, band_in)
+            x_before = x
             speed = zero
-            if x > zero:
-                opened = wp.max(x - band_out, zero) / (one - band_out)
-                rest = one - opened
-                speed = (
-                    numbers[c, Place.SPEED_OUT]
-                    * opened
-                    * (
-                        one
-                        + numbers[c, Place.CURVE_OUT] * rest
-                        + numbers[c, Place.BEND_OUT] * rest * (half - opened)
-                    )
+            if opened_out > opened:
+                opened = opened_out
+                speed = numbers[c, Place.SPEED_OUT] * _shape_flow(
+                    opened, numbers[c, Place.CURVE_OUT], numbers[c, Place.BEND_OUT]
                 )
             else:
-                opened = wp.max(-x - band_in, zero) / (one - band_in)
-                rest = one - opened
-                speed = (
-                    -numbers[c, Place.SPEED_IN]
-                    * opened
-                    * (
-                        one
-                        + numbers[c, Place.CURVE_IN] * rest
-                        + numbers[c, Place.BEND_IN] * rest * (half - opened)
-                    )
+                speed = -numbers[c, Place.SPEED_IN] * _shape_flow(
+                    opened, numbers[c, Place.CURVE_IN], numbers[c, Place.BEND_IN]
                 )
-            own = wp.abs(speed) / mean_speed
-            asked += speed / mean_speed * step
+            own = wp.abs(speed) * per_speed
+            asked += speed * per_speed * step
             total = own + demand[k]
             cut = one
             if numbers[c, Place.PUMP_LOAD] * total > one:
@@ -266,9 +258,8 @@ def simulate_path(
             if numbers[c, Place.DEMAND_LIMIT] > zero and total > numbers[c, Place.DEMAND_LIMIT]:
                 cut *= numbers[c, Place.DEMAND_LIMIT] / total
             if numbers[c, Place.PUMP_LAG_S] > zero:
-                wanted = zero
-                if total > wp.float64(0.02):
-                    wanted = one
+                # It wakes as soon as a valve opens: at 0.5 % of the demand at full speed.
+                wanted = wp.min(total / wp.float64(0.005), one)
                 pump += pumping * (wanted - pump)
                 cut *= wp.clamp((pump - wp.float64(0.3)) / half, zero, one)
             by_load = load_in
@@ -328,12 +319,15 @@ def simulate_path(
             if stops[k] < 0 and speed < zero:
                 speed = zero
             driven += step_s * speed
+            out_before = out
             if play > zero:
                 if numbers[c, Place.PLAY_SLIP] > zero:
                     out += step_s * numbers[c, Place.PLAY_SLIP] * wp.sign(load[k])
                 out = wp.clamp(out, driven - half * play, driven + half * play)
             else:
                 out = driven
+            if i == 0:
+                path[c, k] = wp.float32(out_before + share * (out - out_before))
         flow[c, k] = wp.float32(asked)
 
 
@@ -357,6 +351,9 @@ def simulate_servo(
     zero = wp.float64(0.0)
     step_s = period_s / wp.float64(substeps)
     source = which[c]
+    delay = numbers[c, ServoPlace.DELAY_S] / step_s
+    delay_steps = int(wp.floor(delay))
+    share = one - (delay - wp.float64(delay_steps))
     w = one / numbers[c, ServoPlace.RESPONSE_S]
     damping = numbers[c, ServoPlace.DAMPING_RATIO]
     inside = numbers[c, ServoPlace.FIRMWARE_DAMPING]
@@ -384,7 +381,6 @@ def simulate_servo(
             wound = zero
             hot = zero
             before = wp.float64(spool[source, k * substeps])
-        path[c, k] = wp.float32(q + middle)
         sag = numbers[c, ServoPlace.SAG] - numbers[c, ServoPlace.SAG_LOAD] * load[k]
         for i in range(4):
             sag += numbers[c, ServoPlace.SAG_POSE_1 + i] * poses[k, i]
@@ -393,7 +389,8 @@ def simulate_servo(
             off = (poses[k, 0] - numbers[c, ServoPlace.SECTOR_PLACE]) / wp.float64(0.2)
             dry += numbers[c, ServoPlace.SECTOR] * wp.exp(-off * off)
         for i in range(substeps):
-            target = wp.float64(spool[source, k * substeps + i])
+            at = wp.max(k * substeps + i - delay_steps - 1, begin * substeps)
+            target = wp.float64(spool[source, at])
             held = target + lead * (target - before)
             before = target
             if numbers[c, ServoPlace.WOUND] > zero:
@@ -430,4 +427,6 @@ def simulate_servo(
                 after = zero
             hot += heating * (wp.min(wp.abs(pull) / (wp.float64(0.15) * limit), one) - hot)
             speed = after
+            if i == 0:
+                path[c, k] = wp.float32(q + share * step_s * speed + middle)
             q += step_s * speed

@@ -11,7 +11,6 @@ from diagnosis.engine.joint_model import Course, JointModel, JointNumber, list_p
 from diagnosis.engine.rows import Row, mirror_sizes, spread_sizes
 
 NUMBERS = (
-    JointNumber("delay_s", 0.05, 0.06, 0.002, 0.0015, 0.0, 0.6),
     JointNumber("slope_time_s"),
     JointNumber("command_lag_s"),
     JointNumber("pilot_lag_s", 0.005, 0.02, 0.002, 0.0015, 0.0, 0.5),
@@ -21,6 +20,7 @@ NUMBERS = (
     JointNumber("hysteresis"),
     JointNumber("crosstalk"),
     JointNumber("crosstalk_joint"),
+    JointNumber("delay_s", 0.05, 0.06, 0.002, 0.0015, 0.0, 0.6),
     JointNumber("response_s", 0.05, 0.04, 0.002, 0.001, 0.008, 0.6),
     JointNumber("damping_ratio", 1.0, 0.4, 0.03, 0.02, 0.15, 5.0),
     JointNumber("sag", 0.0, 0.04, 0.001, 0.0015, -1.0, 1.0),

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
+from threadpoolctl import threadpool_limits
 
 from actuators.contracts import ActuatorFit, FitTask
 from actuators.recordings.inspection import InspectionThresholds
@@ -97,6 +98,7 @@ class Diagnose:
         with (
             ItemProgress("fitting the simulator", SHARE) as progress,
             use_workers(self.diagnosis.workers),
+            threadpool_limits(1),
         ):
 
             def tell(doing: str, done: float) -> None:

@@ -30,7 +30,7 @@ from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Motion, fit_variance
 from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row
-from diagnosis.engine.side import Side, measure_full_loads, measure_units, stack_side
+from diagnosis.engine.side import Side, measure_full_loads, stack_side
 from diagnosis.engine.valve import VALVE
 from diagnosis.geometry import TOOL_COLUMNS
 from diagnosis.reference_diagnosis import measure_clock_shift
@@ -128,6 +128,18 @@ def test_a_late_joint_is_that_of_scipy(two_joints: Machine, numbers: Any, system
     _, expected, _ = lsim(system, late, t, interp=False)
     # Two steps a period integrate the lag; their mean lies half a step beside the exact one.
     assert np.abs(path - expected[::fine, ...].ravel()).max() < 0.02
+
+
+def test_a_delay_acts_by_each_part_of_a_step(two_joints: Machine) -> None:
+    """At a steady speed v, each further 5 ms cost 5 ms v; a step of the simulation lasts 25 ms."""
+    side = make_side(two_joints, np.repeat([[0.0, 0.0], [0.6, 0.6]], [20, 80], 0))
+    delays_s = 0.3 + 0.005 * np.arange(11)
+    numbers = np.repeat(VALVE.list_values("mean")[None], len(delays_s), 0)
+    numbers[:, VALVE.place["delay_s"]] = delays_s
+    paths = side.simulate(0, numbers)
+    speed = (paths[0, -1] - paths[0, -2]) * RATE_HZ
+    expected = paths[0, -1] - speed * (delays_s - 0.3)
+    assert paths[:, -1] == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Machine) -> None:
@@ -336,18 +348,6 @@ def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machin
     proof = EngineProof(case, Decider(*sides), [], np.random.default_rng(0))
     assert [one.passed for one in proof.judge()] == [True, False]
     assert diagnose(case).verdict == "unknown"
-
-
-def test_units_do_not_matter(two_joints: Machine) -> None:
-    joints = []
-    for joint in two_joints.joints:
-        speed = replace(joint.max_speed, value=2.0 * joint.max_speed.value)
-        joints.append(replace(joint, max_speed=speed))
-    other = replace(two_joints, joints=tuple(joints))
-    u = make_commands(20.0, 2)
-    one, two = make_side(two_joints, u), make_side(other, u)
-    assert measure_units(other) == pytest.approx(2.0 * measure_units(two_joints))
-    assert two.q == pytest.approx(0.5 * one.q)
 
 
 def test_form_errors_are_those_of_sizes_that_were_stated_and_known() -> None:
