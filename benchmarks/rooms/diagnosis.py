@@ -51,8 +51,8 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "40 simulated machines, answered once. A person drives 20 fields.",
-        "exam_plants=valves exam_recording=operators", 40, "diagnosis", "valve",
+        "44 simulated machines, answered once. A person drives 24 fields.",
+        "exam_plants=valves exam_recording=operators", 44, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
@@ -61,8 +61,8 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "24 simulated arms, answered once.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 24, "servo_diagnosis", "servo",
+        "26 simulated arms, answered once.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 26, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
