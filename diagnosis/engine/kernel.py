@@ -151,6 +151,7 @@ def simulate_path(
     step_s = period_s * step
     delay = numbers[c, Place.DELAY_S] / step_s
     delay_steps = int(wp.floor(delay))
+    # The moment of a sample lies within the first of its sub-steps, behind this share of it.
     share = one - (delay - wp.float64(delay_steps))
     band_out = wp.max(numbers[c, Place.BAND_OUT], zero)
     band_in = wp.max(numbers[c, Place.BAND_IN], zero)
