@@ -56,8 +56,8 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "30 simulated cranes, answered once. A person drives 13 fields.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 30, "diagnosis", "valve",
+        "24 simulated cranes, answered once. A person drives 13 fields.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 24, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
