@@ -2,8 +2,9 @@
 
 The command passes a delay, pilot and spool; behind its dead band the spool gives a speed, which pose, load
 and the demand of the other joints change. Priors were chosen on practice plants of two makes; docs/diagnosis.md
-has the figures. Ageing: one step of expectation and maximisation on 25 unchanged machines of three makes left
-all numbers within 10 % of what was chosen by hand but six, which have their new values here.
+has the figures. Ageing was chosen by hand and compared with one step of expectation and maximisation on 118
+joints of 25 unchanged machines of three makes. It moved six numbers by more than 10 %: delay to 5.8 ms, slope to
+17 ms, pilot to 6.0 ms, pump to 26 ms, play to 0.8 and creep to 0.13 milli units. These are set near to that.
 """
 
 from __future__ import annotations
