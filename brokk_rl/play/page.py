@@ -19,8 +19,7 @@ import viser.uplot as uplot
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.errors import BrokkError
 from brokk_rl.play.scene_view import SceneView
-from brokk_rl.play.session import KEY_STEP, PERSON, PlaySession
-from brokk_rl.play.settings import SPEEDS
+from brokk_rl.play.session import KEY_STEP, PERSON, SPEEDS, PlaySession
 from brokk_rl.plot import BLUE, ORANGE, OTHERS
 
 log = logging.getLogger(__name__)
@@ -291,10 +290,11 @@ class PlayPage:
             episode += f"{title}: {session.successes} of {finished} ({endings})"
         else:
             episode += "no episode finished"
-        _assign(self._status, "content", f"{' · '.join(parts)}\n\n{episode}")
+        # viser sends a browser only what differs
+        self._status.content = f"{' · '.join(parts)}\n\n{episode}"
         for lever, value in zip(self._levers, session.levers, strict=True):
-            _assign(lever, "value", round(float(value), 2))
-        _assign(self._driver, "value", session.driver)
+            lever.value = round(float(value), 2)
+        self._driver.value = session.driver
 
     def _show_traces(self) -> None:
         """Show the last seconds of the selected world."""
@@ -305,9 +305,3 @@ class PlayPage:
         self._commands.data = (t_s, *traces["given"].T, *traces["proposed"].T)
         self._error.data = (t_s, 100 * traces["lateral_m"], 100 * traces["height_m"])
         self._force.data = (t_s, traces["force_n"] / 1000)
-
-
-def _assign(handle: Any, name: str, value: Any) -> None:
-    """Set a property of the page where it differs."""
-    if getattr(handle, name) != value:
-        setattr(handle, name, value)
