@@ -12,8 +12,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from brokk_rl import registry
 
 NAME_WIDTH = 34
@@ -24,6 +22,8 @@ NUM_WORDS = 4
 MAIN_MODES = ("play", "evaluate", "train", "check", "diagnose", "import", "deploy")
 MOST_USED = ("session", "play", "rl", "evaluation", "tracking")
 """Nodes with the values that are changed most, after those of the mode itself."""
+ENTRY = re.compile(r'( *)"?([\w/@ .]+)"?:(?: .*?)??(?:\s+#(.*))?')
+"""Indentation, key and comment of a line that begins a value."""
 NOISE = re.compile(r";? ?chosen by hand(; not searched)?")
 """End of a comment that says nothing about the meaning of a value."""
 USAGE = """\
@@ -106,45 +106,33 @@ def collect_comments(sources: Iterable[tuple[str, Path]]) -> dict[str, str]:
     Args:
         sources: Package and file of each part, as composed; a later one holds over an earlier.
     """
-    comments = {}
+    comments: dict[str, str] = {}
     for package, path in sources:
-        text = path.read_text()
-        lines = text.splitlines()
-        for key, first, line, column in _locate_values(text):
-            comment = re.fullmatch(r"\s*#(.*)", lines[line][column:])
-            words = [comment[1].strip()] if comment else []
-            starts_line = lines[first].lstrip().startswith(key.rpartition(".")[2])
-            if not comment and starts_line:
-                while first > 0 and lines[first - 1].lstrip().startswith("# "):
-                    first -= 1
-                    words.insert(0, lines[first].strip("# "))
-            words = [] if first == 0 else words  # the head of the file
-            if words:
-                comments[".".join(filter(None, (package, key)))] = NOISE.sub("", " ".join(words))
+        tables: dict[int, str] = {}  # the open tables by their indentation
+        above: list[str] = []
+        is_head = True  # the comment at the top is about the file
+        for line in path.read_text().splitlines():
+            if line.lstrip().startswith("# "):
+                above.append(line.strip("# "))
+                continue
+            if entry := ENTRY.fullmatch(line):
+                indent, key, comment = entry.groups()
+                outer = {place: name for place, name in tables.items() if place < len(indent)}
+                tables = outer | {len(indent): key}
+                words = [comment.strip()] if comment else above * (not is_head)
+                if words:
+                    name = ".".join(filter(None, (package, *tables.values())))
+                    comments[name] = NOISE.sub("", " ".join(words))
+            above, is_head = [], False
     return comments
 
 
-def _locate_values(text: str) -> Iterator[tuple[str, int, int, int]]:
-    """Yield the dotted name of each value, the line of its key, and where it ends in the text.
-
-    A table or list in lines of its own ends with its key.
-    """
-    root = yaml.compose(text, Loader=yaml.SafeLoader)
-    waiting = [("", root)]
-    while waiting:
-        above, table = waiting.pop()
-        if not isinstance(table, yaml.MappingNode):
-            continue
-        for key, value in table.value:
-            is_block = isinstance(value, yaml.CollectionNode) and not value.flow_style
-            end = key.end_mark if is_block else value.end_mark
-            column = end.column + 1 if is_block else end.column  # the colon
-            yield f"{above}{key.value}", key.start_mark.line, end.line, column
-            waiting.append((f"{above}{key.value}.", value))
-
-
 def _list_values(
-    node: Mapping[str, Any], target: str, keys: Iterable[str], comments: Mapping[str, str]
+    node: Mapping[str, Any],
+    target: str,
+    keys: Iterable[str],
+    comments: Mapping[str, str],
+    above: str = "",
 ) -> Iterator[tuple[str, str, str]]:
     """Yield name, value and meaning of each value of a node, those of inner nodes last."""
     meanings, inner = registry.read_attributes(target), []
@@ -156,17 +144,14 @@ def _list_values(
             inner.append((key, value))
             continue
         meaning = re.split(r"(?<=[.;]) ", meanings.get(key, ""))[0].rstrip(";.")
-        comment = comments.get(key, "")
+        comment = comments.get(f"{above}{key}", "")
         if len(comment.split()) >= NUM_WORDS or comment.lower() == meaning.lower():
             meaning = ""  # the comment says it itself
-        yield key, _format_value(value), "; ".join(filter(None, (meaning, comment)))
+        text = "; ".join(filter(None, (meaning, comment)))
+        yield f"{above}{key}", _format_value(value), text
     for key, value in inner:
-        below = {}
-        for name, comment in comments.items():
-            if name.startswith(f"{key}."):
-                below[name.removeprefix(f"{key}.")] = comment
-        for name, text, meaning in _list_values(value, value.get("_target_", ""), value, below):
-            yield f"{key}.{name}", text, meaning
+        target = value.get("_target_", "")
+        yield from _list_values(value, target, value, comments, f"{above}{key}.")
 
 
 def _format_value(value: Any) -> str:

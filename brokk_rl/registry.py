@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import functools
-import inspect
 import re
 import sys
 from collections.abc import Iterator, Mapping
@@ -162,7 +161,7 @@ def _find_folder(package: str, who: str) -> Path:
 
 def read_attributes(target: str) -> dict[str, str]:
     """Return the meaning of each field under `Attributes:` in the docstring of the class `target`."""
-    _, _, section = inspect.cleandoc(_read_docstring(target)).partition("\nAttributes:\n")
+    _, _, section = _read_docstring(target).partition("\nAttributes:\n")
     found = {}
     for entry in re.split(r"\n(?= {4}\S)", "\n" + section.split("\n\n")[0]):
         name, colon, text = entry.strip().partition(":")
@@ -172,23 +171,21 @@ def read_attributes(target: str) -> dict[str, str]:
 
 
 def _read_docstring(target: str) -> str:
-    """Return the docstring of the class or function `target` from its source, or an empty string."""
+    """Return the docstring of the class or function `target` from its source, or an empty string.
+
+    The module is not imported.
+    """
     module, _, name = str(target).rpartition(".")
-    for node in _read_source(module):
-        if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == name:
-            return ast.get_docstring(node) or ""
-    return ""
-
-
-def _read_source(module: str) -> list[ast.stmt]:
-    """Return the statements of a module that is not imported; none where it has no source."""
     try:
         place = util.find_spec(module)
     except (ImportError, ValueError):
-        return []
+        return ""
     if place is None or not str(place.origin).endswith(".py"):
-        return []
-    return ast.parse(Path(str(place.origin)).read_text()).body
+        return ""
+    for node in ast.parse(Path(str(place.origin)).read_text()).body:
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == name:
+            return ast.get_docstring(node) or ""
+    return ""
 
 
 def _read_comment(text: str) -> str:
