@@ -97,39 +97,22 @@ class HolePose:
             camera_cov: Covariance of that pose, see `Frame`; it adds to the covariances.
         """
         rotation, shift = base_from_camera[:3, :3], base_from_camera[:3, 3]
-        cov_m2 = rotation @ self.cov_m2 @ rotation.T
-        axis_cov_rad2 = rotation @ self.axis_cov_rad2 @ rotation.T
-        shared_m2 = None if self.shared_m2 is None else rotation @ self.shared_m2 @ rotation.T
-        shared_rad2 = None if self.shared_rad2 is None else rotation @ self.shared_rad2 @ rotation.T
-        if camera_cov is not None:
-            # First order: a small motion (shift, turn) of the camera moves the centre by
-            # shift - center x turn, and the axis by -axis x turn.
-            center_lever = np.hstack([np.eye(3), -_build_cross_matrix(self.center_m)])
-            axis_lever = np.hstack([np.zeros((3, 3)), -_build_cross_matrix(self.axis)])
-            of_camera_m2 = rotation @ center_lever @ camera_cov @ center_lever.T @ rotation.T
-            of_camera_rad2 = rotation @ axis_lever @ camera_cov @ axis_lever.T @ rotation.T
-            cov_m2 = cov_m2 + of_camera_m2
-            axis_cov_rad2 = axis_cov_rad2 + of_camera_rad2
-            shared_m2 = of_camera_m2 if shared_m2 is None else shared_m2 + of_camera_m2
-            shared_rad2 = of_camera_rad2 if shared_rad2 is None else shared_rad2 + of_camera_rad2
-        return HolePose(
-            center_m=rotation @ self.center_m + shift,
-            axis=rotation @ self.axis,
-            radius_m=self.radius_m,
-            cov_m2=cov_m2,
-            axis_cov_rad2=axis_cov_rad2,
-            frame="base",
-            score=self.score,
-            t_s=self.t_s,
-            shared_m2=shared_m2,
-            shared_rad2=shared_rad2,
-        )
-
-
-def _build_cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix that takes the cross product with a vector from the left, `(3, 3)`."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        # First order: a small motion (shift, turn) of the camera moves the centre by
+        # shift - center x turn, and the axis by -axis x turn.
+        center_lever = np.hstack([np.eye(3), -np.cross(np.eye(3), self.center_m)])
+        axis_lever = np.hstack([np.zeros((3, 3)), -np.cross(np.eye(3), self.axis)])
+        levers = {"cov_m2": center_lever, "axis_cov_rad2": axis_lever}
+        levers |= {"shared_m2": center_lever, "shared_rad2": axis_lever}
+        turned: dict[str, Any] = {}
+        for name, lever in levers.items():
+            covariance = getattr(self, name)
+            if camera_cov is not None:
+                of_camera = lever @ camera_cov @ lever.T
+                covariance = of_camera if covariance is None else covariance + of_camera
+            turned[name] = None if covariance is None else rotation @ covariance @ rotation.T
+        center_m = rotation @ self.center_m + shift
+        axis = rotation @ self.axis
+        return replace(self, center_m=center_m, axis=axis, frame="base", **turned)
 
 
 @dataclass(frozen=True)
