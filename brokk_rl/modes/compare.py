@@ -115,28 +115,22 @@ class EvaluatedRun:
         folder: Run folder.
         evaluation: Its `evaluation.json`.
         seed: Seed of the run.
-        choices: Chosen options of the config groups that describe the experiment.
-        overridden: Dotted keys that the command line or the sweep has set.
-        values: Its `resolved.yaml`, flat: dotted key to value.
+        settings: Its `resolved.yaml`, flat: dotted key to value; of a config group the chosen option.
+        named: Those of them that the command line or the sweep has chosen or set.
         training: The run that made the policy which this one evaluated, where it is at hand.
     """
 
     folder: Path
     evaluation: dict[str, Any]
     seed: int | None
-    choices: dict[str, Any]
-    overridden: set[str]
-    values: dict[str, Any]
+    settings: dict[str, Any]
+    named: set[str]
     training: EvaluatedRun | None
 
     @property
     def made(self) -> EvaluatedRun:
         """The run that made the policy: the training, where this is an evaluation elsewhere."""
         return self.training or self
-
-    def describe_setting(self, column: str) -> str:
-        """Return the group option or single value that this run was made with, as text."""
-        return str(self.choices.get(column, self.values.get(column)))
 
 
 def find_runs(patterns: Sequence[str]) -> list[Path]:
@@ -174,26 +168,26 @@ def load_run(folder: Path) -> EvaluatedRun:
         raise ConfigError(
             f"{path} cannot be read ({error}); evaluate the run again or leave it out of compare.runs"
         ) from error
-    values: Any = pd.json_normalize(resolved, sep=".").iloc[0].to_dict()
+    settings: Any = pd.json_normalize(resolved, sep=".").iloc[0].to_dict()
     record = read_record(folder) or {}
+    policy = settings.get("policy.path")
     choices = {"actuator": evaluation["actuator"]} if "actuator" in evaluation else {}
     for key, option in record.get("choices", {}).items():
         if key not in NOT_COMPARED:
             choices[key] = option
-    overridden = set()
+    named = set(choices)
     for override in record.get("overrides", ()):
         key = override.partition("=")[0].lstrip("+~")
         # A key without a dot is a group: `choices` has it.
         if "." in key and key.split(".")[0] not in NOT_COMPARED:
-            overridden.add(key)
+            named.add(key)
     return EvaluatedRun(
         folder=folder,
         evaluation=evaluation,
         seed=record.get("seed", evaluation.get("seed")),
-        choices=choices,
-        overridden=overridden,
-        values=values,
-        training=_find_training_run(folder, values.get("policy.path")),
+        settings=settings | choices,
+        named=named,
+        training=_find_training_run(folder, policy),
     )
 
 
@@ -215,15 +209,13 @@ def find_differences(runs: Sequence[EvaluatedRun]) -> list[str]:
     evaluation is then a column of its own.
     """
     made = [run.made for run in runs]
-    overridden = set().union(*(run.overridden for run in made))
-    inside = tuple(f"{key}." for key in overridden)
-    choices = pd.DataFrame([run.choices for run in made])
-    values = pd.DataFrame([run.values for run in made])
-    values = values[[key for key in values if key in overridden or str(key).startswith(inside)]]
+    named = set().union(*(run.named for run in made))
+    inside = tuple(f"{key}." for key in named if "." in key)
+    texts: Any = pd.DataFrame([run.settings for run in made]).map(repr)
     columns = []
-    for table in (choices, values):
-        texts: Any = table.map(repr)
-        columns += sorted(name for name in texts if texts[name].nunique() > 1)
+    for name in sorted(texts, key=lambda name: ("." in name, name)):
+        if (name in named or name.startswith(inside)) and texts[name].nunique() > 1:
+            columns.append(name)
     return [*columns, EVALUATED_ON] if any(run.training for run in runs) else columns
 
 
@@ -240,9 +232,9 @@ def tabulate_runs(runs: Sequence[EvaluatedRun], columns: Sequence[str]) -> pd.Da
         for policy, evaluation in policies.items():
             made = run.made if policy == main else run
             row = {"folder": str(run.folder), "policy": policy, "seed": made.seed}
-            row |= {column: made.describe_setting(column) for column in columns}
+            row |= {column: str(made.settings.get(column)) for column in columns}
             if EVALUATED_ON in columns:
-                row[EVALUATED_ON] = str(run.choices.get("actuator"))
+                row[EVALUATED_ON] = str(run.settings.get("actuator"))
             rows.append(row | _read_figures(run.folder, evaluation))
     table = pd.DataFrame(rows)
     about = ["folder", "policy", "seed", *columns, "episodes"]
