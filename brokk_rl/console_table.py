@@ -53,7 +53,7 @@ def print_table(
             heading,
             justify="right" if is_right else "left",
             overflow="fold",
-            min_width=min(LONGEST_WORD, _measure_longest_word(cells)),
+            min_width=min(LONGEST_WORD, max(map(len, " ".join(cells).split()), default=0)),
         )
     for row in texts:
         table.add_row(*row)
@@ -72,11 +72,6 @@ def is_numeric(values: Sequence[str | float | None]) -> bool:
     """Return whether a column holds numbers, or texts that begin like one."""
     given = [value for value in values if value not in (None, MISSING, "")]
     return bool(given) and all(not isinstance(value, str) or NUMBER.match(value) for value in given)
-
-
-def _measure_longest_word(texts: Sequence[str]) -> int:
-    words = " ".join(texts).split()
-    return max(map(len, words), default=0)
 
 
 def _format_cell(cell: TableCell) -> Text:

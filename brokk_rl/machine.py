@@ -240,10 +240,8 @@ class Machine:
     @property
     def max_force(self) -> np.ndarray:
         """Force or torque at full command, shape `(J,)`, N or Nm; NaN where the file has none."""
-        found = []
-        for joint in self.joints:
-            found.append(np.nan if joint.max_force is None else joint.max_force.value)
-        return np.array(found)
+        forces = [joint.max_force.value if joint.max_force else None for joint in self.joints]
+        return np.array(forces, float)
 
     @property
     def has_bodies(self) -> bool:
@@ -284,12 +282,10 @@ class Machine:
         Names, order, limits, geometry, rate and masks count. Sources, confidences, titles and home
         positions do not.
         """
-        bodies = [joint.body for joint in self.joints]
-        geometry = []
-        for body in bodies:
-            geometry.append(
-                None if body is None else [d.value for d in body.origin_m] + [*body.axis]
-            )
+        geometry: list[list[float] | None] = []
+        for joint in self.joints:
+            body = joint.body
+            geometry.append(body and [d.value for d in body.origin_m] + [*body.axis])
         groups = {
             "name": self.name,
             "joints": [_list_traits(joint) for joint in self.joints],
@@ -298,10 +294,8 @@ class Machine:
             "control": [self.period_s, self.num_history, list(self.exclusive)],
             "levers": [asdict(lever) for lever in self.levers],
         }
-        hashes = {}
-        for key, value in groups.items():
-            hashes[key] = hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
-        return hashes
+        texts = {key: json.dumps(value).encode() for key, value in groups.items()}
+        return {key: hashlib.sha256(text).hexdigest()[:12] for key, text in texts.items()}
 
     def list_differences(self, other: dict[str, str]) -> list[str]:
         """Return the groups of fields in which the fingerprint `other` differs."""

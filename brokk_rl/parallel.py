@@ -24,8 +24,8 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _workers: ContextVar[int] = ContextVar("workers", default=1)
-_shared: list[tuple[Callable[[Any], Any], Sequence[Any]]] = []
-"""Work of the running calls; forked processes find theirs at the end."""
+_work: list[Any] = []
+"""Function and items of a helper."""
 
 
 @contextlib.contextmanager
@@ -57,10 +57,9 @@ def map_parallel(
     count = min(_workers.get(), len(todo))
     if count > 1 and sys.platform == "linux":
         fork = multiprocessing.get_context("fork")
-        _shared.append((function, todo))
         try:
             with (
-                ProcessPoolExecutor(count, fork, _prepare_helper) as pool,
+                ProcessPoolExecutor(count, fork, _prepare_helper, (function, todo)) as pool,
                 warnings.catch_warnings(),
             ):
                 # Helpers neither log nor take locks of other threads.
@@ -68,8 +67,6 @@ def map_parallel(
                 return _collect(pool.map(_compute_item, range(len(todo))), todo, tell)
         except BrokenProcessPool:
             log.warning("a helper process was killed; its work is done in this process")
-        finally:
-            _shared.pop()
     return _collect(map(function, todo), todo, tell)
 
 
@@ -84,11 +81,12 @@ def _collect(
     return results
 
 
-def _prepare_helper() -> None:
+def _prepare_helper(*work: Any) -> None:
     logging.disable()  # a lock of the log may be held by a thread that is not here
     _workers.set(1)
+    _work[:] = work
 
 
 def _compute_item(number: int) -> Any:
-    function, todo = _shared[-1]
+    function, todo = _work
     return function(todo[number])

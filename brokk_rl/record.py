@@ -19,6 +19,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import write_bytes
 
 SCHEMA = "1"
+STATED = ("schema", "machine", "rate_hz")
+"""Metadata that every recording has."""
 DAMAGE = "damage"
 """Metadata that says in words what was lost of the log."""
 RATE_TOLERANCE = 0.2
@@ -51,7 +53,7 @@ class Breach:
 
 def check_metadata(metadata: Mapping[str, str], machine: str) -> Iterator[Breach]:
     """Yield the breaches in the metadata of a recording of machine `machine`."""
-    for key in ("schema", "machine", "rate_hz"):
+    for key in STATED:
         if key not in metadata:
             yield Breach(
                 f"metadata 'brokk.{key}' is missing; not a recording, or one made by another program: mode=import reads such logs"
@@ -73,13 +75,6 @@ def parse_rate_hz(metadata: Mapping[str, str]) -> float | None:
     except ValueError:
         return None
     return rate if 0.0 < rate < float("inf") else None
-
-
-def check_names(required: Sequence[str], present: Sequence[str]) -> Iterator[Breach]:
-    """Yield the columns that are missing."""
-    for name in required:
-        if name not in present:
-            yield Breach(f"column '{name}' is missing; {list_choices(name, present)}", name)
 
 
 def check_columns(
@@ -297,13 +292,15 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
     commands = list(map(name_command_column, machine.joint_names))
     positions = list(map(name_position_column, machine.joint_names, units))
     required = ["t_s", *commands, *positions]
-    found = [*check_metadata(metadata, machine.name), *check_names(required, table.column_names)]
+    found = list(check_metadata(metadata, machine.name))
     columns: dict[str, np.ndarray] = {}
-    for name in [*required, *(name for name in table.column_names if name not in required)]:
-        if name not in table.column_names:
-            continue
-        column = table.column(name)
-        if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
+    present = table.column_names
+    for name in dict.fromkeys([*required, *present]):
+        column = table.column(name) if name in present else None
+        if column is None:
+            text = f"column '{name}' is missing; {list_choices(name, present)}"
+            found.append(Breach(text, name))
+        elif pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
             columns[name] = column.cast(pa.float64()).to_numpy()  # an empty cell becomes NaN
         else:
             found.append(Breach(f"column '{name}' holds {column.type}, expected numbers", name))
@@ -318,16 +315,8 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
         t_s=columns["t_s"] if "t_s" in columns else np.arange(table.num_rows) / rate_hz,
         u=np.stack([columns.get(name, missing) for name in commands], 1).astype(np.float32),
         q=np.stack([columns.get(name, missing) for name in positions], 1).astype(np.float32),
-        extra={
-            name: values.astype(np.float32)
-            for name, values in columns.items()
-            if name not in required
-        },
-        metadata={
-            key: value
-            for key, value in metadata.items()
-            if key not in ("schema", "machine", "rate_hz")
-        },
+        extra={name: columns[name].astype(np.float32) for name in columns if name not in required},
+        metadata={key: metadata[key] for key in metadata if key not in STATED},
         path=Path(path),
     )
     return recording, found
