@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import yaml
-
 from brokk_rl.errors import FrameError
-from brokk_rl.session import Session, write_text
+from brokk_rl.session import Session
 from brokk_rl.spec import Count, spec
 from perception import dataset
-from perception.calibrate.pair_lens import calibrate_pair, find_board_pair
 from perception.camera import CameraModel, RawFrame, read_camera, write_camera
-from perception.label.camera_pose import Charuco
 from perception.sources import validation
 from perception.sources.lens_file import read_pair_lens
 from perception.sources.recorded import ExportedPictures, SourceCapture, StereoVideo
@@ -24,7 +19,7 @@ from perception.sources.ros_log import RosLog
 
 log = logging.getLogger(__name__)
 
-FOLDER, LENS, BOARD = "frames", "lens.yaml", "board"
+FOLDER = "frames"
 
 
 @spec
@@ -35,9 +30,7 @@ class RecordCamera:
         session: Folder to write into.
         capture: The pictures.
         lens: `camera.yaml` of rectified pictures; for raw pairs a ZED's factory `.conf`, or YAML of
-            OpenCV's `stereoCalibrate` (`K1 D1 K2 D2 R T`); `board` makes that file of raw pairs that
-            show `board`; `null` where the capture tells it.
-        board: The printed board.
+            OpenCV's `stereoCalibrate` (`K1 D1 K2 D2 R T`); `null` where the capture tells it.
         every: One in so many frames is kept.
         count: Frames that are kept at most; `null` for all, which a device has no end of.
     """
@@ -45,24 +38,20 @@ class RecordCamera:
     session: Session
     capture: SourceCapture | StereoVideo | ExportedPictures | RosLog
     lens: str | None
-    board: Charuco
     every: Count
     count: Count | None
 
     def run(self) -> None:
-        """Write `frames/<number>.*` and `frames/camera.yaml`, or `lens.yaml` with `lens: board`.
+        """Write `frames/<number>.*` and `frames/camera.yaml`.
 
         Raises:
             FrameError: the camera file or a picture cannot be used, or there is none.
             StorageError: a file could not be written.
         """
-        if self.lens == BOARD:
-            self._calibrate_lens()
-            return
         folder = self.session.folder / FOLDER
-        kept = 0
-        camera: CameraModel | None = None
-        for frame in self._read_kept():
+        kept, camera = 0, None
+        last = None if self.count is None else self.count * self.every
+        for frame in itertools.islice(self.capture.read(), 0, last, self.every):
             if camera is None:
                 camera = self._find_camera(frame)
                 # Where it stands is another matter: that of `mode=calibrate`.
@@ -72,30 +61,6 @@ class RecordCamera:
         if not kept:
             raise FrameError("record_camera: the camera gave no picture")
         log.info("%d frames: %s", kept, folder)
-
-    def _read_kept(self) -> Iterator[RawFrame]:
-        """Yield one in `every` frames, `count` of them at most."""
-        last = None if self.count is None else self.count * self.every
-        return itertools.islice(self.capture.read(), 0, last, self.every)
-
-    def _calibrate_lens(self) -> None:
-        """Write the lens of both cameras, by the pairs that show the board."""
-        pairs, num_frames, size_px = [], 0, (0, 0)
-        for frame in self._read_kept():
-            num_frames += 1
-            if frame.right is None:
-                raise FrameError(f"{frame.name}: lens=board needs pairs, got a single picture")
-            size_px = frame.color.shape[1], frame.color.shape[0]
-            pair = find_board_pair(self.board, frame.color, frame.right, validation.USUAL_GAMMA)
-            if pair is not None:
-                pairs.append(pair)
-        content = calibrate_pair(pairs, size_px)
-        path = self.session.folder / LENS
-        write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-        log.info(
-            "%d of %d pairs show the board, corners miss by %.2f px: lens=%s",
-            len(pairs), num_frames, content["error_px"], path,
-        )  # fmt: skip
 
     def _find_camera(self, frame: RawFrame) -> CameraModel:
         """Return the camera of the pictures, by `lens` or as it tells itself."""

@@ -74,7 +74,7 @@ def _read_stereo_calibration(
     if missing := [name for name in CALIBRATION if content.get(name) is None]:
         raise FrameError(
             f"{where}: expected {' '.join(CALIBRATION)}, as OpenCV's stereoCalibrate gives them, got no "
-            f"{', '.join(missing)}; lens=board writes such a file"
+            f"{', '.join(missing)}"
         )
     told = validation.parse_size(content.get("size_px"), where)
     validation.check_size(told, size_px[::-1], where, "the pictures")

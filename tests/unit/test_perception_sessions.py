@@ -342,3 +342,22 @@ def test_rows_correspond_after_a_factory_file_and_another_size_is_refused(tmp_pa
     assert depth_m == pytest.approx(points[:, 2], rel=0.1)
     with pytest.raises(FrameError, match="none of a ZED"):
         read_pair_lens(path, None, (640, 480))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("D2", None, "got no D2"), ("R", 2 * np.eye(3), "no rigid transform"), ("R", np.eye(2), r"R has shape \(2, 2\)"),
+        ("T", [-0.12, 0.0], r"T has shape \(2,\)"), ("D1", [np.nan] * 5, "camera 1: dist"), ("T", [-120.0, 0.0, 0.0], "mm"),
+    ],
+)  # fmt: skip
+def test_a_lens_file_without_a_number_or_with_impossible_ones_is_refused(
+    name: str, value: Any, told: str
+) -> None:
+    matrix = np.array([[530.0, 0.0, 650.0], [0.0, 532.0, 352.0], [0.0, 0.0, 1.0]])
+    bent = np.array([-0.05, 0.02, 0.0, 0.0, 0.0])
+    content = {"K1": matrix, "D1": bent, "K2": matrix, "D2": bent, "R": np.eye(3), "T": [[-0.12], [0], [0]]}  # fmt: skip
+    assert read_pair_lens(Path("lens.yaml"), content, (1280, 720)).baseline_m == pytest.approx(0.12)
+    wrong = content | {name: value}
+    with pytest.raises(FrameError, match=told):
+        read_pair_lens(Path("lens.yaml"), wrong, (1280, 720))
