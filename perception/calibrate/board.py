@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
-from perception.calibrate import arm, clock_offset, evaluation, verdict
+from perception.calibrate import arm, clock_offset, evaluation
 from perception.calibrate.disparity_error import (
     BoardDisparity,
     estimate_disparity_error,
@@ -30,6 +29,7 @@ from perception.calibrate.hand_eye import (
     predict_board_poses,
     solve_hand_eye,
 )
+from perception.calibrate.verdict import judge_fit
 from perception.label.camera_pose import BoardPose, Charuco, estimate_board_pose
 from perception.sources.look import look_at_frames
 
@@ -132,24 +132,24 @@ class BoardCalibration:
             chosen = np.linspace(0, len(known) - 1, self.max_poses).round().astype(int)
             known, positions = [known[k] for k in chosen], [positions[k] for k in chosen]
         q = np.stack(positions)
-
-        def build_views(positions: np.ndarray) -> HandEyeViews:
-            return self._build_views(machine, trajectory, known, positions, clock)
-
-        views = build_views(q)
+        views = self._build_views(machine, trajectory, known, q, clock)
         solution = solve_hand_eye(views)
         assert solution is not None  # there are enough
         used = np.flatnonzero(solution.used)
         # Only poses that were used can determine the camera.
         turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
         missing = self._check_coverage(machine, views, solution, q)
+        zeros = {}
+        for name, mean in zip(views.shared_names, solution.guess.shared, strict=True):
+            if name != evaluation.CLOCK_NAME:
+                zeros[name] = (float(mean), self.zero_std_rad)
         more = {
             "T_link_board": solution.guess.link_from_board.round(9).tolist(),
             **evaluation.summarise_solution(views, solution, clock),
             "corners_px": round(float(np.median([one.pose.error_px for one in known])), 3),
             "turns_rad": turns.round(4).tolist(),
             "missing": missing,
-            "verdict": self._judge(machine, q, build_views, solution, missing),
+            "verdict": judge_fit(len(used), len(q), solution.factor, zeros, missing).to_dict(),
         }
         pairs = [known[k].disparity for k in used]
         error = estimate_disparity_error([one for one in pairs if one is not None])
@@ -233,24 +233,6 @@ class BoardCalibration:
             names=tuple(one.name for one in observations),
             shared_names=tuple(names),
         )
-
-    def _judge(
-        self,
-        machine: Machine,
-        q: np.ndarray,
-        build_views: Callable[[np.ndarray], HandEyeViews],
-        solution: HandEyeSolution,
-        missing: list[str],
-    ) -> dict[str, Any]:
-        """Return the verdict and, for a bad one, the joint that explains it; see `verdict`."""
-        views = build_views(q)
-        zeros = {}
-        for name, mean in zip(views.shared_names, solution.guess.shared, strict=True):
-            if name != evaluation.CLOCK_NAME:
-                zeros[name] = (float(mean), self.zero_std_rad)
-        alone = verdict.judge_fit(int(solution.used.sum()), len(q), solution.factor, zeros, missing)
-        explanation = verdict.explain_by_joint(machine, q, views, solution, build_views)
-        return verdict.add_explanation(alone, explanation).to_dict()
 
     def _check_coverage(
         self, machine: Machine, views: HandEyeViews, solution: HandEyeSolution, q: np.ndarray

@@ -243,54 +243,39 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
     assert mm < 4.0 and degrees < 0.1
 
 
-def judged(machine: Machine, poses: board.Posed, q: np.ndarray, seed: int) -> verdict.Verdict:
-    """Returns the verdict on true sights of the board beside joint positions `q`."""
-
-    def build_views(positions: np.ndarray) -> hand_eye.HandEyeViews:
-        return board.views(machine, replace(poses, q=positions), EXACT, seed)[0]
-
-    views = build_views(q)
-    found = hand_eye.solve_hand_eye(views)
-    assert found is not None
-    zeros = {n: (float(z), 0.0087) for n, z in zip(views.shared_names, found.guess.shared, strict=True)}  # fmt: skip
-    alone = verdict.judge_fit(int(found.used.sum()), len(q), found.factor, zeros, [])
-    why = verdict.explain_by_joint(machine, q, views, found, build_views)
-    return verdict.add_explanation(alone, why)
-
-
-def test_a_right_arm_is_called_good(machine: Machine) -> None:
-    poses = board.posed(machine, 30, 0, 0.0044, 0.0017, 0.001)
-    assert judged(machine, poses, poses.q, 0) == verdict.Verdict("good")
-
-
-@pytest.mark.parametrize(("joint", "factor"), [(0, 1.1), (3, 1.1), (1, -1.0), (4, -1.0)])
-def test_a_joint_with_a_wrong_scale_or_sign_is_named(
-    machine: Machine, joint: int, factor: float
-) -> None:
+def judged(machine: Machine, joint: int, factor: float) -> verdict.Verdict:
+    """Returns the verdict on true sights of the board beside positions of which one joint is scaled."""
     poses = board.posed(machine, 30, joint, 0.0044, 0.0017, 0.001)
     q = poses.q.copy()
     q[:, joint] *= factor
-    told = judged(machine, poses, q, joint)
-    assert told.status == "not to be trusted"
-    name, words = told.reasons[0].split(": ", 1)
-    assert name == f"q{joint + 1}"
-    if factor < 0:
-        assert words.startswith("its sign is reversed")
-    else:
-        told_factor = float(words.split("multiplied by ")[1].split(":")[0])
-        assert told_factor == pytest.approx(1 / factor, abs=0.015)
+    views = board.views(machine, replace(poses, q=q), EXACT, joint)[0]
+    found = hand_eye.solve_hand_eye(views)
+    assert found is not None
+    zeros = {n: (float(z), 0.0087) for n, z in zip(views.shared_names, found.guess.shared, strict=True)}  # fmt: skip
+    return verdict.judge_fit(int(found.used.sum()), len(q), found.factor, zeros, [])
+
+
+@pytest.mark.parametrize(
+    ("joint", "factor", "status"),
+    [(0, 1.0, "good"), (0, 1.1, "not to be trusted"), (3, 0.95, "not to be trusted"),
+     (1, -1.0, "not to be trusted"), (4, -1.0, "not to be trusted")],
+)  # fmt: skip
+def test_only_a_right_arm_is_called_good(
+    machine: Machine, joint: int, factor: float, status: str
+) -> None:
+    assert judged(machine, joint, factor).status == status
 
 
 def test_a_fit_is_judged_by_what_it_leaves_out_and_what_it_lacks() -> None:
     right = {"q2": (0.02, 0.0087)}
     assert verdict.judge_fit(30, 30, 1.0, right, []).status == "good"
-    assert verdict.judge_fit(15, 30, 2.0, right, []).status == "good"
+    assert verdict.judge_fit(15, 30, 1.5, right, []).status == "good"
     for wrong in (
         verdict.judge_fit(14, 30, 1.0, right, []),
-        verdict.judge_fit(30, 30, 2.01, right, []),
+        verdict.judge_fit(30, 30, 1.51, right, []),
         verdict.judge_fit(30, 30, 1.0, {"q2": (-0.0262, 0.0087)}, []),
     ):
-        assert wrong.status == "not to be trusted" and len(wrong.reasons) == 1
+        assert wrong.status == "not to be trusted" and len(wrong.reasons) == 2
     assert verdict.judge_fit(7, 10, 1.0, right, []).status == "cannot tell"
     lacking = verdict.judge_fit(30, 30, 1.0, right, ["turn more"])
     assert lacking == verdict.Verdict("cannot tell", ("turn more",))
@@ -307,10 +292,10 @@ def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
         "session.out=run",
     )  # fmt: skip
     assert done.code == 2
-    assert "not to be trusted: q3: its positions are to be multiplied" in done.err
+    assert "not to be trusted: the arm would be" in done.err
     content = yaml.safe_load(Path("run/calibration.yaml").read_text())
     assert content["verdict"]["status"] == "not to be trusted"
-    with pytest.raises(FrameError, match="not to be trusted: q3"):
+    with pytest.raises(FrameError, match="not to be trusted: the arm"):
         load_extrinsics("run/calibration.yaml", "source.base_from_camera")
     content["verdict"] = {"status": "cannot tell", "reasons": ["few"]}
     Path("open.yaml").write_text(yaml.safe_dump(content))
