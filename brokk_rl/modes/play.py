@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import Annotated, Literal
 
 import torch
-from annotated_types import Interval
 
 from brokk_rl.errors import CheckpointError
 from brokk_rl.play.page import PlayPage
-from brokk_rl.play.session import SPEEDS, PlaySession
+from brokk_rl.play.session import PlaySession
+from brokk_rl.play.settings import PlaySettings
 from brokk_rl.policy_folder import find_policy
 from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
 from brokk_rl.rl.policy import (
@@ -22,8 +21,8 @@ from brokk_rl.rl.policy import (
     TrainedPolicy,
     load_policy,
 )
-from brokk_rl.session import Device, Session
-from brokk_rl.spec import Positive, Seed, WorldCount, name_spec, spec
+from brokk_rl.session import Session
+from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
 
@@ -35,33 +34,6 @@ FRAME_S = 1 / 30
 """Time between two pictures, s. Chosen by hand for the eye."""
 POLL_S = 2.0
 """Seconds between two looks for a newer checkpoint. Chosen by hand."""
-PORTS = (1024, 65535)
-"""Ports that a person without special rights may use."""
-
-
-@spec
-class PlaySettings:
-    """Page, worlds and pace of `mode=play`.
-
-    Attributes:
-        port: Port of the page, on this computer only.
-        worlds: Machines that are simulated side by side.
-        speed: Share of real time at first.
-        driver: Who drives at first: `policy`, `classical` or `person`.
-        neutral: Whether effects begin switched off instead of drawn as in training.
-        seed: Seed of starts and noise.
-        device: Where to simulate, as `session.device`.
-        seconds: Time until it ends by itself; `null` for until it is interrupted.
-    """
-
-    port: Annotated[int, Interval(ge=PORTS[0], le=PORTS[1])]
-    worlds: WorldCount
-    speed: Annotated[float, Interval(ge=SPEEDS[0], le=SPEEDS[1])]
-    driver: Literal["policy", "classical", "person"]
-    neutral: bool
-    seed: Seed
-    device: Device
-    seconds: Positive | None
 
 
 @spec

@@ -19,7 +19,8 @@ import viser.uplot as uplot
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.errors import BrokkError
 from brokk_rl.play.scene_view import SceneView
-from brokk_rl.play.session import KEY_STEP, PERSON, SPEEDS, PlaySession
+from brokk_rl.play.session import KEY_STEP, PERSON, PlaySession
+from brokk_rl.play.settings import SPEEDS
 from brokk_rl.plot import BLUE, ORANGE, OTHERS
 
 log = logging.getLogger(__name__)

@@ -18,11 +18,10 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.play.dials import EffectDial, list_dials
+from brokk_rl.play.settings import SPEEDS
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.scene import FAR_M
 
-SPEEDS = (0.1, 10.0)
-"""Slowest and fastest time; chosen by hand."""
 PERSON = "person"
 """Name of the driver who is no policy."""
 TRACE_S = 15.0
