@@ -71,12 +71,12 @@ def _read_value(word: str, groups: Mapping[str, list[str]]) -> str:
         value = str(Path(value).expanduser())
     quoted = f"{key}={_quote(value)}"
     is_plain = MEANINGFUL.isdisjoint(value)
-    if _is_readable(f"{key}={value}"):
-        _refuse_empty(key, value, is_single=key in groups and not is_list_group(key))
+    if override := _parse_word(f"{key}={value}"):
+        _refuse_empty(key, value, override, key in groups and not is_list_group(key))
         return f"{key}={value}"
-    if is_plain and _is_readable(quoted):
+    if is_plain and _parse_word(quoted):
         return quoted
-    if _is_readable(quoted):
+    if _parse_word(quoted):
         raise ConfigError(
             f"{word} cannot be read: brackets do not match, a list stands in others than [], a "
             f"function has other arguments, or a text must be quoted: {shlex.quote(quoted)}"
@@ -87,9 +87,8 @@ def _read_value(word: str, groups: Mapping[str, list[str]]) -> str:
     )
 
 
-def _refuse_empty(key: str, value: str, is_single: bool) -> None:
+def _refuse_empty(key: str, value: str, override: Override, is_single: bool) -> None:
     """Refuse what Hydra reads and what chooses nothing; `is_single`: an option of its group is one."""
-    override = OverridesParser.create().parse_override(f"{key}={value}")
     if not value.strip():
         raise ConfigError(f"'{key}=' has no value; `brokk mode=<mode> --help` lists what it takes")
     if override.is_range_sweep() and not any(override.sweep_string_iterator()):
@@ -152,9 +151,8 @@ def _quote(value: str) -> str:
     return '"' + escaped.replace("${", r"\${") + '"'
 
 
-def _is_readable(word: str) -> bool:
+def _parse_word(word: str) -> Override | None:
     try:
-        OverridesParser.create().parse_override(word)
+        return OverridesParser.create().parse_override(word)
     except HydraException:
-        return False
-    return True
+        return None

@@ -41,7 +41,7 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     fits the machine or the simulator beside it.
 
     Args:
-        values: The configuration as plain data, with `run`; a node may be built already.
+        values: The configuration as plain data, with `run`.
         shared: Nodes that others take in, whole or in part. They are built here only if the mode has such
             a field.
 

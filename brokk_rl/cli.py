@@ -87,7 +87,7 @@ def main() -> int:
 
             sys.argv[1:] = prepare_arguments(sys.argv[1:])
         extensions.register_options(sys.argv[1:])
-        if {"--help", "-h"} & set(sys.argv[1:]):
+        if asks_help:
             sys.stdout.write(_describe_chosen_mode())
             return 0
         hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")(run_job)()

@@ -58,20 +58,19 @@ def run(cfg: DictConfig) -> float | None:
     """Build the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
     extensions.refuse_ambiguous(HydraConfig.get().runtime.choices)
-    built: dict[str, Any] = {}
     goes_on = cfg.get("resume") is not None
     if any(cfg.get(node) for node in WITH_POLICIES):
         from brokk_rl import policy_choice  # its imports take 0.2 s
 
-        cfg, built = policy_choice.insert_policy(cfg)
+        cfg = policy_choice.insert_policy(cfg)
         goes_on |= policy_choice.is_going_on(cfg)
     values, shared = extensions.read_values(cfg)
     if "session" in values:
         folder = choose_run_folder(values)
         if not (sweep or goes_on) and distributed.read_rank().first:
             require_new_folder(folder)
-        built["session"] = values["session"] | {"out": str(folder)}
-    mode = build_mode(values | built, shared)
+        values["session"] |= {"out": str(folder)}
+    mode = build_mode(values, shared)
     distributed.check_together(type(mode), sweep)
     return _run_in_session(mode, values, sweep, goes_on) if "session" in values else mode.run()
 

@@ -64,10 +64,8 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     return prepared if is_whole else prepared + _recall_overrides(given)
 
 
-def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
-    """Return the configuration with what its policies know of machine and task, and built nodes.
-
-    The machine is built for its fingerprint, and not again where it is that of the policy.
+def insert_policy(cfg: DictConfig) -> DictConfig:
+    """Return the configuration with what its policies know of machine and task.
 
     Raises:
         CheckpointError: There is no such policy, or it does not fit machine or task.
@@ -76,13 +74,12 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
     OmegaConf.set_readonly(cfg, False)
     OmegaConf.set_struct(cfg, False)
     target = OmegaConf.select(cfg, f"policy.{TARGET}", default=None)
-    built: dict[str, Any] = {}
     if target == TRAINED or (target == SHIPPED and cfg.get(RUN) == TRAIN):
         cfg.policy[TARGET] = TRAINED
-        cfg = _take_over(cfg, built)
+        cfg = _take_over(cfg)
     elif target == SHIPPED:
         try:
-            cfg = _take_over(cfg.copy(), built)
+            cfg = _take_over(cfg.copy())
         except (CheckpointError, ConfigError) as error:
             if "policy" in _list_given():  # the caller asked for this one
                 raise
@@ -92,7 +89,7 @@ def insert_policy(cfg: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
     for node in _list_rivals(cfg):
         if node[TARGET] == TRAINED:
             _insert_task(cfg, node)
-    return cfg, built
+    return cfg
 
 
 def _list_rivals(cfg: DictConfig) -> list[DictConfig]:
@@ -144,11 +141,8 @@ def _recall_overrides(given: Mapping[str, Override]) -> list[str]:
     return recalled
 
 
-def _take_over(cfg: DictConfig, built: dict[str, Any]) -> DictConfig:
-    """Return the configuration with machine, option and behaviour of the first policy.
-
-    A machine that is built and stays is put into `built`.
-    """
+def _take_over(cfg: DictConfig) -> DictConfig:
+    """Return the configuration with machine, option and behaviour of the first policy."""
     stored = find_policy(str(cfg.policy.path))
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
@@ -158,10 +152,7 @@ def _take_over(cfg: DictConfig, built: dict[str, Any]) -> DictConfig:
     if "task" in cfg:
         cfg = _choose_option(cfg, own, given, stored)
     if "machine" in cfg:
-        here = build_node(OmegaConf.to_container(cfg.machine, resolve=True), "machine")
-        brought = _insert_plant(cfg, here, stored, given)
-        if not brought:
-            built["machine"] = here
+        brought = _insert_plant(cfg, stored, given)
     if "task" in cfg and (num := _insert_behaviour(cfg, own, given, stored)):
         brought.append(f"{num} value{'s' if num > 1 else ''} of its task")
     if brought:
@@ -187,13 +178,12 @@ def _choose_option(
     return changed
 
 
-def _insert_plant(
-    cfg: DictConfig, here: Machine, stored: StoredPolicy, given: set[str]
-) -> list[str]:
+def _insert_plant(cfg: DictConfig, stored: StoredPolicy, given: set[str]) -> list[str]:
     """Put in the machine of the policy, and with another machine the actuator of its training.
 
-    Return what was put in: nothing where the machine is `here`, that of the configuration.
+    Return what was put in: nothing where the machine is that of the configuration.
     """
+    here: Machine = build_node(OmegaConf.to_container(cfg.machine, resolve=True), "machine")
     name = stored.contract["machine"]
     differing = here.list_differences(stored.contract["fingerprint"])
     if not differing:
