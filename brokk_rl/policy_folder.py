@@ -20,6 +20,7 @@ import json
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -146,9 +147,7 @@ def describe_task(task: object) -> TaskDescription:
     """Return the description of a task's spec; a spec without `behaviour` has a name only."""
     behaviour = {}
     for path in getattr(task, "behaviour", ()):
-        value: Any = task
-        for part in path.split("."):
-            value = getattr(value, part)
+        value = attrgetter(path)(task)
         behaviour[path] = json.loads(json.dumps(value, default=list_values))
     return TaskDescription(name=name_target(name_class(task)), behaviour=behaviour)
 

@@ -105,8 +105,8 @@ def spec(cls: type[T]) -> type[T]:
     hints = typing.get_type_hints(cls, include_extras=True)
     for name in inspect.get_annotations(cls):
         cls.__annotations__[name] = _constrain(hints[name])
-    if "__post_init__" not in cls.__dict__:
-        cls.__post_init__ = _check  # type: ignore[attr-defined]
+    if "__post_init__" not in cls.__dict__ and hasattr(cls, "check"):
+        cls.__post_init__ = cls.check  # type: ignore[attr-defined]
     config = ConfigDict(arbitrary_types_allowed=True, extra="forbid", defer_build=True)
     made: Any = pydantic_dataclasses.dataclass(frozen=True, kw_only=True, config=config)(cls)
 
@@ -142,11 +142,6 @@ def require_value(key: str, hint: Any, value: Any) -> Any:
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         raise ConfigError(f"{key}: {_describe_problem(problem)}") from None
-
-
-def _check(self: Any) -> None:
-    if check := getattr(self, "check", None):
-        check()
 
 
 @dataclass(frozen=True)
