@@ -13,7 +13,7 @@ import numpy as np
 
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
-from brokk_rl.spec import Count, NonNegative, Positive, spec
+from brokk_rl.spec import NonNegative, Positive, spec
 from perception import pair_check, rim_scale, search
 from perception.camera import express_in_camera
 from perception.contracts import SegmenterSpec
@@ -114,8 +114,6 @@ class StagedPerception:
             `null` for never.
         rims: Says whether rims of another size than that of the holes show a wrong scale of depth
             where no hole is found; `null` for never.
-        search_every: Frames of which one is searched as a whole; in the others `follow` looks at
-            known holes alone.
         pair: Check of the camera pair before anything else; `null` for none.
     """
 
@@ -130,7 +128,6 @@ class StagedPerception:
     apart: float
     depth: PairDepth | None
     rims: RimScale | None
-    search_every: Count
     pair: PairCheck | None
 
     def build(self) -> StagedFinder:
@@ -156,7 +153,7 @@ class StagedFinder:
 
     def __init__(self, settings: StagedPerception) -> None:
         self.settings = settings
-        self._segmenter, self.search_every = settings.segmenter.build(), settings.search_every
+        self._segmenter = settings.segmenter.build()
         self._pose = settings.pose.build()
         self._pair = settings.pair.build() if settings.pair else None
 
@@ -215,34 +212,6 @@ class StagedFinder:
         reason = rim_scale.OF_DEPTH if frame.right is None else rim_scale.OF_PAIR
         return _Judged([], [*judged.rejected, Rejection("ellipse", reason, found[0], 1.0)])
 
-    def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
-        """Return those of some holes, seen before, that are still where they were."""
-        s = self.settings
-        ms: dict[str, float] = {}
-        frame, fault = self._prepare(frame, ms)
-        if fault is not None:
-            return FrameDetections([], [fault], [], None, ms)
-        places = [one for one in (expect_rim(hole, frame) for hole in holes) if one is not None]
-        if s.depth is None or frame.right is None or frame.baseline_m is None or not places:
-            return self.find(frame)
-        judged, masks = self._judge_near(frame, places, ms)
-        return self._conclude(judged, masks, frame, ms)
-
-    def _judge_near(
-        self, frame: Frame, places: Sequence[tuple[Ellipse, np.ndarray]], ms: dict[str, float]
-    ) -> tuple[_Judged, Masks]:
-        """Return what is at places where rims are expected, and the pixels of their faces."""
-        assert self.settings.depth is not None
-        with _time_stage(ms, "stereo"):
-            frame, face = self.settings.depth.match_near(frame, places)
-        masks = Masks(face, None)
-        judged = _Judged([], [])
-        # The expected rim is the candidate: it is known better than a detector would find it. None
-        # of its edges has been seen yet, so that most of the circle must be.
-        with _time_stage(ms, "pose"):
-            self._judge(frame, masks, [place for place, _ in places], judged)
-        return judged, masks
-
     def _look_again(self, frame: Frame, judged: _Judged, ms: dict[str, float]) -> _Judged:
         """Return holes as they look where they are expected: coarse depth errs, and tells discs less."""
         if self.settings.depth is None or frame.right is None or frame.baseline_m is None:
@@ -253,8 +222,13 @@ class StagedFinder:
             if place is None:
                 again.found.append((ellipse, pose))
                 continue
-            near, _ = self._judge_near(frame, [place], ms)
-            again.rejected.extend(near.rejected)
+            with _time_stage(ms, "stereo"):
+                closer, face = self.settings.depth.match_near(frame, *place)
+            near = _Judged([], again.rejected)
+            # The expected rim is the candidate: it is known better than a detector would find it.
+            # None of its edges has been seen yet, so that most of the circle must be.
+            with _time_stage(ms, "pose"):
+                self._judge(closer, Masks(face, None), [place[0]], near)
             # The score is that of the detected ellipse.
             again.found.extend((ellipse, replace(one, score=pose.score)) for _, one in near.found)
         return again

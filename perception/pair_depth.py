@@ -7,7 +7,6 @@ matched coarsely, far ones finely, so that a hole is as many pixels wide everywh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -26,11 +25,10 @@ from perception.stereo import Stereo, correct_depth
 BEHIND_M = 0.3
 """Depth behind the face that is matched too: the inside of a hole."""
 BEFORE_M, NEAREST_M = 0.2, 0.3
-"""Depth before a face that was seen before and is matched too, for an arm that hides it; and least
-depth that is matched there."""
+"""Depth before the face that is matched too, for an arm that hides it; and least depth that is matched
+there."""
 ON_FACE = 0.03
-"""Relative departure of depth from an expected face within which it may be it: the base may have
-moved by centimetres since."""
+"""Relative departure of depth from the expected face within which it may be it."""
 BAND_PX = 2.0
 """Margin of the band, in pixels of the match."""
 
@@ -60,14 +58,13 @@ class PairDepth:
         depth_m = correct_depth(depth_m, *place)
         return replace(frame, depth_m=depth_m, depth_shrink=self.stereo.shrink)
 
-    def match_near(
-        self, frame: Frame, places: Sequence[tuple[Ellipse, np.ndarray]]
-    ) -> tuple[Frame, np.ndarray]:
-        """Return a frame with depth around holes that were seen before, and the pixels of their faces.
+    def match_near(self, frame: Frame, place: Ellipse, m: np.ndarray) -> tuple[Frame, np.ndarray]:
+        """Return a frame with depth around one hole, and the pixels of its face, `(h, w)` float32.
 
         Args:
             frame: A frame with a right picture.
-            places: The ellipse of each rim and its face, the plane `m · P = 1`, as expected.
+            place: The ellipse of the rim, as expected.
+            m: Its face, the plane `m · P = 1`.
         """
         assert frame.right is not None and frame.baseline_m is not None
         pair = [cv2.cvtColor(some, cv2.COLOR_RGB2GRAY) for some in (frame.color, frame.right)]
@@ -75,25 +72,21 @@ class PairDepth:
         height, width = pair[0].shape
         depth_m = np.full((height, width), np.nan, np.float32)
         face = np.zeros((height, width), np.float32)
-        finest = 1
-        for place, m in places:
-            shrink = max(1, int(place.a / self.radius_px))
-            finest = max(finest, shrink)
-            part = _build_square(place, self.extent * place.a, shrink, height, width)
-            square = np.s_[part.top : part.top + part.height, part.left : part.left + part.width]
-            columns = part.left + np.arange(part.width)[None, :]
-            rows = part.top + np.arange(part.height)[:, None]
-            inverse = compute_inverse_depth(m, frame.camera_matrix, columns, rows)
-            near_px, far_px = pull_px * inverse.max(), pull_px * max(inverse.min(), 1e-3)
-            least_px = max(0.0, pull_px / (pull_px / far_px + BEHIND_M) - BAND_PX * shrink)
-            largest_px = pull_px / max(pull_px / near_px - BEFORE_M, NEAREST_M)
-            matcher = replace(self.stereo, shrink=shrink)
-            found_px = matcher.match_part(pair[0], pair[1], part, least_px, largest_px)
-            found_m = _convert_to_depth(found_px, frame, part)
-            depth_m[square] = np.where(np.isfinite(found_m), found_m, depth_m[square])
-            with np.errstate(invalid="ignore"):
-                face[square] = np.abs(found_m * inverse - 1.0) < ON_FACE
-        return replace(frame, depth_m=depth_m, depth_shrink=finest), face
+        shrink = max(1, int(place.a / self.radius_px))
+        part = _build_square(place, self.extent * place.a, shrink, height, width)
+        square = np.s_[part.top : part.top + part.height, part.left : part.left + part.width]
+        columns = part.left + np.arange(part.width)[None, :]
+        rows = part.top + np.arange(part.height)[:, None]
+        inverse = compute_inverse_depth(m, frame.camera_matrix, columns, rows)
+        near_px, far_px = pull_px * inverse.max(), pull_px * max(inverse.min(), 1e-3)
+        least_px = max(0.0, pull_px / (pull_px / far_px + BEHIND_M) - BAND_PX * shrink)
+        largest_px = pull_px / max(pull_px / near_px - BEFORE_M, NEAREST_M)
+        matcher = replace(self.stereo, shrink=shrink)
+        found_px = matcher.match_part(pair[0], pair[1], part, least_px, largest_px)
+        depth_m[square] = _convert_to_depth(found_px, frame, part)
+        with np.errstate(invalid="ignore"):
+            face[square] = np.abs(depth_m[square] * inverse - 1.0) < ON_FACE
+        return replace(frame, depth_m=depth_m, depth_shrink=shrink), face
 
 
 def _convert_to_depth(found_px: np.ndarray, frame: Frame, part: Window) -> np.ndarray:

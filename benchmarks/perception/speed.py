@@ -2,11 +2,9 @@
 
     taskset -c 0 python benchmarks/perception/speed.py <out.json> --count 3
 
-Renders scenes of several conditions at 1 to 4 m. Each is searched as a whole, and then looked at as
-the tracker steers the finder: around the holes found, moved by 3 mm. Each look is repeated and the
-shortest taken: what else runs on the machine makes the others longer. Writes the milliseconds of
-each stage, the processor time of both kinds of look and of their mean over `search_every` frames,
-what both found, and the load that there was meanwhile.
+Renders scenes of several conditions at 1 to 4 m. Each look is repeated and the shortest taken: what
+else runs on the machine makes the others longer. Writes the milliseconds of each stage, the processor
+time, the number of holes, and the load that there was meanwhile.
 """
 
 from __future__ import annotations
@@ -16,7 +14,6 @@ import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +28,6 @@ from brokk_rl.signals import Frame
 from perception.render.scene_sampler import compose_scene
 
 CONDITIONS, DISTANCES_M, TIMES = ("clean", "haze", "hidden"), (1.0, 2.0, 3.0, 4.0), 5
-MOVED_M = 0.003
-"""Standard deviation by which a tracked hole is off."""
 
 
 def main() -> None:
@@ -47,34 +42,20 @@ def main() -> None:
     given = parser.parse_args()
     cv2.setNumThreads(given.threads)
     finder = configured("perception", "mode=perceive", "perceive.input=.").build()
-    looks: dict[str, list[dict[str, float]]] = {"whole": [], "followed": []}
-    holes = {"whole": 0, "followed": 0}
+    looks, num_holes = [], 0
     kinds = [(condition, distance_m) for condition in CONDITIONS for distance_m in DISTANCES_M]
     for number, (condition, distance_m) in enumerate(track(kinds * given.count, transient=True)):
         frame = rendered(condition, distance_m, number)
         found, ms = look(lambda frame=frame: finder.find(frame))
-        looks["whole"].append(ms)
-        holes["whole"] += len(found.holes)
-        if not found.holes:
-            continue
-        chance = np.random.default_rng(number)
-        known = []
-        for hole in found.holes:
-            known.append(replace(hole, center_m=hole.center_m + chance.normal(0, MOVED_M, 3)))
-        again, ms = look(lambda frame=frame, known=known: finder.follow(frame, known))
-        looks["followed"].append(ms)
-        holes["followed"] += len(again.holes)
-    table = {kind: summarize(some) for kind, some in looks.items()}
-    every = finder.search_every
-    whole, followed = (table[kind]["processor_time"]["median"] for kind in ("whole", "followed"))
+        looks.append(ms)
+        num_holes += len(found.holes)
     told = {
-        "frames": len(looks["whole"]),
-        "holes": holes,
+        "frames": len(looks),
+        "holes": num_holes,
         "threads": given.threads,
         "opencv": cv2.__version__,
         "load": round(os.getloadavg()[0], 1),
-        "ms": table,
-        "ms_steered": (whole + (every - 1) * followed) / every,
+        "ms": summarize(looks),
     }
     given.out.write_text(json.dumps(told, indent=1) + "\n")
 

@@ -27,13 +27,9 @@ def read_holes(folder: Path) -> Table:
 
 def read_times(folder: Path) -> Table:
     """Return the milliseconds of each stage."""
-    times = load_json(folder / "speed.json")["ms"]
     rows: Table = []
-    for look, stages in times.items():
-        for stage, ms in stages.items():
-            row = {"look": look, "stage": stage}
-            row |= {name: round(value, 1) for name, value in ms.items()}
-            rows.append(row)
+    for stage, ms in load_json(folder / "speed.json")["ms"].items():
+        rows.append({"stage": stage} | {name: round(value, 1) for name, value in ms.items()})
     return rows
 
 
@@ -52,7 +48,7 @@ MEASUREMENTS = (
     Measurement(
         name="stage_times",
         title="Time of a frame, stage by stage",
-        conditions="A frame of 1080p, without the network, in ms. `whole` searches the picture, `followed` the places of known holes. `processor_time` is the sum on one core, the others are wall time.",
+        conditions="A frame of 1080p, without the network, in ms. `processor_time` is the sum on one core, the others are wall time.",
         commands=("python benchmarks/perception/speed.py {out}/speed.json --count 1",),
         code=CODE,
         read=read_times,

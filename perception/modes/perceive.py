@@ -31,7 +31,6 @@ from brokk_rl.spec import Count, spec
 from perception.finder import StagedFinder
 from perception.overlay import OverlayDrawing
 from perception.sources.look import look_at_frames
-from perception.tracking.steered_search import SteeredSearch
 
 log = logging.getLogger(__name__)
 
@@ -142,7 +141,11 @@ class Perceive:
         self, finder: BoreholeFinder, tracker: HoleTracker
     ) -> Iterator[tuple[FrameEntry, Frame | None]]:
         """Yield the result of each frame of the source."""
-        look = SteeredSearch(finder, tracker).update
+
+        def look(frame: Frame) -> tuple[FrameDetections, Sequence[TrackedHole]]:
+            found = finder.find(frame).in_base_frame(frame)
+            return found, tracker.update(found.holes, frame.t_s)
+
         if self.perceive.until == "ellipses":
             if not isinstance(finder, StagedFinder):
                 raise ConfigError(

@@ -68,7 +68,7 @@ def test_the_face_of_a_known_hole_is_matched_as_finely_as_it_needs(
     rise = np.array([SLANT[0, 1] - SLANT[0, 0], SLANT[1, 0] - SLANT[0, 0], SLANT[0, 0]])
     place = Ellipse(260.0, 120.0, size_px, size_px, 0.0, rms_px=0.0, coverage=1.0, score=1.0)
     matcher = PairDepth(stereo=stereo, radius_px=12.0, extent=3.0)
-    seen, face = matcher.match_near(frame, [(place, frame.camera_matrix.T @ rise / PULL_PX)])
+    seen, face = matcher.match_near(frame, place, frame.camera_matrix.T @ rise / PULL_PX)
     assert seen.depth_shrink == shrink
     near = np.s_[100:140, 240:280]
     assert np.nanmedian(np.abs(PULL_PX / seen.depth_m[near] - SLANT[near])) < 0.1 * shrink
