@@ -15,6 +15,7 @@ from brokk_rl.errors import FrameError
 from brokk_rl.session import write_text
 from brokk_rl.signals import Frame
 from perception.calibrate.extrinsics import CameraExtrinsics
+from perception.segment.window import Window
 from perception.sources import validation
 from perception.stereo import correct_depth
 
@@ -55,6 +56,11 @@ class CameraModel:
         """Return the camera with what a calibration knows of it better."""
         known = {name: one for name, one in vars(extrinsics).items() if one is not None}
         return replace(self, **known)
+
+    def crop(self, part: Window) -> CameraModel:
+        """Return the camera of a part of the pictures."""
+        size_px = part.width, part.height
+        return replace(self, matrix=part.crop_matrix(self.matrix), size_px=size_px)
 
     def check_picture(self, picture: np.ndarray, where: str, name: str) -> None:
         """Refuse a picture `(h, w, 3)` named `name` that cannot be one of this camera, told by `where`."""

@@ -94,8 +94,7 @@ def _convert_to_depth(found_px: np.ndarray, frame: Frame, part: Window) -> np.nd
     assert frame.baseline_m is not None
     with np.errstate(divide="ignore", invalid="ignore"):
         found_m = float(frame.camera_matrix[0, 0]) * frame.baseline_m / found_px
-    corner = np.array([[0.0, 0.0, part.left], [0.0, 0.0, part.top], [0.0, 0.0, 0.0]])
-    matrix = frame.camera_matrix - corner
+    matrix = part.crop_matrix(frame.camera_matrix)
     return correct_depth(found_m, matrix, frame.baseline_m, frame.disparity_error_px)
 
 

@@ -28,7 +28,7 @@ from perception.calibrate import transforms
 from perception.calibrate.extrinsics import CameraExtrinsics
 from perception.mount.mounts import AxesMount, CameraMount
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewPlanner
-from perception.render.stereo_camera import StereoRig, place_rig
+from perception.segment.window import Window
 from perception.sources.simulator import SimulatedCamera
 
 LEAST_HINT_M = 1e-3
@@ -76,7 +76,8 @@ class _Exposure:
 
     task_scene: tuple[float, ...]
     chain_m: np.ndarray
-    rig: StereoRig
+    true_pose: np.ndarray
+    part: Window
     believed_pose: np.ndarray
     t_s: float
     seed: tuple[int, ...]
@@ -150,8 +151,8 @@ class WatchedHole:
         if (pixel < 0).any() or (pixel > size - 1).any():
             return None
         corner = np.clip(np.round(pixel - np.array(window) / 2), 0, size - window).astype(int)
-        placed = place_rig(rig, true, (int(corner[0]), int(corner[1])), window)
-        return _Exposure(self.task_scene, chain_m, placed, believed, t_s, seed)
+        part = Window(int(corner[0]), int(corner[1]), *window)
+        return _Exposure(self.task_scene, chain_m, true, part, believed, t_s, seed)
 
     def wait_for(self, holes: Sequence[HolePose] | None, t_s: float) -> None:
         """Take the holes of a picture at `t_s`, known after the delay; `None`: no sharp picture."""
@@ -311,9 +312,10 @@ def _search(
 ) -> list[HolePose]:
     """Render a picture, and return the holes that are found in it, in the base frame."""
     noise = np.random.default_rng(exposure.seed)
-    shot = settings.camera.shoot(exposure.task_scene, exposure.chain_m, noise, exposure.rig)
+    place = exposure.true_pose, exposure.part
+    shot = settings.camera.shoot(exposure.task_scene, exposure.chain_m, noise, *place)
     believed = CameraExtrinsics(exposure.believed_pose, mount.error.covariance)
-    camera = exposure.rig.model.place(believed)
+    camera = settings.camera.rig.model.crop(exposure.part).place(believed)
     frame = camera.build_frame(shot.color, shot.depth_m, exposure.t_s, shot.right)
     try:
         return list(finder.find(frame).in_base_frame(frame).holes)

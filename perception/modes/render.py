@@ -53,12 +53,12 @@ class Render:
                 f"session.out={self.resume}"
             )
         numbers = range(self.render.first, self.render.first + self.render.count)
-        scenes = self.studio.prepare(folder, self.session, numbers.stop)
+        compose = self.studio.prepare(folder, self.session, numbers.stop)
         done = 0
         for number in track_items(numbers, "frames"):
             stem = folder / f"{number:05d}"
             if dataset.is_whole(stem):
                 continue
-            self.studio.shoot(stem, *scenes.compose(number))
+            self.studio.shoot(stem, *compose(number))
             done += 1
         log.info("%d frames rendered, %d were there; see %s", done, len(numbers) - done, folder)

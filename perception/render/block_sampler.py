@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from brokk_rl.spec import Range
-from perception.render.drilled_block import FRONT, Chip, Disc, DrilledBlock, DrilledHole
+from perception.render.drilled_block import FRONT, Chip, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
 from perception.render.scene_ranges import BlockRanges, CountRange, draw_integer, draw_uniform
 from perception.render.solids import SolidPose, build_frame
@@ -45,7 +45,7 @@ def draw_block(
         holes.append(_draw_side_hole(kind, half, radius, edge, generator))
     discs = []
     for place, size in zip(places[num_holes:], radii[num_holes:], strict=False):
-        discs.append(Disc(np.array([*place, half[2]]), size))
+        discs.append(DrilledHole(np.array([*place, half[2]]), size, 0.0, FRONT))
     chips = []
     for hole in holes[:num_holes]:
         chips += _draw_bowls(hole, kind.chips, kind.chip_m, False, generator)
@@ -118,7 +118,7 @@ def draw_block_materials(
     kind: BlockRanges,
     half: np.ndarray,
     holes: Sequence[DrilledHole],
-    discs: Sequence[Disc],
+    discs: Sequence[DrilledHole],
     generator: np.random.Generator,
 ) -> tuple[Material, ...]:
     """Return the materials of all parts of the block; see `Block`."""

@@ -83,7 +83,7 @@ class BoardOnArm:
 
 
 class BoardScenes:
-    """The frames of one recording; like `perception.render.scene_sampler.RandomScenes`.
+    """The frames of one recording.
 
     Raises:
         ConfigError: the board cannot be drawn, or is not seen.

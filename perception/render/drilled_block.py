@@ -8,7 +8,6 @@ is in, until no cavity takes it further.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -28,7 +27,7 @@ class DrilledHole:
     Attributes:
         center_m: Centre of the rim in the block's coordinates, on that face, `(3,)`.
         radius_m: Radius.
-        depth_m: From the face to the floor, or to the surface of a filling.
+        depth_m: From the face to the floor, or to the surface of a filling; 0 for a painted disc.
         part: The face.
     """
 
@@ -95,17 +94,6 @@ class Chip:
 
 
 @dataclass(frozen=True)
-class Disc:
-    """A flat disc on the front face: centre in the block's coordinates, `(3,)`, and radius, m."""
-
-    center_m: np.ndarray
-    radius_m: float
-    depth_m: ClassVar[float] = 0.0
-    axis: ClassVar[int] = 2
-    outward: ClassVar[np.ndarray] = np.array([0.0, 0.0, 1.0])
-
-
-@dataclass(frozen=True)
 class DrilledBlock(Box):
     """A box with holes, chips and discs.
 
@@ -114,7 +102,7 @@ class DrilledBlock(Box):
 
     holes: tuple[DrilledHole, ...]
     chips: tuple[Chip, ...] = ()
-    discs: tuple[Disc, ...] = ()
+    discs: tuple[DrilledHole, ...] = ()
 
     @property
     def break_part(self) -> int:

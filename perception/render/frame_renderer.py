@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,12 +17,16 @@ from perception.camera import write_camera
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.render.board_on_arm import BoardOnArm, BoardScenes
 from perception.render.camera_sensor import draw_dust, take_picture
-from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
+from perception.render.drilled_block import DrilledHole
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
-from perception.render.scene_sampler import RandomScenes, sample_rim
+from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
 from perception.render.stereo_camera import StereoRig
+from perception.segment.window import Window
 from perception.stereo import Stereo
+
+ComposeScene = Callable[[int], tuple[Scene, np.random.Generator]]
+"""From the number of a frame to its scene, and the source of its noise."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,8 @@ class FrameRenderer:
                 "studio.pair=false: there is no pair to match; choose studio.depth=exact or none"
             )
 
-    def prepare(self, folder: Path, session: Session, count: int) -> RandomScenes | BoardScenes:
-        """Return the scenes, and write what their frames share.
+    def prepare(self, folder: Path, session: Session, count: int) -> ComposeScene:
+        """Return what composes scene `number`, and write what the frames share.
 
         Args:
             folder: Of the frames; what was recorded along goes into the folder above.
@@ -83,14 +88,19 @@ class FrameRenderer:
             ConfigError: the scenes cannot be drawn.
             StorageError: a file could not be written.
         """
-        rig = self.rig
-        if isinstance(self.scene, SceneRanges):
-            scenes = RandomScenes(self.scene, rig, session)
+        kind, rig = self.scene, self.rig
+        if isinstance(kind, SceneRanges):
+
+            def compose(number: int) -> tuple[Scene, np.random.Generator]:
+                generator = session.generator(f"scene/{number}")
+                return compose_scene(kind, rig, generator), generator
+
         else:
-            scenes = BoardScenes(self.scene, rig, session)
+            scenes = BoardScenes(kind, rig, session)
             scenes.write_records(folder.parent, count)
+            compose = scenes.compose
         write_camera(folder, rig.model)
-        return scenes
+        return compose
 
     def shoot(self, stem: Path, scene: Scene, generator: np.random.Generator) -> None:
         """Render and write one frame; the same scene and noise make the same files.
@@ -102,19 +112,36 @@ class FrameRenderer:
         depth = {"matched": shot.depth_m, "exact": shot.exact_depth_m, "none": None}[self.depth]
         dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
 
-    def shot(self, scene: Scene, generator: np.random.Generator) -> RenderedFrame:
-        """Return the frame of a scene in the left camera's coordinates, with noise of `generator`."""
+    def shot(
+        self, scene: Scene, generator: np.random.Generator, part: Window | None = None
+    ) -> RenderedFrame:
+        """Return the frame of a scene in the left camera's coordinates, with noise of `generator`.
+
+        Args:
+            scene: The scene.
+            generator: Source of the noise.
+            part: The part of the picture that is read out; `None` for all of it.
+
+        Raises:
+            ConfigError: a part is wanted of a pair that is not perfect: its radial shift is that of a
+                whole picture.
+        """
+        if part is not None and not self.rig.error.is_none:
+            raise ConfigError("error: a part of the picture is rendered for rig/error=none only")
+        cameras = [
+            one if part is None else one.crop(part) for one in (self.rig.left, self.rig.right)
+        ]
         tracer = Tracer(scene.solids, scene.light, scene.sky)
-        left = tracer.view(self.rig.left)
+        left = tracer.view(cameras[0])
         exposure = scene.exposure
-        cameras = self.rig.sensor.draw_pair(generator)
+        sensors = self.rig.sensor.draw_pair(generator)
         density = draw_dust(exposure.patchiness, generator)
-        color = take_picture(left.radiance, left.depth_m, exposure, density, cameras[0], generator)
+        color = take_picture(left.radiance, left.depth_m, exposure, density, sensors[0], generator)
         partner = None
         if self.pair:
-            right = tracer.view(self.rig.right)
+            right = tracer.view(cameras[1])
             partner = take_picture(
-                right.radiance, right.depth_m, exposure, density, cameras[1], generator
+                right.radiance, right.depth_m, exposure, density, sensors[1], generator
             )
         depth = left.depth_m
         if partner is not None and self.depth == "matched":
@@ -125,32 +152,25 @@ class FrameRenderer:
         return RenderedFrame(color, partner, depth, left.depth_m, label, truth)
 
     def _truth(self, scene: Scene) -> SceneTruth:
-        block, base = scene.block, self.rig.base_from_camera
+        block = scene.block
         if block is None:
             return SceneTruth(self.scene.name, scene.conditions, (), (), {})
-        holes, decoys = [], []
-        for hole, hidden in zip(block.holes, scene.hidden, strict=True):
-            holes.append(self._describe_circle(block, hole, hidden, base))
-        for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True):
-            decoys.append(self._describe_circle(block, disc, hidden, base))
         place = {
             "center_m": np.asarray(block.pose.center_m).tolist(),
             "rotation": np.asarray(block.pose.rotation).tolist(),
             "half_m": np.asarray(block.half_m).tolist(),
         }
-        return SceneTruth(self.scene.name, scene.conditions, tuple(holes), tuple(decoys), place)
 
-    def _describe_circle(
-        self, block: DrilledBlock, circle: DrilledHole | Disc, hidden: float, base: np.ndarray
-    ) -> TrueCircle:
-        center = block.pose.point(circle.center_m)
-        axis = block.pose.rotation @ circle.outward
-        return TrueCircle.place(
-            center,
-            axis,
-            base,
-            circle.radius_m,
-            depth_m=float(circle.depth_m),
-            hidden=float(hidden),
-            in_view=self.rig.left.is_inside(sample_rim(block, circle), 0.0),
-        )
+        def describe(circle: DrilledHole) -> TrueCircle:
+            return TrueCircle.place(
+                block.pose.point(circle.center_m),
+                block.pose.rotation @ circle.outward,
+                self.rig.base_from_camera,
+                circle.radius_m,
+                depth_m=float(circle.depth_m),
+                hidden=float(compute_hidden_share(scene.solids, block, circle)),
+                in_view=self.rig.left.is_inside(sample_rim(block, circle), 0.0),
+            )
+
+        holes, decoys = (tuple(map(describe, some)) for some in (block.holes, block.discs))
+        return SceneTruth(self.scene.name, scene.conditions, holes, decoys, place)

@@ -8,11 +8,12 @@ rays where edges of solids, rims or shadows cross it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from perception.render.solids import Solid
+from perception.segment.window import Window
 
 OVER = 4
 CHUNK = 1 << 17
@@ -47,6 +48,11 @@ class Pinhole:
         """Camera matrix, `(3, 3)`; pixel centres lie at integers."""
         x, y = self.axis_px or ((self.width - 1) / 2, (self.height - 1) / 2)
         return np.array([[self.focal_px, 0, x], [0, self.focal_px, y], [0, 0, 1.0]])
+
+    def crop(self, part: Window) -> Pinhole:
+        """Return the camera that reads out a part of the picture alone."""
+        x, y = part.crop_matrix(self.matrix)[:2, 2].tolist()
+        return replace(self, width=part.width, height=part.height, axis_px=(x, y))
 
     def project(self, point_m: np.ndarray) -> np.ndarray:
         """Return the pixels, `(…, 2)`, of points, `(…, 3)`, in front of the camera."""

@@ -179,8 +179,6 @@ class Scene:
         light: How it is lit.
         exposure: How the pictures are taken.
         sky: Radiance where nothing is.
-        hidden: Part of each rim that something else hides from the left camera, one for each hole.
-        hidden_discs: Likewise for the discs.
         conditions: Drawn values by name, for statistics.
     """
 
@@ -189,15 +187,13 @@ class Scene:
     light: Light
     exposure: CameraExposure
     sky: tuple[float, float, float]
-    hidden: tuple[float, ...]
-    hidden_discs: tuple[float, ...]
     conditions: dict[str, float]
 
 
 def view_from(scene: Scene, camera_from_reference: np.ndarray) -> Scene:
     """Return the scene in the coordinates of another left camera; light and exposure stay.
 
-    `hidden` and `conditions` stay those of the first camera.
+    `conditions` stay those of the first camera.
 
     Args:
         scene: The scene.

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from brokk_rl.session import Session
 from perception.render.block_sampler import draw_block
 from perception.render.camera_sensor import CameraExposure
-from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
+from perception.render.drilled_block import DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
 from perception.render.ray_tracer import Light
 from perception.render.scene_ranges import (
@@ -131,20 +129,6 @@ def compose_scene(kind: SceneRanges, rig: StereoRig, generator: np.random.Genera
     return add_surroundings(kind, rig, block, arm, target, normal, generator)
 
 
-@dataclass(frozen=True)
-class RandomScenes:
-    """Scenes that have nothing in common but their kind and the camera, drawn by the session's seed."""
-
-    kind: SceneRanges
-    rig: StereoRig
-    session: Session
-
-    def compose(self, number: int) -> tuple[Scene, np.random.Generator]:
-        """Return scene `number`, and the source of its frame's noise."""
-        generator = self.session.generator(f"scene/{number}")
-        return compose_scene(self.kind, self.rig, generator), generator
-
-
 def add_surroundings(
     kind: SceneRanges,
     rig: StereoRig,
@@ -182,24 +166,23 @@ def add_surroundings(
     exposure, level = _draw_exposure(kind, light, normal, target, generator)
     # The sky is a little darker than its light on a surface. Chosen by hand; not searched.
     sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
-    hidden_parts, hidden_discs = (), ()
-    if block:
-        hidden_parts = tuple(compute_hidden_share(solids, block, hole) for hole in block.holes)
-        hidden_discs = tuple(compute_hidden_share(solids, block, disc) for disc in block.discs)
+    hidden = 0.0
+    if block and block.holes:
+        hidden = compute_hidden_share(solids, block, block.holes[0])
     sight = target / np.linalg.norm(target)
     conditions = {
         "distance_m": float(np.linalg.norm(target)),
         "obliquity_rad": float(np.arccos(np.clip(-normal @ sight, -1, 1))),
-        "hidden": hidden_parts[0] if hidden_parts else 0.0,
+        "hidden": hidden,
         "light": level,
         "transmission": math.exp(-exposure.extinction_per_m * float(target[2])),
         "arm": float(bool(arm)),
         "decoys": float(len(block.discs)) if block else 0.0,
     }
-    return Scene(tuple(solids), block, light, exposure, sky, hidden_parts, hidden_discs, conditions)
+    return Scene(tuple(solids), block, light, exposure, sky, conditions)
 
 
-def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
+def sample_rim(block: DrilledBlock, circle: DrilledHole) -> np.ndarray:
     """Return points on the rim of a hole or disc, camera coordinates, `(NUM_RIM_POINTS, 3)`."""
     axis = circle.axis
     angle = np.linspace(0, 2 * np.pi, NUM_RIM_POINTS, endpoint=False)
@@ -210,7 +193,7 @@ def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
 
 
 def compute_hidden_share(
-    solids: Sequence[Solid], block: DrilledBlock, circle: DrilledHole | Disc
+    solids: Sequence[Solid], block: DrilledBlock, circle: DrilledHole
 ) -> float:
     """Return the part of a rim that other solids or the block hide from the left camera."""
     rim = sample_rim(block, circle)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 from annotated_types import Ge
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.spec import Positive, spec
 from perception.camera import CameraModel
 from perception.render.camera_sensor import LinearSensor, MosaicSensor
@@ -47,14 +46,13 @@ class PairMisalignment:
         """Return the errors of one rig: these, or those drawn by the seed."""
         if self.seed is None:
             return self
-        chance = np.random.default_rng(self.seed).standard_normal(7)
-        turn = chance[:3] * self.turn_rad
-        offset = chance[4:6] * self.offset_px
+        std = np.array([*self.turn_rad, self.focal, *self.offset_px, self.distortion_px])
+        chance = (std * np.random.default_rng(self.seed).standard_normal(7)).tolist()
         return PairMisalignment(
-            turn_rad=(float(turn[0]), float(turn[1]), float(turn[2])),
-            focal=float(chance[3] * self.focal),
-            offset_px=(float(offset[0]), float(offset[1])),
-            distortion_px=float(chance[6] * self.distortion_px),
+            turn_rad=tuple(chance[:3]),
+            focal=chance[3],
+            offset_px=tuple(chance[4:6]),
+            distortion_px=chance[6],
             seed=None,
         )
 
@@ -111,19 +109,15 @@ class StereoRig:
     @property
     def left(self) -> Pinhole:
         """The camera in whose coordinates everything is told."""
-        return self._make_camera(0.0)
+        return Pinhole(self.width, self.height, self.focal_px, np.zeros(3))
 
     @property
     def right(self) -> Pinhole:
         """Its partner."""
-        return self._make_camera(self.baseline_m)
-
-    def _make_camera(self, x_m: float) -> Pinhole:
-        """Return the camera at a place along the baseline; the left one is at 0 and has no error."""
-        place = self.width, self.height, self.focal_px, np.array([x_m, 0.0, 0.0])
-        if x_m == 0.0 or self.error.is_none:
-            return Pinhole(*place)
-        return MisalignedPinhole(*place, self.error.draw())
+        place = self.width, self.height, self.focal_px, np.array([self.baseline_m, 0.0, 0.0])
+        return (
+            Pinhole(*place) if self.error.is_none else MisalignedPinhole(*place, self.error.draw())
+        )
 
     @property
     def base_from_camera(self) -> np.ndarray:
@@ -146,50 +140,6 @@ class StereoRig:
     def down_in_camera(self) -> np.ndarray:
         """Direction of gravity, `(3,)`, camera coordinates."""
         return -self.base_from_camera[2, :3]
-
-
-@spec
-class PlacedRig(StereoRig):
-    """A rig in another place, of which a part of the picture is read out.
-
-    Attributes:
-        pose: Pose of the left camera in the base frame, `(4, 4)`; counts instead of position, yaw
-            and pitch.
-        axis_px: Pixel of the optical axis in the part that is read out.
-    """
-
-    pose: Any
-    axis_px: tuple[float, float]
-
-    def check(self) -> None:
-        # Its radial shift is that of a whole picture, which a part does not know.
-        if not self.error.is_none:
-            raise ConfigError("error: a part of the picture is rendered for rig/error=none only")
-
-    def _make_camera(self, x_m: float) -> Pinhole:
-        return replace(super()._make_camera(x_m), axis_px=self.axis_px)
-
-    @property
-    def base_from_camera(self) -> np.ndarray:
-        """Pose of the left camera in the base frame, `(4, 4)`."""
-        return self.pose
-
-
-def place_rig(
-    rig: StereoRig, pose: np.ndarray, corner_px: tuple[int, int], size_px: tuple[int, int]
-) -> PlacedRig:
-    """Return `rig` at `pose`, `(4, 4)`, which reads out a part of its picture.
-
-    Args:
-        rig: The rig.
-        pose: Pose of the left camera in the base frame.
-        corner_px: First column and row of the part.
-        size_px: Columns and rows of the part.
-    """
-    values = {entry.name: getattr(rig, entry.name) for entry in fields(rig)}
-    axis_px = (rig.left.matrix[0, 2] - corner_px[0], rig.left.matrix[1, 2] - corner_px[1])
-    values |= {"width": size_px[0], "height": size_px[1], "pose": pose, "axis_px": axis_px}
-    return PlacedRig(**values)
 
 
 def build_camera_pose(position_m: Sequence[float], yaw_rad: float, pitch_rad: float) -> np.ndarray:
@@ -216,7 +166,7 @@ def measure_disparity_error(rig: StereoRig) -> tuple[float, float, float]:
     It is fitted to rays over the middle half of the right picture: near the border distortion bends
     it. Measured disparity less this error is the true one.
     """
-    ideal = Pinhole(rig.width, rig.height, rig.focal_px, np.zeros(3))
+    ideal = rig.left
     columns, rows = np.meshgrid(
         np.linspace(0.25, 0.75, 32) * (rig.width - 1),
         np.linspace(0.25, 0.75, 18) * (rig.height - 1),

@@ -24,6 +24,11 @@ class Window:
     width: int
     height: int
 
+    def crop_matrix(self, camera_matrix: np.ndarray) -> np.ndarray:
+        """Return the camera matrix of the picture in the window, from that of the whole, `(3, 3)`."""
+        corner = np.array([[0.0, 0.0, self.left], [0.0, 0.0, self.top], [0.0, 0.0, 0.0]])
+        return camera_matrix - corner
+
     def take(self, picture: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
         """Return the picture in the window, `(h, w)` or `(h, w, c)` of the picture's type.
 

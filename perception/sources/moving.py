@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from brokk_rl.spec import Positive, spec
 from perception.mount.approach import plan_approach_motion
 from perception.mount.mounts import AxesMount
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewPlanner
-from perception.render.stereo_camera import place_rig
 from perception.sources.simulator import SimulatedCamera
 
 
@@ -99,10 +99,9 @@ class MovingSource:
             raise FrameError("moving camera: on its way, its pictures are not used")
         s, number = self._settings, self._count
         self._count, self._is_taken = number + 1, True
-        rig = s.camera.rig
         pose = self._mount.locate(self._planner.position, self._q)
-        placed = place_rig(rig, pose, (0, 0), (rig.width, rig.height))
         noise = np.random.default_rng((s.camera.seed, number))
         chain_m = s.camera.arm.trace(s.machine, self._q)
-        shot = s.camera.shoot(s.camera.task_scene, chain_m, noise, placed)
-        return placed.model.build_frame(shot.color, shot.depth_m, self._t_s, shot.right)
+        shot = s.camera.shoot(s.camera.task_scene, chain_m, noise, pose)
+        camera = replace(s.camera.rig.model, base_from_camera=pose)
+        return camera.build_frame(shot.color, shot.depth_m, self._t_s, shot.right)

@@ -18,6 +18,7 @@ from perception.render.scene_ranges import Scene, SceneRanges, view_from
 from perception.render.scene_sampler import add_surroundings
 from perception.render.solids import SolidPose, build_rods
 from perception.render.stereo_camera import StereoRig
+from perception.segment.window import Window
 from perception.stereo import Stereo
 
 
@@ -66,7 +67,8 @@ class SimulatedCamera:
         task_scene: Sequence[float],
         chain_in_base_m: np.ndarray,
         noise: np.random.Generator,
-        rig: StereoRig | None = None,
+        pose: np.ndarray | None = None,
+        part: Window | None = None,
     ) -> RenderedFrame:
         """Return a frame of a scene, with its truth.
 
@@ -75,21 +77,16 @@ class SimulatedCamera:
             chain_in_base_m: The arm as points in the base frame, `(P, 3)`: its joints in order,
                 then the tip of the tool (`brokk_rl.kinematics`); empty for none.
             noise: Noise of the pictures.
-            rig: A rig elsewhere that takes it; `None`: the own one.
+            pose: Another pose of the left camera in the base frame, `(4, 4)`; `None`: the rig's own.
+            part: The part of the picture that is read out; `None` for all of it.
         """
         scene = self.compose(task_scene, chain_in_base_m)
-        if rig is not None:
-            scene = view_from(
-                scene, np.linalg.inv(rig.base_from_camera) @ self.rig.base_from_camera
-            )
+        if pose is not None:
+            scene = view_from(scene, np.linalg.inv(pose) @ self.rig.base_from_camera)
         studio = FrameRenderer(
-            rig=rig or self.rig,
-            scene=self.surroundings,
-            stereo=self.stereo,
-            depth="matched",
-            pair=True,
+            rig=self.rig, scene=self.surroundings, stereo=self.stereo, depth="matched", pair=True
         )
-        return studio.shot(scene, noise)
+        return studio.shot(scene, noise, part)
 
     def compose(self, task_scene: Sequence[float], chain_in_base_m: np.ndarray) -> Scene:
         """Return a scene in the coordinates of the rig's own camera; see `shoot`."""

@@ -237,9 +237,9 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(
 ) -> None:
     rig = replace(rig, width=240, height=136, focal_px=132.0)
     maker = studio(name, rig)
-    scenes = maker.prepare(tmp_path / "frames", Session(out=".", seed=3, device="cpu"), 1)
+    compose = maker.prepare(tmp_path / "frames", Session(out=".", seed=3, device="cpu"), 1)
     for number in range(1 if name != "varied" else 2):
-        shot = maker.shot(*scenes.compose(number))
+        shot = maker.shot(*compose(number))
         assert shot.right is not None
         assert shot.color.shape == shot.right.shape == (136, 240, 3)
         assert not (shot.label.hole_mask & ~shot.label.block).any()
@@ -272,7 +272,7 @@ def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: Ste
             int
         )
         covered = shot.label.arm[pixel[:, 1], pixel[:, 0]].mean()
-        assert covered == pytest.approx(scene.hidden[0], abs=0.05)
+        assert covered == pytest.approx(scene.conditions["hidden"], abs=0.05)
         assert compute_hidden_share([], scene.block, scene.block.holes[0]) == 0.0
 
 
