@@ -198,15 +198,8 @@ def fit_broken_rim(
     doubt_m = slope * edges.depth_std_m * max(1.0 - whole / SURE_WHOLE, LEAST_DOUBT)
     spread = posterior.spread + np.diag([0.0, doubt_m**2])
     cov = turn.T @ spread @ turn + np.eye(2) * (center_px * edges.pixel_m) ** 2
-    axes = np.column_stack([chart.first, chart.second])
-    return rim.RimCircle(
-        chart.origin + axes @ center,
-        float(posterior.mean[2]),
-        axes @ cov @ axes.T,
-        NOISE_PX,
-        posterior.coverage,
-        chart.seen(np.array([*center, posterior.mean[2]])),
-    )
+    circle = np.array([*center, posterior.mean[2]])
+    return chart.place_circle(circle, cov, NOISE_PX, posterior.coverage)
 
 
 def _compute_posterior(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import cv2
 import numpy as np
@@ -160,230 +160,17 @@ class PlaneConicEstimator:
 
     def __init__(self, settings: PlaneConic) -> None:
         self.settings = settings
-        self._focal = FocalBelief(settings.focal)
+        self.focal = FocalBelief(settings.focal)
         self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is none; `frame` has no distortion."""
-        s, row = self.settings, conic.as_row(ellipse)
-        gray, light, allowed = self._prepare(frame, masks)
-        self._focal.begin(frame)
-        points = self._collect_support(frame, allowed, row)
-        face = self._fit_face(frame, points, ellipse)
-        if isinstance(face, Rejection):
-            return face
-        shape = self._check_shape(face, row, frame, ellipse)
-        if isinstance(shape, Rejection):
-            return shape
-        from_depth = face
-        # The right picture gives the plane again, without the bias of the matcher.
-        both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
-        if both is not None:
-            agreed = alignment.align_plane(both, face, frame, allowed, row, s.inner, s.cell_px)
-            # `None` says that the pictures disagree: then parallax means nothing either.
-            both, face = (None, face) if agreed is None else (both, agreed)
-            # A refined plane may turn a plausible ellipse into an implausible one.
-            shape = self._check_shape(face, row, frame, ellipse)
-            if isinstance(shape, Rejection):
-                return shape
-        aside = consistency.check_ring(
-            points, from_depth, (s.rings[0], s.on_face), both is not None, ellipse
-        )
-        if aside is not None:
-            return aside
-        circle = self._fit_circle(light, frame, face, both, ellipse, has_good_shape=shape)
-        if isinstance(circle, Rejection):
-            return circle
-        refused, doubt = self._judge_appearance(light, frame, masks, face, circle, both, ellipse)
-        if refused is not None:
-            return refused
-        slip = self._focal.find_slip() if frame.right is not None else None
-        if slip is not None:
-            return Rejection("pose", consistency.STRETCH, slip, 1.0, ellipse)
-        return self._describe_hole(frame, face, circle, float(ellipse.score) * doubt)
-
-    def _collect_support(self, frame: Frame, allowed: np.ndarray, row: np.ndarray) -> FaceSupport:
-        """Return the depth around an ellipse `(5,)`: inside the hole it shows no face."""
-        s = self.settings
-        reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
-        return plane.collect_support(
-            frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
-        )
-
-    def _fit_face(
-        self, frame: Frame, points: FaceSupport, ellipse: Ellipse
-    ) -> FacePlane | Rejection:
-        """Return the plane of the face from depth, or why there is none."""
-        s = self.settings
-        # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
-        pair = plane.compare_pair(frame)
-        floor_per_m = s.noise_floor_per_m * pair
-        face = plane.fit_plane(points, s.rings, floor_per_m, np.random.default_rng(0))
-        if face is None:
-            reason, num_points = "pixels of the face with depth", float(len(points.inverse))
-            return Rejection("pose", reason, num_points, float(plane.LEAST), ellipse)
-        # Noise above that of any matcher: the surroundings are no single plane.
-        limit_per_m = s.noise_limit_per_m * max(pair, 1.0)
-        if face.sigma > limit_per_m:
-            reason = "depth noise on the face, 1/m"
-            return Rejection("pose", reason, face.sigma, limit_per_m, ellipse)
-        # Errors of neighbouring pixels are alike; those of a coarse match grow with its pixels.
-        cov = face.cov * s.matcher_alike * frame.depth_shrink**2
-        # A bias of a matcher shifts the whole face, so it enters the constant term alone.
-        bias_per_m = s.matcher_bias_per_m * pair * frame.depth_shrink + s.matcher_drift * face.sigma
-        return replace(face, cov=cov + np.diag([0.0, 0.0, bias_per_m**2]))
-
-    def _fit_circle(
-        self,
-        light: np.ndarray,
-        frame: Frame,
-        face: FacePlane,
-        both: alignment.StereoPatch | None,
-        ellipse: Ellipse,
-        has_good_shape: bool,
-    ) -> RimCircle | Rejection:
-        """Return the circle of the rim on the final plane, or the gate that it misses."""
-        s = self.settings
-        # On the plane a circle has only three unknowns.
-        circle = rim.fit_rim_circle(
-            light,
-            conic.as_row(ellipse),
-            frame.camera_matrix,
-            face.m,
-            s.radius_m,
-            s.radius_tolerance,
-            s.center_px,
-        )
-        # What is missing of a rim is hidden, or broken off.
-        seen = 0.0 if circle is None else circle.coverage
-        row = conic.as_row(ellipse) if circle is None else circle.ellipse
-        ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
-        chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
-        if seen > HALF or ellipse.coverage > WHOLE:
-            outline = row if seen > AS_MUCH * ellipse.coverage else conic.as_row(ellipse)
-            oval = self._judge_focal_length(light, frame, chart, face, outline)
-            if oval is not None:
-                return replace(oval, ellipse=ellipse)
-        is_broken = 1.0 - seen - consistency.measure_hidden_part(face, row, frame) > s.broken
-        if (
-            s.broken < 1.0
-            and both is not None
-            and broken_rim.is_below_face(light, chart, both, row)
-        ):
-            # The circle lies below the face: a refusal is better than its place.
-            is_broken, circle, seen = True, None, 0.0
-        if is_broken:
-            broken = broken_rim.fit_broken_rim(
-                light, chart, both, np.zeros(2), s.radius_m, s.center_px
-            )
-            # Its coverage counts the broken parts too.
-            if broken is not None and broken.coverage >= max(seen, BROKEN_SEEN):
-                circle = broken
-        # An ellipse of wrong shape, or a region with little border, may still belong to a rim, but
-        # then most of the circle must be seen.
-        is_sure = has_good_shape and ellipse.coverage >= s.coverage
-        least = s.coverage if is_sure else max(s.coverage, FORGIVEN)
-        if circle is None or circle.coverage < least:
-            reason = "part of a circle on the face with a rim"
-            seen = 0.0 if circle is None else circle.coverage
-            return Rejection("pose", reason, seen, least, ellipse)
-        size = circle.radius_m / s.radius_m
-        limit = s.radius_tolerance if is_broken else s.size_agrees
-        if abs(size - 1.0) > limit:
-            limit = 1.0 + float(np.sign(size - 1.0)) * limit
-            return Rejection("pose", consistency.SIZE, size, limit, ellipse)
-        return circle
-
-    def _judge_focal_length(
-        self, light: np.ndarray, frame: Frame, chart: PlaneChart, face: FacePlane, row: np.ndarray
-    ) -> Rejection | None:
-        """Return that a rim `(5,)` on a face is round with another focal length of the pair."""
-        told = consistency.measure_stretch(light, chart, face, row)
-        if told is None:
-            return None
-        if frame.right is not None:
-            std = float(np.hypot(told[1], consistency.measure_tilt_doubt(chart, face)))
-            self._focal.learn(row, frame.camera_matrix, float(np.log(told[0])), std)
-        if abs(np.log(told[0])) <= np.log(self.settings.stretch) + 3.0 * told[1]:
-            return None
-        return Rejection("pose", consistency.STRETCH, told[0], 1.0)
-
-    def _judge_appearance(
-        self,
-        light: np.ndarray,
-        frame: Frame,
-        masks: Masks,
-        face: FacePlane,
-        circle: RimCircle,
-        both: alignment.StereoPatch | None,
-        ellipse: Ellipse,
-    ) -> tuple[Rejection | None, float]:
-        """Return the gate of the appearance that a rim misses, and the factor on its score."""
-        s, row = self.settings, circle.ellipse
-        # The first ellipse may follow the shade within: the fitted circle counts.
-        inside = appearance.measure_interior(light, frame.depth_m, row, frame.camera_matrix, face)
-        parallax, covered = float("nan"), 0.0
-        if both is not None:
-            parallax, covered = alignment.measure_parallax(
-                both, face, frame.depth_m, row, *s.looks.parts
-            )
-        # Behind an occluder, or in dust, hole and disc look the same.
-        undecided = inside.darkness > s.looks.veiled or (
-            covered > UNDECIDED and inside.unknown > UNDECIDED
-        )
-        wall = None
-        if inside.darkness > s.looks.veiled:
-            place = (frame.camera_matrix, face, circle.center_m, circle.radius_m)
-            wall = measure_wall_light(light, frame.depth_m, row, *place)
-            if covered > COVERED:
-                parallax = float("nan")
-        refused = self._check_appearance(inside, parallax, wall, masks, row, ellipse, undecided)
-        # A network that marks mouths has decided already; without it the doubt stays.
-        doubt = UNDECIDED_SCORE if undecided and masks.hole_mask is None else 1.0
-        return refused, doubt
-
-    def _describe_hole(
-        self, frame: Frame, face: FacePlane, circle: RimCircle, score: float
-    ) -> HolePose:
-        """Return the hole of a rim, with all that its place and axis may be off."""
-        s = self.settings
-        bias_per_m = s.bias_per_m * plane.compare_pair(frame)
-        own_m2 = face.point_cov_m2(circle.center_m, bias_per_m) + circle.cov_m2
-        own_rad2 = face.normal_cov_rad2()
-        shared_m2, shared_rad2 = self._compute_rig_covariances(frame, face, circle.center_m)
-        return HolePose(
-            center_m=circle.center_m,
-            axis=face.normal,
-            radius_m=circle.radius_m,
-            cov_m2=own_m2 if shared_m2 is None else own_m2 + shared_m2,
-            axis_cov_rad2=own_rad2 if shared_rad2 is None else own_rad2 + shared_rad2,
-            frame="camera",
-            score=score,
-            t_s=frame.t_s,
-            shared_m2=shared_m2,
-            shared_rad2=shared_rad2,
-        )
-
-    def _compute_rig_covariances(
-        self, frame: Frame, face: FacePlane, center_m: np.ndarray
-    ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Return covariances of centre and normal by the errors of a pair, `None` without one.
-
-        A disparity that is wrong by `c0 + c1 x/z + c2 y/z` shifts the plane in inverse depth by
-        `(c1, c2, c0)` over focal length and baseline. No residual shows it, in any frame; the same
-        holds of a wrong focal length.
-        """
-        std_px = self.settings.rig_px if frame.disparity_std_px is None else frame.disparity_std_px
-        if frame.baseline_m is None or (frame.right is None and not std_px):
-            return None, None
-        std_per_m = std_px / (float(frame.camera_matrix[0, 0]) * frame.baseline_m)
-        shifted = replace(face, cov=np.eye(3) * std_per_m**2)
-        shared_m2, shared_rad2 = shifted.point_cov_m2(center_m, 0.0), shifted.normal_cov_rad2()
-        if frame.right is not None:
-            by_focal = compute_focal_covariances(center_m, face.normal, self._focal.std)
-            shared_m2 = shared_m2 + by_focal[0]
-            shared_rad2 = shared_rad2 + by_focal[1]
-        return shared_m2, shared_rad2
+        prepared = self._prepare(frame, masks)
+        self.focal.begin(frame)
+        try:
+            return _Candidate(self, frame, masks, ellipse, *prepared).estimate()
+        except _RefusalError as refused:
+            return refused.rejection
 
     def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return grey picture, linear light and pixels of the face, cached for a frame's ellipses."""
@@ -396,60 +183,222 @@ class PlaneConicEstimator:
             self._seen = frame, masks, gray, linearize(gray, frame.gamma), allowed
         return self._seen[2:]
 
-    def _check_shape(
-        self, face: FacePlane, row: np.ndarray, frame: Frame, ellipse: Ellipse
-    ) -> bool | Rejection:
-        """Return whether an ellipse has size and shape of a whole rim, or the gate that it misses."""
-        s = self.settings
+
+class _RefusalError(Exception):
+    """A candidate misses a gate."""
+
+    def __init__(self, rejection: Rejection) -> None:
+        super().__init__(rejection.reason)
+        self.rejection = rejection
+
+
+class _Candidate:
+    """One ellipse of a frame; each step raises `_RefusalError` where it misses a gate.
+
+    Args:
+        estimator: Gives settings and the belief about the focal length.
+        frame: The frame.
+        masks: Its masks.
+        ellipse: The ellipse.
+        gray: Grey picture, `(h, w)` uint8.
+        light: Linear light, `(h, w)` float32.
+        allowed: Pixels of the face, `(h, w)` bool.
+    """
+
+    def __init__(
+        self,
+        estimator: PlaneConicEstimator,
+        frame: Frame,
+        masks: Masks,
+        ellipse: Ellipse,
+        gray: np.ndarray,
+        light: np.ndarray,
+        allowed: np.ndarray,
+    ) -> None:
+        self._settings, self._focal = estimator.settings, estimator.focal
+        self._frame, self._masks, self._matrix = frame, masks, frame.camera_matrix
+        self._gray, self._light, self._allowed = gray, light, allowed
+        self._ellipse, self._row = ellipse, conic.as_row(ellipse)
+        self._ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
+
+    def estimate(self) -> HolePose:
+        """Return the hole in camera coordinates."""
+        s, frame = self._settings, self._frame
+        # Inside the hole depth shows no face.
+        reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
+        points = plane.collect_support(
+            frame.depth_m, self._allowed, self._matrix, self._row, *reach, s.max_pixels, s.cell_px
+        )
+        face = from_depth = self._fit_face(points)
+        has_good_shape = self._check_shape(face)
+        # The right picture gives the plane again, without the bias of the matcher.
+        both = alignment.crop_pair(frame, self._gray, face.m, self._row, face.extent)
+        if both is not None:
+            agreed = alignment.align_plane(
+                both, face, frame, self._allowed, self._row, s.inner, s.cell_px
+            )
+            # `None` says that the pictures disagree: then parallax means nothing either.
+            both, face = (None, face) if agreed is None else (both, agreed)
+            # A refined plane may turn a plausible ellipse into an implausible one.
+            has_good_shape = self._check_shape(face)
+        limits = (s.rings[0], s.on_face)
+        aside = consistency.check_ring(points, from_depth, limits, both is not None, self._ellipse)
+        if aside is not None:
+            raise _RefusalError(aside)
+        circle = self._fit_circle(face, both, has_good_shape)
+        doubt = self._judge_appearance(face, circle, both)
+        slip = self._focal.find_slip() if frame.right is not None else None
+        if slip is not None:
+            self._refuse(consistency.STRETCH, slip, 1.0)
+        return self._describe_hole(face, circle, float(self._ellipse.score) * doubt)
+
+    def _refuse(self, reason: str, value: float, limit: float) -> NoReturn:
+        raise _RefusalError(Rejection("pose", reason, value, limit, self._ellipse))
+
+    def _fit_face(self, points: FaceSupport) -> FacePlane:
+        """Return the plane of the face from depth."""
+        s, frame = self._settings, self._frame
+        # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
+        pair = plane.compare_pair(frame)
+        floor_per_m = s.noise_floor_per_m * pair
+        face = plane.fit_plane(points, s.rings, floor_per_m, np.random.default_rng(0))
+        if face is None:
+            num_points = float(len(points.inverse))
+            self._refuse("pixels of the face with depth", num_points, float(plane.LEAST))
+        # Noise above that of any matcher: the surroundings are no single plane.
+        limit_per_m = s.noise_limit_per_m * max(pair, 1.0)
+        if face.sigma > limit_per_m:
+            self._refuse("depth noise on the face, 1/m", face.sigma, limit_per_m)
+        # Errors of neighbouring pixels are alike; those of a coarse match grow with its pixels.
+        cov = face.cov * s.matcher_alike * frame.depth_shrink**2
+        # A bias of a matcher shifts the whole face, so it enters the constant term alone.
+        bias_per_m = s.matcher_bias_per_m * pair * frame.depth_shrink + s.matcher_drift * face.sigma
+        return replace(face, cov=cov + np.diag([0.0, 0.0, bias_per_m**2]))
+
+    def _check_shape(self, face: FacePlane) -> bool:
+        """Return whether the ellipse has size and shape of a whole rim; others may be hidden in part."""
+        s, row = self._settings, self._row
         # The angle at the centre of the ellipse: across a close face it varies by some degrees.
-        ray = np.linalg.solve(frame.camera_matrix, np.array([row[0], row[1], 1.0]))
-        cosine = -float(face.normal @ ray) / float(np.linalg.norm(ray))
+        cosine = -float(face.normal @ self._ray) / float(np.linalg.norm(self._ray))
         tilt = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         if tilt > s.tilt_rad:
-            return Rejection("pose", "tilt of the face, rad", tilt, s.tilt_rad, ellipse)
-        chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
-        axes = chart.flatten(row)[2:4]
+            self._refuse("tilt of the face, rad", tilt, s.tilt_rad)
+        axes = rim.build_chart(face.point(self._ray), face.m, self._matrix).flatten(row)[2:4]
         # The face is seen edge-on: the projection of the ellipse onto it is no ellipse.
         if not np.isfinite(axes).all():
-            return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
+            self._refuse("axis ratio on the face", 0.0, s.axis_ratio)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
         # The less of a rim is visible, the less precise is its ellipse.
-        seen = max(1.0 - consistency.measure_hidden_part(face, row, frame), s.coverage)
+        seen = max(1.0 - consistency.measure_hidden_part(face, row, self._frame), s.coverage)
         tolerance = AT_FIRST * s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
-            return Rejection("pose", "radius, m", radius, float(limit), ellipse)
+            self._refuse("radius, m", radius, float(limit))
         least = 1.0 - AT_FIRST * (1.0 - s.axis_ratio) / seen
         if ratio < least:
-            return Rejection("pose", "axis ratio on the face", ratio, least, ellipse)
+            self._refuse("axis ratio on the face", ratio, least)
         return abs(radius / s.radius_m - 1.0) <= s.radius_tolerance and ratio >= s.axis_ratio
+
+    def _fit_circle(
+        self, face: FacePlane, both: alignment.StereoPatch | None, has_good_shape: bool
+    ) -> RimCircle:
+        """Return the circle of the rim on the final plane."""
+        s, ellipse = self._settings, self._ellipse
+        chart = rim.build_chart(face.point(self._ray), face.m, self._matrix)
+        # On the plane a circle has only three unknowns.
+        circle = rim.fit_rim_circle(
+            self._light, self._row, chart, s.radius_m, s.radius_tolerance, s.center_px
+        )
+        # What is missing of a rim is hidden, or broken off.
+        seen = 0.0 if circle is None else circle.coverage
+        row = self._row if circle is None else circle.ellipse
+        if seen > HALF or ellipse.coverage > WHOLE:
+            outline = row if seen > AS_MUCH * ellipse.coverage else self._row
+            self._judge_focal_length(chart, face, outline)
+        hidden = consistency.measure_hidden_part(face, row, self._frame)
+        is_broken = 1.0 - seen - hidden > s.broken
+        if (
+            s.broken < 1.0
+            and both is not None
+            and broken_rim.is_below_face(self._light, chart, both, row)
+        ):
+            # The circle lies below the face: a refusal is better than its place.
+            is_broken, circle, seen = True, None, 0.0
+        if is_broken:
+            broken = broken_rim.fit_broken_rim(
+                self._light, chart, both, np.zeros(2), s.radius_m, s.center_px
+            )
+            # Its coverage counts the broken parts too.
+            if broken is not None and broken.coverage >= max(seen, BROKEN_SEEN):
+                circle = broken
+        # An ellipse of wrong shape, or a region with little border, may still belong to a rim, but
+        # then most of the circle must be seen.
+        is_sure = has_good_shape and ellipse.coverage >= s.coverage
+        least = s.coverage if is_sure else max(s.coverage, FORGIVEN)
+        seen = 0.0 if circle is None else circle.coverage
+        if circle is None or seen < least:
+            self._refuse("part of a circle on the face with a rim", seen, least)
+        size = circle.radius_m / s.radius_m
+        limit = s.radius_tolerance if is_broken else s.size_agrees
+        if abs(size - 1.0) > limit:
+            self._refuse(consistency.SIZE, size, 1.0 + float(np.sign(size - 1.0)) * limit)
+        return circle
+
+    def _judge_focal_length(self, chart: PlaneChart, face: FacePlane, row: np.ndarray) -> None:
+        """Refuse a rim `(5,)` on a face that is round with another focal length of the pair."""
+        told = consistency.measure_stretch(self._light, chart, face, row)
+        if told is None:
+            return
+        if self._frame.right is not None:
+            std = float(np.hypot(told[1], consistency.measure_tilt_doubt(chart, face)))
+            self._focal.learn(row, self._matrix, float(np.log(told[0])), std)
+        if abs(np.log(told[0])) > np.log(self._settings.stretch) + 3.0 * told[1]:
+            self._refuse(consistency.STRETCH, told[0], 1.0)
+
+    def _judge_appearance(
+        self, face: FacePlane, circle: RimCircle, both: alignment.StereoPatch | None
+    ) -> float:
+        """Return the factor on the score of a rim that looks like a hole."""
+        looks, frame, row = self._settings.looks, self._frame, circle.ellipse
+        # The first ellipse may follow the shade within: the fitted circle counts.
+        inside = appearance.measure_interior(self._light, frame.depth_m, row, self._matrix, face)
+        parallax, covered = float("nan"), 0.0
+        if both is not None:
+            parallax, covered = alignment.measure_parallax(
+                both, face, frame.depth_m, row, *looks.parts
+            )
+        is_veiled = inside.darkness > looks.veiled
+        # Behind an occluder, or in dust, hole and disc look the same.
+        is_undecided = is_veiled or (covered > UNDECIDED and inside.unknown > UNDECIDED)
+        wall = None
+        if is_veiled:
+            place = (self._matrix, face, circle.center_m, circle.radius_m)
+            wall = measure_wall_light(self._light, frame.depth_m, row, *place)
+            if covered > COVERED:
+                parallax = float("nan")
+        self._check_appearance(inside, parallax, wall, row, is_undecided)
+        # A network that marks mouths has decided already; without it the doubt stays.
+        return UNDECIDED_SCORE if is_undecided and self._masks.hole_mask is None else 1.0
 
     def _check_appearance(
         self,
         inside: Interior,
         parallax: float,
         wall: WallLight | None,
-        masks: Masks,
         row: np.ndarray,
-        ellipse: Ellipse,
-        undecided: bool,
-    ) -> Rejection | None:
-        """Return the gate that a hole misses, `None` for none; `wall` is known for veiled ones."""
-        looks = self.settings.looks
-
-        def refuse(reason: str, value: float, limit: float) -> Rejection:
-            return Rejection("pose", reason, value, limit, ellipse)
-
-        if inside.nearer > self.settings.nearer:
-            return refuse(consistency.NEARER, inside.nearer, self.settings.nearer)
+        is_undecided: bool,
+    ) -> None:
+        """Refuse what is no hole; `wall` is known for veiled ones."""
+        looks, mask = self._settings.looks, self._masks.hole_mask
+        if inside.nearer > self._settings.nearer:
+            self._refuse(consistency.NEARER, inside.nearer, self._settings.nearer)
         # Written as a negation so that NaN, an inside without pixels, is refused too.
         if not inside.darkness <= looks.darkness:
-            return refuse("brightness inside over outside", inside.darkness, looks.darkness)
-        has_mask = masks.hole_mask is not None
-        mouth = 0.0 if masks.hole_mask is None else appearance.average_inside(masks.hole_mask, row)
-        if has_mask and mouth < looks.mouth:
-            # A mouth probability of 0 with no mask means "not asked", not "no mouth".
-            return refuse("mouth probability inside", mouth, looks.mouth)
+            self._refuse("brightness inside over outside", inside.darkness, looks.darkness)
+        # A mouth probability of 0 with no mask means "not asked", not "no mouth".
+        mouth = 0.0 if mask is None else appearance.average_inside(mask, row)
+        if mask is not None and mouth < looks.mouth:
+            self._refuse("mouth probability inside", mouth, looks.mouth)
         is_sure = mouth >= looks.sure_mouth
         evidence = 0.0
         for value in (inside.slope / looks.slope, inside.deeper / looks.deeper):
@@ -465,20 +414,62 @@ class PlaneConicEstimator:
         # Dust and haze brighten the inside; there darkness alone does not decide.
         if wall is not None:
             if is_sure:
-                return None
+                return
             if inside.around < inside.darkness - looks.darker:
-                return refuse("brightness inside over outside", inside.darkness, looks.veiled)
+                self._refuse("brightness inside over outside", inside.darkness, looks.veiled)
             if has_parallax and from_parallax >= 1.0:
-                return None
+                return
             if inside.contrast < looks.contrast:
-                return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
+                self._refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
             if wall.log_ratio < looks.hole_log_ratio:
-                return refuse(IN_DUST, wall.log_ratio, looks.hole_log_ratio)
-            return None
+                self._refuse(IN_DUST, wall.log_ratio, looks.hole_log_ratio)
+            return
         # Nothing can be seen that would decide: the hole passes with a lower score.
-        if undecided and not has_parallax and (is_sure or not has_mask):
-            return None
-        return None if evidence >= 1.0 else refuse("evidence of depth inside", evidence, 1.0)
+        if is_undecided and not has_parallax and (is_sure or mask is None):
+            return
+        if not evidence >= 1.0:
+            self._refuse("evidence of depth inside", evidence, 1.0)
+
+    def _describe_hole(self, face: FacePlane, circle: RimCircle, score: float) -> HolePose:
+        """Return the hole of a rim, with all that its place and axis may be off."""
+        bias_per_m = self._settings.bias_per_m * plane.compare_pair(self._frame)
+        own_m2 = face.point_cov_m2(circle.center_m, bias_per_m) + circle.cov_m2
+        own_rad2 = face.normal_cov_rad2()
+        shared_m2, shared_rad2 = self._compute_rig_covariances(face, circle.center_m)
+        return HolePose(
+            center_m=circle.center_m,
+            axis=face.normal,
+            radius_m=circle.radius_m,
+            cov_m2=own_m2 if shared_m2 is None else own_m2 + shared_m2,
+            axis_cov_rad2=own_rad2 if shared_rad2 is None else own_rad2 + shared_rad2,
+            frame="camera",
+            score=score,
+            t_s=self._frame.t_s,
+            shared_m2=shared_m2,
+            shared_rad2=shared_rad2,
+        )
+
+    def _compute_rig_covariances(
+        self, face: FacePlane, center_m: np.ndarray
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Return covariances of centre and normal by the errors of a pair, `None` without one.
+
+        A disparity that is wrong by `c0 + c1 x/z + c2 y/z` shifts the plane in inverse depth by
+        `(c1, c2, c0)` over focal length and baseline. No residual shows it, in any frame; the same
+        holds of a wrong focal length.
+        """
+        frame, std_px = self._frame, self._frame.disparity_std_px
+        std_px = self._settings.rig_px if std_px is None else std_px
+        if frame.baseline_m is None or (frame.right is None and not std_px):
+            return None, None
+        std_per_m = std_px / (float(self._matrix[0, 0]) * frame.baseline_m)
+        shifted = replace(face, cov=np.eye(3) * std_per_m**2)
+        shared_m2, shared_rad2 = shifted.point_cov_m2(center_m, 0.0), shifted.normal_cov_rad2()
+        if frame.right is not None:
+            by_focal = compute_focal_covariances(center_m, face.normal, self._focal.std)
+            shared_m2 = shared_m2 + by_focal[0]
+            shared_rad2 = shared_rad2 + by_focal[1]
+        return shared_m2, shared_rad2
 
 
 def convert_to_gray(frame: Frame) -> np.ndarray:

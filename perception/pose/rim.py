@@ -100,6 +100,14 @@ class PlaneChart:
         form = back.T @ conic.build_quadratic_forms(np.array([x, y, radius, radius, 0.0])) @ back
         return conic.convert_forms_to_ellipses(form[None])[0]
 
+    def place_circle(
+        self, circle: np.ndarray, cov_m2: np.ndarray, rms_px: float, coverage: float
+    ) -> RimCircle:
+        """Return a circle `(x, y, radius)` in camera coordinates; `cov_m2`, `(2, 2)`, is its centre's."""
+        axes = np.column_stack([self.first, self.second])
+        center_m, cov = self.origin + axes @ circle[:2], axes @ cov_m2 @ axes.T
+        return RimCircle(center_m, float(circle[2]), cov, rms_px, coverage, self.seen(circle))
+
 
 def build_chart(origin: np.ndarray, m: np.ndarray, camera_matrix: np.ndarray) -> PlaneChart:
     """Return coordinates on the plane `m · P = 1` about one of its points, `(3,)`."""
@@ -131,28 +139,24 @@ class _CircleFit:
 def fit_rim_circle(
     gray: np.ndarray,
     ellipse: np.ndarray,
-    camera_matrix: np.ndarray,
-    m: np.ndarray,
+    chart: PlaneChart,
     radius_m: float,
     tolerance: float,
     center_px: float,
 ) -> RimCircle | None:
-    """Fit the circle on the plane `m · P = 1` along which most edges run from dark to bright.
+    """Fit the circle on a plane along which most edges run from dark to bright.
 
     Return `None` where no circle of a possible size has enough.
 
     Args:
         gray: Light, `(h, w)` float32; see `plane_conic.linearize`.
         ellipse: Start, `(5,)`.
-        camera_matrix: Camera matrix, `(3, 3)`.
-        m: Plane, `(3,)`.
+        chart: Coordinates on the plane about the ellipse's centre.
         radius_m: Expected radius.
         tolerance: Allowed relative error of it.
         center_px: Least standard deviation of each wave of a rim, px: of the first one, which no
             residual shows, and of the `WAVES` beyond what the residuals show.
     """
-    ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
-    chart = build_chart(ray / (m @ ray), m, camera_matrix)
     # The search reaches a quarter of the size: the first ellipse may be that wrong.
     size = float(np.sqrt(ellipse[2] * ellipse[3]))
     profiles = find_profile_edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
@@ -176,15 +180,7 @@ def fit_rim_circle(
             return None
     if fit is None or found is None:
         return None
-    axes = np.column_stack([chart.first, chart.second])
-    return RimCircle(
-        chart.origin + axes @ found[:2],
-        float(found[2]),
-        axes @ fit.cov_m2 @ axes.T,
-        fit.rms_px,
-        fit.coverage,
-        chart.seen(found),
-    )
+    return chart.place_circle(found, fit.cov_m2, fit.rms_px, fit.coverage)
 
 
 @dataclass(frozen=True)
