@@ -77,12 +77,11 @@ class RimScale:
 
     def _measure_depth(self, one: Ellipse, gray: np.ndarray, depth_m: np.ndarray) -> float | None:
         """Return the depth around a rim, m; `None` for one that is not dark, or without depth."""
-        height, width = min(len(gray), len(depth_m)), min(len(gray[0]), len(depth_m[0]))
-        reach = RING[1] * one.a
-        rows = np.arange(max(0, int(one.y - reach)), min(height, int(one.y + reach) + 1))
-        columns = np.arange(max(0, int(one.x - reach)), min(width, int(one.x + reach) + 1))
-        part = np.ix_(rows, columns)
-        radii = conic.measure_radii(conic.as_row(one), columns[None, :], rows[:, None])
+        shape = min(len(gray), len(depth_m)), min(len(gray[0]), len(depth_m[0]))
+        row = conic.as_row(one)
+        part = conic.bound_ellipse(row, RING[1] * one.a, shape)
+        rows, columns = np.ogrid[part]
+        radii = conic.measure_radii(row, columns, rows)
         ring = (radii > RING[0]) & (radii < RING[1])
         inside = radii < 0.8
         if not ring.any() or not inside.any():

@@ -200,6 +200,17 @@ def measure_radii(ellipse: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarr
     return np.hypot((c * dx + s * dy) / ellipse[2], (c * dy - s * dx) / ellipse[3])
 
 
+def bound_ellipse(
+    ellipse: np.ndarray, reach_px: float, shape: tuple[int, ...]
+) -> tuple[slice, slice]:
+    """Return rows and columns of a picture `(h, w)` around an ellipse's centre, to `reach_px`."""
+    rows, columns = (
+        slice(max(0, int(middle - reach_px)), max(0, min(size, int(middle + reach_px) + 2)))
+        for middle, size in ((ellipse[1], shape[0]), (ellipse[0], shape[1]))
+    )
+    return rows, columns
+
+
 def compute_perimeter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the circumference by Ramanujan's first approximation (1914)."""
     return np.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))

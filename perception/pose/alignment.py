@@ -117,11 +117,8 @@ def crop_pair(
     """Return both pictures around an ellipse `(5,)`, to `outer` radii; `None` without a right one."""
     if frame.right is None or frame.baseline_m is None or frame.right.shape != frame.color.shape:
         return None
-    height, width = gray.shape
-    x, y, reach = ellipse[0], ellipse[1], ellipse[2] * outer
-    # The picture ends where it ends: the ellipse may reach beyond it.
-    left, right = max(0, int(x - reach)), min(width, int(x + reach) + 2)
-    top, bottom = max(0, int(y - reach)), min(height, int(y + reach) + 2)
+    down, across = conic.bound_ellipse(ellipse, ellipse[2] * outer, gray.shape)
+    top, bottom, left, right = down.start, down.stop, across.start, across.stop
     # 16 px: less has no room for the window of the means.
     if right - left < 16 or bottom - top < 16:
         return None
@@ -134,7 +131,7 @@ def crop_pair(
     )
     # 8 px of room: the plane from depth may be off by a pixel, and interpolation needs some more.
     first = max(0, int(left - shift.max()) - 8 * shrink)
-    last = min(width, int(right - shift.min()) + 8 * shrink)
+    last = min(gray.shape[1], int(right - shift.min()) + 8 * shrink)
     rows, columns = (bottom - top) // shrink, (right - left) // shrink
     others = (last - first) // shrink
     if others < 16:

@@ -63,11 +63,9 @@ def measure_interior(
 ) -> Interior:
     """Return the appearance inside an ellipse `(5,)` on a face."""
     x, y, a = ellipse[:3]
-    reach = a * RING[1] + 2
-    top, left = max(0, int(y - reach)), max(0, int(x - reach))
-    bottom, right = min(gray.shape[0], int(y + reach) + 2), min(gray.shape[1], int(x + reach) + 2)
-    part = gray[top:bottom, left:right].astype(np.float32)
-    rows, columns = np.ogrid[top:bottom, left:right]
+    box = conic.bound_ellipse(ellipse, a * RING[1] + 2, gray.shape)
+    part = gray[box].astype(np.float32)
+    rows, columns = np.mgrid[box]
     radii = conic.measure_radii(ellipse, columns, rows)
     inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < 8 or ring.sum() < 8:
@@ -78,7 +76,7 @@ def measure_interior(
     )
     # Brighter pixels without depth show a lit arm before the hole.
     inside &= smooth < face
-    depth = depth_m[top:bottom, left:right]
+    depth = depth_m[box]
     known = np.isfinite(depth)
     behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(
         known, depth, np.inf
@@ -96,11 +94,12 @@ def measure_interior(
     clearly = max(4 * plane.sigma, CLEARLY_M * float(plane.m @ middle) ** 2)
     deeper = float(np.mean(behind[inside & known] > clearly)) if (inside & known).any() else 0.0
     into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
-    away = _list_pixels(inside, left, top) - (x, y)
+    places = np.stack([columns - x, rows - y], -1)
+    away = places[inside]
     along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
     # Uneven light changes hole and face by the same factor: take the face's change off.
     level = np.log(part[ring] + 1.0)
-    drift = _fit_brightness_gradient(level, _list_pixels(ring, left, top) - (x, y))
+    drift = _fit_brightness_gradient(level, places[ring])
     values = np.log(values + 1.0) - away @ drift
     contrast = float(np.log((face + 1.0) / (face * darkness + 1.0)))
     apart = along - along.mean()
@@ -160,12 +159,6 @@ def _measure_darkest_around(
     return float(np.percentile(near, 1.0)) if near.size else 0.0
 
 
-def _list_pixels(there: np.ndarray, left: int, top: int) -> np.ndarray:
-    """Return column and row of the marked pixels of a part of a picture, `(P, 2)`."""
-    line, column = np.nonzero(there)
-    return np.column_stack([column + left, line + top])
-
-
 def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
     """Fit the gradient of values `(P,)` over places `(P, 2)`, `(2,)` a pixel.
 
@@ -179,10 +172,8 @@ def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray
 def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
     """Return the mean of a picture within 0.8 of an ellipse."""
     # The semi-major axis bounds the ellipse, however it is turned.
-    x, y, a = row[:3]
-    top, left = max(0, int(y - a)), max(0, int(x - a))
-    part = picture[top : int(y + a) + 2, left : int(x + a) + 2]
-    rows, columns = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
+    box = conic.bound_ellipse(row, row[2], picture.shape)
+    rows, columns = np.ogrid[box]
     # 0.8 leaves out the blurred edge of the rim.
     inside = conic.measure_radii(row, columns, rows) < 0.8
-    return float(part[inside].mean()) if inside.any() else 0.0
+    return float(picture[box][inside].mean()) if inside.any() else 0.0

@@ -161,21 +161,14 @@ def collect_support(
         most: Largest number of pixels; of more, a regular grid is taken.
         cell_px: Side of the squares within which noise is correlated.
     """
-    height, width = depth_m.shape
-    x, y, a = ellipse[0], ellipse[1], ellipse[2] * outer
-    left, right = max(0, int(x - a)), min(width, int(x + a) + 2)
-    top, bottom = max(0, int(y - a)), min(height, int(y + a) + 2)
-    area = max(right - left, 0) * max(bottom - top, 0)
+    down, across = conic.bound_ellipse(ellipse, ellipse[2] * outer, depth_m.shape)
     # A regular grid keeps the coverage and limits the number of pixels.
-    step = max(1, int(np.sqrt(area / most)))
-    rows, columns = np.ogrid[top:bottom:step, left:right:step]
-    depth = depth_m[top:bottom:step, left:right:step]
+    step = max(1, int(np.sqrt(depth_m[down, across].size / most)))
+    grid = slice(down.start, down.stop, step), slice(across.start, across.stop, step)
+    rows, columns = np.ogrid[grid]
+    depth = depth_m[grid]
     radii = conic.measure_radii(ellipse, columns, rows)
-    good = (
-        (allowed[top:bottom:step, left:right:step] | (radii < certain))
-        & np.isfinite(depth)
-        & (depth > 0)
-    )
+    good = (allowed[grid] | (radii < certain)) & np.isfinite(depth) & (depth > 0)
     # The size of the circle in units of the focal length gives its distance roughly.
     size = ellipse[2] / float(np.sqrt(camera_matrix[0, 0] * camera_matrix[1, 1]))
     # The axes' ratio bounds the slope of the face.
@@ -185,17 +178,13 @@ def collect_support(
     good &= (radii > inner) & (radii < outer)
     line, place = np.nonzero(good)
     radii, inverse = radii[good], 1.0 / depth[good].astype(float)
-    v, u = top + step * line, left + step * place
+    v, u = rows[line, 0], columns[0, place]
     # A number for each cell: row times columns plus column.
-    cell = number_cells(v // cell_px * (width // cell_px + 1) + u // cell_px)
+    cell = number_cells(v // cell_px * (depth_m.shape[1] // cell_px + 1) + u // cell_px)
     outwards = np.argsort(radii)
-    u = u[outwards]
-    v = v[outwards]
-    radii = radii[outwards]
-    inverse = inverse[outwards]
-    cell = cell[outwards]
-    rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
-    return FaceSupport(rays, inverse, radii, cell)
+    pixels = np.column_stack([u, v, np.ones(len(u))])[outwards]
+    rays = pixels @ np.linalg.inv(camera_matrix).T
+    return FaceSupport(rays, inverse[outwards], radii[outwards], cell[outwards])
 
 
 def fit_plane(

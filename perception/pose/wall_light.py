@@ -85,13 +85,11 @@ def measure_wall_light(
         radius_m: Its radius.
     """
     x, y, a, b = ellipse[:4]
-    reach = a * RING[1] + 2
-    top, left = max(0, int(y - reach)), max(0, int(x - reach))
-    bottom, right = min(len(light), int(y + reach) + 2), min(len(light[0]), int(x + reach) + 2)
-    part = light[top:bottom, left:right].astype(np.float32)
-    rows, columns = np.mgrid[top:bottom, left:right]
+    box = conic.bound_ellipse(ellipse, a * RING[1] + 2, light.shape)
+    part = light[box].astype(np.float32)
+    rows, columns = np.mgrid[box]
     radii = conic.measure_radii(ellipse, columns, rows)
-    before = plane.find_nearer(depth_m[top:bottom, left:right], camera_matrix, columns, rows)
+    before = plane.find_nearer(depth_m[box], camera_matrix, columns, rows)
     free = cv2.dilate(before.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     inside = free & (radii < min(OUTERMOST, 1.0 - BRINK_PX / b))
     ring = free & (radii > RING[0]) & (radii < RING[1])
