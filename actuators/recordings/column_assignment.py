@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from actuators.recordings.advice import advise, format_joints
 from actuators.recordings.clock_evidence import guess_times
-from actuators.recordings.clocks import list_time_columns, unwrap
+from actuators.recordings.clocks import list_time_columns
 from actuators.recordings.guess import GivenColumns
 from actuators.recordings.joint_evidence import (
     CLEAR_CORRELATION,
@@ -25,7 +25,6 @@ from actuators.recordings.joint_evidence import (
     ColumnEntry,
     Correlations,
     JointGuess,
-    JointJudge,
     weigh_correlation,
 )
 from actuators.recordings.log_signals import RunSignals
@@ -68,16 +67,11 @@ class ColumnTable:
 
     def _judge_joints(self) -> None:
         """Weigh by the numbers what the columns of each joint are."""
-        joints = self.joints
-        matrix = self._correlate([one.u for one in joints], [one.q for one in joints])
-        for at, joint in enumerate(joints):
-            judge = JointJudge(joint, matrix, at, self._given)
-            judge.judge_kind()
-            judge.judge_motion([one.u.text for one in joints])
+        commands = [one.u for one in self.joints]
+        matrix = Correlations(self._run, commands, [one.q for one in self.joints])
+        for at, joint in enumerate(self.joints):
             self._check_drive(joint)
-            judge.judge_columns()
-            judge.judge_unit()
-            judge.judge_target()
+            joint.judge(matrix, at, self._given, [one.text for one in commands])
 
     def _take(self, given: Mapping[str, tuple[str, str]]) -> list[JointGuess]:
         """Return the joints whose columns a person gives; refuse one that is missing."""
@@ -85,7 +79,8 @@ class ColumnTable:
         for joint, columns in given.items():
             u, q = (self._read_entry(column) for column in columns)
             (u,), (q,) = self._unwrap([u], [q], [joint])
-            joints.append(JointGuess(joint, u, q, [("as given by log.joints", 5.0)]))
+            evidence = [("as given by log.joints", 5.0)]
+            joints.append(JointGuess(joint, u, q, evidence, self.signals))
         return joints
 
     def _find(self) -> list[JointGuess]:
@@ -163,11 +158,11 @@ class ColumnTable:
             if given is not None and (wrap is None or wrap.modulus != given):
                 wrap = Wrap(float(given), np.empty(0, dtype=int)) if given else None
             moduli |= {wrap.modulus} if wrap else set()
-            plain.append(_remove_wrap(entry, wrap))
+            plain.append(entry.remove_wrap(wrap))
         targets = []
         for entry in commands:
             wrap = find_wrap(entry.values) if moduli else None
-            targets.append(_remove_wrap(entry, wrap if wrap and wrap.modulus in moduli else None))
+            targets.append(entry.remove_wrap(wrap if wrap and wrap.modulus in moduli else None))
         return targets, plain
 
     def _assign(
@@ -175,12 +170,10 @@ class ColumnTable:
     ) -> list[JointGuess]:
         """Return the pairs of the assignment with the most evidence."""
         names = _weigh_names(commands, positions)
-        size = self._correlate(commands, positions).size
+        size = Correlations(self._run, commands, positions).size
         numbers = np.vectorize(weigh_correlation)(size) + size
         numbers[[not one.is_changing for one in commands]] = -1.0  # another log may move it
-        score = (
-            names + numbers + np.add.outer(_prefer_targets(commands), _prefer_measured(positions))
-        )
+        score = names + numbers + _prefer(commands, positions)
         pairs = [
             (int(row), int(column)) for row, column in np.stack(linear_sum_assignment(-score), 1)
         ]
@@ -190,7 +183,9 @@ class ColumnTable:
                 chosen.setdefault(commands[pair[0]].name.key, pair)
         found = [(*pair, "same name", SAME_NAME) for pair in chosen.values()]
         rows, columns = _list_rest(commands, chosen), _list_rest(positions, chosen)
-        clear = [pair for pair in pairs if _is_clear(size, *pair, rows, columns)]
+        rest = np.zeros_like(size)
+        rest[np.ix_(rows, columns)] = size[np.ix_(rows, columns)]
+        clear = [pair for pair in pairs if _is_clear(rest, *pair)]
         if len(rows) == len(columns) == 1:
             found.append((rows[0], columns[0], "the only command and the only position", 2.0))
         elif len(clear) == min(len(rows), len(columns)):
@@ -202,15 +197,8 @@ class ColumnTable:
         for row, column, text, weight in sorted(found):
             u, q = commands[row], positions[column]
             name = name_joint(q.name.joint or u.name.joint)
-            joints.append(JointGuess(name, u, q, [(text, weight)]))
+            joints.append(JointGuess(name, u, q, [(text, weight)], self.signals))
         return joints
-
-    def _correlate(
-        self, commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]
-    ) -> Correlations:
-        """Return how positions follow commands."""
-        u, q = ([one.signal for one in several] for several in (commands, positions))
-        return Correlations(self._run, u, q)
 
     def _list_followers(
         self, entries: Sequence[ColumnEntry]
@@ -219,7 +207,7 @@ class ColumnTable:
         moving = [one for one in entries if one.is_changing]
         if not moving:
             return []
-        size = self._correlate(moving, moving).size
+        size = Correlations(self._run, moving, moving).size
         np.fill_diagonal(size, 0.0)
         size = np.where((size >= size.T) & (size >= CLEAR_CORRELATION), size, 0.0)
         pairs, used = [], set[int]()
@@ -258,18 +246,10 @@ class ColumnTable:
                 )
 
 
-def _remove_wrap(entry: ColumnEntry, wrap: Wrap | None) -> ColumnEntry:
-    """Return a column without its wraps."""
-    if wrap is None:
-        return entry
-    signal = replace(entry.signal, values=unwrap(entry.values, wrap.modulus))
-    return replace(entry, signal=signal, wrap=wrap)
-
-
 def _choose_roles(entries: list[ColumnEntry]) -> tuple[list[ColumnEntry], list[ColumnEntry]]:
     """Return the columns that may be commands, and those that may be positions."""
     commands = [one for one in entries if one.name.role == "command"]
-    commands = [one for one in commands if one.name.quantity != "effort"] or commands
+    commands = [one for one in commands if one.name.quantity != "torque"] or commands
     positions = []
     for one in entries:
         if one.name.role != "command" and one.name.quantity in ("position", "unknown"):
@@ -286,18 +266,15 @@ def _weigh_names(commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntr
     return np.where(is_same, SAME_NAME, np.where(has_other, OTHER_NAME, 0.0))
 
 
-def _prefer_targets(commands: Sequence[ColumnEntry]) -> list[float]:
-    """Return log odds of commands among others of their joints: targets of the position come first."""
+def _prefer(commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]) -> np.ndarray:
+    """Return log odds of pairs among others of their joint, `(C, P)`: targets and measured positions come first."""
     weights = {"position": 0.6, "velocity": 0.0}
-    return [weights.get(one.name.quantity, 0.2) for one in commands]
-
-
-def _prefer_measured(positions: Sequence[ColumnEntry]) -> list[float]:
-    """Return log odds of positions among others of their joints: what is called a measured position comes first."""
-    found = []
+    of_command = [weights.get(one.name.quantity, 0.2) for one in commands]
+    of_position = []
     for one in positions:
-        found.append(0.4 * (one.name.quantity == "position") + 0.2 * (one.name.role == "measured"))
-    return found
+        is_position, is_measured = one.name.quantity == "position", one.name.role == "measured"
+        of_position.append(0.4 * is_position + 0.2 * is_measured)
+    return np.add.outer(of_command, of_position)
 
 
 def _list_rest(entries: Sequence[ColumnEntry], chosen: Mapping[str, tuple[int, int]]) -> list[int]:
@@ -309,13 +286,10 @@ def _list_rest(entries: Sequence[ColumnEntry], chosen: Mapping[str, tuple[int, i
     return found
 
 
-def _is_clear(size: np.ndarray, row: int, column: int, rows: list[int], columns: list[int]) -> bool:
-    """Return whether two columns among some follow each other, and no other follows one of them as well."""
-    if row not in rows or column not in columns:
-        return False
-    along = [size[row, one] for one in columns if one != column]
-    across = [size[one, column] for one in rows if one != row]
-    return bool(size[row, column] >= max(CLEAR_CORRELATION, max([0.0, *along, *across]) + MARGIN))
+def _is_clear(size: np.ndarray, row: int, column: int) -> bool:
+    """Return whether two columns follow each other, and no other follows one of them as well."""
+    rivals = [*np.delete(size[row], column), *np.delete(size[:, column], row)]
+    return size[row, column] >= max(CLEAR_CORRELATION, max(rivals, default=0.0) + MARGIN)
 
 
 def _tell_sources(*sides: Sequence[ColumnEntry]) -> list[list[ColumnEntry]]:

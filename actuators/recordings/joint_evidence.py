@@ -7,14 +7,16 @@ speak against it make it unsure, but it is used as it was given. Axes: `T` sampl
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NoReturn
 
 import numpy as np
 
 from actuators.recordings.advice import advise
+from actuators.recordings.clocks import unwrap
 from actuators.recordings.guess import CommandKind, Evidence, GivenColumns, Guess
-from actuators.recordings.log_signals import Signal
+from actuators.recordings.log_signals import RunSignals, Signal
 from actuators.recordings.log_tables import LogRun
 from actuators.recordings.name_evidence import UNITS, ColumnName, read_unit
 from actuators.recordings.signal_checks import (
@@ -31,15 +33,10 @@ KIND_TEXTS: dict[CommandKind, str] = {
     "position": "a target of the position",
     "torque": "sets a force or torque",
 }
-ADVISED = {"kind": "command", "unit": "unit"}
-"""Key that gives a guess by hand."""
+GIVEN_BY_KEY = ("command", "unit")
+"""Guesses that a person can give."""
 FOLLOWED = {"position": "position", "velocity": "speed", "torque": "acceleration"}
 """Quantity of the motion that follows each kind of command."""
-NAMED_KINDS: dict[str, CommandKind] = {
-    "position": "position",
-    "velocity": "velocity",
-    "effort": "torque",
-}
 TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
 SAME_SHARE = 0.1
@@ -92,6 +89,13 @@ class ColumnEntry:
         """Value at which it begins again, `None` for none."""
         return self.wrap.modulus if self.wrap else None
 
+    def remove_wrap(self, wrap: Wrap | None) -> ColumnEntry:
+        """Return it without its wraps."""
+        if wrap is None:
+            return self
+        values = unwrap(self.values, wrap.modulus)
+        return replace(self, signal=replace(self.signal, values=values), wrap=wrap)
+
 
 @dataclass
 class JointGuess:
@@ -102,6 +106,7 @@ class JointGuess:
         u: Column of its command.
         q: Column of its position.
         evidence: Why the two belong together.
+        signals: Signals of the run that it is judged by.
         kind: Quantity that the command sets.
         sign: -1 where larger commands move to smaller positions.
         lag_s: Lag of the motion behind the command at the best correlation.
@@ -109,13 +114,17 @@ class JointGuess:
         scale: That unit for one of the log.
         target_scale: The same for its targets.
         target_offset: Position at a target of 0, in that unit.
-        guesses: How sure each part is; `target` where the unit of the targets is in question.
+        neutral: Command without motion, in the unit of the log.
+        full_plus: Full command towards larger positions; `None` without such commands.
+        full_minus: The same towards smaller positions.
+        guesses: How sure each part is; `unit of targets` where that is in question.
     """
 
     name: str
     u: ColumnEntry
     q: ColumnEntry
     evidence: list[Evidence]
+    signals: RunSignals
     kind: CommandKind = "velocity"
     sign: int = 1
     lag_s: float = 0.0
@@ -123,6 +132,9 @@ class JointGuess:
     scale: float = 1.0
     target_scale: float = 1.0
     target_offset: float = 0.0
+    neutral: float = 0.0
+    full_plus: float | None = None
+    full_minus: float | None = None
     guesses: dict[str, Guess] = field(default_factory=dict)
 
     @property
@@ -130,167 +142,157 @@ class JointGuess:
         """Value at which a target begins again."""
         return self.u.modulus if self.kind == "position" else None
 
-
-class JointJudge:
-    """Weighs kind, motion and units of one joint by the numbers.
-
-    Args:
-        joint: The joint, to be completed.
-        matrix: Correlations of all joints.
-        at: Its place among them.
-        given: Meanings that a person gives.
-    """
-
-    def __init__(
-        self, joint: JointGuess, matrix: Correlations, at: int, given: GivenColumns
+    def judge(
+        self, matrix: Correlations, at: int, given: GivenColumns, commands: Sequence[str]
     ) -> None:
-        self._joint, self._matrix, self._at, self._given = joint, matrix, at, given
-        self._slope, self._rest = matrix.fit_target(at)
-        self._r = {kind: float(matrix.r[kind][at, at]) for kind in KIND_TEXTS}
+        """Weigh kind, motion and units by the numbers.
 
-    def judge_kind(self) -> None:
+        Args:
+            matrix: Correlations of all joints.
+            at: Its place among them.
+            given: Meanings that a person gives.
+            commands: Names of the commands of all joints.
+        """
+        slope, rest = matrix.fit_target(at)
+        r = {kind: float(r[at, at]) for kind, r in matrix.r.items()}
+        self._judge_kind(r, slope, rest, given.command)
+        if self.u.is_changing:
+            self._judge_motion(matrix, at, commands)
+            self._check_steps(slope, rest)
+        else:
+            text = "its command does not change in the beginning of the log"
+            self.evidence.append((text, 0.0))
+        lead_s = matrix.find_lead(at) if self.kind == "position" else 0.0
+        if lead_s > 0.0:
+            text = f"but the position leads it by {lead_s:.2f} s: columns swapped, or clocks apart?"
+            self.evidence.append((text, -8.0))
+        is_given = given.joints is not None
+        self.add_guess("columns", f"{self.u.text} → {self.q.text}", self.evidence, is_given)
+        if self.q.wrap is not None:
+            text = f"{self.q.wrap.explain()}: unwrapped; {advise('wraps', modulus=self.q.modulus)}"
+            is_given = given.find_wraps(self.name) is not None
+            evidence = [("as given by log.wraps", 5.0) if is_given else (text, 4.0)]
+            self.add_guess("wraps", f"{self.q.modulus:.6g}", evidence, is_given)
+        self._judge_unit(given.find_unit(self.name), slope)
+        if self.kind == "position" and abs(r["position"]) >= CLEAR_CORRELATION:
+            self._judge_target(slope, rest)
+
+    def add_guess(
+        self, what: str, value: str, evidence: list[Evidence], is_given: bool = False
+    ) -> None:
+        """Add a guess, with the key that gives it by hand where it is unsure."""
+        guess = Guess(f"{self.name}: {what}", value, evidence, (), is_given)
+        self.guesses[what] = guess.advise(advise(what)) if what in GIVEN_BY_KEY else guess
+
+    def _judge_kind(
+        self, r: Mapping[CommandKind, float], slope: float, rest: float, given: CommandKind | None
+    ) -> None:
         """Choose which quantity the command sets."""
-        joint, given = self._joint, self._given.command
-        named = NAMED_KINDS.get(joint.u.name.quantity)
-        r = {kind: abs(value) for kind, value in self._r.items()}
+        named, size = self.u.name.quantity, {kind: abs(value) for kind, value in r.items()}
         weights = {}
         for kind in KIND_TEXTS:
-            weights[kind] = 2.5 * (kind == named) - math.log(max(1.0 - r[kind], 0.005))
-        weights["position"] += self._weigh_line()
+            weights[kind] = 2.5 * (kind == named) - math.log(max(1.0 - size[kind], 0.005))
+        # a line of 1 : 1 from targets to positions is no coincidence
+        is_through = abs(rest) <= SAME_SHARE * float(np.ptp(self.q.values))
+        if abs(slope - 1.0) <= SAME_SHARE and is_through:
+            weights["position"] += 3.0
+        else:
+            weights["position"] += 0.5 if TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] else -0.5
         if named != "torque":  # an acceleration that follows a target is that of a servo
             weights["torque"] = -math.inf
-        chosen = given or max(weights, key=lambda kind: weights[kind])
-        joint.kind = chosen
-        reason = f"correlation with position {r['position']:.2f}, with speed {r['velocity']:.2f}"
+        self.kind = chosen = given or max(weights, key=lambda kind: weights[kind])
+        text = (
+            f"correlation with position {size['position']:.2f}, with speed {size['velocity']:.2f}"
+        )
         if given is not None:
-            is_refuted = given != "torque" and joint.u.is_changing and r[given] < NO_CORRELATION
-            evidence = [("as given by log.command", 5.0), (reason, -6.0 if is_refuted else 0.0)]
+            is_refuted = given != "torque" and self.u.is_changing and size[given] < NO_CORRELATION
+            evidence = [("as given by log.command", 5.0), (text, -6.0 if is_refuted else 0.0)]
         else:
             lead = weights[chosen] - max(weights[kind] for kind in weights if kind != chosen)
-            evidence = [(reason, min(lead, 6.0))]
-            if named is None:
+            evidence = [(text, min(lead, 6.0))]
+            if named == "unknown":
                 evidence.append(("its name does not say it", -0.3))
             elif named != chosen:
                 evidence.append(("its name says otherwise", -0.5))
-            elif r[chosen] < CLEAR_CORRELATION:
+            elif size[chosen] < CLEAR_CORRELATION:
                 evidence.append(("", -1.0))
-        self._add("kind", "command", KIND_TEXTS[chosen], evidence, given is not None)
+        self.add_guess("command", KIND_TEXTS[chosen], evidence, given is not None)
 
-    def _weigh_line(self) -> float:
-        """Return the log odds of a target by the line from commands to positions: one of 1 : 1 is no coincidence."""
-        is_through = abs(self._rest) <= SAME_SHARE * float(np.ptp(self._joint.q.values))
-        if abs(self._slope - 1.0) <= SAME_SHARE and is_through:
-            return 3.0
-        return 0.5 if TARGET_SLOPE[0] <= self._slope <= TARGET_SLOPE[1] else -0.5
-
-    def judge_motion(self, commands: list[str]) -> None:
-        """Add the evidence of correlations, of another command that fits better, and of odd steps."""
-        joint, r = self._joint, self._r[self._joint.kind]
-        if not joint.u.is_changing:
-            joint.evidence.append(("its command does not change in the beginning of the log", 0.0))
-            return
-        joint.sign = -1 if joint.kind == "velocity" and r < 0 else 1
+    def _judge_motion(self, matrix: Correlations, at: int, commands: Sequence[str]) -> None:
+        """Add the evidence of correlations, and of another command that fits better."""
+        r = float(matrix.r[self.kind][at, at])
+        self.sign = -1 if self.kind == "velocity" and r < 0 else 1
         weight = weigh_correlation(abs(r))
-        if joint.kind == "torque":
+        if self.kind == "torque":
             weight = 1.0 if abs(r) >= NO_CORRELATION else -2.0
         else:
-            joint.lag_s = self._matrix.find_lag(self._at, joint.kind == "position")
-        what = FOLLOWED[joint.kind]
-        text = f"correlation of {what} with command {r:.2f}, {joint.lag_s:.2f} s later"
-        joint.evidence.append((text, weight))
-        if joint.lag_s > LAST_LAG * LONGEST_LAG_S:
+            self.lag_s = matrix.find_lag(at, self.kind == "position")
+        text = (
+            f"correlation of {FOLLOWED[self.kind]} with command {r:.2f}, {self.lag_s:.2f} s later"
+        )
+        self.evidence.append((text, weight))
+        if self.lag_s > LAST_LAG * LONGEST_LAG_S:
             text = "no longer lag is tried: its delay is longer, or it is no pair"
-            joint.evidence.append((text, -5.0))
-        size = np.abs(self._matrix.r[joint.kind][:, self._at])
+            self.evidence.append((text, -5.0))
+        size = np.abs(matrix.r[self.kind][:, at])
         rival = int(np.argmax(size))
-        if size[self._at] < CLEAR_CORRELATION and size[rival] > size[self._at] + MARGIN:
+        if size[at] < CLEAR_CORRELATION and size[rival] > size[at] + MARGIN:
             weight = -6.0 if size[rival] > CLEAR_CORRELATION else -1.0
-            joint.evidence.append((f"with the command {commands[rival]} {size[rival]:.2f}", weight))
-        self._check_steps()
+            self.evidence.append((f"with the command {commands[rival]} {size[rival]:.2f}", weight))
 
-    def _check_steps(self) -> None:
+    def _check_steps(self, slope: float, rest: float) -> None:
         """Add the evidence of steps that no machine makes."""
-        joint, q, t_s = self._joint, self._joint.q.values, self._joint.q.signal.t_s
-        if joint.q.wrap is None and (wrap := find_wrap(q)) is not None:
-            joint.evidence.append((f"{wrap.explain()}, and is taken as it is", -6.0))
+        q, t_s = self.q.values, self.q.signal.t_s
+        if self.q.wrap is None and (wrap := find_wrap(q)) is not None:
+            self.evidence.append((f"{wrap.explain()}, and is taken as it is", -6.0))
             return
         cause = np.zeros(len(q))
-        if joint.kind == "position":
-            cause = self._slope * joint.u.signal.interpolate(t_s) + self._rest
+        if self.kind == "position":
+            cause = slope * self.u.signal.interpolate(t_s) + rest
         spikes, jumps = find_spikes(q), find_jumps(t_s, q, cause)
         if len(spikes):
             is_mixed = len(spikes) > SPIKE_SHARE * len(q)
-            text = f"{len(spikes)} of {len(q)} samples leave their neighbours and come back"
             asked = "two sources, or lost bits?" if is_mixed else "lost bits?"
-            begin_s = t_s[spikes[0]] - t_s[0]
-            joint.evidence.append(
-                (f"{text}, first at {begin_s:.2f} s: {asked}", -8.0 if is_mixed else -0.5)
+            text = (
+                f"{len(spikes)} of {len(q)} samples leave their neighbours and come back, first at "
+                f"{t_s[spikes[0]] - t_s[0]:.2f} s: {asked}"
             )
+            self.evidence.append((text, -8.0 if is_mixed else -0.5))
         if len(jumps):
             row = jumps[0]
             text = (
                 f"{len(jumps)} jumps that no command causes, the first by {abs(q[row + 1] - q[row]):.4g} at "
                 f"{t_s[row] - t_s[0]:.2f} s: a reset, a wrap or another source?"
             )
-            joint.evidence.append((text, -6.0))
+            self.evidence.append((text, -6.0))
 
-    def judge_columns(self) -> None:
-        """Add the evidence of a position that leads its target, and make the guesses of columns and wraps."""
-        joint, wrap = self._joint, self._joint.q.wrap
-        lead_s = self._matrix.find_lead(self._at) if joint.kind == "position" else 0.0
-        if lead_s > 0.0:
-            text = f"but the position leads it by {lead_s:.2f} s: columns swapped, or clocks apart?"
-            joint.evidence.append((text, -8.0))
-        is_given = self._given.joints is not None
-        value = f"{joint.u.text} → {joint.q.text}"
-        self._add("columns", "columns", value, joint.evidence, is_given)
-        if wrap is not None:
-            text = f"{wrap.explain()}: unwrapped; {advise('wraps', modulus=wrap.modulus)}"
-            is_given = self._given.find_wraps(joint.name) is not None
-            evidence = [("as given by log.wraps", 5.0) if is_given else (text, 4.0)]
-            self._add("wraps", "wraps", f"{wrap.modulus:.6g}", evidence, is_given)
-
-    def judge_unit(self) -> None:
+    def _judge_unit(self, given: str | None, slope: float) -> None:
         """Choose the unit of the position: as given, named, that of its target, or by its travel."""
-        joint, named = self._joint, self._joint.q.name.unit
-        given, target = self._given.find_unit(joint.name), joint.u.name
+        named, target = self.q.name.unit, self.u.name
         if given is not None:
             value, evidence = given, [("as given by log.position_unit", 5.0)]
         elif named is not None:
             value, evidence = named, [("unit in its name", 5.0)]
-        elif target.unit and target.quantity == "position" and 0.8 <= self._slope <= 1.2:
-            text = f"unit in the name of its target, which it follows 1 : {self._slope:.2f}"
+        elif target.unit and target.quantity == "position" and 0.8 <= slope <= 1.2:
+            text = f"unit in the name of its target, which it follows 1 : {slope:.2f}"
             value, evidence = target.unit, [(text, 4.0)]
         else:
-            value, evidence = _guess_unit(joint.q)
-        joint.unit, joint.scale = read_unit(value) or ("rad", 1.0)
-        evidence += _check_travel(joint)
-        self._add("unit", "unit", value, evidence, given is not None)
+            value, evidence = _guess_unit(self.q)
+        self.unit, self.scale = read_unit(value) or ("rad", 1.0)
+        self.target_scale = self.scale
+        self.add_guess("unit", value, evidence + _check_travel(self), given is not None)
 
-    def judge_target(self) -> None:
+    def _judge_target(self, slope: float, rest: float) -> None:
         """Choose the unit of the targets; it is in question where the positions do not follow 1 : 1."""
-        joint, stated = self._joint, self._joint.u.name.unit
-        joint.target_scale = joint.scale
-        if joint.kind != "position" or abs(self._r["position"]) < CLEAR_CORRELATION:
-            return
-        if stated is not None and UNITS[stated][0] == joint.unit:
-            joint.target_scale = UNITS[stated][1]
-        ratio = self._slope * joint.scale / joint.target_scale
+        stated = self.u.name.unit
+        if stated is not None and UNITS[stated][0] == self.unit:
+            self.target_scale = UNITS[stated][1]
+        ratio = slope * self.scale / self.target_scale
         if not TARGET_SLOPE[0] <= ratio <= TARGET_SLOPE[1]:
-            joint.target_scale = self._slope * joint.scale
-            joint.target_offset = self._rest * joint.scale
+            self.target_scale, self.target_offset = slope * self.scale, rest * self.scale
             text = "this line fits the positions best; fill in scale and offset, those of the code that commands"
-            value = f"{self._slope:.3g} × target + {self._rest:.3g}"
-            self._add("target", "unit of targets", value, [(text, -1.0)], False)
-
-    def _add(
-        self, key: str, what: str, value: str, evidence: list[Evidence], is_given: bool
-    ) -> None:
-        """Add a guess, with the key that gives it by hand where it is unsure."""
-        guess = Guess(f"{self._joint.name}: {what}", value, evidence, (), is_given)
-        if key in ADVISED:
-            guess = guess.advise(advise(ADVISED[key]))
-        self._joint.guesses[key] = guess
+            value = f"{slope:.3g} × target + {rest:.3g}"
+            self.add_guess("unit of targets", value, [(text, -1.0)])
 
 
 def _guess_unit(entry: ColumnEntry) -> tuple[str, list[Evidence]]:
@@ -344,38 +346,26 @@ class Correlations:
     """
 
     def __init__(
-        self, run: LogRun, commands: Sequence[Signal], positions: Sequence[Signal]
+        self, run: LogRun, commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]
     ) -> None:
-        signals = [*commands, *positions]
+        signals = [one.signal for one in (*commands, *positions)]
         begin_s = max(float(one.t_s[0]) for one in signals)
         end_s = min(float(one.t_s[-1]) for one in signals)
         if end_s <= begin_s:
-            self._refuse(run, signals)
+            _refuse_clocks(run, signals)
         period_s = float(np.median([np.median(np.diff(one.t_s)) for one in signals]))
         num_rows = int(np.clip((end_s - begin_s) / max(period_s, 1e-9), 2, GRID_ROWS))
-        self._grid_s = np.linspace(begin_s, end_s, num_rows)
-        self._period_s = float(self._grid_s[1] - self._grid_s[0])
-        self._u = np.stack([np.interp(self._grid_s, one.t_s, one.values) for one in commands], 1)
-        self._q = np.stack([np.interp(self._grid_s, one.t_s, one.values) for one in positions], 1)
-        self._v = np.gradient(self._q, self._period_s, axis=0)
+        grid_s = np.linspace(begin_s, end_s, num_rows)
+        self._period_s = float(grid_s[1] - grid_s[0])
+        values = np.stack([one.interpolate(grid_s) for one in signals], 1)
+        self._u, self._q = values[:, : len(commands)], values[:, len(commands) :]
+        self._v = self._differentiate(self._q)
         most = min(int(LONGEST_LAG_S / self._period_s), num_rows // 4)
         self._lags = np.arange(0, most + 1, max(1, most // NUM_LAGS))
-        acceleration = np.gradient(self._v, self._period_s, axis=0)
-        followed = {"position": self._q, "velocity": self._v, "torque": acceleration}
-        self.r = {kind: self._correlate(self._u, moved)[0] for kind, moved in followed.items()}
-
-    def _refuse(self, run: LogRun, signals: Sequence[Signal]) -> None:
-        spans = {one.table: (float(one.t_s[0]), float(one.t_s[-1])) for one in signals}
-        listed = ", ".join(
-            f"{table}: {begin:.12g} to {end:.12g} s" for table, (begin, end) in spans.items()
-        )
-        first = min(spans, key=lambda table: spans[table])
-        last = max(spans, key=lambda table: spans[table])
-        apart_s = spans[first][0] - spans[last][0]
-        raise RecordingError(
-            f"{run.where}: the clocks of its tables have no time in common ({listed}); "
-            f"{advise('offset', table=last, offset_s=apart_s)}"
-        )
+        acceleration = self._differentiate(self._v)
+        self.r: dict[CommandKind, np.ndarray] = {}
+        for kind, followed in zip(KIND_TEXTS, (self._v, self._q, acceleration), strict=True):
+            self.r[kind] = self._correlate(self._u, followed)[0]
 
     @property
     def size(self) -> np.ndarray:
@@ -384,14 +374,13 @@ class Correlations:
 
     def find_lag(self, at: int, is_target: bool) -> float:
         """Return the lag of a joint's speed behind its command, or behind its target's speed, s."""
-        u = self._u[:, [at]]
-        cause = np.gradient(u, self._period_s, axis=0) if is_target else u
-        return float(self._correlate(cause, self._v[:, [at]])[1][0, 0])
+        u = self._differentiate(self._u) if is_target else self._u
+        return self._correlate_pair(u[:, at], self._v[:, at])[1]
 
     def fit_target(self, at: int) -> tuple[float, float]:
         """Return slope and offset of the line from targets to positions, at the best lag."""
         u, q = self._u[:, at], self._q[:, at]
-        rows = round(float(self._correlate(u[:, None], q[:, None])[1][0, 0]) / self._period_s)
+        rows = round(self._correlate_pair(u, q)[1] / self._period_s)
         u, q = u[: len(u) - rows], q[rows:]
         if np.ptp(u) == 0:
             return 0.0, 0.0
@@ -400,11 +389,18 @@ class Correlations:
 
     def find_lead(self, at: int) -> float:
         """Return the time by which the position leads its target, s; 0 where it does not, clearly."""
-        u, q = self._u[:, [at]], self._q[:, [at]]
-        behind, before = self._correlate(u, q), self._correlate(q, u)
-        left, left_behind = 1.0 - abs(before[0][0, 0]), 1.0 - abs(behind[0][0, 0])
-        is_leading = abs(before[0][0, 0]) >= CLEAR_CORRELATION and left < 0.3 * left_behind
-        return float(before[1][0, 0]) if is_leading else 0.0
+        u, q = self._u[:, at], self._q[:, at]
+        behind, (before, lead_s) = self._correlate_pair(u, q)[0], self._correlate_pair(q, u)
+        left, left_behind = 1.0 - abs(before), 1.0 - abs(behind)
+        return lead_s if abs(before) >= CLEAR_CORRELATION and left < 0.3 * left_behind else 0.0
+
+    def _differentiate(self, values: np.ndarray) -> np.ndarray:
+        return np.gradient(values, self._period_s, axis=0)
+
+    def _correlate_pair(self, a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+        """Return the largest correlation of `b` with `a` before it, and its lag, s."""
+        r, lag_s = self._correlate(a[:, None], b[:, None])
+        return float(r[0, 0]), float(lag_s[0, 0])
 
     def _correlate(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the largest correlations, in size, of the columns of `b` with those of `a` before them, and lags, s."""
@@ -427,3 +423,18 @@ def weigh_correlation(size: float) -> float:
     if size >= CLEAR_CORRELATION:
         return 3.0 if size >= HIGH_CORRELATION else 2.0
     return -0.5 if size >= NO_CORRELATION else -4.5
+
+
+def _refuse_clocks(run: LogRun, signals: Sequence[Signal]) -> NoReturn:
+    """Raise a `RecordingError` with the clocks, which have no time in common."""
+    spans = {one.table: (float(one.t_s[0]), float(one.t_s[-1])) for one in signals}
+    listed = ", ".join(
+        f"{table}: {begin:.12g} to {end:.12g} s" for table, (begin, end) in spans.items()
+    )
+    first = min(spans, key=lambda table: spans[table])
+    last = max(spans, key=lambda table: spans[table])
+    apart_s = spans[first][0] - spans[last][0]
+    raise RecordingError(
+        f"{run.where}: the clocks of its tables have no time in common ({listed}); "
+        f"{advise('offset', table=last, offset_s=apart_s)}"
+    )

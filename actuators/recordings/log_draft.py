@@ -22,7 +22,7 @@ from actuators.recordings.column_assignment import ColumnTable
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.joint_evidence import JointGuess
 from actuators.recordings.log_files import open_log
-from actuators.recordings.log_signals import RunSignals, Signal, open_signals
+from actuators.recordings.log_signals import Signal, open_signals
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import RecordingError
 
@@ -51,23 +51,6 @@ that turns round passes through rest within 1 % of the rows."""
 
 
 @dataclass(frozen=True)
-class CommandDraft:
-    """Scale of a command.
-
-    Attributes:
-        neutral: Value without motion.
-        full_plus: Value of full command towards larger positions; `None` without such commands.
-        full_minus: The same towards smaller positions.
-        guess: How sure it is.
-    """
-
-    neutral: float
-    full_plus: float | None
-    full_minus: float | None
-    guess: Guess
-
-
-@dataclass(frozen=True)
 class Draft:
     """All that was guessed about a kind of log.
 
@@ -76,8 +59,6 @@ class Draft:
         times: Clock of each table that is used.
         joints: Joints whose command changes.
         survey: Their numbers over all logs.
-        commands: Scales of their commands, of use where these set a speed or a force.
-        signals: Signals of the run that each joint was judged by.
         signs: Delimiter and decimal sign of text files.
         given: Meanings that a person gave.
         remarks: Further remarks.
@@ -87,8 +68,6 @@ class Draft:
     times: Mapping[str, TimeGuess]
     joints: Sequence[JointGuess]
     survey: LogSurvey
-    commands: Mapping[str, CommandDraft]
-    signals: Mapping[str, RunSignals]
     signs: tuple[str, str]
     given: GivenColumns
     remarks: Sequence[str]
@@ -141,11 +120,9 @@ class Draft:
         That of the command where its unit says it, else of the fastest motion. The fastest target says
         nothing about a machine: a step of a target is infinitely fast.
         """
-        if joint.kind == "velocity" and joint.u.name.speed_unit is not None:
-            full = self.commands[joint.name]
-            if full.neutral == 0.0:
-                largest = max(abs(full.full_plus or 0.0), abs(full.full_minus or 0.0))
-                return joint.u.name.speed_unit * largest
+        unit = joint.u.name.speed_unit
+        if joint.kind == "velocity" and unit is not None and joint.neutral == 0.0:
+            return unit * max(abs(joint.full_plus or 0.0), abs(joint.full_minus or 0.0))
         numbers = self.survey.joints[joint.name]
         speed = abs(joint.scale) * numbers.top_speed
         if joint.kind == "position" and not self.has_targets:
@@ -158,8 +135,6 @@ class Draft:
         found = [time.guess for time in self.times.values()]
         for joint in self.joints:
             found += joint.guesses.values()
-            if joint.kind != "position":
-                found.append(self.commands[joint.name].guess)
         return found
 
     def format(self, template: str) -> str:
@@ -181,7 +156,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         RecordingError: A log cannot be read, nothing can be proposed, or no joint is ever commanded.
     """
     clocks: dict[str, TimeGuess] = {}
-    best: dict[str, tuple[JointGuess, RunSignals]] = {}
+    best: dict[str, JointGuess] = {}
     remarks: dict[str, None] = {}
     signs = (",", ".")
     for path in paths[:SAMPLED_LOGS]:
@@ -196,9 +171,8 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
             clocks.setdefault(table, time)
         remarks |= dict.fromkeys(sample.remarks)
         for joint in sample.joints:
-            if joint.name not in best or _rank(joint) > _rank(best[joint.name][0]):
-                best[joint.name] = joint, sample.signals
-    joints = [joint for joint, _ in best.values()]
+            best[joint.name] = max(best.get(joint.name, joint), joint, key=_rank)
+    joints = [*best.values()]
     used = {one.u.signal.table for one in joints} | {one.q.signal.table for one in joints}
     times = {table: time for table, time in clocks.items() if table in used}
     survey = measure_logs(paths, times, joints, signs, given)
@@ -207,22 +181,21 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         numbers = survey.joints[joint.name]
         if numbers.highest_command > numbers.lowest_command:
             moving.append(joint)
+            if joint.kind != "position":
+                _scale_command(joint, numbers)
         else:
             remarks[f"{joint.name} is left out: its command never changes"] = None
     if not moving:
         raise RecordingError(f"{paths[0]}: no command of any joint changes in {len(paths)} logs")
-    all_remarks = [*remarks, *survey.gaps]
-    signals = {name: one for name, (_, one) in best.items()}
-    commands = {joint.name: _scale_command(joint, survey.joints[joint.name]) for joint in moving}
-    return Draft(name, times, moving, survey, commands, signals, signs, given, all_remarks)
+    return Draft(name, times, moving, survey, signs, given, [*remarks, *survey.gaps])
 
 
 def _rank(joint: JointGuess) -> tuple[float, float]:
-    return joint.guesses["columns"].probability, joint.guesses["kind"].probability
+    return joint.guesses["columns"].probability, joint.guesses["command"].probability
 
 
-def _scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
-    """Return neutral and full commands of a joint whose command sets its speed, or a force."""
+def _scale_command(joint: JointGuess, survey: JointSurvey) -> None:
+    """Choose neutral and full commands of a joint whose command sets its speed, or a force."""
     low, high, neutral = survey.lowest_command, survey.highest_command, 0.0
     is_at_rest = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
     largest = max(abs(low), abs(high))
@@ -256,8 +229,8 @@ def _scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
         evidence.append(("commands go one way only", 0.0))
     if joint.sign < 0:
         above, below = below, above
-    guess = Guess(f"{joint.name}: full command", value, evidence)
-    return CommandDraft(neutral, above, below, guess)
+    joint.neutral, joint.full_plus, joint.full_minus = neutral, above, below
+    joint.add_guess("full command", value, evidence)
 
 
 def _explain(guess: Guess) -> str:
@@ -282,8 +255,7 @@ def draw_draft(draft: Draft) -> Figure:
     figure = make_figure(12.0, 0.6 + 1.6 * len(draft.joints))
     axes = figure.subplots(len(draft.joints), 1, squeeze=False)[:, 0]
     for joint, axis in zip(draft.joints, axes, strict=True):
-        signals = draft.signals[joint.name]
-        command, position = signals.read(joint.u.text), signals.read(joint.q.text)
+        command, position = (joint.signals.read(one.text) for one in (joint.u, joint.q))
         begin_s = min(command.t_s[0], position.t_s[0])
         axis.plot(position.t_s - begin_s, position.values, color=BLUE, lw=1.2)
         is_same_unit = joint.kind == "position" and joint.target_scale == joint.scale
@@ -293,9 +265,9 @@ def draw_draft(draft: Draft) -> Figure:
         if other is not axis:
             other.set_ylabel(joint.u.text, color=ORANGE, fontsize=7)
             other.spines["top"].set_visible(False)
-        columns, kind = joint.guesses["columns"], joint.guesses["kind"]
+        columns, kind = joint.guesses["columns"], joint.guesses["command"]
         verb = "is " if joint.kind == "position" else ""
-        title = f"{joint.name} ({columns.sureness}): {joint.u.text} {verb}{kind.value} ({kind.sureness}); {signals.run.name}"
+        title = f"{joint.name} ({columns.sureness}): {joint.u.text} {verb}{kind.value} ({kind.sureness}); {joint.signals.run.name}"
         axis.set_title(title, loc="left", fontsize=8)
         remove_frame(axis)
     axes[-1].set_xlabel("s")

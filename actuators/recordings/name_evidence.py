@@ -11,14 +11,14 @@ from typing import Literal
 import yaml
 
 Role = Literal["command", "measured"]
-Quantity = Literal["position", "velocity", "effort", "unknown"]
+Quantity = Literal["position", "velocity", "torque", "unknown"]
 
 
 WORDS: dict[str, frozenset[str]] = {}
 """Words of names by what they say; see `words.yaml`."""
 for _kind, _text in yaml.safe_load(Path(__file__).with_name("words.yaml").read_text()).items():
     WORDS[_kind] = frozenset(_text.split())
-QUANTITIES: tuple[Quantity, ...] = ("effort", "velocity", "position")
+QUANTITIES: tuple[Quantity, ...] = ("torque", "velocity", "position")
 """The first one with a word in a name is its quantity."""
 DEG = math.pi / 180.0
 UNITS = {
@@ -146,7 +146,7 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     elif quantity == "unknown" and stated in UNITS:
         quantity = "position"
     elif quantity == "unknown" and stated in EFFORT_UNITS:
-        quantity = "effort"
+        quantity = "torque"
     is_si = any(name <= {*words, *outer} for name in SI_NAMES)
     known = ROLE_WORDS | WORDS["filler"] | UNITS.keys() | ({"d"} if "q" in words else set())
     joint, source = ("_".join(one for one in each if one not in known) for each in (words, outer))
