@@ -19,7 +19,7 @@ from typing import Any
 import can
 import cantools
 
-from actuators.recordings.advice import advise
+from actuators.recordings.guess import advise
 from actuators.recordings.message_log import HEAD_UNLISTED, LoggedMessage, MessageLog
 from brokk_rl import registry
 from brokk_rl.errors import ConfigError, RecordingError

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from actuators.recordings.message_numbers import read_number
-
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[Nn]a[Nn]")
+"""A number as text."""
 MISSING_WORDS = "nan NaN NAN na NA N/A n/a null NULL None none - --"
 MISSING = ("", *MISSING_WORDS.split())
 """Cells without a value."""
@@ -144,3 +144,11 @@ def read_items(cell: Any) -> list[float]:
     inner = str(cell).strip().strip("[]").strip()
     numbers = [read_number(part) for part in re.split(r"\s*,\s*|\s+", inner)]
     return [] if None in numbers else [one for one in numbers if one is not None]
+
+
+def read_number(value: Any) -> float | None:
+    """Return a number, also one that is written as text; `None` for anything else."""
+    if isinstance(value, str) and NUMBER.fullmatch(value):
+        return float(value)
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return float(value) if is_number else None

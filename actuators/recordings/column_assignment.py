@@ -15,10 +15,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from actuators.recordings.advice import advise, format_joints
-from actuators.recordings.clock_evidence import guess_times
-from actuators.recordings.clocks import list_time_columns
-from actuators.recordings.guess import GivenColumns
+from actuators.recordings.clocks import guess_times, list_time_columns
+from actuators.recordings.guess import GivenColumns, advise
 from actuators.recordings.joint_evidence import (
     CLEAR_CORRELATION,
     MARGIN,
@@ -220,8 +218,8 @@ class ColumnTable:
 
     def _refuse(self, text: str, pairs: Sequence[tuple[ColumnEntry, ColumnEntry]]) -> None:
         """Raise a `RecordingError` with the columns of each joint as they are given by hand."""
-        proposed = {f"joint_{at}": (u.text, q.text) for at, (u, q) in enumerate(pairs, 1)}
-        joints = format_joints(proposed) or 'boom: ["<command>", "<position>"]'
+        proposed = [f'joint_{at}: ["{u.text}", "{q.text}"]' for at, (u, q) in enumerate(pairs, 1)]
+        joints = ", ".join(proposed) or 'boom: ["<command>", "<position>"]'
         raise RecordingError(
             f"{self._run.where}: {text}{advise('joints', joints=joints)}; its columns are {', '.join(self._places)}"
         )

@@ -27,13 +27,13 @@ from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn
 from actuators.recordings.guess import Damaged
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import (
+    TICK_TOLERANCE,
     RunSignals,
     Signal,
-    describe_source,
-    list_ticks,
     locate,
     open_signals,
 )
+from actuators.recordings.log_tables import LogRun
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -41,16 +41,6 @@ from brokk_rl.record import Recording
 from brokk_rl.spec import NonNegative, Positive, spec
 
 log = logging.getLogger(__name__)
-
-__all__ = [
-    "AlignedTime",
-    "Column",
-    "ColumnMap",
-    "CommandColumn",
-    "JointColumns",
-    "RowTime",
-    "TargetColumn",
-]
 
 
 @spec
@@ -237,15 +227,11 @@ class ColumnMap:
 
     def _read_run(self, signals: RunSignals, machine: Machine) -> list[Recording]:
         """Return the pieces of a run, resampled to the rate of the machine."""
-        commands, positions = [], []
+        commands, positions, optional = [], [], {}
         for j, name in enumerate(machine.joint_names):
             middle = (machine.upper[j] + machine.lower[j]) / 2.0
-            position = read_column(signals, self.joints[name].position, middle)
-            positions.append(position)
-            commands.append(
-                self._read_command(signals, self.joints[name].command, position, machine, j)
-            )
-        optional = {}
+            positions.append(read_column(signals, self.joints[name].position, middle))
+            commands.append(self._read_command(signals, positions[j], machine, j))
         for name, column in self.optional.items():
             optional[name] = read_column(signals, column, None, empty=True)
         # arithmetic has the clock of its first column, and gaps of the others count too
@@ -257,77 +243,70 @@ class ColumnMap:
             else:
                 num_left_out += 1
         if num_left_out:
-            log.warning(
-                "%s: %d pieces shorter than %g s left out",
-                signals.run.where,
-                num_left_out,
-                self.shortest_s,
-            )
+            text = "%s: %d pieces shorter than %g s left out"
+            log.warning(text, signals.run.where, num_left_out, self.shortest_s)
         found = []
         for begin_s, end_s in spans_s:
-            t_s = list_ticks(begin_s, end_s, machine.period_s)
-            u = []
-            for command in commands:
-                read = command.average if machine.interface == "torque" else command.hold
-                u.append(read(begin_s + t_s, machine.period_s))
+            num_rows = int((end_s - begin_s) / machine.period_s + TICK_TOLERANCE) + 1
+            t_s = np.arange(num_rows) * machine.period_s
+            read = Signal.average if machine.interface == "torque" else Signal.hold
+            u = [read(command, begin_s + t_s, machine.period_s) for command in commands]
             q = [position.interpolate(begin_s + t_s) for position in positions]
+            made = record.make_motion(
+                machine, signals.run.name, t_s, np.stack(u, 1), np.stack(q, 1)
+            )
             extra = {}
             for name, signal in optional.items():
                 extra[name] = signal.interpolate(begin_s + t_s).astype(np.float32)
             clock_s = positions[0].t_s
             inside_s = clock_s[(clock_s >= begin_s) & (clock_s <= end_s)]
             metadata = describe_source(signals.run, machine, inside_s)
-            made = record.make_motion(
-                machine, signals.run.name, t_s, np.stack(u, 1), np.stack(q, 1)
-            )
             found.append(replace(made, extra=extra, metadata=metadata))
         return found
 
     def _read_command(
-        self,
-        signals: RunSignals,
-        column: CommandColumn | TargetColumn,
-        position: Signal,
-        machine: Machine,
-        joint: int,
+        self, signals: RunSignals, position: Signal, machine: Machine, j: int
     ) -> Signal:
-        wraps = column.wraps if isinstance(column, TargetColumn) else None
-        signal = signals.read(column.column, wraps=wraps)
-        if isinstance(column, TargetColumn) and wraps:
-            following = (position.interpolate(signal.t_s) - column.offset) / column.scale
-            values = put_near(signal.values, float(np.median(following)), wraps)
-            signal = replace(signal, values=values)
-        if isinstance(column, TargetColumn) and column.full_speed is None:
-            low, high = machine.lower[joint], machine.upper[joint]
-            middle, half = (high + low) / 2.0, (high - low) / 2.0
-            u = (column.scale * signal.values + column.offset - middle) / half
-        elif isinstance(column, TargetColumn):
-            u = column.command(signal.values, signal.t_s)
-            # a gap between pieces is no motion of the target
-            u[:-1][np.diff(signal.t_s) > self.longest_gap_s] = 0.0
-        else:
+        """Return the commands of a joint, from -1 to 1; refuse those beyond full."""
+        joint, column = machine.joints[j], self.joints[machine.joint_names[j]].command
+        target: np.ndarray | None = None
+        if isinstance(column, CommandColumn):
+            signal = signals.read(column.column)
             u = column.command(signal.values)
+        else:
+            signal = signals.read(column.column, wraps=column.wraps)
+            if column.wraps:
+                following = (position.interpolate(signal.t_s) - column.offset) / column.scale
+                values = put_near(signal.values, float(np.median(following)), column.wraps)
+                signal = replace(signal, values=values)
+            if column.full_speed is None:
+                low, high = machine.lower[j], machine.upper[j]
+                target = column.scale * signal.values + column.offset
+                u = (target - (high + low) / 2.0) / ((high - low) / 2.0)
+            else:
+                u = column.command(signal.values, signal.t_s)
+                # a gap between pieces is no motion of the target
+                u[:-1][np.diff(signal.t_s) > self.longest_gap_s] = 0.0
         is_beyond = ~(np.abs(u) <= 1.0 + self.overrun)
-        if is_beyond.any():
-            row = int(np.argmax(is_beyond))
-            where = locate(signals.run, signal, row, column.column)
-            if np.isnan(u[row]):
-                raise RecordingError(
-                    f"{where}: {signal.values[row]:g} lies on the side of neutral for which the column map has no full "
-                    "command; give both full_plus and full_minus, or mend neutral"
-                )
-            if isinstance(column, TargetColumn) and column.full_speed is None:
-                target = column.scale * signal.values[row] + column.offset
-                raise RecordingError(
-                    f"{where}: the target is {target:.5g} {machine.joints[joint].unit}, beyond the limits {machine.lower[joint]:g} "
-                    f"to {machine.upper[joint]:g} of '{machine.joints[joint].name}'; mend lower and upper in the machine file, "
-                    "scale or offset in the column map, or the log"
-                )
+        if not is_beyond.any():
+            return replace(signal, values=np.clip(u, -1.0, 1.0))
+        row = int(np.argmax(is_beyond))
+        where = locate(signals.run, signal, row, column.column)
+        if np.isnan(u[row]):
             raise RecordingError(
-                f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
-                "neutral or full_speed of the column map, or the log"
+                f"{where}: {signal.values[row]:g} lies on the side of neutral for which the column map has no full "
+                "command; give both full_plus and full_minus, or mend neutral"
             )
-        return replace(signal, values=np.clip(u, -1.0, 1.0))
+        if target is not None:
+            raise RecordingError(
+                f"{where}: the target is {target[row]:.5g} {joint.unit}, beyond the limits {machine.lower[j]:g} "
+                f"to {machine.upper[j]:g} of '{joint.name}'; mend lower and upper in the machine file, "
+                "scale or offset in the column map, or the log"
+            )
+        raise RecordingError(
+            f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
+            "neutral or full_speed of the column map, or the log"
+        )
 
 
 def read_column(
@@ -346,3 +325,18 @@ def read_column(
     if column.wraps is not None and middle is not None:
         values = put_near(values, (middle - column.offset) / column.scale, column.wraps)
     return replace(signal, values=column.scale * values + column.offset)
+
+
+def describe_source(run: LogRun, machine: Machine, clock_s: np.ndarray) -> dict[str, str]:
+    """Return the metadata of a recording of a run; `clock_s` is the clock that it is resampled from."""
+    metadata = {
+        "source": f"log: {Path(run.where).name}",
+        "run": run.name,
+        "fingerprint": record.format_fingerprint(machine),
+    }
+    if len(clock_s) > 1:
+        period_s = np.diff(clock_s)
+        metadata["resampled_from"] = (
+            f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"
+        )
+    return metadata

@@ -1,7 +1,8 @@
-"""Guesses about columns: evidence with a weight, a probability, and what a person gives.
+"""Guesses about columns: evidence with a weight, a probability, what a person gives, and advice what to give.
 
 The weight of an observation is the logarithm of the odds that it adds; the sum gives a probability. A
-guess is `sure` from 0.97 on, `likely` from 0.8 on, `unsure` below.
+guess is `sure` from 0.97 on, `likely` from 0.8 on, `unsure` below. Advice of a message is the key that reads a
+log, written as it is typed. A test follows each: with the key the same log is read, or refused for another reason.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
+
+import yaml
 
 from brokk_rl.spec import Positive
 
@@ -20,6 +24,11 @@ SURE, LIKELY = 0.97, 0.8
 """Least probabilities of a sure and of a likely guess."""
 Damaged = Literal["refuse", "skip"]
 """Choices for damaged parts of a log."""
+_TEXTS = yaml.safe_load(Path(__file__).with_name("advice.yaml").read_text())
+ADVICE: dict[str, str] = _TEXTS["advice"]
+"""Texts by the key that they advise; numbers and names are filled in."""
+FOREIGN: dict[str, str] = _TEXTS["foreign"]
+"""Files that are no logs yet, and what makes logs of them, by their ending."""
 Evidence = tuple[str, float]
 """An observation as text, and the logarithm of the odds that it adds."""
 
@@ -116,3 +125,8 @@ class GivenColumns:
     def find_wraps(self, joint: str) -> float | None:
         """Return the value at which a joint's positions begin again, where it is given."""
         return self.wraps.get(joint) if isinstance(self.wraps, Mapping) else self.wraps
+
+
+def advise(key: str, **values: object) -> str:
+    """Return the advice of a key with its values."""
+    return ADVICE[key].format(**values)

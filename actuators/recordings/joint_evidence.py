@@ -13,9 +13,8 @@ from typing import NoReturn
 
 import numpy as np
 
-from actuators.recordings.advice import advise
 from actuators.recordings.clocks import unwrap
-from actuators.recordings.guess import CommandKind, Evidence, GivenColumns, Guess
+from actuators.recordings.guess import CommandKind, Evidence, GivenColumns, Guess, advise
 from actuators.recordings.log_signals import RunSignals, Signal
 from actuators.recordings.log_tables import LogRun
 from actuators.recordings.name_evidence import UNITS, ColumnName, read_unit
@@ -154,7 +153,9 @@ class JointGuess:
             commands: Names of the commands of all joints.
         """
         slope, rest = matrix.fit_target(at)
-        r = {kind: float(r[at, at]) for kind, r in matrix.r.items()}
+        r: dict[CommandKind, float] = {}
+        for kind, several in matrix.r.items():
+            r[kind] = float(several[at, at])
         self._judge_kind(r, slope, rest, given.command)
         if self.u.is_changing:
             self._judge_motion(matrix, at, commands)

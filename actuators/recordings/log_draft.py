@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from actuators.recordings.clock_evidence import TimeGuess
-from actuators.recordings.clocks import put_near
+from actuators.recordings.clocks import TimeGuess, put_near
 from actuators.recordings.column_assignment import ColumnTable
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.joint_evidence import JointGuess

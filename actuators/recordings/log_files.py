@@ -7,9 +7,8 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-from actuators.recordings.advice import FOREIGN, advise
 from actuators.recordings.array_log import FORMATS
-from actuators.recordings.guess import Damaged
+from actuators.recordings.guess import FOREIGN, Damaged, advise
 from actuators.recordings.log_tables import LogFile, Table, Wanted
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import ConfigError, RecordingError

@@ -1,21 +1,18 @@
-"""Signals of a log on their own clocks, and recordings made of them at the machine's rate."""
+"""Signals of a log on their own clocks."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
-from actuators.recordings.advice import advise
 from actuators.recordings.clocks import TimeColumn, list_time_columns, read_clock, unwrap
 from actuators.recordings.expression import parse_expression
+from actuators.recordings.guess import advise
 from actuators.recordings.log_tables import LogFile, LogRun, index_columns
-from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
-from brokk_rl.machine import Machine
 
 log = logging.getLogger(__name__)
 
@@ -227,23 +224,3 @@ def locate(run: LogRun, signal: Signal, row: int, column: str) -> str:
     inside = f"table '{table}', " if table and not column.startswith(f"{table}:") else ""
     place = run.tables[table].locate(int(signal.rows[row]))
     return f"{run.where}: {place}, {inside}column '{column}'"
-
-
-def list_ticks(begin_s: float, end_s: float, period_s: float) -> np.ndarray:
-    """Return the times, `(T,)` s, of a recording from its beginning on, which is 0."""
-    return np.arange(int((end_s - begin_s) / period_s + TICK_TOLERANCE) + 1) * period_s
-
-
-def describe_source(run: LogRun, machine: Machine, clock_s: np.ndarray) -> dict[str, str]:
-    """Return the metadata of a recording of a run; `clock_s` is the clock that it is resampled from."""
-    metadata = {
-        "source": f"log: {Path(run.where).name}",
-        "run": run.name,
-        "fingerprint": record.format_fingerprint(machine),
-    }
-    if len(clock_s) > 1:
-        period_s = np.diff(clock_s)
-        metadata["resampled_from"] = (
-            f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"
-        )
-    return metadata

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from actuators.recordings.advice import advise
+from actuators.recordings.guess import advise
 from brokk_rl.errors import RecordingError
 
 log = logging.getLogger(__name__)
@@ -128,15 +128,10 @@ class LogFile:
         raise NotImplementedError
 
 
-def join_names(table: str, column: str) -> str:
-    """Return the full name of a column."""
-    return f"{table}:{column}" if table else column
-
-
 def index_columns(tables: Mapping[str, Collection[str]]) -> dict[str, tuple[str, str]]:
-    """Return table and column of each full name."""
+    """Return table and column of each full name; a column of the only table, which has no name, is named alone."""
     places = {}
     for table, columns in tables.items():
         for column in columns:
-            places[join_names(table, column)] = (table, column)
+            places[f"{table}:{column}" if table else column] = (table, column)
     return places

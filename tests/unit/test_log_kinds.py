@@ -18,7 +18,7 @@ import pytest
 import scipy.io
 from log_import import delay, import_log, try_draft, write_messages
 
-from actuators.recordings.advice import ADVICE
+from actuators.recordings.guess import ADVICE
 from actuators.recordings.log_files import open_log
 from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
 from brokk_rl import extensions
