@@ -1,18 +1,21 @@
 """Motifs: short single-joint programs that separate effects which look alike otherwise."""
 
-from collections.abc import Callable
 from itertools import product
 from typing import Annotated
 
 import numpy as np
 from annotated_types import MinLen
+from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from actuators.excite.poses import draw_start_poses
+from actuators.excite.poses import draw_start_poses, move_joint
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
+
+Programs = list[tuple[str, np.ndarray]]
+"""Name and commands `(T, J)` of each program."""
 
 
 class Motif:
@@ -21,15 +24,11 @@ class Motif:
     share: float
     stop_margin: float
 
-    def programs(
-        self, machine: Machine, generator: np.random.Generator
-    ) -> list[tuple[str, np.ndarray]]:
-        """Return name and program `(T, J)` of all that is played in one pose."""
+    def programs(self, machine: Machine, generator: Generator) -> Programs:
+        """Return all that is played in one pose."""
         raise NotImplementedError
 
-    def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator
-    ) -> list[Segment]:
+    def segments(self, machine: Machine, duration_s: float, generator: Generator) -> list[Segment]:
         """Return as many segments as fit into `duration_s`.
 
         Raises:
@@ -52,19 +51,6 @@ class Motif:
                         f"excitation={type(self).__name__.lower()}: its part of a run, {duration_s:.0f} s, does not hold its first "
                         "segment; raise collect.run_minutes (or its share), or leave it out"
                     )
-
-
-def build_joint_programs(
-    name: str, machine: Machine, program: Callable[[int], np.ndarray]
-) -> list[tuple[str, np.ndarray]]:
-    """Return name and `(T, J)` of `program(joint)`, `(T,)`, for each joint, the others at rest."""
-    found = []
-    for joint, joint_name in enumerate(machine.joint_names):
-        commands = program(joint)
-        u = np.zeros((len(commands), machine.num_joints))
-        u[:, joint] = commands
-        found.append((f"{name}_{joint_name}", u))
-    return found
 
 
 def hold_levels(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.ndarray:
@@ -92,30 +78,21 @@ class Ramps(Motif):
     reach: float
     stop_margin: float
 
-    def programs(
-        self, machine: Machine, generator: np.random.Generator
-    ) -> list[tuple[str, np.ndarray]]:
+    def programs(self, machine: Machine, generator: Generator) -> Programs:
         """Return a ramp to one side, to the other and back, per joint and slope.
 
         The first side is random.
         """
         way = self.reach * (machine.upper - machine.lower) / machine.max_speed
-
-        def ramp(slope_per_s: float) -> Callable[[int], np.ndarray]:
-            def program(joint: int) -> np.ndarray:
-                # a triangle of height h and slope s takes the joint h^2 / s of its full speed
-                # further
-                height = min(self.highest, np.sqrt(slope_per_s * way[joint]))
-                rise = max(1, round(height / slope_per_s / machine.period_s))
-                up = np.linspace(0.0, height, rise + 1)
-                down = np.linspace(height, -height, 2 * rise + 1)
-                return generator.choice([-1.0, 1.0]) * np.concatenate([up, down[1:], -up[::-1][1:]])
-
-            return program
-
         found = []
-        for slope_per_s in self.slopes_per_s:
-            found += build_joint_programs("ramps", machine, ramp(slope_per_s))
+        for slope_per_s, joint in product(self.slopes_per_s, range(machine.num_joints)):
+            # a triangle of height h and slope s takes the joint h^2 / s of its full speed further
+            height = min(self.highest, np.sqrt(slope_per_s * way[joint]))
+            rise = max(1, round(height / slope_per_s / machine.period_s))
+            up = np.linspace(0.0, height, rise + 1)
+            down = np.linspace(height, -height, 2 * rise + 1)
+            ramp = np.concatenate([up, down[1:], -up[::-1][1:]])
+            found.append(move_joint("ramps", machine, joint, generator.choice([-1.0, 1.0]) * ramp))
         return found
 
 
@@ -133,9 +110,7 @@ class Holds(Motif):
     hold_s: float
     stop_margin: float
 
-    def programs(
-        self, machine: Machine, generator: np.random.Generator
-    ) -> list[tuple[str, np.ndarray]]:
+    def programs(self, machine: Machine, generator: Generator) -> Programs:
         """Return one hold: the way to each pose does the rest."""
         steps = max(1, round(self.hold_s / machine.period_s))
         return [("holds", np.zeros((steps, machine.num_joints)))]
@@ -161,9 +136,7 @@ class Reversals(Motif):
     pause_s: float
     stop_margin: float
 
-    def programs(
-        self, machine: Machine, generator: np.random.Generator
-    ) -> list[tuple[str, np.ndarray]]:
+    def programs(self, machine: Machine, generator: Generator) -> Programs:
         """Return all reversals of a joint in one program."""
         parts = []
         pause = hold_levels([0.0], [self.pause_s], machine.period_s)
@@ -171,4 +144,5 @@ class Reversals(Motif):
             cycle = hold_levels([level, -level], [hold_s, hold_s], machine.period_s)
             parts += [np.tile(cycle, self.num_cycles), pause]
         commands = np.concatenate(parts)
-        return build_joint_programs("reversals", machine, lambda joint: commands)
+        joints = range(machine.num_joints)
+        return [move_joint("reversals", machine, joint, commands) for joint in joints]

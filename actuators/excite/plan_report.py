@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from actuators.excite.player import DONE, INSIDE, PLAY, Sample
+from actuators.excite.player import DONE, INSIDE, PLAY, Sample, predict_tool_speed
 from actuators.excite.schedule import ExcitationPlan
 from actuators.motion_panels import draw_joint_track
-from brokk_rl.contracts.actuator import Segment
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, draw_grid, make_figure, save_figure
 
@@ -61,16 +60,14 @@ def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> 
         "run_s": plan.run_s,
         "num_runs": len(plan.runs),
         "predicted": "by a nominal machine: dead time, full speed times command",
-        "runs": [_summarise_run(run, track, n, machine) for n, run in enumerate(plan.runs)],
+        "runs": [_summarise_run(plan, track, n, machine) for n in range(len(plan.runs))],
     }
 
 
-def _summarise_run(
-    run: tuple[Segment, ...], track: PlanTrack, n: int, machine: Machine
-) -> list[dict[str, Any]]:
+def _summarise_run(plan: ExcitationPlan, track: PlanTrack, n: int, machine: Machine) -> list[Any]:
     """Return the segments of one run; one that finds no time has no `start_s`."""
     period_s, inside, found = machine.period_s, INSIDE[track.phase[:, n]], []
-    for i, segment in enumerate(run):
+    for i, segment in enumerate(plan.runs[n]):
         rows = np.flatnonzero((track.segment[:, n] == i) & inside)
         entry = {
             "name": segment.name,
@@ -87,32 +84,24 @@ def _round_ms(value_s: Any) -> float:
     return round(float(value_s), 3)
 
 
-def draw_plan(
-    plan: ExcitationPlan,
-    track: PlanTrack,
-    machine: Machine,
-    tool_speed_m_s: np.ndarray | None,
-    path: Path,
-) -> None:
-    """Draw the first run as PNG: segments, commands, predicted positions and tool speed.
+def draw_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine, path: Path) -> None:
+    """Draw the first run as PNG: segments, commands, predicted positions and, where the geometry is known, tool speed.
 
     Args:
         plan: Gives names.
         track: The prediction.
         machine: Limits.
-        tool_speed_m_s: Predicted speed of the tool point in this run, `(T,)`, where the geometry is
-            known.
         path: Where to write.
     """
-    has_tool = tool_speed_m_s is not None
-    rows = machine.num_joints + has_tool
+    tool_speed_m_s = predict_tool_speed(machine, track.q[:, 0])
+    rows = machine.num_joints + (tool_speed_m_s is not None)
     whole = make_figure(WIDTH_INCHES, STRIP_INCHES + INCHES_A_ROW * rows)
     ratios = [0.55, *[1.0] * rows]
     axes = whole.subplots(rows + 1, 1, sharex=True, height_ratios=ratios)
     minutes = track.t_s / 60.0
     for j, axis in enumerate(axes[1 : machine.num_joints + 1]):
         draw_joint_track(axis, minutes, track.q[:, 0, j], track.u[:, 0, j], machine, j)
-    if has_tool:
+    if tool_speed_m_s is not None:
         axes[-1].fill_between(minutes, tool_speed_m_s, color=GREY, linewidth=0)
         axes[-1].set_ylabel("tool\nm/s")
     _draw_segments(axes, plan, track, minutes)
@@ -141,10 +130,8 @@ def _draw_segments(
         if track.phase[begin, 0] < PLAY:
             name, color = "", "white"
         start, stop = minutes[begin], minutes[min(end, len(minutes) - 1)]
-        for axis in axes:
-            axis.axvspan(
-                start, stop, color=color, alpha=0.9 if axis is axes[0] else 0.13, linewidth=0
-            )
+        for axis, alpha in zip(axes, (0.9, *[0.13] * (len(axes) - 1)), strict=True):
+            axis.axvspan(start, stop, color=color, alpha=alpha, linewidth=0)
         if stop - start > LETTER * minutes[-1] * len(name):
             place = 0.5 * (start + stop), 0.5
             axes[0].annotate(name.replace("_", " "), place, ha="center", va="center", fontsize=8)

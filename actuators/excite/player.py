@@ -124,26 +124,24 @@ class PlanPlayer:
         target = self._start[self._rows, self.segment]
         error = target - slow
         far = np.abs(error) > self._approach.tolerance * self._travel
-        self._advance(q, far)
-
         program = self._program[self._rows, self._index]
         before = self._program[self._rows, np.maximum(self._index - 1, 0)]
+        self._advance(q, far, ((program * before <= 0) & (before != 0)).any(1))
         program = program * (self.phase == PLAY)[:, None]
         low, high = self._low[self._rows, self.segment], self._high[self._rows, self.segment]
         # Kept until the program passes zero.
         self._turned = np.where(program * before > 0, self._turned, 1.0)
-        outward = np.minimum(slow, fast) < low, np.maximum(slow, fast) > high
         demand = program * self._turned
-        leaving = ((demand < 0) & outward[0]) | ((demand > 0) & outward[1])
+        leaving = (demand < 0) & (np.minimum(slow, fast) < low)
+        leaving |= (demand > 0) & (np.maximum(slow, fast) > high)
         home = self._goes_home[self._rows, self.segment]
         self._turned = np.where(leaving & ~home[:, None], -self._turned, self._turned)
         sent_home = leaving.any(1) & home
         if sent_home.any():
             self.phase[sent_home] = RETURN
             self._left[sent_home] = self._patience(q)[sent_home]
-
         moving = MOVES[self.phase][:, None]
-        u = np.where(moving, self._toward(error, far), program * self._turned * ~sent_home[:, None])
+        u = np.where(moving, self._toward(error, far), program * self._turned)
         return self._guarded(u, slow)
 
     def took(self, u: np.ndarray) -> None:
@@ -166,8 +164,8 @@ class PlanPlayer:
         """True when every run has played all its segments."""
         return bool((self.phase == DONE).all())
 
-    def _advance(self, q: np.ndarray, far: np.ndarray) -> None:
-        """Go on from approach to rest to play, and from return to wait to play."""
+    def _advance(self, q: np.ndarray, far: np.ndarray, at_zero: np.ndarray) -> None:
+        """Go on from approach to rest to play, and from return to wait to play, where a program passes zero."""
         phase, late = self.phase, self._left <= 0
         moving = MOVES[phase]
         arrived = moving & (~far.any(1) | late)
@@ -182,7 +180,6 @@ class PlanPlayer:
         self._left[arrived] = rest
         rested = ~arrived & late
         phase[rested & (phase == REST)] = PLAY
-        at_zero = self._at_zero[self._rows, self._index]
         phase[rested & (phase == WAIT) & at_zero] = PLAY
 
     def _rest_positions(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -228,28 +225,21 @@ class PlanPlayer:
     def _pack(self) -> None:
         """Pack segments into arrays: programs end to end, `(N, L, J)`, the rest `(N, S, …)`."""
         runs, machine = self._plan.runs, self._machine
-        count, most = len(runs), max(len(run) for run in runs)
         if not all(runs):
             raise ConfigError("plan: a run has no segments")
-        length = max(sum(len(segment.u) for segment in run) for run in runs)
-        self._program = np.zeros((count, length, machine.num_joints))
-        self._at_zero = np.zeros((count, length), dtype=bool)
-        self._start = np.tile(machine.home, (count, most, 1))
-        self._low, self._high = np.zeros_like(self._start), np.zeros_like(self._start)
-        self._end = np.zeros((count, most), dtype=int)
-        self._goes_home = np.zeros((count, most), dtype=bool)
+        shape = len(runs), max(len(run) for run in runs)
+        programs = [np.concatenate([segment.u for segment in run]) for run in runs]
+        self._program = np.zeros((len(runs), max(map(len, programs)), machine.num_joints))
+        self._start, self._end = np.tile(machine.home, (*shape, 1)), np.zeros(shape, dtype=int)
+        self._goes_home, margin = np.zeros(shape, dtype=bool), np.zeros((*shape, 1))
         for n, run in enumerate(runs):
-            end = 0
+            self._program[n, : len(programs[n])] = programs[n]
             for i, segment in enumerate(run):
-                begin, end = end, end + len(segment.u)
-                self._program[n, begin:end] = segment.u
-                passes = np.zeros(segment.u.shape, dtype=bool)
-                passes[1:] = (segment.u[1:] * segment.u[:-1] <= 0) & (segment.u[:-1] != 0)
-                self._at_zero[n, begin:end] = passes.any(1)
-                self._start[n, i], self._end[n, i] = segment.start, end
+                self._start[n, i], margin[n, i] = segment.start, segment.stop_margin
                 self._goes_home[n, i] = segment.stops == "home"
-                margin = segment.stop_margin * self._travel
-                self._low[n, i], self._high[n, i] = machine.lower + margin, machine.upper - margin
+            self._end[n, : len(run)] = np.cumsum([len(segment.u) for segment in run])
+        self._low = machine.lower + margin * self._travel
+        self._high = machine.upper - margin * self._travel
 
 
 DUE = 0.9

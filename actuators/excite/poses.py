@@ -7,6 +7,7 @@ uneven dead band look alike.
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.random import Generator
 
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.kinematics import Gravity
@@ -16,9 +17,7 @@ NUM_CANDIDATES = 128
 """Random poses among which the next one is chosen."""
 
 
-def draw_start_poses(
-    machine: Machine, margin: float, generator: np.random.Generator
-) -> Iterator[np.ndarray]:
+def draw_start_poses(machine: Machine, margin: float, generator: Generator) -> Iterator[np.ndarray]:
     """Yield start poses `(J,)` without end, each opposing the load of those before.
 
     So the weight on each joint takes both signs, in turn, where it can. Where masses are not known
@@ -47,6 +46,15 @@ def draw_start_poses(
         yield candidates[best]
 
 
+def move_joint(
+    name: str, machine: Machine, joint: int, commands: np.ndarray
+) -> tuple[str, np.ndarray]:
+    """Return name and commands, `(T, J)`, of a program of one joint, `(T,)`, with the others at rest."""
+    u = np.zeros((len(commands), machine.num_joints))
+    u[:, joint] = commands
+    return f"{name}_{machine.joint_names[joint]}", u
+
+
 class PoseProgram:
     """Base of excitations that fill the time from poses of opposite load.
 
@@ -58,13 +66,11 @@ class PoseProgram:
     pose_s: float
     stop_margin: float
 
-    def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
+    def program(self, machine: Machine, steps: int, generator: Generator) -> np.ndarray:
         """Return the commands of so many control periods, `(T, J)`."""
         raise NotImplementedError
 
-    def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator
-    ) -> list[Segment]:
+    def segments(self, machine: Machine, duration_s: float, generator: Generator) -> list[Segment]:
         """Return segments of about `pose_s` each, which fill the time."""
         total = max(1, int(duration_s / machine.period_s))
         count = min(max(1, round(duration_s / self.pose_s)), total)

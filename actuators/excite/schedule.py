@@ -98,27 +98,16 @@ def plan_runs(
     for seed in generator.integers(2**63, size=num_runs):
         programs_s, tries = run_s, []
         for _ in range(NUM_TRIES):
-            segments = _collect_segments(excitations, parts, machine, programs_s, int(seed))
+            segments: list[Segment] = []
+            draws = np.random.default_rng(int(seed))  # the same seed draws the same
+            for name, excitation in excitations.items():
+                segments += excitation.segments(machine, parts[name] * programs_s, draws)
             needed_s = _estimate_duration_s(segments, machine, approach)
             fill_s = needed_s if needed_s <= run_s else run_s - needed_s
             tries.append((fill_s, len(tries), tuple(segments)))
             programs_s *= run_s / needed_s
         runs.append(max(tries)[-1])
     return ExcitationPlan(runs=tuple(runs), run_s=run_s, names=tuple(excitations))
-
-
-def _collect_segments(
-    excitations: Mapping[str, Excitation],
-    parts: Mapping[str, float],
-    machine: Machine,
-    programs_s: float,
-    seed: int,
-) -> list[Segment]:
-    """Return the segments of one run; the same seed draws the same."""
-    generator, found = np.random.default_rng(seed), []
-    for name, excitation in excitations.items():
-        found += excitation.segments(machine, parts[name] * programs_s, generator)
-    return found
 
 
 def _estimate_duration_s(segments: list[Segment], machine: Machine, approach: Approach) -> float:

@@ -4,7 +4,9 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
+from numpy.random import Generator
 
+from actuators.excite.poses import move_joint
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -42,9 +44,7 @@ class Sine:
                 f"smallest: expected largest={self.largest} or less, got {self.smallest}"
             )
 
-    def segments(
-        self, machine: Machine, duration_s: float, generator: np.random.Generator
-    ) -> list[Segment]:
+    def segments(self, machine: Machine, duration_s: float, generator: Generator) -> list[Segment]:
         """Return one segment per joint, from home, of equal length, in random order."""
         steps = int(duration_s / machine.num_joints / machine.period_s)
         if steps * machine.period_s < 1.0 / self.highest_hz:
@@ -54,13 +54,12 @@ class Sine:
             )
         found = []
         for joint in generator.permutation(machine.num_joints):
-            u = np.zeros((steps, machine.num_joints))
-            u[:, joint] = self._waves(steps, machine.period_s, generator)
-            name = f"sine_{machine.joint_names[joint]}"
+            waves = self._waves(steps, machine.period_s, generator)
+            name, u = move_joint("sine", machine, joint, waves)
             found.append(Segment(name, machine.home, u, "home", self.stop_margin))
         return found
 
-    def _waves(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
+    def _waves(self, steps: int, period_s: float, generator: Generator) -> np.ndarray:
         """Return full waves end to end, `(T,)`; each begins at a command of zero."""
         u, at = np.zeros(steps), 0
         shortest = max(2, round(1.0 / self.highest_hz / period_s))

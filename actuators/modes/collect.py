@@ -1,5 +1,7 @@
 """`brokk mode=collect`: plans an excitation, drives a machine through it, writes recordings."""
 
+from __future__ import annotations
+
 import logging
 import time
 from dataclasses import replace
@@ -8,14 +10,7 @@ from pathlib import Path
 
 from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
-from actuators.excite.player import (
-    CommandGuards,
-    NominalLink,
-    PlanPlayer,
-    Sample,
-    drive,
-    predict_tool_speed,
-)
+from actuators.excite.player import CommandGuards, NominalLink, PlanPlayer, Sample, drive
 from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
@@ -91,7 +86,7 @@ class Collect:
         self._show(plan)
         if settings.only_plan:
             return
-        writer = Writer(self.machine, plan, self._folder, settings, self._metadata(plan))
+        writer = Writer(self, plan)
         num_periods = round(run_s / self.machine.period_s)
         title = f"control periods of {settings.num_runs} runs"
         with link as opened, ItemProgress(title, num_periods) as progress:
@@ -102,10 +97,11 @@ class Collect:
             finally:
                 writer.finish()  # what was recorded before an interruption is kept
         minutes = writer.recorded_s / 60.0
-        log.info("%d recordings of %.1f minutes in all in %s", writer.files, minutes, self._folder)
+        log.info("%d recordings of %.1f minutes in all in %s", writer.files, minutes, self.folder)
 
     @property
-    def _folder(self) -> Path:
+    def folder(self) -> Path:
+        """Folder of the recordings."""
         return self.session.folder / FOLDER
 
     def _runner(self, plan: ExcitationPlan) -> PlanPlayer:
@@ -119,9 +115,8 @@ class Collect:
         )
         summary = plan_report.summarise_plan(plan, track, machine)
         write_json(self.session.folder / "plan.json", summary)
-        tool_speed_m_s = predict_tool_speed(machine, track.q[:, 0])
         path = self.session.folder / "plan.png"
-        plan_report.draw_plan(plan, track, machine, tool_speed_m_s, path)
+        plan_report.draw_plan(plan, track, machine, path)
         unplayed = set()
         for entry in chain.from_iterable(summary["runs"]):
             if entry["cut_s"] > CUT * entry["program_s"]:
@@ -133,13 +128,6 @@ class Collect:
             "plan: %d segments in the first of %d runs; see %s", len(plan.runs[0]), count, path
         )
 
-    def _metadata(self, plan: ExcitationPlan) -> dict[str, str]:
-        return {
-            "source": f"{self.link.source}, excitation: {', '.join(plan.names)}",
-            "fingerprint": record.format_fingerprint(self.machine),
-            "seed": str(self.session.seed),
-        }
-
 
 class Writer:
     """Writer of the recordings of all runs; a growing file is rewritten at intervals.
@@ -149,20 +137,15 @@ class Writer:
         recorded_s: Time recorded, all runs together.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        plan: ExcitationPlan,
-        folder: Path,
-        settings: Collection,
-        metadata: dict[str, str],
-    ) -> None:
-        self._folder = folder
-        self._period_s, self._flush_s = machine.period_s, settings.flush_s
-        self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
+    def __init__(self, mode: Collect, plan: ExcitationPlan) -> None:
+        self._machine, self._settings, self._folder = mode.machine, mode.collect, mode.folder
         self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
         self._created, self._begin_s = record.format_now(), 0.0
-        self._machine, self._metadata = machine, metadata
+        self._metadata = {
+            "source": f"{mode.link.source}, excitation: {', '.join(plan.names)}",
+            "fingerprint": record.format_fingerprint(mode.machine),
+            "seed": str(mode.session.seed),
+        }
         self._part, self._samples, self._written = 0, [], time.monotonic()
         self.files, self.recorded_s = 0, 0.0
 
@@ -171,11 +154,12 @@ class Writer:
         if not self.files and not self._samples:
             self._begin_s = sample.t_s
         if self._samples:
-            late = abs((sample.t_s - self._samples[-1].t_s) / self._period_s - 1.0) > RATE_TOLERANCE
-            if late or len(self._samples) >= self._per_file:
+            most = max(2, round(self._settings.file_minutes * 60.0 / self._machine.period_s))
+            periods = (sample.t_s - self._samples[-1].t_s) / self._machine.period_s
+            if abs(periods - 1.0) > RATE_TOLERANCE or len(self._samples) >= most:
                 self.finish()
         self._samples.append(sample)
-        if time.monotonic() - self._written > self._flush_s:
+        if time.monotonic() - self._written > self._settings.flush_s:
             self._write()
 
     def finish(self) -> None:
@@ -184,7 +168,7 @@ class Writer:
             self._write()
             self._part += 1
             self.files += len(self._names)
-            self.recorded_s += len(self._names) * len(self._samples) * self._period_s
+            self.recorded_s += len(self._names) * len(self._samples) * self._machine.period_s
         self._samples = []
 
     def _write(self) -> None:
@@ -194,13 +178,8 @@ class Writer:
             return
         track, begin_s = PlanTrack(self._samples), self._samples[0].t_s
         for n, name in enumerate(self._names):
-            motion = record.make_motion(
-                self._machine,
-                f"{name} {self._created}",
-                track.t_s - begin_s,
-                track.u[:, n],
-                track.q[:, n],
-            )
+            run, t_s = f"{name} {self._created}", track.t_s - begin_s
+            motion = record.make_motion(self._machine, run, t_s, track.u[:, n], track.q[:, n])
             created = record.add_seconds(self._created, begin_s - self._begin_s)
             recording = replace(
                 motion,
