@@ -15,15 +15,16 @@ from perception.contracts import SizePrior
 from perception.ellipse import conic
 from perception.ellipse import edges as ellipse_edges
 from perception.ellipse import support as ellipse_support
-from perception.ellipse.candidate_fit import (
+from perception.ellipse.edges import Edges
+from perception.ellipse.picture_noise import estimate_noise
+from perception.ellipse.support import (
+    ANGLES,
+    NUM_SAMPLES,
     CandidateFit,
-    is_centre_inside,
+    EllipseCandidates,
     is_other_side_of_line,
     measure_wholeness,
 )
-from perception.ellipse.edges import Edges
-from perception.ellipse.picture_noise import estimate_noise
-from perception.ellipse.support import ANGLES, NUM_SAMPLES, EllipseCandidates
 
 # A change of these by 20 % changed no count of drawn patterns, photographs and hidden ellipses.
 PERCENTILE, NOISE, LOW = 85.0, 4.0, 0.4
@@ -146,7 +147,7 @@ class ContourArcs:
         limits = prior or SizePrior(0.0, float(max(part.shape)))
         where = None if roi is None else roi[top:bottom, left:right]
         # The map of nearest edges must cover the reach of the largest ellipse.
-        near_px = int(np.ceil(self._limit_reach(limits.highest_px))) + ROUNDING_PX
+        near_px = int(np.ceil(self.limit_reach(limits.highest_px))) + ROUNDING_PX
         edges = ellipse_edges.detect_edges(
             part,
             where,
@@ -162,8 +163,9 @@ class ContourArcs:
         # An arc of a large ellipse must be long; a short one fits any curvature.
         least = max(self.arc_points, int(0.5 * limits.lowest_px))
         edges = edges.cut(self.arc_tolerance_px, self.corner_rad, least)
+        found = _ArcSearch(self, edges, limits).find()
         # Back to the coordinates of the whole picture.
-        return [replace(one, x=one.x + left, y=one.y + top) for one in self._find_on(edges, limits)]
+        return [replace(one, x=one.x + left, y=one.y + top) for one in found]
 
     def _choose_blur(self, gray: np.ndarray, limits: SizePrior) -> float:
         """Return the blur before the gradient, px: in noise more, of which small rims bear little."""
@@ -173,24 +175,39 @@ class ContourArcs:
             highest_px = min(highest_px, 0.2 * limits.lowest_px)
         return float(np.clip(wanted_px, self.sigma_px, max(highest_px, self.sigma_px)))
 
-    def _find_on(self, edges: Edges, limits: SizePrior) -> list[Ellipse]:
-        """Return the ellipses of whole contours, single arcs and groups of arcs, the best first.
+    def limit_reach(self, size_px: np.ndarray | float) -> np.ndarray:
+        """Return the reach of ellipses of a geometric mean semi-axis, px."""
+        # Proportional to the size, since rims deviate by a share of it; bounded against other
+        # edges.
+        return np.clip(REACH_RELATIVE * size_px, self.reach_px, 4.0 * self.reach_px)
 
-        Args:
-            edges: Edges with their arcs.
-            limits: Range of the size.
-        """
-        seeds, lengths = self._collect_seeds(edges, limits)
-        first = self._fit_first(seeds, lengths, edges, limits)
+
+class _ArcSearch:
+    """Search for ellipses on the edges of one picture.
+
+    Args:
+        settings: Limits of all gates.
+        edges: Edges with their arcs.
+        limits: Range of the size; from 0 on where it is unknown.
+    """
+
+    def __init__(self, settings: ContourArcs, edges: Edges, limits: SizePrior) -> None:
+        self._settings, self._edges, self._limits = settings, edges, limits
+        self._is_sized = limits.lowest_px > 0
+        self._slack = settings.prior_slack if self._is_sized else 1.0
+        self._flattest = settings.prior_flattest if self._is_sized else FLATTEST
+
+    def find(self) -> list[Ellipse]:
+        """Return the ellipses of whole contours, single arcs and groups of arcs, the best first."""
+        first = self._fit_first(*self._collect_seeds())
         # With a known size few shapes compete, so rough rounds are enough.
-        rounds_px = ROUGH_PX if limits.lowest_px > 0 else PRECISE_PX
-        refined = self._refine(first, edges, rounds_px)
-        return sorted(self._judge(refined, edges, limits), key=lambda one: -one.score)
+        refined = self._refine(first, ROUGH_PX if self._is_sized else PRECISE_PX)
+        return sorted(self._judge(refined), key=lambda one: -one.score)
 
-    def _collect_seeds(self, edges: Edges, limits: SizePrior) -> tuple[np.ndarray, np.ndarray]:
+    def _collect_seeds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return seed points `(C, NUM_SEEDS)` of spans, arcs and groups, and their lengths `(C,)`."""
-        spans = self._select_compact(edges.spans, edges, limits)
-        arcs = self._select_compact(edges.arcs, edges, limits)
+        edges = self._edges
+        spans, arcs = self._select_compact(edges.spans), self._select_compact(edges.arcs)
         # An arc that is a whole span would be fitted twice.
         whole = set(map(tuple, spans.tolist()))
         parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int)
@@ -198,33 +215,31 @@ class ContourArcs:
         # Longer groups first: more arcs determine the ellipse better.
         groups = [arcs[group] for group in ellipse_edges.group_arcs(arcs, edges, (4, 3, 2))]
         # Pieces of arcs only where the size is unknown: elsewhere they add nothing but time.
-        if limits.lowest_px == 0:
-            parts = np.concatenate([parts, ellipse_edges.split_arcs(arcs, self.arc_points)])
+        if not self._is_sized:
+            pieces = ellipse_edges.split_arcs(arcs, self._settings.arc_points)
+            parts = np.concatenate([parts, pieces])
         kinds = (spans[:, None], parts[:, None], *groups)
         seeds = np.concatenate([ellipse_edges.select_seed_points(some) for some in kinds])
         lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
         return seeds, lengths
 
-    def _fit_first(
-        self, seeds: np.ndarray, lengths: np.ndarray, edges: Edges, limits: SizePrior
-    ) -> EllipseCandidates:
+    def _fit_first(self, seeds: np.ndarray, lengths: np.ndarray) -> EllipseCandidates:
         """Return candidates of seed points `(C, P)`: of a possible size, with one polarity.
 
         The arcs behind the seeds have `lengths`, `(C,)` points; they must be a good part of the
         circumference.
         """
-        least_px = limits.lowest_px / SEARCH_SLACK
+        edges, least_px = self._edges, np.array(self._limits.lowest_px / SEARCH_SLACK)
         # The smallest ellipse of the flattest form bounds the length of any arc from below.
-        flat_px = least_px * self._choose_flattest(limits)
-        smallest = conic.compute_perimeter(np.array(least_px), np.array(flat_px))
+        smallest = conic.compute_perimeter(least_px, least_px * self._flattest)
         # Cut before the fit: most seeds are too short, and the fit is the dear part.
         is_long = lengths >= LEAST_ARC * smallest
         seeds, lengths = seeds[is_long], lengths[is_long]
         if not len(seeds):
-            return EllipseCandidates(NO_ELLIPSES, np.empty(0))
+            return EllipseCandidates(NO_ELLIPSES, np.empty(0), edges)
         points = edges.points[seeds]
         ellipses = conic.fit_ellipses(points, np.ones(seeds.shape))
-        possible = self._is_sized(ellipses, limits, SEARCH_SLACK)
+        possible = self._has_possible_size(ellipses, SEARCH_SLACK)
         perimeter = conic.compute_perimeter(ellipses[:, 2], ellipses[:, 3])
         possible &= lengths >= LEAST_ARC * np.nan_to_num(perimeter)
         ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
@@ -235,23 +250,24 @@ class ContourArcs:
         # More than half of the points, so that one wrong arc of a group does not carry it.
         near = (np.abs(off) < self._reach(ellipses)[:, None]).mean(1) > 0.5
         keep = near & (np.abs(along.mean(1)) > 0.5)
-        return EllipseCandidates(ellipses[keep], np.sign(along.mean(1))[keep])
+        return EllipseCandidates(ellipses[keep], np.sign(along.mean(1))[keep], edges)
 
     def _refine(
-        self, candidates: EllipseCandidates, edges: Edges, rounds_px: tuple[float, ...]
+        self, candidates: EllipseCandidates, rounds_px: tuple[float, ...]
     ) -> EllipseCandidates:
         """Return the candidates fitted again to the edge points that support them.
 
         Weights turn algebraic errors into distances. From round to round they count less those
         points that lie beside the ellipse, where another edge meets it.
         """
+        edges = self._edges
         for number, scale_px in enumerate(rounds_px):
             if not len(candidates.ellipses):
                 break
             e = candidates.ellipses
             # All places in the last precise round only; every second one is enough before.
             angles = ANGLES[:: 1 if scale_px == PRECISE_PX[-1] else 2]
-            support, off, along = self._gather(candidates, edges, angles)
+            support, off, along = self._gather(candidates, angles)
             # The geometric mean semi-axis: it scales with the picture and does not favour flat
             # ellipses.
             size = np.sqrt(e[:, 2] * e[:, 3])
@@ -265,21 +281,20 @@ class ContourArcs:
             # After the first round an ellipse should have found half of its own edge.
             least = HALFWAY if number else LEAST_ARC
             keep = np.isfinite(ellipses).all(1) & ((support >= 0).mean(1) >= least)
-            candidates = EllipseCandidates(ellipses[keep], candidates.polarity[keep])
+            candidates = EllipseCandidates(ellipses[keep], candidates.polarity[keep], edges)
         return candidates
 
-    def _judge(
-        self, candidates: EllipseCandidates, edges: Edges, limits: SizePrior
-    ) -> list[Ellipse]:
+    def _judge(self, candidates: EllipseCandidates) -> list[Ellipse]:
         """Return the candidates with enough support of the right kind, each rim once."""
         # Sized without slack now: the refined ellipse is final.
-        sized = self._is_sized(candidates.ellipses, limits, 1.0)
-        candidates = candidates[sized & is_centre_inside(candidates.ellipses, edges)]
+        height, width = self._edges.nearest.shape
+        x, y = candidates.ellipses[:, :2].T
+        is_inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        candidates = candidates[is_inside & self._has_possible_size(candidates.ellipses, 1.0)]
         if not len(candidates.ellipses):
             return []
-        slack = self._choose_slack(limits)
-        fit = self._measure_fit(candidates, edges, slack)
-        good = self._has_good_shape(fit, edges, slack)
+        fit = self._measure_fit(candidates)
+        good = self._has_good_shape(fit)
         # Coverage, distance and angle each scale the score, so that none can make up for another.
         score = (
             fit.coverage
@@ -288,18 +303,16 @@ class ContourArcs:
         )
         fit, score = fit[good], score[good]
         # Costly gates come last and see only the candidates that passed the others.
-        good = self._has_own_edges(fit, edges, limits, slack)
+        good = self._has_own_edges(fit)
         # A whole ellipse must fit well to count; of half of one its limits are nearly enough.
         share = np.maximum(np.clip(3 * fit.coverage - 1.5, 0.0, 1.0), 0.9 * fit.coverage)
-        good &= score * slack**2 >= self.score * share
-        return self._choose(fit[good], score[good], edges)
+        good &= score * self._slack**2 >= self._settings.score * share
+        return self._choose(fit[good], score[good])
 
-    def _measure_fit(
-        self, candidates: EllipseCandidates, edges: Edges, slack: float
-    ) -> CandidateFit:
+    def _measure_fit(self, candidates: EllipseCandidates) -> CandidateFit:
         """Return how well the edges around the candidates fit, with the limits of that."""
-        e = candidates.ellipses
-        support, off, along = self._gather(candidates, edges, ANGLES, TIGHT)
+        s, e, slack = self._settings, candidates.ellipses, self._slack
+        support, off, along = self._gather(candidates, ANGLES, TIGHT)
         # No support has index -1, which must not count as the last edge point.
         there = support >= 0
         length = conic.sample_ellipses(e, ANGLES)[2]
@@ -317,67 +330,53 @@ class ContourArcs:
             off_px=off,
             rms_px=np.sqrt((off**2 * there).sum(1) / count),
             spread_px=ellipse_support.estimate_spread(np.abs(off), there),
-            spread_limit_px=slack * (self.rms_px * coverage + self.rms_relative * size * whole),
+            spread_limit_px=slack * (s.rms_px * coverage + s.rms_relative * size * whole),
             angle_rad=ellipse_support.estimate_spread(angles, there),
-            angle_limit_rad=slack
-            * (self.angle_rms_rad * seen**1.5 + self.angle_rms_small / size * seen),
+            angle_limit_rad=slack * (s.angle_rms_rad * seen**1.5 + s.angle_rms_small / size * seen),
         )
 
-    def _has_good_shape(self, fit: CandidateFit, edges: Edges, slack: float) -> np.ndarray:
+    def _has_good_shape(self, fit: CandidateFit) -> np.ndarray:
         """Find candidates whose support is long and close enough, and no accident, `(C,)`."""
-        e = fit.candidates.ellipses
+        s, e = self._settings, fit.candidates.ellipses
         size, whole = np.sqrt(e[:, 2] * e[:, 3]), measure_wholeness(fit.coverage)
-        good = fit.coverage >= self.coverage
+        good = fit.coverage >= s.coverage
         good &= fit.spread_px <= fit.spread_limit_px
         good &= fit.rms_px <= TAIL * fit.spread_limit_px
         good &= fit.angle_rad <= fit.angle_limit_rad
-        wave_px, wave_rad = ellipse_support.measure_waviness(
-            fit.candidates, edges, fit.support, fit.off_px
-        )
+        wave_px, wave_rad = ellipse_support.measure_waviness(fit)
         waviness = np.hypot(
             # A fixed part for noise, and a share of the size for rims that are not quite round.
-            wave_px / (self.wave_px + self.rms_relative * size * whole),
-            wave_rad / (self.wave_rad + self.wave_small / size),
+            wave_px / (s.wave_px + s.rms_relative * size * whole),
+            wave_rad / (s.wave_rad + s.wave_small / size),
         )
-        good &= waviness <= slack * (1 + whole)
+        good &= waviness <= self._slack * (1 + whole)
         perimeter = conic.compute_perimeter(e[:, 2], e[:, 3])
+        # The odds grow with the perimeter: a longer support is less of an accident.
         evidence = ellipse_support.compute_evidence(
-            fit.coverage,
-            fit.angle_rad,
-            perimeter,
-            self.angle_rad,
-            # The odds grow with the perimeter: a longer support is less of an accident.
+            fit.coverage, fit.angle_rad, perimeter, s.angle_rad
         )
-        return good & (evidence >= self.evidence)
+        return good & (evidence >= s.evidence)
 
-    def _has_own_edges(
-        self, fit: CandidateFit, edges: Edges, limits: SizePrior, slack: float
-    ) -> np.ndarray:
+    def _has_own_edges(self, fit: CandidateFit) -> np.ndarray:
         """Find candidates whose edges are theirs alone: those of no spiral, heart or stain, `(C,)`."""
-        candidates, support, length = fit.candidates, fit.support, fit.length
-        good = ellipse_support.measure_largest_gap(support >= 0, length) <= self.gap
+        good = ellipse_support.measure_largest_gap(fit) <= self._settings.gap
         # An occluder explains a corner between the edge and the ellipse.
-        occluded = ellipse_support.find_occluded(candidates, edges, support, length)
-        purity = ellipse_support.measure_purity(edges, support, length)
-        good &= occluded | (purity >= self.purity / slack)
-        if limits.lowest_px == 0:
+        is_pure = ellipse_support.measure_purity(fit) >= self._settings.purity / self._slack
+        good &= is_pure | ellipse_support.find_occluded(fit)
+        if not self._is_sized:
             # A known size excludes the shapes that these two gates are for.
-            size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
-            faintest = (
-                # The strongest edges tell the contrast of the picture; small ellipses are blurred
-                # more.
-                FAINT * np.percentile(edges.strength, 95.0) * np.minimum(SMALL_PX / size, 1.0)
-            )
-            good &= ellipse_support.measure_strength(edges, support) >= faintest
-            good[good] &= ~ellipse_support.find_smooth_continuations(
-                candidates[good], edges, support[good], length[good]
-            )
+            e = fit.candidates.ellipses
+            # The strongest edges tell the contrast of the picture; small ellipses are blurred more.
+            faintest = FAINT * np.percentile(self._edges.strength, 95.0)
+            faintest = faintest * np.minimum(SMALL_PX / np.sqrt(e[:, 2] * e[:, 3]), 1.0)
+            good &= ellipse_support.measure_strength(fit) >= faintest
+            good[good] &= ~ellipse_support.find_smooth_continuations(fit[good])
         return good
 
-    def _choose(self, fit: CandidateFit, score: np.ndarray, edges: Edges) -> list[Ellipse]:
+    def _choose(self, fit: CandidateFit, score: np.ndarray) -> list[Ellipse]:
         """Return the candidates that share little support with better ones."""
         # Points of a better ellipse are claimed: a second ellipse may not live on them.
-        claimed = np.zeros(len(edges.points), bool)
+        claimed = np.zeros(len(self._edges.points), bool)
         found: list[Ellipse] = []
         # A stable order, so that equal scores give the same result everywhere.
         for k in np.argsort(-score, kind="stable"):
@@ -390,61 +389,43 @@ class ContourArcs:
             # Twice as many places as pixels claim all edge points along the ellipse.
             number = max(NUM_SAMPLES, int(conic.compute_perimeter(*row[2:4])) * 2)
             angles = np.arange(number) * (2 * np.pi / number)
-            dense = self._gather(candidate, edges, angles)[0][0]
+            dense = self._gather(candidate, angles)[0][0]
             claimed[dense[dense >= 0]] = True
             judged = (values[k] for values in (fit.rms_px, fit.coverage, score))
             found.append(Ellipse(*map(float, (*row, *judged))))
         return found
 
     def _gather(
-        self,
-        candidates: EllipseCandidates,
-        edges: Edges,
-        angles_rad: np.ndarray,
-        tight: float = 1.0,
+        self, candidates: EllipseCandidates, angles_rad: np.ndarray, tight: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the support within reach; see `gather_support`."""
         reach_px = tight * self._reach(candidates.ellipses)
-        return ellipse_support.gather_support(
-            candidates, edges, angles_rad, reach_px, self.angle_rad
-        )
+        angle_rad = self._settings.angle_rad
+        return ellipse_support.gather_support(candidates, angles_rad, reach_px, angle_rad)
 
-    def _is_sized(self, ellipses: np.ndarray, limits: SizePrior, slack: float) -> np.ndarray:
+    def _reach(self, ellipses: np.ndarray) -> np.ndarray:
+        return self._settings.limit_reach(np.sqrt(ellipses[:, 2] * ellipses[:, 3]))
+
+    def _has_possible_size(self, ellipses: np.ndarray, slack: float) -> np.ndarray:
         """Find ellipses of a possible size and flatness, `(C,)`."""
         a, b = ellipses[:, 2], ellipses[:, 3]
         # A failed fit is NaN, compares false and is left out.
         with np.errstate(invalid="ignore"):
             return (
-                (a * slack >= limits.lowest_px)
-                & (a <= limits.highest_px * slack)
-                & (b * slack >= self.smallest_px)
-                & (b * slack >= a * self._choose_flattest(limits))
+                (a * slack >= self._limits.lowest_px)
+                & (a <= self._limits.highest_px * slack)
+                & (b * slack >= self._settings.smallest_px)
+                & (b * slack >= a * self._flattest)
             )
 
-    def _choose_flattest(self, limits: SizePrior) -> float:
-        return self.prior_flattest if limits.lowest_px > 0 else FLATTEST
-
-    def _choose_slack(self, limits: SizePrior) -> float:
-        return self.prior_slack if limits.lowest_px > 0 else 1.0
-
-    def _select_compact(self, spans: np.ndarray, edges: Edges, limits: SizePrior) -> np.ndarray:
+    def _select_compact(self, spans: np.ndarray) -> np.ndarray:
         """Return the spans that are neither larger nor smaller than a good part of an ellipse."""
         if not len(spans):
             return spans
         # Nine points of a span tell its extent well enough.
         steps = np.linspace(0, 1, 9) * (spans[:, 1:] - 1 - spans[:, :1])
-        places = edges.points[(spans[:, :1] + steps).astype(int)]
+        places = self._edges.points[(spans[:, :1] + steps).astype(int)]
         extent = np.ptp(places, axis=1)
         # An ellipse of semi-axis `a` is at most 2 a long; 10 % allow for the error of the prior.
-        fits = extent.max(1) <= 2.2 * limits.highest_px
-        return spans[fits & (np.hypot(*extent.T) >= 0.5 * limits.lowest_px)]
-
-    def _reach(self, ellipses: np.ndarray) -> np.ndarray:
-        return self._limit_reach(np.sqrt(ellipses[:, 2] * ellipses[:, 3]))
-
-    def _limit_reach(self, size_px: np.ndarray | float) -> np.ndarray:
-        """Return the reach of ellipses of a geometric mean semi-axis, px."""
-        least_px = self.reach_px
-        # Proportional to the size, since rims deviate by a share of it; bounded against other
-        # edges.
-        return np.clip(REACH_RELATIVE * size_px, least_px, 4.0 * least_px)
+        fits = extent.max(1) <= 2.2 * self._limits.highest_px
+        return spans[fits & (np.hypot(*extent.T) >= 0.5 * self._limits.lowest_px)]

@@ -5,10 +5,11 @@ Axes: `C` candidates, `P` places around each, `M` ends of arcs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from brokk_rl.contracts.vision import Ellipse
 from perception.ellipse import conic
 from perception.ellipse.edges import Edges
 
@@ -27,21 +28,59 @@ class EllipseCandidates:
     Attributes:
         ellipses: `(C, 5)`.
         polarity: +1 where it is brighter outside, -1 where it is brighter inside, `(C,)`.
+        edges: Edges of the picture.
     """
 
     ellipses: np.ndarray
     polarity: np.ndarray
+    edges: Edges
 
     def __getitem__(self, keep: np.ndarray | slice) -> EllipseCandidates:
-        return EllipseCandidates(self.ellipses[keep], self.polarity[keep])
+        return EllipseCandidates(self.ellipses[keep], self.polarity[keep], self.edges)
+
+
+@dataclass(frozen=True)
+class CandidateFit:
+    """Quality of fit of `C` candidates.
+
+    Attributes:
+        candidates: Ellipses and polarity.
+        support: Number of the edge point at each place, `(C, NUM_SAMPLES)`, -1 for none.
+        length: Arc length per radian at each place, `(C, NUM_SAMPLES)`.
+        coverage: Part of the circumference with support, `(C,)`.
+        off_px: Distance of the support at each place, `(C, NUM_SAMPLES)`.
+        rms_px: Root mean square of these distances.
+        spread_px: Robust standard deviation of these distances.
+        spread_limit_px: Its limit.
+        angle_rad: Robust standard deviation of the angles between gradient and normal.
+        angle_limit_rad: Its limit.
+    """
+
+    candidates: EllipseCandidates
+    support: np.ndarray
+    length: np.ndarray
+    coverage: np.ndarray
+    off_px: np.ndarray
+    rms_px: np.ndarray
+    spread_px: np.ndarray
+    spread_limit_px: np.ndarray
+    angle_rad: np.ndarray
+    angle_limit_rad: np.ndarray
+
+    def __getitem__(self, keep: np.ndarray) -> CandidateFit:
+        return CandidateFit(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+
+def measure_wholeness(coverage: np.ndarray) -> np.ndarray:
+    """Return 1 at full coverage, falling to 0 at one half.
+
+    A part of an ellipse must fit better than a whole one: the lobe of a heart nearly fits.
+    """
+    return np.clip(2 * coverage - 1, 0.0, 1.0)
 
 
 def gather_support(
-    candidates: EllipseCandidates,
-    edges: Edges,
-    angles_rad: np.ndarray,
-    reach_px: np.ndarray,
-    angle_rad: float,
+    candidates: EllipseCandidates, angles_rad: np.ndarray, reach_px: np.ndarray, angle_rad: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the edge points that support each candidate at each eccentric angle, `(C, P)` each.
 
@@ -52,6 +91,7 @@ def gather_support(
         Number of the point, -1 where there is none; its distance along the normal, px; and the
         cosine between gradient and normal.
     """
+    edges = candidates.edges
     points, outward, _ = conic.sample_ellipses(candidates.ellipses, angles_rad)
     found = edges.at(points)
     apart = edges.points[found] - points
@@ -64,21 +104,23 @@ def gather_support(
     return np.where(good, found, -1), off, along
 
 
-def measure_strength(edges: Edges, support: np.ndarray) -> np.ndarray:
+def measure_strength(fit: CandidateFit) -> np.ndarray:
     """Return the mean gradient of each candidate's support, grey levels a pixel, `(C,)`."""
-    there = support >= 0
-    return (edges.strength[support] * there).sum(1) / np.maximum(there.sum(1), 1)
+    there = fit.support >= 0
+    strength = fit.candidates.edges.strength[fit.support]
+    return (strength * there).sum(1) / np.maximum(there.sum(1), 1)
 
 
-def measure_purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
+def measure_purity(fit: CandidateFit) -> np.ndarray:
     """Return the part of the supporting edges, corner to corner, that lies on each candidate, `(C,)`.
 
     The edge of an occluded ellipse ends in a corner; that of a spiral or a heart leaves smoothly.
     """
+    edges, support = fit.candidates.edges, fit.support
     there = support >= 0
     run = np.where(there, edges.run[support], -1)
     known = run >= 0
-    ds = length * (2 * np.pi / support.shape[1])
+    ds = fit.length * (2 * np.pi / support.shape[1])
     # One key for ellipse and run, so that all are summed in one pass.
     key = np.arange(len(support))[:, None] * (len(edges.run_length) + 1) + run + 1
     _, number, inverse = np.unique(key[known], return_index=True, return_inverse=True)
@@ -89,17 +131,15 @@ def measure_purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.
     return np.minimum((each * ds * there).sum(1) / np.maximum((ds * there).sum(1), 1e-9), 1.0)
 
 
-def measure_waviness(
-    candidates: EllipseCandidates, edges: Edges, support: np.ndarray, off: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def measure_waviness(fit: CandidateFit) -> tuple[np.ndarray, np.ndarray]:
     """Return the waviness of each support in distance, px, and in angle, rad, `(C,)` each.
 
     It is the root mean square of the means over an eighth of a turn. Noise averages out of these
     means; the misfit of a curve that is no ellipse stays.
     """
-    there = support >= 0
+    candidates, there = fit.candidates, fit.support >= 0
     outward = conic.sample_ellipses(candidates.ellipses, ANGLES)[1]
-    bright = edges.directions[support] * candidates.polarity[:, None, None]
+    bright = candidates.edges.directions[fit.support] * candidates.polarity[:, None, None]
     turn = np.arctan2(
         outward[..., 0] * bright[..., 1] - outward[..., 1] * bright[..., 0],
         conic.sum_products(outward, bright),
@@ -112,7 +152,7 @@ def measure_waviness(
             ((_sum_windows(value * there) / np.maximum(known, 1)) ** 2 * enough).sum(1)
             / np.maximum(enough.sum(1), 1)
         )
-        for value in (off, turn)
+        for value in (fit.off_px, turn)
     )
 
 
@@ -125,8 +165,9 @@ def _sum_windows(values: np.ndarray) -> np.ndarray:
     return total[:, WINDOW:] - total[:, :-WINDOW]
 
 
-def measure_largest_gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:
+def measure_largest_gap(fit: CandidateFit) -> np.ndarray:
     """Return the longest stretch without support, as a part of the circumference, `(C,)`."""
+    there, length = fit.support >= 0, fit.length
     twice = np.concatenate([there, there], 1)  # around twice: a stretch may run over the end
     # Length along the ellipse, since equal angles are unequal stretches on a flat one.
     way = np.cumsum(np.concatenate([length, length], 1), 1)
@@ -166,6 +207,8 @@ def compute_evidence(
 
 # Each of these times 0.8 or 1.25 left every count of 8 drawn patterns, 3 pictures of hidden discs and
 # 6 negatives as it was. CHORD was not varied.
+SAME_AREA = 0.6
+"""Least ratio of areas of the two edges of one thin line."""
 OPEN = 0.12
 """Part of the circumference without support from which its ends are examined."""
 BACK_PX, STRIDE_PX = 4.0, 2.0
@@ -190,25 +233,21 @@ BOW_PX, STROKE_PX = 0.6, 4.5
 follows the arc nearer than that."""
 
 
-def find_smooth_continuations(
-    candidates: EllipseCandidates, edges: Edges, support: np.ndarray, length: np.ndarray
-) -> np.ndarray:
+def find_smooth_continuations(fit: CandidateFit) -> np.ndarray:
     """Find candidates whose edge leaves them smoothly, `(C,)`: lobes of hearts, round corners, spirals.
 
     The edge of an occluded ellipse ends in a corner. An occluder of the same width may go on
     without a corner, but has an edge from one end of the arc to the other.
     """
+    edges, support, length = fit.candidates.edges, fit.support, fit.length
     result = np.zeros(len(support), bool)
     ds = length * (2 * np.pi / support.shape[1])
     for side in (1, -1):  # by increasing and by decreasing angle
-        row, end, other = _find_open_ends(support, length, side)
-        hidden = _find_occluding_edges(
-            candidates.ellipses[row], edges, support[row, end], support[row, other]
-        )
+        row, end, hidden = _find_open_ends(fit, side)
         # Back beyond the corner, where the blur has already turned the edge.
         back = (end - side * np.ceil(BACK_PX / ds[row, end]).astype(int)) % NUM_SAMPLES
         start = np.where(support[row, back] >= 0, back, end)
-        e = candidates.ellipses[row]
+        e = fit.candidates.ellipses[row]
         outward = conic.measure_sampson_distance(e, edges.points[support[row, start]][:, None])[1][
             :, 0
         ]
@@ -223,26 +262,21 @@ def find_smooth_continuations(
     return result
 
 
-def find_occluded(
-    candidates: EllipseCandidates, edges: Edges, support: np.ndarray, length: np.ndarray
-) -> np.ndarray:
+def find_occluded(fit: CandidateFit) -> np.ndarray:
     """Find candidates with the straight edge of an occluder between the ends of their arc, `(C,)`."""
-    row, end, other = _find_open_ends(support, length, 1)
-    result = np.zeros(len(support), bool)
-    hidden = _find_occluding_edges(
-        candidates.ellipses[row], edges, support[row, end], support[row, other]
-    )
+    row, _, hidden = _find_open_ends(fit, 1)
+    result = np.zeros(len(fit.support), bool)
     result[row[hidden]] = True
     return result
 
 
-def _find_open_ends(
-    support: np.ndarray, length: np.ndarray, side: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return candidate, last supported place before and first one after each wide gap, `(M,)` each.
+def _find_open_ends(fit: CandidateFit, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return candidate and last supported place before each wide gap, `(M,)` each.
 
-    Before and after are meant by increasing angle for `side` 1, by decreasing angle for -1.
+    Also return whether the edge of an occluder leads to the first supported place after it. Before and
+    after are meant by increasing angle for `side` 1, by decreasing angle for -1.
     """
+    support, length = fit.support, fit.length
     there = support >= 0
     # A place with support whose next one has none.
     row, end = np.nonzero(there & ~np.roll(there, -side, 1))
@@ -251,7 +285,11 @@ def _find_open_ends(
     free = np.cumprod(~there[row[:, None], ahead], axis=1)
     wide = (free * length[row[:, None], ahead]).sum(1) > OPEN * length.sum(1)[row]
     # The first supported place behind the gap.
-    return row[wide], end[wide], (end + side * (1 + free.sum(1)))[wide] % NUM_SAMPLES
+    other = ((end + side * (1 + free.sum(1))) % NUM_SAMPLES)[wide]
+    row, end = row[wide], end[wide]
+    ends = support[row, end], support[row, other]
+    candidates = fit.candidates
+    return row, end, _find_occluding_edges(candidates.ellipses[row], candidates.edges, *ends)
 
 
 def _find_occluding_edges(
@@ -330,3 +368,14 @@ def _follow_edges(
         seen.append(bright)
     alike = np.abs(np.log(np.maximum(strength, 1e-6) / edges.strength[start])) < np.log(ALIKE)
     return alive & alike
+
+
+def is_other_side_of_line(row: np.ndarray, others: list[Ellipse]) -> bool:
+    """Return whether an ellipse and one of the others are the two edges of a thin line."""
+    for other in others:
+        apart = np.abs(conic.as_row(other) - row)
+        areas = row[2] * row[3], other.a * other.b
+        is_near = apart[:2].max() < 0.5 * STROKE_PX and apart[2:4].max() < STROKE_PX
+        if is_near and min(areas) > SAME_AREA * max(areas):
+            return True
+    return False
