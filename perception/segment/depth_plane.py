@@ -102,9 +102,7 @@ class DepthPlane:
             )
         tolerance = self.num_sigma * scale_noise(self.noise_per_m, frame)
         rays = compute_sight_rays(frame.camera_matrix, inverse.shape, step)
-        face = np.zeros(inverse.shape, np.uint8)
-        for plane in self._planes(rays, inverse, known, tolerance):
-            face |= self._faces(plane, rays, inverse, known, tolerance)
+        face = _PlaneSearch(self, rays, inverse, known, tolerance).find_faces()
         mask = np.zeros((height, width), np.float32)
         # The last cells may be smaller ones.
         size = (min(len(face[0]) * step, width), min(len(face) * step, height))
@@ -113,102 +111,125 @@ class DepthPlane:
         )
         return Masks(mask, None)
 
-    def _planes(
-        self, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray, tolerance: float
-    ) -> list[np.ndarray]:
-        """Return planes `n / d`, `(3,)`, the best supported first, each of pixels left by those before."""
-        generator = np.random.default_rng(self.seed)
-        found, rest = [], known.copy()
-        for _ in range(self.num_planes):
-            there = np.flatnonzero(rest)
-            if len(there) < self.min_area * known.size:
-                break
-            trials = self._trials(rays, inverse, rest, there, generator)
-            judge = there[generator.integers(len(there), size=self.num_samples)]
-            off = trials @ rays.reshape(-1, 3)[judge].T - inverse.ravel()[judge]
-            votes = np.count_nonzero(np.abs(off) < tolerance, axis=1)
-            best = int(votes.argmax()) if len(votes) else 0
-            if (
-                not len(votes)
-                or votes[best] / self.num_samples * len(there) < self.min_area * known.size
-            ):
-                break
-            found.append(_refine_plane(trials[best], rays, inverse, rest, tolerance))
-            rest &= np.abs(rays @ found[-1].astype(np.float32) - inverse) >= tolerance
-        return found
 
-    def _trials(
+class _PlaneSearch:
+    """Search for the faces of a block in the depth of one frame.
+
+    Args:
+        settings: Sizes, and the number of trials.
+        rays: Lines of sight of the cells, `(h, w, 3)`.
+        inverse: Inverse depth, 1/m, `(h, w)` float32.
+        known: Where it is known, `(h, w)` bool.
+        tolerance: Of a plane, 1/m.
+    """
+
+    def __init__(
         self,
+        settings: DepthPlane,
         rays: np.ndarray,
         inverse: np.ndarray,
-        rest: np.ndarray,
-        there: np.ndarray,
-        generator: np.random.Generator,
+        known: np.ndarray,
+        tolerance: float,
+    ) -> None:
+        self._settings, self._rays, self._inverse = settings, rays, inverse
+        self._known, self._tolerance = known, tolerance
+
+    def find_faces(self) -> np.ndarray:
+        """Return the cells of all faces, `(h, w)` uint8."""
+        face = np.zeros(self._inverse.shape, np.uint8)
+        for plane in self._find_planes():
+            face |= self._select_faces(plane)
+        return face
+
+    def _find_planes(self) -> list[np.ndarray]:
+        """Return planes `n / d`, `(3,)`, the best supported first, each of pixels left by those before."""
+        s, rays, inverse = self._settings, self._rays, self._inverse
+        generator = np.random.default_rng(s.seed)
+        found, rest = [], self._known.copy()
+        for _ in range(s.num_planes):
+            there = np.flatnonzero(rest)
+            if len(there) < s.min_area * rest.size:
+                break
+            trials = self._draw_trials(rest, there, generator)
+            judge = there[generator.integers(len(there), size=s.num_samples)]
+            off = trials @ rays.reshape(-1, 3)[judge].T - inverse.ravel()[judge]
+            votes = np.count_nonzero(np.abs(off) < self._tolerance, axis=1)
+            best = int(votes.argmax()) if len(votes) else 0
+            if not len(votes) or votes[best] / s.num_samples * len(there) < s.min_area * rest.size:
+                break
+            found.append(self._refine(trials[best], rest))
+            rest &= np.abs(rays @ found[-1].astype(np.float32) - inverse) >= self._tolerance
+        return found
+
+    def _draw_trials(
+        self, rest: np.ndarray, there: np.ndarray, generator: np.random.Generator
     ) -> np.ndarray:
         """Return planes through three neighbouring pixels of `rest`, at many scales, `(trials, 3)`."""
-        count, (height, width) = self.num_trials, inverse.shape
+        count, (height, width) = self._settings.num_trials, rest.shape
         row, column = np.divmod(there[generator.integers(len(there), size=count)], width)
-        reach = width * self.neighbourhood * generator.uniform(0.2, 1.0, count)
+        reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
         shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
         corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
         corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
         corners = corner_rows, corner_columns
         # (trials, 3 pixels, 3)
-        triples = np.moveaxis(rays[corners], 0, 1)
+        triples = np.moveaxis(self._rays[corners], 0, 1)
         usable = rest[corners].all(0) & (np.abs(np.linalg.det(triples)) > 1e-5)
-        values = inverse[corners].T[usable]
+        values = self._inverse[corners].T[usable]
         return np.linalg.solve(triples[usable], values[..., None])[..., 0]
 
-    def _faces(
-        self,
-        plane: np.ndarray,
-        rays: np.ndarray,
-        inverse: np.ndarray,
-        known: np.ndarray,
-        tolerance: float,
-    ) -> np.ndarray:
+    def _refine(self, plane: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        """Return the least-squares plane of the pixels of `rest` that agree with `plane`."""
+        # A quarter of the pixels tells it as well.
+        rest = rest[::2, ::2]
+        rays, inverse = self._rays[::2, ::2][rest].astype(float), self._inverse[::2, ::2][rest]
+        for _ in range(2):
+            inside = np.abs(rays @ plane - inverse) < self._tolerance
+            plane = np.linalg.lstsq(rays[inside], inverse[inside], rcond=None)[0]
+        return plane
+
+    def _select_faces(self, plane: np.ndarray) -> np.ndarray:
         """Return the connected pieces of a plane that can be faces of a block, `(h, w)` uint8."""
-        excess = inverse - rays @ plane.astype(np.float32)  # > 0: nearer than the plane
+        s, known, rays, tolerance = self._settings, self._known, self._rays, self._tolerance
+        excess = self._inverse - rays @ plane.astype(np.float32)  # > 0: nearer than the plane
         support = (known & (np.abs(excess) < tolerance)).astype(np.uint8)
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=4)
-        large = []
-        for label in range(1, count):
-            if stats[label, cv2.CC_STAT_AREA] >= self.min_area * support.size:
-                large.append(label)
         nearer = (known & (excess > tolerance)).astype(np.uint8)
         nearer = np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
-        pieces = [_fill_holes((labels == label).astype(np.uint8), nearer) for label in large]
+        pieces = []
+        for label in range(1, count):
+            if stats[label, cv2.CC_STAT_AREA] >= s.min_area * support.size:
+                pieces.append(_fill_holes((labels == label).astype(np.uint8), nearer))
         pieces = [piece for piece in pieces if piece[::2, ::2].any()]
         faces = np.zeros_like(support)
         # Ground and wall are too large for a face. Pieces that an occluder cuts off from them must
         # also stand in front of their surroundings; a face by itself may have none in sight.
         extents_m = [_measure_extents(piece, plane, rays) for piece in pieces]
-        wide = any(extent.prod() > self.max_extent_m**2 for extent in extents_m)
+        wide = any(extent.prod() > s.max_extent_m**2 for extent in extents_m)
         for piece, extent in zip(pieces, extents_m, strict=True):
-            if self._fits(piece, extent, plane, rays) and (
-                not wide or _measure_front(piece, excess, known, tolerance) >= self.min_front
+            if self._fits(piece, extent, plane) and (
+                not wide or _measure_front(piece, excess, known, tolerance) >= s.min_front
             ):
                 faces |= piece
         # An arm cuts a face into pieces; the smaller ones have hardly any surroundings but the arm.
         for piece in pieces if faces.any() else ():
-            if _measure_extents(faces | piece, plane, rays).max() <= self.max_extent_m:
+            if _measure_extents(faces | piece, plane, rays).max() <= s.max_extent_m:
                 faces |= piece
         return faces
 
-    def _fits(
-        self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, rays: np.ndarray
-    ) -> bool:
+    def _fits(self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray) -> bool:
         """Return whether a piece of a plane has the size of a face and is turned to the camera."""
-        if extents_m.min() < self.min_extent_m or extents_m.max() > self.max_extent_m:
+        s = self._settings
+        if extents_m.min() < s.min_extent_m or extents_m.max() > s.max_extent_m:
             return False
         sums = cv2.moments(piece, binaryImage=True)
-        sight = rays[round(sums["m01"] / sums["m00"]), round(sums["m10"] / sums["m00"])]
+        sight = self._rays[round(sums["m01"] / sums["m00"]), round(sums["m10"] / sums["m00"])]
         tilt_rad = np.arccos(
             np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0)
         )
-        return bool(tilt_rad <= self.max_tilt_rad)
+        return bool(tilt_rad <= s.max_tilt_rad)
 
 
 def _measure_front(
@@ -222,19 +243,6 @@ def _measure_front(
     before = np.count_nonzero(excess[ring] > tolerance)
     doubt = 0.05 * np.count_nonzero(ring) + 1.0
     return (behind + 0.5 * doubt) / (behind + before + doubt)
-
-
-def _refine_plane(
-    plane: np.ndarray, rays: np.ndarray, inverse: np.ndarray, known: np.ndarray, tolerance: float
-) -> np.ndarray:
-    """Return the least-squares plane of the pixels that agree with `plane`."""
-    # A quarter of the pixels tells it as well.
-    known = known[::2, ::2]
-    rays, inverse = rays[::2, ::2][known].astype(float), inverse[::2, ::2][known]
-    for _ in range(2):
-        inside = np.abs(rays @ plane - inverse) < tolerance
-        plane = np.linalg.lstsq(rays[inside], inverse[inside], rcond=None)[0]
-    return plane
 
 
 def _shrink_depth(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
