@@ -170,7 +170,7 @@ class StagedFinder:
             return FrameDetections([], [fault], [], None, ms)
         if s.depth is not None:
             with _time_stage(ms, "stereo"):
-                frame = s.depth.match_whole(frame)
+                frame = s.depth.stereo.match_frame(frame)
         with _time_stage(ms, "segment"):
             masks = self._segmenter.segment(frame)
         # The share decides before the dear search begins.

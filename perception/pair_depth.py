@@ -35,7 +35,7 @@ BAND_PX = 2.0
 
 @spec
 class PairDepth:
-    """Match a pair coarsely, and the surroundings of a place as finely as it needs.
+    """Match the surroundings of a place as finely as it needs.
 
     Attributes:
         stereo: The matcher; its `shrink` serves where the whole picture is matched, and is chosen
@@ -47,16 +47,6 @@ class PairDepth:
     stereo: Stereo
     radius_px: Positive
     extent: Annotated[float, Ge(1)]
-
-    def match_whole(self, frame: Frame) -> Frame:
-        """Return a frame with the depth of its pair; the frame itself if it has depth, or no pair."""
-        if frame.right is None or frame.baseline_m is None or np.isfinite(frame.depth_m).any():
-            return frame
-        focal_px = float(frame.camera_matrix[0, 0])
-        depth_m = self.stereo.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
-        place = (frame.camera_matrix, frame.baseline_m, frame.disparity_error_px)
-        depth_m = correct_depth(depth_m, *place)
-        return replace(frame, depth_m=depth_m, depth_shrink=self.stereo.shrink)
 
     def match_near(self, frame: Frame, place: Ellipse, m: np.ndarray) -> tuple[Frame, np.ndarray]:
         """Return a frame with depth around one hole, and the pixels of its face, `(h, w)` float32.

@@ -7,10 +7,13 @@ of Lucas and Kanade's registration (1981), with brightness and contrast free, re
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
 from perception.segment.window import Window
 
@@ -87,6 +90,15 @@ class Stereo:
             depth = pull_px / found
             known = (found > 0) & (depth >= self.nearest_m) & (depth <= self.farthest_m)
         return np.where(known, depth, np.float32(np.nan))
+
+    def match_frame(self, frame: Frame) -> Frame:
+        """Return a frame with the depth of its pair; the frame itself if it has depth, or no pair."""
+        if frame.right is None or frame.baseline_m is None or np.isfinite(frame.depth_m).any():
+            return frame
+        focal_px = float(frame.camera_matrix[0, 0])
+        depth_m = self.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
+        place = (frame.camera_matrix, frame.baseline_m, frame.disparity_error_px)
+        return replace(frame, depth_m=correct_depth(depth_m, *place), depth_shrink=self.shrink)
 
     def match_part(
         self, left: np.ndarray, right: np.ndarray, part: Window, least_px: float, largest_px: float

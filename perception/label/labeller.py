@@ -24,6 +24,7 @@ from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.label.camera_pose import Charuco
 from perception.label.measured import MeasuredHole, MeasuredScene, read_measured
 from perception.sources.look import look_at_frames
+from perception.stereo import Stereo
 
 FRAMES, OVERLAYS = "frames", "overlays"
 LEAST_STEP_M = 0.02
@@ -60,6 +61,7 @@ class BlockLabelling:
         board: The board, in whose frame block and holes were measured.
         measured: YAML file of the measured block and holes; see `perception.label.measured`.
         noise_per_m: Standard deviation of inverse depth, 1/m.
+        stereo: Gives the depth of a pair.
         num_sigma: Depth this many standard deviations off says that something else is there.
         min_depth_share: Least part of the block's known depth that must agree with it.
     """
@@ -68,6 +70,7 @@ class BlockLabelling:
     board: Charuco
     measured: str
     noise_per_m: Positive
+    stereo: Stereo
     num_sigma: Positive
     min_depth_share: float
 
@@ -91,8 +94,9 @@ class BlockLabelling:
             """Write what a frame gives, and return its figures."""
             pose, name = self.board.locate(frame), Path(frame.name).name
             world_from_camera = transforms.invert(pose.camera_from_board[0])
+            frame = self.stereo.match_frame(frame)
             view = self._build_view(scene, block_m, frame, world_from_camera)
-            reason = self._find_fault(view)
+            reason = self._find_fault(view, frame.right is not None)
             picture = _draw_overlay(frame, view.label, reason is None)
             dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
             if reason is None:
@@ -109,11 +113,13 @@ class BlockLabelling:
             raise FrameError(f"no frame could be labelled: {'; '.join(reasons[:3])}")
         return {"schema": 3, "num_labelled": num_labelled, "frames": entries}
 
-    def _find_fault(self, view: _LabelledView) -> str | None:
+    def _find_fault(self, view: _LabelledView, is_pair: bool) -> str | None:
         """Return why a frame is left out, `None` where it is not."""
         if not view.label.block.any():
             return "the block is not in view"
         share = view.depth_share
+        if share is None and is_pair:
+            return "left and right picture give no depth of the block; are they rectified?"
         if share is not None and share < self.min_depth_share:
             return (
                 f"{share:.0%} of the depth agrees with the block, {self.min_depth_share:.0%} are "

@@ -15,9 +15,7 @@ from brokk_rl.spec import Positive, Share, spec
 from perception import dataset
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.camera import FILE, CameraModel, read_camera
-from perception.pair_check import EXPLANATIONS, PairCheck
 from perception.sources import validation
-from perception.stereo import Stereo
 
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
@@ -30,21 +28,17 @@ class FrameFolder:
         folder: The folder.
         rate_hz: Frame rate; gives frame `k` the time k / rate_hz.
         least_known: Least part of the picture with known depth.
-        needs: Required files of a frame. `depth`: depth, or a pair that is matched here. `pair`: the
-            same, but a pair is left to the finder. `camera`: a picture alone, for boards.
+        needs: Required files of a frame. `depth`: depth, or a pair, which is left to who uses the frame.
+            `camera`: a picture alone, for boards.
         base_from_camera: Pose of the camera in the base frame: `calibration.yaml` of
             `mode=calibrate`, or `(4, 4)`; `null` takes `T_base_cam` of `camera.yaml`.
-        stereo: Computes the depth of a frame that has a right picture and no depth.
-        pair: Says why a pair gives no depth.
     """
 
     folder: str
     rate_hz: Positive
     least_known: Share
-    needs: Literal["depth", "pair", "camera"]
+    needs: Literal["depth", "camera"]
     base_from_camera: CameraPlacement
-    stereo: Stereo
-    pair: PairCheck
 
     def build(self) -> FolderSource:
         """Return the source, not yet opened."""
@@ -121,13 +115,13 @@ class FolderSource:
         if right_path.exists():
             right = validation.convert_color(read_picture(right_path), str(right_path))
             validation.check_same_size(color, right, str(right_path), "the right picture")
-        depth, shrink = self._depth(stem, color, right, camera)
-        return camera.build_frame(color, depth, t_s, right, str(stem), shrink)
+        depth_m = self._read_depth(stem, color, right is not None, camera)
+        return camera.build_frame(color, depth_m, t_s, right, str(stem))
 
-    def _depth(
-        self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
-    ) -> tuple[np.ndarray, int]:
-        """Return the stored depth of a frame, else that of its pair, and its `depth_shrink`."""
+    def _read_depth(
+        self, stem: Path, color: np.ndarray, is_pair: bool, camera: CameraModel
+    ) -> np.ndarray:
+        """Return the stored depth of a frame, NaN where there is none."""
         stored = stem.with_name(stem.name + dataset.DEPTH)
         millimetres = stem.with_name(stem.name + dataset.DEPTH_MM)
         least = self._settings.least_known
@@ -139,32 +133,19 @@ class FolderSource:
                 values = validation.convert_png_depth(read_picture(where), str(where))
             found = validation.check_depth(values, str(where), least)
             validation.check_same_size(color, found, str(where), "depth")
-            return found, 1
-        if self._settings.needs == "camera":
-            return np.full(color.shape[:2], np.nan, np.float32), 1
-        if right is None:
+            return found
+        if self._settings.needs == "depth" and not is_pair:
             raise FrameError(
                 f"{stem}: no depth; expected {stored.name}, {millimetres.name}, or "
                 f"{stem.name}{dataset.RIGHT} to match with"
             )
-        if camera.baseline_m is None or camera.distortion is not None:
+        is_rectified = camera.baseline_m is not None and camera.distortion is None
+        if self._settings.needs == "depth" and not is_rectified:
             raise FrameError(
                 f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in "
                 f"{FILE}"
             )
-        if self._settings.needs == "pair":
-            return np.full(color.shape[:2], np.nan, np.float32), 1
-        matched = self._settings.stereo.depth_m(
-            color, right, float(camera.matrix[0, 0]), camera.baseline_m
-        )
-        try:
-            checked = validation.check_depth(matched, f"{stem}: matching left and right", least)
-        except FrameError as error:
-            fault = self._settings.pair.find_fault(camera.build_frame(color, matched, 0.0, right))
-            if fault is None:
-                raise
-            raise FrameError(f"{stem}: {EXPLANATIONS[fault.reason]}") from error
-        return checked, self._settings.stereo.shrink
+        return np.full(color.shape[:2], np.nan, np.float32)
 
 
 def _load_array(path: Path) -> np.ndarray:

@@ -17,7 +17,6 @@ from motion import make_recording
 from scipy.spatial.transform import Rotation
 
 from brokk_rl.errors import FrameError
-from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import write_recording
 from perception import dataset
@@ -180,7 +179,6 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     assert "corners of the board" in lost["left_out"]
     folder = FrameFolder(
         folder=str(footage), rate_hz=1.0, least_known=0.0, needs="camera", base_from_camera="run/calibration.yaml",
-        stereo=load_part("stereo"), pair=load_part("pair_check"),
     )  # fmt: skip
     with folder.build() as source:
         frame = source.read_latest()

@@ -58,7 +58,7 @@ def write_labels(views: list[cuboid.View], folder: Path, **block: list[float]) -
         patch.setattr(Charuco, "locate", locate)
         labelling = BlockLabelling(
         source=source, board=load_part("board"), measured=str(folder / "measured.yaml"), noise_per_m=0.003,
-        num_sigma=3.0, min_depth_share=0.5,
+        stereo=load_part("stereo"), num_sigma=3.0, min_depth_share=0.5,
         )  # fmt: skip
         return labelling.label(folder)
 
