@@ -25,7 +25,7 @@ from rich.progress import track
 
 from brokk_rl.contracts.vision import FrameDetections
 from brokk_rl.signals import Frame
-from perception.render.scene_sampler import compose_scene
+from perception.render.scene_sampler import SceneSampler
 
 CONDITIONS, DISTANCES_M, TIMES = ("clean", "haze", "hidden"), (1.0, 2.0, 3.0, 4.0), 5
 
@@ -92,7 +92,7 @@ def rendered(condition: str, distance_m: float, number: int) -> Frame:
         f"scene.sight.distance_m=[{distance_m},{distance_m}]",
     )
     generator = np.random.default_rng((7, number))
-    shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
+    shot = studio.shot(SceneSampler(studio.scene, studio.rig, generator).compose(), generator)
     return Frame(
         color=shot.color, depth_m=np.full_like(shot.depth_m, np.nan), camera_matrix=studio.rig.left.matrix,
         base_from_camera=None, t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,

@@ -49,7 +49,7 @@ from perception.finder import StagedFinder
 from perception.overlay import OverlayDrawing
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges
-from perception.render.scene_sampler import compose_scene
+from perception.render.scene_sampler import SceneSampler
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 VARIATIONS = {
@@ -165,7 +165,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     studio = renderer(task.condition, task.distance_m, task.render)
     generator = scenes(task.seed).generator(f"scene/{task.number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
-    shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
+    shot = studio.shot(SceneSampler(studio.scene, studio.rig, generator).compose(), generator)
     frame = studio.rig.model.build_frame(shot.color, shot.depth_m, 0.0, shot.right)
     lines = []
     for option in task.options:

@@ -20,7 +20,7 @@ from perception.calibrate.transforms import make_transform
 from perception.label.camera_pose import Charuco
 from perception.render.printed_board import build_plate
 from perception.render.scene_ranges import Scene, SceneRanges
-from perception.render.scene_sampler import add_surroundings
+from perception.render.scene_sampler import SceneSampler
 from perception.render.solids import build_rods
 from perception.render.stereo_camera import StereoRig, measure_disparity_error
 
@@ -116,10 +116,8 @@ class BoardScenes:
         target = self._compute_board(np.array(settings.middle))[:3, 3]
         normal = -target / np.linalg.norm(target)
         ground_m = float(self._rig.base_from_camera[2, 3]) - GROUND_M
-        scene = add_surroundings(
-            settings.kind, self._rig, None, solids, target, normal, scenery, ground_m
-        )
-        return scene, generator
+        sampler = SceneSampler(settings.kind, self._rig, scenery)
+        return sampler.surround(None, solids, target, normal, ground_m), generator
 
     def write_records(self, folder: Path, count: int) -> None:
         """Write the recording of the joints, and the numbers that a calibration should find."""

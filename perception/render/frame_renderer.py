@@ -20,7 +20,7 @@ from perception.render.camera_sensor import draw_dust, take_picture
 from perception.render.drilled_block import DrilledHole
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
-from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
+from perception.render.scene_sampler import SceneSampler, compute_hidden_share, sample_rim
 from perception.render.stereo_camera import StereoRig
 from perception.segment.window import Window
 from perception.stereo import Stereo
@@ -93,7 +93,7 @@ class FrameRenderer:
 
             def compose(number: int) -> tuple[Scene, np.random.Generator]:
                 generator = session.generator(f"scene/{number}")
-                return compose_scene(kind, rig, generator), generator
+                return SceneSampler(kind, rig, generator).compose(), generator
 
         else:
             scenes = BoardScenes(kind, rig, session)

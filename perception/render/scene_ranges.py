@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -210,7 +209,7 @@ def view_from(scene: Scene, camera_from_reference: np.ndarray) -> Scene:
 
 @spec
 class SceneRanges:
-    """A kind of scene; `perception.render.scene_sampler.compose_scene` draws one.
+    """A kind of scene; `perception.render.scene_sampler.SceneSampler` draws one.
 
     Attributes:
         name: In truth files and tables.
@@ -227,16 +226,20 @@ class SceneRanges:
     light: LightRanges
 
 
-def draw_uniform(value: Range, generator: np.random.Generator) -> float:
-    """Draw evenly from a range."""
-    return float(generator.uniform(*value))
+class RangeSampler:
+    """Draw numbers from ranges.
 
+    Attributes:
+        generator: The only source of chance.
+    """
 
-def draw_log_uniform(value: Range, generator: np.random.Generator) -> float:
-    """Draw from a range, each factor as likely as any other."""
-    return math.exp(generator.uniform(math.log(value[0]), math.log(value[1])))
+    def __init__(self, generator: np.random.Generator) -> None:
+        self.generator = generator
 
+    def uniform(self, value: Range) -> float:
+        """Draw evenly from a range."""
+        return float(self.generator.uniform(*value))
 
-def draw_integer(value: CountRange, generator: np.random.Generator) -> int:
-    """Draw a whole number, both ends included."""
-    return int(generator.integers(value[0], value[1] + 1))
+    def integer(self, value: CountRange) -> int:
+        """Draw a whole number, both ends included."""
+        return int(self.generator.integers(value[0], value[1] + 1))

@@ -11,11 +11,11 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
 from perception.mount.occlusion import ArmShape
-from perception.render.block_sampler import draw_block_materials
+from perception.render.block_sampler import BlockSampler
 from perception.render.drilled_block import FRONT, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer, RenderedFrame
 from perception.render.scene_ranges import Scene, SceneRanges, view_from
-from perception.render.scene_sampler import add_surroundings
+from perception.render.scene_sampler import SceneSampler
 from perception.render.solids import SolidPose, build_rods
 from perception.render.stereo_camera import StereoRig
 from perception.segment.window import Window
@@ -107,20 +107,13 @@ class SimulatedCamera:
         rotation = from_base[:3, :3] @ turn
         hole = DrilledHole(np.array([0.0, 0.0, half[2]]), radius_m, self.hole_depth_m, FRONT)
         pose = SolidPose(rotation, target - rotation @ hole.center_m)
-        materials = draw_block_materials(kind.block, half, (hole,), (), chance)
+        materials = BlockSampler(kind.block, chance).draw_materials(half, (hole,), ())
         block = DrilledBlock("block", pose, half, materials, (hole,))
         points_m = chain_in_base_m @ from_base[:3, :3].T + from_base[:3, 3]
         down_m = float((from_base[:3, 3]) @ self.rig.down_in_camera)
-        return add_surroundings(
-            kind,
-            self.rig,
-            block,
-            build_rods(points_m, self.arm.link_m, self.arm.tool_m),
-            target,
-            rotation[:, 2],
-            chance,
-            max(down_m, 0.3),
-        )
+        rods = build_rods(points_m, self.arm.link_m, self.arm.tool_m)
+        sampler = SceneSampler(kind, self.rig, chance)
+        return sampler.surround(block, rods, target, rotation[:, 2], max(down_m, 0.3))
 
 
 class SimulatedSource:

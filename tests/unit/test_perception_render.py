@@ -28,7 +28,7 @@ from perception.render.frame_renderer import FrameRenderer
 from perception.render.materials import Material
 from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
-from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
+from perception.render.scene_sampler import SceneSampler, compute_hidden_share, sample_rim
 from perception.render.solids import Box, PlaneSolid, SolidPose, build_frame
 from perception.render.stereo_camera import StereoRig
 
@@ -265,7 +265,7 @@ def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: Ste
     large = replace(rig, width=640, height=360, focal_px=352.0)
     near = replace(kind("hidden"), sight=replace(kind("hidden").sight, distance_m=(0.8, 0.8)))
     for _ in range(2):
-        scene = compose_scene(near, large, chance)
+        scene = SceneSampler(near, large, chance).compose()
         shot = studio("hidden", large).shot(scene, chance)
         assert scene.block is not None
         pixel = np.round(large.left.project(sample_rim(scene.block, scene.block.holes[0]))).astype(

@@ -15,7 +15,7 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception.render.frame_renderer import FrameRenderer
-from perception.render.scene_sampler import compose_scene
+from perception.render.scene_sampler import SceneSampler
 from perception.segment import network as segment_network
 from perception.segment.network import NetworkSegmenter
 from perception.segment.unet import UNet, read_checkpoint
@@ -141,7 +141,7 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
         studio = FrameRenderer(
             rig=rig, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
         )
-        shot = studio.shot(compose_scene(kind, rig, chance), chance)
+        shot = studio.shot(SceneSampler(kind, rig, chance).compose(), chance)
         frame = Frame(
             color=shot.color,
             depth_m=shot.exact_depth_m,
