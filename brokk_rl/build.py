@@ -48,8 +48,6 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     Raises:
         ConfigError: A class cannot be found, a key is unknown, or a value is refused.
     """
-    if RUN not in values:
-        raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
     built = build_quick_nodes(values, shared)
     kind = load_class(values[RUN], "")
     own = [field.name for field in fields(kind)]

@@ -58,7 +58,7 @@ def check_effect(effect: Effect, machine: Machine, device: torch.device | str = 
     """Check that an effect around the simplest actuator model is again an actuator model."""
     place = torch.device(device)
     with isolate_randomness():
-        inner = _Proportional(machine, place)
+        inner = ProportionalModel(machine, place)
         check_actuator_model(effect.wrap(inner, machine, NUM_ENVS, place), machine, place)
 
 
@@ -73,7 +73,7 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
     assert (moved <= limit).all(), text
 
 
-class _Proportional:
+class ProportionalModel:
     """The simplest actuator model: speed proportional to the command.
 
     Attributes:

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from brokk_rl.checks import ProportionalModel, build_rest_history
 from brokk_rl.commands import accept_speeds
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import BrokkError
-from brokk_rl.history import History
 from brokk_rl.kinematics import Gravity, compute_tool_kinematics
 from brokk_rl.machine import Body, Dimension, Joint, Machine
 from brokk_rl.session import Session, write_bytes, write_json, write_text
@@ -277,14 +277,11 @@ def try_machine(
     else:
         q = drawn["q"]
         scene = drawn["scene"]
-    zeros = torch.zeros(num_worlds, machine.num_history, machine.num_joints)
-    history = History(q=zeros, u=zeros.clone())
+    history = build_rest_history(machine, world.device, q)
+    model = actuator or ProportionalModel(machine, world.device)
+    model.reset(everywhere)
     world.reset(everywhere, q, scene)
-    history.reset(everywhere, q)
-    if actuator is not None:
-        actuator.reset(everywhere)
     cause = ""
-    stride = torch.tensor(machine.max_speed * machine.period_s, dtype=torch.float32)
     is_touching = torch.zeros(num_worlds, dtype=torch.bool)
     held = torch.randn(q.shape, generator=generator).sign()
     with torch.inference_mode():
@@ -293,10 +290,7 @@ def try_machine(
             if drawn is None:  # a task would end such episodes before they hit the ground
                 u[::2] = held[::2]
             history.push_u(u)
-            increment = u * stride
-            if actuator is not None:
-                increment = actuator.step(history) - history.q[:, -1]
-            world.step(increment)
+            world.step(model.step(history) - history.q[:, -1])
             if step == 0:
                 is_touching = world.contact_force_n > 0.0
             if not cause and world.faults.any():

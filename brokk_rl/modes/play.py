@@ -13,14 +13,8 @@ from brokk_rl.play.page import PlayPage
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.policy_folder import find_policy
-from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
-from brokk_rl.rl.policy import (
-    ClassicalPolicy,
-    NetworkPolicy,
-    PolicySpec,
-    TrainedPolicy,
-    load_policy,
-)
+from brokk_rl.rl.loop import SimulatedPlant
+from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy, load_policy
 from brokk_rl.session import Session
 from brokk_rl.spec import name_spec, spec
 
@@ -81,64 +75,56 @@ class Play(SimulatedPlant):
         session.seed_all()
         pool = max(NUM_STARTS, settings.worlds)
         loop = self.build(device, settings.worlds, pool, session.stream("starts"))
-        watch = None
         policies = {}
         if not isinstance(self.policy, ClassicalPolicy):
             policies[POLICY] = self.policy.build(loop, settings.seed)
         if not policies or "classical_action" in loop.task.offers:
             policies[CLASSICAL] = ClassicalPolicy(task=None).build(loop, settings.seed)
         played = PlaySession(loop, policies, settings.neutral)
-        if isinstance(self.policy, TrainedPolicy) and find_policy(self.policy.path).is_checkpoint:
-            watch = CheckpointWatch(self.policy.path, loop)
-            played.replace_policy(POLICY, watch.load(), watch.note)
         if settings.driver not in (POLICY, played.driver):
             played.choose_driver(settings.driver)
         played.set_speed(settings.speed)
         name = f"{name_spec(self.policy)} {getattr(self.policy, 'path', '')}".rstrip()
-        log.info("%s drives; policy=%s", played.driver, watch.note if watch else name)
-        return played, watch
+        log.info("%s drives; policy=%s", played.driver, name)
+        if isinstance(self.policy, TrainedPolicy) and find_policy(self.policy.path).is_checkpoint:
+            return played, CheckpointWatch(self.policy.path, played)
+        return played, None
 
 
 class CheckpointWatch:
-    """A policy on disk, loaded anew whenever a training has written another one.
+    """Follows a training: the policy that is played is loaded anew with each checkpoint.
 
     Args:
         path: Run folder, policy folder or checkpoint.
-        loop: Control loop in which the policy acts.
+        session: Session in which the policy acts.
     """
 
-    def __init__(self, path: str, loop: ControlLoop) -> None:
-        self._path = path
-        self._loop = loop
+    def __init__(self, path: str, session: PlaySession) -> None:
+        self._path, self._session = path, session
         self._next_s = 0.0
         self._loaded: Path | None = None
-        self.note = ""
-        """Run and file of the checkpoint that was loaded last."""
 
-    def load(self) -> NetworkPolicy:
-        """Return the newest policy; errors as in `TrainedPolicy.build`."""
-        stored = find_policy(self._path)
-        policy = load_policy(stored, self._loop)
-        self._loaded = stored.file
-        self.note = f"{stored.file.parent.name}/{stored.file.name}"
-        return policy
-
-    def poll(self) -> NetworkPolicy | None:
-        """Return a policy that is newer than the last one, else `None`.
+    def poll(self) -> None:
+        """Play a policy that is newer than the last one, if there is one.
 
         A checkpoint that cannot be read, because the training has just replaced it, is tried again.
         """
         now_s = time.monotonic()
         if now_s < self._next_s:
-            return None
+            return
         self._next_s = now_s + POLL_S
         try:
-            if find_policy(self._path).file == self._loaded:
-                return None
-            return self.load()
+            stored = find_policy(self._path)
+            if stored.file == self._loaded:
+                return
+            policy = load_policy(stored, self._session.loop)
         except CheckpointError as error:
             log.warning("the newest checkpoint is left out: %s", error)
-            return None
+            return
+        self._loaded = stored.file
+        note = f"{stored.file.parent.name}/{stored.file.name}"
+        self._session.replace_policy(POLICY, policy, note)
+        log.info("playing %s", note)
 
 
 def _drive(
@@ -148,11 +134,10 @@ def _drive(
     begun_s = last_s = time.monotonic()
     with torch.no_grad():
         while seconds is None or time.monotonic() - begun_s < seconds:
+            if watch is not None:
+                watch.poll()
             now_s = time.monotonic()
             session.advance(now_s - last_s)
             last_s = now_s
             page.update()
-            if watch is not None and (policy := watch.poll()) is not None:
-                session.replace_policy(POLICY, policy, watch.note)
-                log.info("playing %s", watch.note)
             time.sleep(max(0.0, FRAME_S - (time.monotonic() - now_s)))
