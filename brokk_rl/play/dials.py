@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from brokk_rl.contracts.actuator import ActuatorModel
@@ -77,18 +78,14 @@ def _make_dial(
     chain: Any, prefix: str, effect: str, key: str, number: Any, machine: Machine
 ) -> EffectDial:
     """Return the dial of one number; `prefix` is the name of its effect in the chain."""
-    least, most = number.limit_on(machine)
     none, typical = (number.scale_to(machine, value) for value in (number.none, number.typical))
-    ends = [-LARGEST], [LARGEST]
-    for lower, upper, zero, one in zip(least, most, none, typical, strict=True):
-        reach = sorted(((lower - zero) / (one - zero), (upper - zero) / (one - zero)))
-        ends[0].append(reach[0])
-        ends[1].append(reach[1])
+    ends = (np.array(number.limit_on(machine)) - none) / (typical - none)
+    low, high = max(-LARGEST, ends.min(0).max()), min(LARGEST, ends.max(0).min())
     return EffectDial(
         effect=effect,
         number=key,
-        low=math.ceil(max(ends[0]) * 10 - 1e-6) / 10,
-        high=math.floor(min(ends[1]) * 10 + 1e-6) / 10,
+        low=math.ceil(low * 10 - 1e-6) / 10,
+        high=math.floor(high * 10 + 1e-6) / 10,
         typical=torch.as_tensor(typical, dtype=torch.float32),
         none=torch.as_tensor(none, dtype=torch.float32),
         parameters=chain.parameters,

@@ -122,7 +122,5 @@ def place_worlds(num_worlds: int) -> np.ndarray:
     """Return the place of each world in the scene, `(N, 3)`: rows along x, the first at the origin."""
     columns = math.ceil(math.sqrt(num_worlds))
     index = np.arange(num_worlds)
-    places = np.zeros((num_worlds, 3))
-    places[:, 0] = index // columns * -SPACING_M[0]
-    places[:, 1] = index % columns * SPACING_M[1]
-    return places
+    x_m, y_m = index // columns * -SPACING_M[0], index % columns * SPACING_M[1]
+    return np.stack((x_m, y_m, np.zeros(num_worlds)), 1)
