@@ -6,6 +6,7 @@ its YAML file adds, such as the unit.
 
 from __future__ import annotations
 
+import json
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
@@ -155,14 +156,10 @@ def _list_values(
 
 
 def _format_value(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
     if isinstance(value, list):
         text = f"[{','.join(map(_format_value, value))}]"
         return text if len(text) <= LONGEST_VALUE else f"[{len(value)} entries]"
-    return str(value)
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _format_entry(name: str, text: str, width: int) -> list[str]:

@@ -285,10 +285,8 @@ def read_versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that influence results."""
     found = {"python": ".".join(map(str, sys.version_info[:3]))}
     for name in STAMPED:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return found
 
 
@@ -297,14 +295,17 @@ def describe_commit() -> str | None:
     root = Path(__file__).parents[1]
     if not (root / ".git").exists():  # A wheel may be installed inside another checkout.
         return None
+    git = ["git", "-C", str(root)]
+    return read_output([*git, "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"])
+
+
+def read_output(command: list[str]) -> str | None:
+    """Return what a short program prints; `None` where it is missing, fails or takes too long."""
     try:
-        git = ["git", "-C", str(root)]
-        git += ["describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
-        return subprocess.run(
-            git, capture_output=True, text=True, check=True, timeout=10
-        ).stdout.strip()
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20)
     except (OSError, subprocess.SubprocessError):
         return None
+    return done.stdout.strip()
 
 
 def _format_now() -> str:

@@ -90,12 +90,14 @@ class HolePose:
     shared_rad2: np.ndarray | None = None
 
     def moved(self, base_from_camera: np.ndarray, camera_cov: np.ndarray | None = None) -> HolePose:
-        """Return the pose in the base frame.
+        """Return the pose in the base frame, in which it may be already.
 
         Args:
             base_from_camera: Pose of the camera, `(4, 4)`.
             camera_cov: Covariance of that pose, see `Frame`; it adds to the covariances.
         """
+        if self.frame == "base":
+            return self
         rotation, shift = base_from_camera[:3, :3], base_from_camera[:3, 3]
         # First order: a small motion (shift, turn) of the camera moves the centre by
         # shift - center x turn, and the axis by -axis x turn.
@@ -156,12 +158,7 @@ class FrameDetections:
         """Return the same with all holes in the base frame, as they are if the camera's pose is unknown."""
         if frame.base_from_camera is None:
             return self
-        holes = []
-        for hole in self.holes:
-            in_camera = hole.frame == "camera"
-            holes.append(
-                hole.moved(frame.base_from_camera, frame.camera_cov) if in_camera else hole
-            )
+        holes = [hole.moved(frame.base_from_camera, frame.camera_cov) for hole in self.holes]
         return replace(self, holes=holes)
 
 

@@ -141,15 +141,13 @@ def find_runs(patterns: Sequence[str]) -> list[Path]:
     """
     found: set[Path] = set()
     for pattern in patterns:
-        inside: set[Path] = set()
-        for top in glob(pattern):
-            inside.update(path.parent for path in Path(top).rglob(EVALUATION))
+        inside = glob(f"{pattern}/**/{EVALUATION}", recursive=True)
         if not inside:
             raise ConfigError(
                 f"compare.runs: no {EVALUATION} under '{pattern}'; expected run folders, "
                 "a sweep's folder, or a pattern of either"
             )
-        found |= inside
+        found.update(Path(name).parent for name in inside)
     return sorted(found, key=lambda path: [part.zfill(9) for part in re.split(r"(\d+)", str(path))])
 
 
@@ -265,8 +263,8 @@ def _read_figures(folder: Path, evaluation: Mapping[str, Any]) -> dict[str, Any]
 
 def list_figures(table: pd.DataFrame) -> list[str]:
     """Return the names of the figures of a table, without the columns of their intervals."""
-    behind = list(table.columns).index("episodes") + 1 if "episodes" in table else 0
-    return [name for name in table.columns[behind:] if not name.endswith((LOW, HIGH))]
+    figures = table.loc[:, "episodes":].columns[1:]
+    return [name for name in figures if not name.endswith((LOW, HIGH))]
 
 
 def list_rates(table: pd.DataFrame) -> list[str]:

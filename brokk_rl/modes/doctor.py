@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import tempfile
 from collections.abc import Callable
 from importlib import metadata, util
@@ -17,6 +16,7 @@ from rich.text import Text
 import brokk_rl
 from brokk_rl import extras
 from brokk_rl.console_table import print_table
+from brokk_rl.session import read_output
 from brokk_rl.sim import probe
 from brokk_rl.spec import NonNegative, spec
 
@@ -123,7 +123,8 @@ def check_torch() -> DoctorFinding:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     threads = torch.get_num_threads()
-    driver = _read_driver_version()
+    driver = read_output(["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"])
+    driver = driver and driver.split()[0]  # a line for each GPU
     text = f"{torch.__version__}, {threads} threads on {cores} cores, "
     text += f"built for CUDA {torch.version.cuda or 'none'}, driver {driver or 'none'}"
     if torch.cuda.is_available():
@@ -136,16 +137,6 @@ def check_torch() -> DoctorFinding:
         advice = f"more threads than cores slow each other down: OMP_NUM_THREADS={cores}"
         return DoctorFinding("warn", text, advice)
     return DoctorFinding("ok", f"{text}: everything runs on the CPU")
-
-
-def _read_driver_version() -> str | None:
-    """Return the version of the NVIDIA driver, `None` without one."""
-    query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        done = subprocess.run(query, capture_output=True, text=True, check=True, timeout=20)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return next(iter(done.stdout.split()), None)
 
 
 def check_warp() -> DoctorFinding:
