@@ -90,6 +90,7 @@ class ProportionalModel:
         """Have no memory."""
 
     def step(self, history: History) -> torch.Tensor:
+        """Return the joint positions one control period later, `(N, J)`."""
         return history.q[:, -1] + history.u[:, -1] * self._step
 
 
