@@ -36,8 +36,7 @@ class Gamepad:
     """
 
     def __init__(self, path: Path, option: str, instead: str) -> None:
-        self._axes: dict[int, float] = {}
-        self._buttons: dict[int, bool] = {}
+        self._values: dict[tuple[int, int], int] = {}  # by kind and number
         self._rest = b""
         self.connected = True
         try:
@@ -62,10 +61,7 @@ class Gamepad:
         whole = len(self._rest) // EVENT.size * EVENT.size
         events, self._rest = self._rest[:whole], self._rest[whole:]
         for _, value, kind, number in EVENT.iter_unpack(events):
-            if kind & ~INITIAL == AXIS:
-                self._axes[number] = value / FULL_SCALE
-            elif kind & ~INITIAL == BUTTON:
-                self._buttons[number] = bool(value)
+            self._values[kind & ~INITIAL, number] = value
         return bool(events)
 
     def read_axes(self, axes: Sequence[int]) -> list[float]:
@@ -76,14 +72,16 @@ class Gamepad:
         """
         found = []
         for axis in axes:
-            value = self._axes.get(abs(axis), 0.0) * (-1.0 if axis < 0 else 1.0)
+            value = (
+                self._values.get((AXIS, abs(axis)), 0) / FULL_SCALE * (-1.0 if axis < 0 else 1.0)
+            )
             size = min(1.0, max(0.0, abs(value) - DEAD_ZONE) / (1.0 - DEAD_ZONE))
             found.append(size if value > 0 else -size)
         return found
 
     def is_pressed(self, button: int) -> bool:
         """Return whether a button is held."""
-        return self._buttons.get(button, False)
+        return self._values.get((BUTTON, button), 0) != 0
 
     def close(self) -> None:
         """Close the device."""

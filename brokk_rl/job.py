@@ -198,13 +198,9 @@ class SweepFolder(Callback):
     @classmethod
     def drop_if_unused(cls) -> None:
         """Remove the folders of a sweep into which no job has written."""
-        if (
-            cls.new
-            and cls.new[0].is_dir()
-            and {path.name for path in cls.new[0].iterdir()} <= {"multirun.yaml"}
-        ):
-            (cls.new[0] / "multirun.yaml").unlink(missing_ok=True)
-            remove_empty_folders(cls.new)
+        if cls.new and {path.name for path in cls.new[0].glob("*")} == {"multirun.yaml"}:
+            (cls.new[0] / "multirun.yaml").unlink()
+        remove_empty_folders(cls.new)
         cls.new = ()
 
 

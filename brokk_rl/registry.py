@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata, resources, util
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,9 @@ class Option:
 
     def comment(self) -> str:
         """Return the whole comment at the top of the file, in one line."""
-        return _read_comment(self.path.read_text())
+        head = takewhile(lambda line: line[:1] == "#", self.path.read_text().splitlines())
+        lines = [line.strip("# ") for line in head]
+        return " ".join(line for line in lines if not line.startswith("@package")).strip()
 
     @property
     def target(self) -> str | None:
@@ -186,14 +189,3 @@ def _read_docstring(target: str) -> str:
         if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == name:
             return ast.get_docstring(node) or ""
     return ""
-
-
-def _read_comment(text: str) -> str:
-    """Return the comment at the top of a file in one line, or an empty string."""
-    lines = []
-    for line in text.splitlines():
-        if not line.startswith("#"):
-            break
-        if not line.lstrip("# ").startswith("@package"):
-            lines.append(line.lstrip("#").strip())
-    return " ".join(lines).strip()
