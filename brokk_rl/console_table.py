@@ -48,7 +48,8 @@ def print_table(
     for column in range(num_columns):
         heading = Text(headings[column] if headings else "")
         cells = [row[column].plain for row in texts]
-        is_right = column > 0 and is_numeric(cells)
+        given = [cell for cell in cells if cell not in (MISSING, "")]
+        is_right = column > 0 and bool(given) and all(map(NUMBER.match, given))
         table.add_column(
             heading,
             justify="right" if is_right else "left",
@@ -66,12 +67,6 @@ def print_table(
 def print_text(text: str, style: str = "") -> None:
     """Print a line of text to stdout as it is: not wrapped, nothing in it taken as markup."""
     Console().print(text, style=style, markup=False, highlight=False, soft_wrap=True)
-
-
-def is_numeric(values: Sequence[str | float | None]) -> bool:
-    """Return whether a column holds numbers, or texts that begin like one."""
-    given = [value for value in values if value not in (None, MISSING, "")]
-    return bool(given) and all(not isinstance(value, str) or NUMBER.match(value) for value in given)
 
 
 def _format_cell(cell: TableCell) -> Text:

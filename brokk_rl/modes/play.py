@@ -6,8 +6,6 @@ import logging
 import time
 from pathlib import Path
 
-import torch
-
 from brokk_rl.errors import CheckpointError
 from brokk_rl.play.page import PlayPage
 from brokk_rl.play.session import PlaySession
@@ -62,8 +60,16 @@ class Play(SimulatedPlant):
         port = page.port
         log.info("open http://localhost:%d in a browser; end with Ctrl-C", port)
         log.info("over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", port, port)
+        begun_s = last_s = time.monotonic()
         try:
-            _drive(session, page, watch, self.play.seconds)
+            while self.play.seconds is None or last_s - begun_s < self.play.seconds:
+                if watch is not None:
+                    watch.poll()
+                now_s = time.monotonic()
+                session.advance(now_s - last_s)
+                last_s = now_s
+                page.update()
+                time.sleep(max(0.0, FRAME_S - (time.monotonic() - now_s)))
         finally:
             page.close()
 
@@ -125,19 +131,3 @@ class CheckpointWatch:
         note = f"{stored.file.parent.name}/{stored.file.name}"
         self._session.replace_policy(POLICY, policy, note)
         log.info("playing %s", note)
-
-
-def _drive(
-    session: PlaySession, page: PlayPage, watch: CheckpointWatch | None, seconds: float | None
-) -> None:
-    """Simulate at the wanted pace and show it, until the time ends it."""
-    begun_s = last_s = time.monotonic()
-    with torch.no_grad():
-        while seconds is None or time.monotonic() - begun_s < seconds:
-            if watch is not None:
-                watch.poll()
-            now_s = time.monotonic()
-            session.advance(now_s - last_s)
-            last_s = now_s
-            page.update()
-            time.sleep(max(0.0, FRAME_S - (time.monotonic() - now_s)))
