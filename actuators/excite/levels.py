@@ -3,6 +3,7 @@
 import numpy as np
 
 from actuators.excite.poses import PoseProgram
+from actuators.excite.schedule import check_order
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import Positive, Share, spec
@@ -39,16 +40,12 @@ class Levels(PoseProgram):
     stop_margin: float
 
     def check(self) -> None:
-        if self.shortest_s > self.longest_s:
-            raise ConfigError(
-                f"longest_s: expected shortest_s={self.shortest_s} or more, got {self.longest_s}"
-            )
+        check_order(self, "shortest_s", "longest_s")
+        check_order(self, "turn_s", "pose_s")
         if self.zero_share + self.small_share > 1:
             raise ConfigError(
                 f"zero_share: expected 1 or less with small_share, got {self.zero_share + self.small_share}"
             )
-        if self.turn_s > self.pose_s:
-            raise ConfigError(f"pose_s: expected turn_s={self.turn_s} or more, got {self.pose_s}")
 
     def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands of so many control periods, `(T, J)`."""

@@ -17,6 +17,13 @@ NUM_TRIES = 6
 longest that fits is taken."""
 
 
+def check_order(options: object, smaller: str, larger: str) -> None:
+    """Raise a `ConfigError` where one field of a spec is above another one."""
+    least, most = getattr(options, smaller), getattr(options, larger)
+    if least > most:
+        raise ConfigError(f"{smaller}: expected {larger}={most} or less, got {least}")
+
+
 @spec
 class Approach:
     """Approach to the start pose of a segment.
@@ -40,8 +47,7 @@ class Approach:
     patience: Annotated[float, Ge(1)]
 
     def check(self) -> None:
-        if self.smallest > self.level:
-            raise ConfigError(f"smallest: expected level={self.level} or less, got {self.smallest}")
+        check_order(self, "smallest", "level")
 
     def duration_s(self, machine: Machine, start: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return the nominal time from `start` to `target`, each `(…, J)`, with the rest."""

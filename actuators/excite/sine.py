@@ -7,6 +7,7 @@ from annotated_types import Interval
 from numpy.random import Generator
 
 from actuators.excite.poses import move_joint
+from actuators.excite.schedule import check_order
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -35,14 +36,8 @@ class Sine:
     stop_margin: float
 
     def check(self) -> None:
-        if self.lowest_hz > self.highest_hz:
-            raise ConfigError(
-                f"highest_hz: expected lowest_hz={self.lowest_hz} or more, got {self.highest_hz}"
-            )
-        if self.smallest > self.largest:
-            raise ConfigError(
-                f"smallest: expected largest={self.largest} or less, got {self.smallest}"
-            )
+        check_order(self, "lowest_hz", "highest_hz")
+        check_order(self, "smallest", "largest")
 
     def segments(self, machine: Machine, duration_s: float, generator: Generator) -> list[Segment]:
         """Return one segment per joint, from home, of equal length, in random order."""

@@ -11,11 +11,10 @@ from pathlib import Path
 from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
 from actuators.excite.player import CommandGuards, NominalLink, PlanPlayer, Sample, drive
-from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
+from actuators.excite.schedule import Approach, ExcitationPlan, check_order, plan_runs
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.contracts.link import Connection
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import RATE_TOLERANCE
@@ -53,10 +52,7 @@ class Collection:
     guards: CommandGuards
 
     def check(self) -> None:
-        if self.file_minutes > self.run_minutes:
-            raise ConfigError(
-                f"file_minutes: expected run_minutes={self.run_minutes} or less, got {self.file_minutes}"
-            )
+        check_order(self, "file_minutes", "run_minutes")
 
 
 @spec

@@ -95,8 +95,22 @@ class ImportLogs:
             },
         )
         command = _format_next(folder, self.log.input)
-        _write_page(draft, guesses, folder, command)
-        _show(draft, guesses, folder, command)
+        summary = summarise(draft, guesses)
+        values = {
+            "title": f"Logs of {draft.name}",
+            "tone": "bad" if unsure else "",
+            "summary": summary,
+            "motion": embed_picture(folder / PICTURE_FILE),
+            "head": HEAD,
+            "guesses": guesses,
+            "draft": draft,
+            "command": command,
+        }
+        write_text(folder / PAGE_FILE, render_page(TEMPLATE, values))
+        rows = [(guess.subject, guess.value, guess.sureness, guess.reason) for guess in guesses]
+        print_table(HEAD, rows)
+        for text in (*draft.remarks, summary, f"look at {folder / PAGE_FILE}, then:", command):
+            print_text(text)
 
 
 def _name_machine(path: Path) -> str:
@@ -132,32 +146,3 @@ def summarise(draft: Draft, guesses: list[Guess]) -> str:
         f"{draft.survey.num_runs} runs, {draft.survey.minutes:.1f} minutes, {len(draft.joints)} joints at "
         f"{1.0 / draft.survey.period_s:.4g} Hz. {end}"
     )
-
-
-def _write_page(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
-    is_unsure = any(guess.sureness == "unsure" for guess in guesses)
-    values = {
-        "title": f"Logs of {draft.name}",
-        "tone": "bad" if is_unsure else "",
-        "summary": summarise(draft, guesses),
-        "motion": embed_picture(folder / PICTURE_FILE),
-        "head": HEAD,
-        "guesses": guesses,
-        "draft": draft,
-        "command": command,
-    }
-    write_text(folder / PAGE_FILE, render_page(TEMPLATE, values))
-
-
-def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
-    rows = []
-    for guess in guesses:
-        rows.append((guess.subject, guess.value, guess.sureness, guess.reason))
-    print_table(HEAD, rows)
-    for text in (
-        *draft.remarks,
-        summarise(draft, guesses),
-        f"look at {folder / PAGE_FILE}, then:",
-        command,
-    ):
-        print_text(text)

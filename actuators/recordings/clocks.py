@@ -272,21 +272,8 @@ TIME_MODULI = (2.0**16, 2.0**24, 2.0**32, 1e3, 1e4, 1e5, 1e6, 1e9, 3600.0, 86400
 """Values at which counters of time begin again, in their own unit."""
 
 
-@dataclass(frozen=True)
-class TimeGuess:
-    """The clock of a table.
-
-    Attributes:
-        time: Its column.
-        guess: How sure it is.
-    """
-
-    time: TimeColumn
-    guess: Guess
-
-
-def guess_times(run: LogRun, given: GivenColumns) -> dict[str, TimeGuess]:
-    """Return the clock of each table that has one.
+def guess_times(run: LogRun, given: GivenColumns) -> dict[str, Guess]:
+    """Return the clock of each table that has one; the choice of a guess is a `TimeColumn`.
 
     Raises:
         RecordingError: None has, or a clock that is given an offset is missing.
@@ -294,9 +281,9 @@ def guess_times(run: LogRun, given: GivenColumns) -> dict[str, TimeGuess]:
     times, faults = {}, []
     for name, table in run.tables.items():
         found = _guess_time(f"time of '{name}'" if name else "time", table, given)
-        if isinstance(found, TimeGuess):
+        if isinstance(found, Guess):
             offset_s = (given.clock_offset_s or {}).get(name, 0.0)
-            times[name] = replace(found, time=_shift_clock(found.time, offset_s))
+            times[name] = replace(found, choice=_shift_clock(found.choice, offset_s))
         else:
             faults += found
     columns = index_columns({name: [*table.columns] for name, table in run.tables.items()})
@@ -323,30 +310,29 @@ def _shift_clock(time: TimeColumn, offset_s: float) -> TimeColumn:
     return time if isinstance(time, RowTime) else replace(time, offset=time.offset + offset_s)
 
 
-def _guess_time(subject: str, table: Table, given: GivenColumns) -> TimeGuess | list[str]:
+def _guess_time(subject: str, table: Table, given: GivenColumns) -> Guess | list[str]:
     """Return the clock of a table, or what is wrong with the columns that could be one."""
     if given.rate_hz is not None:
         evidence = [("as given by log.rate_hz", 5.0)]
-        guess = Guess(subject, f"row / {given.rate_hz:g} Hz", evidence, (), True)
-        return TimeGuess(RowTime(rate_hz=given.rate_hz), guess)
+        time = RowTime(rate_hz=given.rate_hz)
+        return Guess(subject, f"row / {given.rate_hz:g} Hz", evidence, (), True, time)
     if table.clock is not None and given.time is None:
         return _guess_own_clock(subject, table, table.clock)
     candidates, faults = [], []
     for text, values in _list_clocks(table, given.time):
         judged = _judge_clock(subject, text, values, table, given)
-        if isinstance(judged, TimeGuess):
+        if isinstance(judged, Guess):
             candidates.append(judged)
         elif judged:
             faults.append(judged)
     if not candidates:
         return faults
-    best = max(candidates, key=lambda one: one.guess.probability)
-    others = tuple(one.guess.value for one in candidates if one is not best)
-    guess = replace(best.guess, others=others).advise(advise("time", columns=best.guess.value))
-    return replace(best, guess=guess)
+    best = max(candidates, key=lambda one: one.probability)
+    others = tuple(one.value for one in candidates if one is not best)
+    return replace(best, others=others).advise(advise("time", columns=best.value))
 
 
-def _guess_own_clock(subject: str, table: Table, clock: str) -> TimeGuess:
+def _guess_own_clock(subject: str, table: Table, clock: str) -> Guess:
     """Return the clock that the reader of the log made, or that of the sensor tied to it."""
     stamp_s, anchor_s = table.columns.get("header.stamp", np.zeros(1)), table.columns[clock]
     anchor = Column(column=clock, scale=1.0, offset=0.0)
@@ -360,14 +346,14 @@ def _guess_own_clock(subject: str, table: Table, clock: str) -> TimeGuess:
         if steps_s.any() and num_doubled > DOUBLED_SHARE * len(steps_s):
             text = f"{num_doubled} of {len(stamp_s)} messages repeat the stamp of the one before"
             evidence.append((f"{text}: two programs send on one topic", -8.0))
-        return TimeGuess(anchor, Guess(subject, clock, evidence))
+        return Guess(subject, clock, evidence, choice=anchor)
     scatter_s = np.quantile(late_s, 0.95) - late_s.min()
     reason = (
         f"the sensor's own clock; behind the recorder's by {np.median(late_s):.4g} s, drift {1e6 * drift:.3g} ppm, "
         f"scatter of the transport {1000 * scatter_s:.3g} ms"
     )
     time = AlignedTime(column="header.stamp", scale=1.0, anchor=anchor)
-    return TimeGuess(time, Guess(subject, "header.stamp", ((reason, 5.0),), (clock,)))
+    return Guess(subject, "header.stamp", ((reason, 5.0),), (clock,), choice=time)
 
 
 def _list_clocks(table: Table, given: Sequence[str] | None) -> Iterator[tuple[str, np.ndarray]]:
@@ -394,7 +380,7 @@ def _quote(name: str) -> str:
 
 def _judge_clock(
     subject: str, text: str, values: np.ndarray, table: Table, given: GivenColumns
-) -> TimeGuess | str | None:
+) -> Guess | str | None:
     """Return a column as a clock, a sentence about one that is broken, or `None` for no clock.
 
     Args:
@@ -445,7 +431,7 @@ def _judge_clock(
     if is_given:
         evidence.append(("as given by log.time", 2.0))
     time = Column(column=text, scale=scale, offset=0.0, wraps=wraps)
-    return TimeGuess(time, Guess(subject, text, evidence, (), is_given))
+    return Guess(subject, text, evidence, (), is_given, time)
 
 
 def _weigh_time_unit(

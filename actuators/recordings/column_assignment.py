@@ -57,7 +57,7 @@ class ColumnTable:
         self.times = times = guess_times(run, given)
         self._places = index_columns({name: [*run.tables[name].columns] for name in times})
         self.signals = RunSignals(
-            run, self._places, lambda name: times[name].time, True, 1.0, quiet=True
+            run, self._places, lambda name: times[name].choice, True, 1.0, quiet=True
         )
         self.remarks: list[str] = []
         self.joints = self._find() if given.joints is None else self._take(given.joints)
@@ -127,7 +127,7 @@ class ColumnTable:
         """Return the columns that are neither clock nor count nor switch."""
         entries = []
         for full_name, (table, column) in self._places.items():
-            clocks = list_time_columns(self.times[table].time)
+            clocks = list_time_columns(self.times[table].choice)
             is_time = any(column == one or column in re.findall(r"\w+", one) for one in clocks)
             is_time |= column.endswith("stamp") or column == self._run.tables[table].clock
             if not is_time and (WORDS["count"] | WORDS["enable"]).isdisjoint(read_words(column)):
@@ -152,7 +152,7 @@ class ColumnTable:
         """Return positions without wraps, and targets that have the same ones."""
         plain, moduli = [], set[float]()
         for name, entry in zip(names, positions, strict=True):
-            given, wrap = self._given.find_wraps(name), find_wrap(entry.values)
+            given, wrap = self._given.find("wraps", name), find_wrap(entry.values)
             if given is not None and (wrap is None or wrap.modulus != given):
                 wrap = Wrap(float(given), np.empty(0, dtype=int)) if given else None
             moduli |= {wrap.modulus} if wrap else set()

@@ -43,6 +43,7 @@ class Guess:
         evidence: What speaks for it and against it.
         others: Other candidates.
         is_given: A person gave the value.
+        choice: The value itself, where it is more than a text: the clock of a table.
     """
 
     subject: str
@@ -50,6 +51,7 @@ class Guess:
     evidence: Sequence[Evidence]
     others: tuple[str, ...] = ()
     is_given: bool = False
+    choice: Any = None
 
     @property
     def probability(self) -> float:
@@ -117,14 +119,10 @@ class GivenColumns:
     channel: int | str | None = None
     damaged: Damaged = "refuse"
 
-    def find_unit(self, joint: str) -> str | None:
-        """Return the unit of a joint's positions, where it is given."""
-        given = self.position_unit
+    def find(self, key: Literal["position_unit", "wraps"], joint: str) -> Any:
+        """Return what is given for a joint, `None` for nothing."""
+        given = getattr(self, key)
         return given.get(joint) if isinstance(given, Mapping) else given
-
-    def find_wraps(self, joint: str) -> float | None:
-        """Return the value at which a joint's positions begin again, where it is given."""
-        return self.wraps.get(joint) if isinstance(self.wraps, Mapping) else self.wraps
 
 
 def advise(key: str, **values: object) -> str:

@@ -115,12 +115,14 @@ class Inspection:
 
     Attributes:
         recording: The recording.
+        viewed: The same with speeds as commands, whatever the interface of the machine.
         timing: Rate and jitter of the file.
         joints: Ranges, shares of time, noise and sensor step of each joint, by name.
         findings: In order of time.
     """
 
     recording: Recording
+    viewed: Recording
     timing: dict[str, float | None]
     joints: dict[str, dict[str, float | None]]
     findings: list[RecordingFinding]
@@ -134,7 +136,7 @@ def inspect_recording(
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
         scan = _RecordingScan(recording, machine, thresholds)
         findings = sorted(scan.find_all(), key=lambda finding: finding.row)
-        return Inspection(recording, scan.timing(), scan.joints(), findings)
+        return Inspection(recording, scan.viewed, scan.timing(), scan.joints(), findings)
 
 
 class _RecordingScan:
@@ -144,9 +146,9 @@ class _RecordingScan:
         self, recording: Recording, machine: Machine, thresholds: InspectionThresholds
     ) -> None:
         self._machine, self._limits = machine, thresholds
-        (viewed,) = view_recordings([recording], machine)
-        self._t_s, self._u = viewed.t_s, viewed.u.astype(np.float64)
-        self._q = viewed.q.astype(np.float64)
+        (self.viewed,) = view_recordings([recording], machine)
+        self._t_s, self._u = self.viewed.t_s, self.viewed.u.astype(np.float64)
+        self._q = self.viewed.q.astype(np.float64)
         # of joints that are commanded by position, `(T, J)`, rad or m
         self._targets: np.ndarray | None = None
         if machine.interface == "position":
@@ -364,10 +366,9 @@ class _RecordingScan:
         """
         speed, span = np.full(self._q.shape, np.nan), ahead + behind
         if len(self._q) > span:
-            change = (self._q[span:] - self._q[:-span]) / (self._t_s[span:] - self._t_s[:-span])[
-                :, None
-            ]
-            speed[behind : len(self._q) - ahead] = change
+            elapsed_s = self._t_s[span:] - self._t_s[:-span]
+            change = self._q[span:] - self._q[:-span]
+            speed[behind : len(self._q) - ahead] = change / elapsed_s[:, None]
         return speed
 
     def _noise_of(self, joint: int) -> float:

@@ -171,10 +171,10 @@ class JointGuess:
         self.add_guess("columns", f"{self.u.text} → {self.q.text}", self.evidence, is_given)
         if self.q.wrap is not None:
             text = f"{self.q.wrap.explain()}: unwrapped; {advise('wraps', modulus=self.q.modulus)}"
-            is_given = given.find_wraps(self.name) is not None
+            is_given = given.find("wraps", self.name) is not None
             evidence = [("as given by log.wraps", 5.0) if is_given else (text, 4.0)]
             self.add_guess("wraps", f"{self.q.modulus:.6g}", evidence, is_given)
-        self._judge_unit(given.find_unit(self.name), slope)
+        self._judge_unit(given.find("position_unit", self.name), slope)
         if self.kind == "position" and abs(r["position"]) >= CLEAR_CORRELATION:
             self._judge_target(slope, rest)
 
@@ -344,6 +344,7 @@ class Correlations:
     Attributes:
         r: Correlation at the best lag of each position, its speed or its acceleration with each command, by the
             kind of command that they follow, `(C, P)`.
+        lag_s: That lag, `(C, P)`.
     """
 
     def __init__(
@@ -365,8 +366,9 @@ class Correlations:
         self._lags = np.arange(0, most + 1, max(1, most // NUM_LAGS))
         acceleration = self._differentiate(self._v)
         self.r: dict[CommandKind, np.ndarray] = {}
+        self.lag_s: dict[CommandKind, np.ndarray] = {}
         for kind, followed in zip(KIND_TEXTS, (self._v, self._q, acceleration), strict=True):
-            self.r[kind] = self._correlate(self._u, followed)[0]
+            self.r[kind], self.lag_s[kind] = self._correlate(self._u, followed)
 
     @property
     def size(self) -> np.ndarray:
@@ -375,14 +377,15 @@ class Correlations:
 
     def find_lag(self, at: int, is_target: bool) -> float:
         """Return the lag of a joint's speed behind its command, or behind its target's speed, s."""
-        u = self._differentiate(self._u) if is_target else self._u
-        return self._correlate_pair(u[:, at], self._v[:, at])[1]
+        if not is_target:
+            return float(self.lag_s["velocity"][at, at])
+        speed = self._differentiate(self._u[:, [at]])
+        return float(self._correlate(speed, self._v[:, [at]])[1][0, 0])
 
     def fit_target(self, at: int) -> tuple[float, float]:
         """Return slope and offset of the line from targets to positions, at the best lag."""
-        u, q = self._u[:, at], self._q[:, at]
-        rows = round(self._correlate_pair(u, q)[1] / self._period_s)
-        u, q = u[: len(u) - rows], q[rows:]
+        rows = round(float(self.lag_s["position"][at, at]) / self._period_s)
+        u, q = self._u[: len(self._u) - rows, at], self._q[rows:, at]
         if np.ptp(u) == 0:
             return 0.0, 0.0
         slope, offset = np.polyfit(u, q, 1)
@@ -390,18 +393,13 @@ class Correlations:
 
     def find_lead(self, at: int) -> float:
         """Return the time by which the position leads its target, s; 0 where it does not, clearly."""
-        u, q = self._u[:, at], self._q[:, at]
-        behind, (before, lead_s) = self._correlate_pair(u, q)[0], self._correlate_pair(q, u)
-        left, left_behind = 1.0 - abs(before), 1.0 - abs(behind)
-        return lead_s if abs(before) >= CLEAR_CORRELATION and left < 0.3 * left_behind else 0.0
+        r, lead_s = self._correlate(self._q[:, [at]], self._u[:, [at]])
+        before, behind = abs(r[0, 0]), abs(self.r["position"][at, at])
+        is_leading = before >= CLEAR_CORRELATION and 1.0 - before < 0.3 * (1.0 - behind)
+        return float(lead_s[0, 0]) if is_leading else 0.0
 
     def _differentiate(self, values: np.ndarray) -> np.ndarray:
         return np.gradient(values, self._period_s, axis=0)
-
-    def _correlate_pair(self, a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-        """Return the largest correlation of `b` with `a` before it, and its lag, s."""
-        r, lag_s = self._correlate(a[:, None], b[:, None])
-        return float(r[0, 0]), float(lag_s[0, 0])
 
     def _correlate(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the largest correlations, in size, of the columns of `b` with those of `a` before them, and lags, s."""

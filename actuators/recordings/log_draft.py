@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from actuators.recordings.clocks import TimeGuess, put_near
+from actuators.recordings.clocks import put_near
 from actuators.recordings.column_assignment import ColumnTable
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.joint_evidence import JointGuess
@@ -64,7 +64,7 @@ class Draft:
     """
 
     name: str
-    times: Mapping[str, TimeGuess]
+    times: Mapping[str, Guess]
     joints: Sequence[JointGuess]
     survey: LogSurvey
     signs: tuple[str, str]
@@ -131,7 +131,7 @@ class Draft:
 
     def list_guesses(self) -> list[Guess]:
         """Return all guesses, those of the clocks first."""
-        found = [time.guess for time in self.times.values()]
+        found = [*self.times.values()]
         for joint in self.joints:
             found += joint.guesses.values()
         return found
@@ -154,7 +154,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
     Raises:
         RecordingError: A log cannot be read, nothing can be proposed, or no joint is ever commanded.
     """
-    clocks: dict[str, TimeGuess] = {}
+    clocks: dict[str, Guess] = {}
     best: dict[str, JointGuess] = {}
     remarks: dict[str, None] = {}
     signs = (",", ".")
@@ -402,7 +402,7 @@ def count_gap_periods(periods: np.ndarray) -> int:
 
 def measure_logs(
     paths: Sequence[Path],
-    times: Mapping[str, TimeGuess],
+    times: Mapping[str, Guess],
     joints: Sequence[JointGuess],
     signs: tuple[str, str],
     given: GivenColumns,
@@ -418,7 +418,7 @@ def measure_logs(
     survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
     for path in paths:
         opened = open_log(path, signs, given.dbc, given.damaged, given.channel)
-        for signals in open_signals(opened, texts, lambda table: times[table].time, 1.0):
+        for signals in open_signals(opened, texts, lambda table: times[table].choice, 1.0):
             read = []
             for joint in joints:
                 position = signals.read(joint.q.text, wraps=joint.q.modulus)

@@ -9,22 +9,20 @@ from typing import Any, Literal
 
 from actuators.recordings.array_log import FORMATS
 from actuators.recordings.guess import FOREIGN, Damaged, advise
-from actuators.recordings.log_tables import LogFile, Table, Wanted
-from actuators.recordings.text_log import TextLog
+from actuators.recordings.log_tables import LogFile
 from brokk_rl.errors import ConfigError, RecordingError
 
 TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".log", ".lvm")
-CAN_ENDINGS = (".blf", ".asc", ".trc")
 READERS: dict[str, str] = {
+    **dict.fromkeys(TEXT_ENDINGS, "text_log.TextLog"),
+    **dict.fromkeys((".blf", ".asc", ".trc"), "can_log.CanLog"),
     **dict.fromkeys(FORMATS, "array_log.TableLog"),
     **dict.fromkeys((".npz", ".mat"), "array_log.ArrayLog"),
     **dict.fromkeys((".db3", ".bag"), "message_log.BagLog"),
     ".mcap": "message_log.McapLog",
 }
-"""Readers of files that need no more than their path, by their ending."""
+"""Readers of files by their ending."""
 FOLDER_READERS = {"lerobot": "array_log.LeRobotLog", "bag": "message_log.BagLog"}
-ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *READERS)
-"""Endings of the files that are logs."""
 SIGNATURES = {
     b"\x89MCAP0\r\n": (".mcap", "an MCAP file"),
     b"LOGG": (".blf", "a BLF file"),
@@ -37,22 +35,6 @@ SIGNATURES = {
 """First bytes of files, with the ending and the name of their kind."""
 CANDUMP_LINE = re.compile(rb"^\s*\([-\d:. ]+\)\s+\S+\s+[0-9A-Fa-f]+(#|\s+\[\d+\])", re.MULTILINE)
 """A line of candump, as a file (`candump -l`) or as printed on a terminal (`candump -t a`)."""
-
-
-class CsvFolderLog(LogFile):
-    """A folder with the CSV files of one run, each on its clock."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._logs = {Path(name).stem: TextLog(path / name) for name in _list_csv_files(path)}
-
-    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
-        """Return the rows of each file that is needed."""
-        tables = {}
-        for table, log in self._logs.items():
-            if wanted is None or table in wanted:
-                tables[table] = log.read_tables(None, max_rows)[""]
-        return tables
 
 
 def open_log(
@@ -75,8 +57,16 @@ def open_log(
         ConfigError: A log of a CAN bus without a DBC file, or a library is not installed.
         RecordingError: It is no log of a known kind, or its beginning cannot be read.
     """
-    try:
-        opened = _open_folder(path) if path.is_dir() else _open_file(path, signs, dbc, channel)
+    name = _find_folder_reader(path) if path.is_dir() else _find_reader(path)
+    more: dict[str, tuple[Any, ...]] = {"TextLog": (signs,), "CanLog": (dbc, channel)}
+    if name == "can_log.CanLog" and dbc is None:
+        raise ConfigError(
+            f"{path}: frames of a CAN bus mean nothing without their DBC file: {advise('dbc')}"
+        )
+    module, _, reader = name.partition(".")
+    try:  # a desk without such logs lacks what their module imports
+        imported = importlib.import_module(f"actuators.recordings.{module}")
+        opened = getattr(imported, reader)(path, *more.get(reader, ()))
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"{path}: this kind of log needs {error.name}: pip install 'brokk-rl[logs]'"
@@ -85,54 +75,27 @@ def open_log(
     return opened
 
 
-def _open_folder(path: Path) -> LogFile:
+def _find_folder_reader(path: Path) -> str:
     kind = tell_folder(path)
     if kind is not None:
-        return _load_reader(FOLDER_READERS[kind])(path)
+        return FOLDER_READERS[kind]
     if len(_list_csv_files(path)) > 1:
-        return CsvFolderLog(path)
+        return "text_log.CsvFolderLog"
     raise RecordingError(
         f"{path}: expected a folder with the CSV files of one run, a LeRobotDataset (meta/info.json) or a bag of "
         "ROS 2 (metadata.yaml)"
     )
 
 
-def _open_file(
-    path: Path, signs: tuple[str, str] | None, dbc: str | None, channel: int | str | None
-) -> LogFile:
+def _find_reader(path: Path) -> str:
+    """Return the reader of a file; refuse an empty one, and one whose first bytes are those of another kind."""
     if not path.exists():
         raise RecordingError(f"{path}: no such log")
     ending = path.suffix.lower()
     if ending in FOREIGN:
         raise RecordingError(f"{path}: {FOREIGN[ending]}")
-    _check_ending(path, ending)
-    if ending in READERS:
-        return _load_reader(READERS[ending])(path)
-    if ending in CAN_ENDINGS or (ending in (".log", ".txt") and is_candump(path)):
-        if dbc is None:
-            raise ConfigError(
-                f"{path}: frames of a CAN bus mean nothing without their DBC file: {advise('dbc')}"
-            )
-        return _load_reader("can_log.CanLog")(path, dbc, channel)
-    return TextLog(path, signs)
-
-
-def _load_reader(name: str) -> Any:
-    """Return a class of a module beside this one; a desk without such logs lacks what it imports."""
-    module, _, reader = name.partition(".")
-    return getattr(importlib.import_module(f"actuators.recordings.{module}"), reader)
-
-
-def is_candump(path: Path) -> bool:
-    """Return whether a text file is a log of candump: time in brackets, channel, identifier."""
     with path.open("rb") as file:
-        return CANDUMP_LINE.search(file.read(4096)) is not None
-
-
-def _check_ending(path: Path, ending: str) -> None:
-    """Refuse an empty file, and one whose first bytes are those of another kind."""
-    with path.open("rb") as file:
-        head = file.read(max(map(len, SIGNATURES)))
+        head = file.read(4096)
     if not head:
         raise RecordingError(f"{path}: the file is empty")
     for signature, (expected, name) in SIGNATURES.items():
@@ -140,6 +103,9 @@ def _check_ending(path: Path, ending: str) -> None:
             raise RecordingError(
                 f"{path}: ends in '{ending}', its first bytes are those of {name}; rename it to end in '{expected}'"
             )
+    if ending in (".log", ".txt") and CANDUMP_LINE.search(head):
+        return "can_log.CanLog"
+    return READERS.get(ending, "text_log.TextLog")
 
 
 def tell_folder(path: Path) -> Literal["lerobot", "bag"] | None:
@@ -166,7 +132,7 @@ def expand_logs(paths: list[Path]) -> list[Path]:
                 raise RecordingError(f"{path}: each file {FOREIGN[there[0].lower()]}")
             ends = f" (its files end in {', '.join(there)})" if there else ""
             raise RecordingError(
-                f"{path}: no log in this folder{ends}; logs end in {', '.join(ENDINGS)} or are folders of their own"
+                f"{path}: no log in this folder{ends}; logs end in {', '.join(READERS)} or are folders of their own"
             )
         found += inside
     return found
@@ -178,7 +144,7 @@ def _expand_log(path: Path) -> list[Path]:
         return [path]
     runs, found = _list_csv_runs(path), []
     for entry in sorted(path.iterdir()):
-        if entry in runs or (entry.is_file() and entry.suffix.lower() in ENDINGS):
+        if entry in runs or (entry.is_file() and entry.suffix.lower() in READERS):
             found.append(entry)
         elif entry.is_dir() and not entry.name.startswith("."):
             found += _expand_log(entry)

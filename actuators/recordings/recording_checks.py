@@ -22,7 +22,6 @@ from actuators.recordings.inspection import (
     inspect_recording,
 )
 from actuators.scales import choose_horizon_s
-from brokk_rl.commands import view_recordings
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
@@ -111,16 +110,13 @@ def list_remarks(
     inspections: Sequence[Inspection], machine: Machine, thresholds: InspectionThresholds
 ) -> list[RecordingRemark]:
     """Return all remarks about inspected recordings of `machine`, the most severe first."""
-    viewed = view_recordings([one.recording for one in inspections], machine)
-    inspected = [(seen, one.findings) for seen, one in zip(viewed, inspections, strict=True)]
     locks = {}
     for j, name in enumerate(machine.joint_names):
-        if text := _find_lock(inspected, machine, j, thresholds):
+        if text := _find_lock(inspections, machine, j, thresholds):
             locks[name] = text
-    remarks: list[RecordingRemark] = []
-    for recording, findings in inspected:
-        remarks += _group_findings(recording, findings, machine, locks)
-    remarks += _check_excitation(viewed, machine, thresholds)
+    remarks = [*_check_excitation(inspections, machine, thresholds)]
+    for one in inspections:
+        remarks += _group_findings(one, machine, locks)
     return sorted(
         remarks,
         key=lambda one: (ORDER.index(one.kind.severity), one.name, one.joint or "", one.recording),
@@ -143,17 +139,15 @@ def name_recording(recording: Recording) -> str:
 
 
 def _group_findings(
-    recording: Recording,
-    findings: Sequence[RecordingFinding],
-    machine: Machine,
-    locks: dict[str, str],
+    inspection: Inspection, machine: Machine, locks: dict[str, str]
 ) -> Iterator[RecordingRemark]:
     """Yield one remark for all stretches of one kind and joint."""
+    recording = inspection.recording
 
     def key(finding: RecordingFinding) -> tuple[str, str]:
         return finding.kind, finding.joint or ""
 
-    for (name, joint), group in groupby(sorted(findings, key=key), key):
+    for (name, joint), group in groupby(sorted(inspection.findings, key=key), key):
         some = sorted(group, key=lambda finding: finding.row)
         seconds = sum(finding.num_rows for finding in some) / recording.rate_hz
         part = seconds / max(recording.duration_s, 1.0 / recording.rate_hz)
@@ -168,7 +162,7 @@ def _group_findings(
 
 
 def _find_lock(
-    inspected: Sequence[tuple[Recording, Sequence[RecordingFinding]]],
+    inspections: Sequence[Inspection],
     machine: Machine,
     joint: int,
     thresholds: InspectionThresholds,
@@ -177,10 +171,10 @@ def _find_lock(
     name = machine.joint_names[joint]
     lead = round((machine.dead_time_s + thresholds.settle_s) / machine.period_s)
     ignored, obeyed, count = [], [], 0
-    for recording, findings in inspected:
-        is_ignored = np.zeros(recording.num_samples, dtype=bool)
-        near = np.zeros(recording.num_samples, dtype=bool)
-        for finding in findings:
+    for inspection in inspections:
+        recording = inspection.viewed
+        is_ignored, near = np.zeros((2, recording.num_samples), dtype=bool)
+        for finding in inspection.findings:
             if finding.kind == IGNORED and finding.joint == name:
                 count += 1
                 end = finding.row + finding.num_rows
@@ -196,8 +190,8 @@ def _find_lock(
     ignores, obeys = np.concatenate(ignored), np.concatenate(obeyed)
     if not obeys.any():
         return f"{name} ignores every command"
-    u = np.concatenate([recording.u for recording, _ in inspected])
-    q = np.concatenate([recording.q for recording, _ in inspected])
+    u = np.concatenate([one.viewed.u for one in inspections])
+    q = np.concatenate([one.viewed.q for one in inspections])
     best = (0.0, 1.0, "")
     for text, condition in _list_conditions(u, q, machine, joint, thresholds):
         # a lock may stop the motion itself, or the command on its way
@@ -233,15 +227,15 @@ def _list_conditions(
 
 
 def _check_excitation(
-    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
+    inspections: Sequence[Inspection], machine: Machine, thresholds: InspectionThresholds
 ) -> Iterator[RecordingRemark]:
-    if not recordings:
-        return
-    for j, name in enumerate(machine.joint_names):
-        seconds = sum(
-            float((np.abs(r.u[:, j]) > thresholds.commanded).sum()) / r.rate_hz for r in recordings
-        )
+    """Yield the joints that are hardly commanded."""
+    total_s = sum(one.viewed.duration_s for one in inspections)
+    for j, name in enumerate(machine.joint_names if inspections else ()):
+        seconds = 0.0
+        for one in inspections:
+            is_commanded = np.abs(one.viewed.u[:, j]) > thresholds.commanded
+            seconds += float(is_commanded.sum()) / one.viewed.rate_hz
         if seconds < MIN_COMMANDED_RUNS * choose_horizon_s(machine):
-            total_s = sum(recording.duration_s for recording in recordings)
             text = f"commanded for {seconds:.1f} s of {total_s:.0f} s"
             yield RecordingRemark("joint at rest", name, "all recordings", 0.0, total_s, 1, text)

@@ -38,6 +38,18 @@ FIRST_ROWS = 3
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
 
+class CsvFolderLog(LogFile):
+    """A folder with the CSV files of one run, each on its clock."""
+
+    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+        """Return the rows of each file that is needed."""
+        tables = {}
+        for path in sorted(self.path.glob("*.csv")):
+            if wanted is None or path.stem in wanted:
+                tables[path.stem] = TextLog(path).read_tables(None, max_rows)[""]
+        return tables
+
+
 @dataclass(frozen=True)
 class TextLayout:
     """Place and form of the rows of a text log.
