@@ -53,11 +53,7 @@ class TableLog(LogFile):
         self._labels = labels or {}
 
     def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
-        """Return the table of the file."""
-        return {"": Table(self.read_columns(max_rows))}
-
-    def read_columns(self, max_rows: int | None) -> dict[str, np.ndarray]:
-        """Return the columns of numbers, times, flags and lists, each `(T,)`; NaN stands for an empty cell."""
+        """Return the columns of numbers, times, flags and lists; NaN stands for an empty cell."""
         kind = FORMATS[self.path.suffix.lower()]
         found = {}
         try:
@@ -76,7 +72,7 @@ class TableLog(LogFile):
             raise RecordingError(f"{self.path}: no such log") from error
         except TABLE_ERRORS as error:
             raise RecordingError(f"{self.path}: cannot be read as {kind} ({error})") from error
-        return found
+        return {"": Table(found)}
 
 
 class LeRobotLog(LogFile):
@@ -110,7 +106,7 @@ class LeRobotLog(LogFile):
     def read_runs(self, wanted: Wanted | None, max_rows: int | None) -> Iterator[LogRun]:
         """Yield each episode as a run."""
         for file in self._files if max_rows is None else self._files[:1]:
-            columns = file.read_columns(max_rows)
+            columns = file.read_tables(None, max_rows)[""].columns
             numbers = columns.get(EPISODE, np.empty(0))
             if not len(numbers):
                 raise RecordingError(f"{file.path}: column '{EPISODE}' is missing or has no rows")

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.stats import theilslopes
 
-from actuators.recordings.expression import parse_expression
 from actuators.recordings.guess import Evidence, GivenColumns, Guess, advise
-from actuators.recordings.log_tables import LogRun, Table, index_columns, warn_once
+from actuators.recordings.log_tables import LogRun, Table, index_columns
 from actuators.recordings.name_evidence import TIME_UNITS, WORDS, read_words, split_unit
 from brokk_rl.errors import RecordingError, list_choices
 from brokk_rl.spec import Positive, spec
@@ -163,11 +162,11 @@ def find_fault(t_s: np.ndarray, table: Table, clock: str) -> ClockFault | None:
     bad = np.flatnonzero(~later)
     steps = np.diff(t_s, prepend=-np.inf)
     is_equal = steps[bad] == 0
-    others = [values for name, values in table.columns.items() if name != clock]
     same = np.ones(len(bad), dtype=bool)
-    for values in others:
-        now, before = values[bad], values[bad - 1]
-        same &= (now == before) | (np.isnan(now) & np.isnan(before))
+    for name, values in table.columns.items():
+        if name != clock:
+            now, before = values[bad], values[bad - 1]
+            same &= (now == before) | (np.isnan(now) & np.isnan(before))
     count = f"{len(bad)} of {len(t_s)} rows"
     if (is_equal & ~same).sum() > COARSE_SHARE * len(t_s):
         text = f"the clock is coarser than the rows: {count} repeat the time of the row before, with other values"
@@ -193,68 +192,6 @@ def _advise_rate(t_s: np.ndarray) -> str:
     span_s = stamps_s[-1] - stamps_s[1] if len(stamps_s) > 2 else 1.0
     rate_hz = float(counts[1:-1].sum() / span_s) or len(t_s)
     return advise("rate", rate_hz=float(f"{rate_hz:.3g}"))
-
-
-def read_clock(
-    run: LogRun, name: str, time: TimeColumn, skip: bool, gap_s: float, quiet: bool = False
-) -> np.ndarray:
-    """Return the times of a table, `(T,)` s; NaN for rows that are left out.
-
-    Args:
-        run: The run.
-        name: The table.
-        time: Its clock.
-        skip: Leave rows out whose time does not increase, instead of refusing the log.
-        gap_s: Time at which a log is split; parts between which the clock was set back lie further apart.
-        quiet: Leave out without a warning.
-
-    Raises:
-        RecordingError: The times cannot be used.
-    """
-    table = run.tables[name]
-    num_rows = len(next(iter(table.columns.values())))
-    if num_rows < 2:
-        raise RecordingError(
-            f"{run.where}: table '{name}' has {num_rows} rows; a log has at least 2"
-        )
-    if isinstance(time, RowTime):
-        return np.arange(num_rows) / time.rate_hz
-    wraps, offset_s = (time.wraps, time.offset) if isinstance(time, Column) else (None, 0.0)
-    t_s = time.scale * unwrap(_read_column(table.columns, time.column), wraps) + offset_s
-    known = np.isfinite(t_s)
-    if not known.all() and not skip:
-        row = int(np.argmin(known))
-        cell = table.show_cell(row, time.column) if time.column in table.columns else "the value"
-        raise RecordingError(
-            f"{run.where}: {table.locate(row)}, column '{time.column}': {cell} is not a number; {advise('damaged')}"
-        )
-    fault = find_fault(t_s, table, time.column)
-    if fault is not None:
-        row = int(fault.rows[0])
-        place = f"{run.where}: {table.locate(row)}, column '{time.column}'"
-        if not (skip and fault.is_damage):
-            before_s = t_s[max(row - 1, 0)]
-            raise RecordingError(
-                f"{place}: time does not increase ({before_s:g} s, then {t_s[row]:g} s): {fault.text}; {fault.advice}"
-            )
-        for at in fault.rows if fault.kind == "back" else ():
-            t_s[at:] += t_s[at - 1] - t_s[at] + 2.0 * gap_s
-        later = is_later(t_s)
-        if not quiet:
-            warn_once(f"{place}: {fault.text}; {np.sum(~later)} of {num_rows} rows left out")
-        t_s = np.where(later, t_s, np.nan)
-    if isinstance(time, AlignedTime):
-        kept = np.isfinite(t_s)
-        anchor = _read_column(table.columns, time.anchor.column)
-        anchor_s = time.anchor.scale * anchor + time.anchor.offset
-        t_s[kept] = time.align(t_s[kept], anchor_s[kept])
-    return t_s
-
-
-def _read_column(columns: Mapping[str, np.ndarray], text: str) -> np.ndarray:
-    if text in columns:
-        return np.asarray(columns[text], dtype=float)
-    return parse_expression(text).evaluate(columns)
 
 
 RATES_HZ = (0.1, 5000.0)

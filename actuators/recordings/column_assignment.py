@@ -35,6 +35,9 @@ SAME_NAME, OTHER_NAME = 3.0, -6.0
 """Log odds of a pair with one name of a joint, and of one in which a column shares it with another one."""
 
 
+Entries = Sequence[ColumnEntry]
+
+
 class ColumnTable:
     """Meanings of the columns of a run.
 
@@ -74,11 +77,11 @@ class ColumnTable:
     def _take(self, given: Mapping[str, tuple[str, str]]) -> list[JointGuess]:
         """Return the joints whose columns a person gives; refuse one that is missing."""
         joints = []
-        for joint, columns in given.items():
+        for name, columns in given.items():
             u, q = (self._read_entry(column) for column in columns)
-            (u,), (q,) = self._unwrap([u], [q], [joint])
+            (u,), (q,) = self._unwrap([u], [q], [name])
             evidence = [("as given by log.joints", 5.0)]
-            joints.append(JointGuess(joint, u, q, evidence, self.signals))
+            joints.append(JointGuess(name, u, q, evidence, self.signals))
         return joints
 
     def _find(self) -> list[JointGuess]:
@@ -100,12 +103,7 @@ class ColumnTable:
         self._weigh_lone(joints, commands, positions)
         return joints
 
-    def _weigh_lone(
-        self,
-        joints: list[JointGuess],
-        commands: Sequence[ColumnEntry],
-        positions: Sequence[ColumnEntry],
-    ) -> None:
+    def _weigh_lone(self, joints: list[JointGuess], commands: Entries, positions: Entries) -> None:
         """Remark the columns that move and belong to no joint; several of both speak against the others."""
         used = [*(joint.u for joint in joints), *(joint.q for joint in joints)]
         keys, taken = {one.name.key for one in used}, {one.text for one in used}
@@ -144,10 +142,7 @@ class ColumnTable:
         return ColumnEntry(read_column_name(signal.table, column, unit), signal)
 
     def _unwrap(
-        self,
-        commands: Sequence[ColumnEntry],
-        positions: Sequence[ColumnEntry],
-        names: Sequence[str],
+        self, commands: Entries, positions: Entries, names: Sequence[str]
     ) -> tuple[list[ColumnEntry], list[ColumnEntry]]:
         """Return positions without wraps, and targets that have the same ones."""
         plain, moduli = [], set[float]()
@@ -163,18 +158,14 @@ class ColumnTable:
             targets.append(entry.remove_wrap(wrap if wrap and wrap.modulus in moduli else None))
         return targets, plain
 
-    def _assign(
-        self, commands: list[ColumnEntry], positions: list[ColumnEntry]
-    ) -> list[JointGuess]:
+    def _assign(self, commands: Entries, positions: Entries) -> list[JointGuess]:
         """Return the pairs of the assignment with the most evidence."""
         names = _weigh_names(commands, positions)
         size = Correlations(self._run, commands, positions).size
         numbers = np.vectorize(weigh_correlation)(size) + size
         numbers[[not one.is_changing for one in commands]] = -1.0  # another log may move it
         score = names + numbers + _prefer(commands, positions)
-        pairs = [
-            (int(row), int(column)) for row, column in np.stack(linear_sum_assignment(-score), 1)
-        ]
+        pairs = list(zip(*linear_sum_assignment(-score), strict=True))
         chosen: dict[str, tuple[int, int]] = {}
         for pair in sorted(pairs, key=lambda pair: -score[pair]):
             if names[pair] == SAME_NAME:
@@ -198,9 +189,7 @@ class ColumnTable:
             joints.append(JointGuess(name, u, q, [(text, weight)], self.signals))
         return joints
 
-    def _list_followers(
-        self, entries: Sequence[ColumnEntry]
-    ) -> list[tuple[ColumnEntry, ColumnEntry]]:
+    def _list_followers(self, entries: Entries) -> list[tuple[ColumnEntry, ColumnEntry]]:
         """Return columns that clearly follow others, whose past tells more of them than theirs of those."""
         moving = [one for one in entries if one.is_changing]
         if not moving:
@@ -216,7 +205,7 @@ class ColumnTable:
                 pairs.append((moving[row], moving[column]))
         return pairs
 
-    def _refuse(self, text: str, pairs: Sequence[tuple[ColumnEntry, ColumnEntry]]) -> None:
+    def _refuse(self, text: str, pairs: Sequence[Entries]) -> None:
         """Raise a `RecordingError` with the columns of each joint as they are given by hand."""
         proposed = [f'joint_{at}: ["{u.text}", "{q.text}"]' for at, (u, q) in enumerate(pairs, 1)]
         joints = ", ".join(proposed) or 'boom: ["<command>", "<position>"]'
@@ -228,10 +217,9 @@ class ColumnTable:
         """Add the evidence of a drive that is off by a column that says so, and remark it."""
         for full_name, (_, column) in self._places.items():
             words = read_words(column)
-            left = [
-                one for one in words if one not in WORDS["enable"] | {"torque", "drive", "motor"}
-            ]
-            if WORDS["enable"].isdisjoint(words) or "".join(left) not in ("", joint.q.name.key):
+            known = WORDS["enable"] | {"torque", "drive", "motor"}
+            left = "".join(one for one in words if one not in known)
+            if WORDS["enable"].isdisjoint(words) or left not in ("", joint.q.name.key):
                 continue
             signal = self.signals.read(full_name)
             off = signal.values == 0.0
@@ -244,7 +232,7 @@ class ColumnTable:
                 )
 
 
-def _choose_roles(entries: list[ColumnEntry]) -> tuple[list[ColumnEntry], list[ColumnEntry]]:
+def _choose_roles(entries: Entries) -> tuple[list[ColumnEntry], list[ColumnEntry]]:
     """Return the columns that may be commands, and those that may be positions."""
     commands = [one for one in entries if one.name.role == "command"]
     commands = [one for one in commands if one.name.quantity != "torque"] or commands
@@ -256,7 +244,7 @@ def _choose_roles(entries: list[ColumnEntry]) -> tuple[list[ColumnEntry], list[C
     return commands, named or positions
 
 
-def _weigh_names(commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]) -> np.ndarray:
+def _weigh_names(commands: Entries, positions: Entries) -> np.ndarray:
     """Return the log odds of each pair by the names of its joint, `(C, P)`."""
     u, q = (np.array([one.name.key for one in several]) for several in (commands, positions))
     is_same = u[:, None] == q[None]
@@ -264,7 +252,7 @@ def _weigh_names(commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntr
     return np.where(is_same, SAME_NAME, np.where(has_other, OTHER_NAME, 0.0))
 
 
-def _prefer(commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]) -> np.ndarray:
+def _prefer(commands: Entries, positions: Entries) -> np.ndarray:
     """Return log odds of pairs among others of their joint, `(C, P)`: targets and measured positions come first."""
     weights = {"position": 0.6, "velocity": 0.0}
     of_command = [weights.get(one.name.quantity, 0.2) for one in commands]
@@ -275,7 +263,7 @@ def _prefer(commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]) -
     return np.add.outer(of_command, of_position)
 
 
-def _list_rest(entries: Sequence[ColumnEntry], chosen: Mapping[str, tuple[int, int]]) -> list[int]:
+def _list_rest(entries: Entries, chosen: Mapping[str, tuple[int, int]]) -> list[int]:
     """Return the places of the columns whose joint has no pair yet; constant ones only where no joint has."""
     found = []
     for at, one in enumerate(entries):
@@ -290,7 +278,7 @@ def _is_clear(size: np.ndarray, row: int, column: int) -> bool:
     return size[row, column] >= max(CLEAR_CORRELATION, max(rivals, default=0.0) + MARGIN)
 
 
-def _tell_sources(*sides: Sequence[ColumnEntry]) -> list[list[ColumnEntry]]:
+def _tell_sources(*sides: Entries) -> list[list[ColumnEntry]]:
     """Return commands and positions, with the words of their tables where both have a joint of one name twice.
 
     Two arms, each on its topics, have joints of the same names.

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.joint_evidence import JointGuess
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import Signal, open_signals
+from actuators.recordings.log_tables import LogFile
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import RecordingError
 
@@ -174,7 +176,10 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
     joints = [*best.values()]
     used = {one.u.signal.table for one in joints} | {one.q.signal.table for one in joints}
     times = {table: time for table, time in clocks.items() if table in used}
-    survey = measure_logs(paths, times, joints, signs, given)
+    survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
+    for path in paths:
+        opened = open_log(path, signs, given.dbc, given.damaged, given.channel)
+        survey.add_log(opened, times, joints)
     moving = []
     for joint in joints:
         numbers = survey.joints[joint.name]
@@ -361,7 +366,25 @@ class LogSurvey:
         """Median period of the positions."""
         return float(np.median(self.periods_s))
 
-    def add_clocks(self, where: str, signals: Sequence[Signal]) -> None:
+    def add_log(
+        self, opened: LogFile, times: Mapping[str, Guess], joints: Sequence[JointGuess]
+    ) -> None:
+        """Add the numbers of a log.
+
+        Raises:
+            RecordingError: It is damaged, or lacks a column that the first one has.
+        """
+        texts = chain.from_iterable((joint.q.text, joint.u.text) for joint in joints)
+        for signals in open_signals(opened, [*texts], lambda table: times[table].choice, 1.0):
+            read = []
+            for joint in joints:
+                position = signals.read(joint.q.text, wraps=joint.q.modulus)
+                command = signals.read(joint.u.text, wraps=joint.target_wraps)
+                self.joints[joint.name].add(command, position, joint)
+                read += [position, command]
+            self._add_clocks(signals.run.where, read)
+
+    def _add_clocks(self, where: str, signals: Sequence[Signal]) -> None:
         """Add the clocks of a run, that of a position first."""
         t_s = signals[0].t_s
         periods_s = np.diff(t_s)
@@ -398,32 +421,3 @@ def count_gap_periods(periods: np.ndarray) -> int:
     if lost <= 0.0:
         return GAP_PERIODS
     return max(GAP_PERIODS, 2 + math.ceil(math.log(len(steps)) / math.log(1.0 / lost)))
-
-
-def measure_logs(
-    paths: Sequence[Path],
-    times: Mapping[str, Guess],
-    joints: Sequence[JointGuess],
-    signs: tuple[str, str],
-    given: GivenColumns,
-) -> LogSurvey:
-    """Return the numbers of all logs.
-
-    Raises:
-        RecordingError: A log is damaged, or lacks a column that the first one has.
-    """
-    texts = []
-    for joint in joints:
-        texts += [joint.q.text, joint.u.text]
-    survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
-    for path in paths:
-        opened = open_log(path, signs, given.dbc, given.damaged, given.channel)
-        for signals in open_signals(opened, texts, lambda table: times[table].choice, 1.0):
-            read = []
-            for joint in joints:
-                position = signals.read(joint.q.text, wraps=joint.q.modulus)
-                command = signals.read(joint.u.text, wraps=joint.target_wraps)
-                survey.joints[joint.name].add(command, position, joint)
-                read += [position, command]
-            survey.add_clocks(signals.run.where, read)
-    return survey

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from actuators.recordings.clocks import TimeColumn, list_time_columns, read_clock, unwrap
-from actuators.recordings.expression import parse_expression
+from actuators.recordings import clocks
+from actuators.recordings.clocks import TimeColumn, unwrap
 from actuators.recordings.guess import advise
-from actuators.recordings.log_tables import LogFile, LogRun, index_columns
+from actuators.recordings.log_tables import (
+    LogFile,
+    LogRun,
+    index_columns,
+    parse_expression,
+    warn_once,
+)
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 
 log = logging.getLogger(__name__)
@@ -66,40 +72,81 @@ Places = Mapping[str, tuple[str, str]]
 """Table and column of each full name."""
 
 
+@dataclass
 class RunSignals:
     """The signals of a run, each on the clock of its table.
 
-    Args:
+    Attributes:
         run: The run.
         places: Table and column of each full name.
         find_time: Returns the clock of a table by its name.
         skip: Leave rows out that lack a number or whose time does not increase.
-        gap_s: Time at which a log is split.
+        gap_s: Time at which a log is split; parts between which a clock was set back lie further apart.
         quiet: Leave out without a warning.
+        times_s: Times of the tables that were read.
     """
 
-    def __init__(
-        self,
-        run: LogRun,
-        places: Places,
-        find_time: Callable[[str], TimeColumn],
-        skip: bool,
-        gap_s: float,
-        quiet: bool = False,
-    ) -> None:
-        self.run = run
-        self._places, self._find_time = places, find_time
-        self._skip, self._gap_s, self._quiet = skip, gap_s, quiet
-        self._clocks: dict[str, np.ndarray] = {}
+    run: LogRun
+    places: Places
+    find_time: Callable[[str], TimeColumn]
+    skip: bool
+    gap_s: float
+    quiet: bool = False
+    times_s: dict[str, np.ndarray] = field(default_factory=dict)
 
-    def read_times(self, table: str) -> np.ndarray:
-        """Return the times of a table, `(T,)` s; NaN for rows that are left out."""
-        if table not in self._clocks:
-            time = self._find_time(table)
-            self._clocks[table] = read_clock(
-                self.run, table, time, self._skip, self._gap_s, self._quiet
+    def read_times(self, name: str) -> np.ndarray:
+        """Return the times of a table, `(T,)` s; NaN for rows that are left out.
+
+        Raises:
+            RecordingError: The times cannot be used.
+        """
+        if name not in self.times_s:
+            self.times_s[name] = self._read_times(name, self.find_time(name))
+        return self.times_s[name]
+
+    def _read_times(self, name: str, time: TimeColumn) -> np.ndarray:
+        table, where = self.run.tables[name], self.run.where
+        num_rows = len(next(iter(table.columns.values())))
+        if num_rows < 2:
+            raise RecordingError(
+                f"{where}: table '{name}' has {num_rows} rows; a log has at least 2"
             )
-        return self._clocks[table]
+        if isinstance(time, clocks.RowTime):
+            return np.arange(num_rows) / time.rate_hz
+        wraps, offset_s = (
+            (time.wraps, time.offset) if isinstance(time, clocks.Column) else (None, 0.0)
+        )
+        t_s = time.scale * unwrap(_compute_column(table.columns, time.column), wraps) + offset_s
+        known = np.isfinite(t_s)
+        if not known.all() and not self.skip:
+            row = int(np.argmin(known))
+            cell = (
+                table.show_cell(row, time.column) if time.column in table.columns else "the value"
+            )
+            raise RecordingError(
+                f"{where}: {table.locate(row)}, column '{time.column}': {cell} is not a number; {advise('damaged')}"
+            )
+        fault = clocks.find_fault(t_s, table, time.column)
+        if fault is not None:
+            row = int(fault.rows[0])
+            place = f"{where}: {table.locate(row)}, column '{time.column}'"
+            if not (self.skip and fault.is_damage):
+                before_s = t_s[max(row - 1, 0)]
+                raise RecordingError(
+                    f"{place}: time does not increase ({before_s:g} s, then {t_s[row]:g} s): {fault.text}; {fault.advice}"
+                )
+            for at in fault.rows if fault.kind == "back" else ():
+                t_s[at:] += t_s[at - 1] - t_s[at] + 2.0 * self.gap_s
+            later = clocks.is_later(t_s)
+            if not self.quiet:
+                warn_once(f"{place}: {fault.text}; {np.sum(~later)} of {num_rows} rows left out")
+            t_s = np.where(later, t_s, np.nan)
+        if isinstance(time, clocks.AlignedTime):
+            kept = np.isfinite(t_s)
+            anchor = _compute_column(table.columns, time.anchor.column)
+            anchor_s = time.anchor.scale * anchor + time.anchor.offset
+            t_s[kept] = time.align(t_s[kept], anchor_s[kept])
+        return t_s
 
     def read(self, text: str, empty: bool = False, wraps: float | None = None) -> Signal:
         """Return a column or arithmetic over columns.
@@ -110,7 +157,7 @@ class RunSignals:
         Raises:
             RecordingError: It holds what is no number; names row and column.
         """
-        names = list_names(text, self._places, self.run.where)
+        names = list_names(text, self.places, self.run.where)
         parts = {name: self._read_column(name, empty) for name in names}
         first = parts[names[0]]
         if names == (text,):
@@ -129,19 +176,19 @@ class RunSignals:
         return Signal(first.table, first.t_s, unwrap(values, wraps), first.rows, text)
 
     def _read_column(self, name: str, empty: bool) -> Signal:
-        table, column = self._places[name]
+        table, column = self.places[name]
         content, t_s = self.run.tables[table], self.read_times(table)
         values = np.asarray(content.columns[column], dtype=float)
         lacking = ~np.isfinite(values)
         is_sparse = content.is_sparse or lacking.mean() >= SPARSE_SHARE
-        if lacking.any() and not (empty or self._skip or is_sparse):
+        if lacking.any() and not (empty or self.skip or is_sparse):
             row = int(np.argmax(lacking))
             cell = content.show_cell(row, column)
             raise RecordingError(
                 f"{self.run.where}: {content.locate(row)}, column '{name}': {cell} is not a number; {advise('damaged')}"
             )
         is_left_out = lacking & np.isfinite(t_s)
-        if is_left_out.any() and not (self._quiet or empty or is_sparse):
+        if is_left_out.any() and not (self.quiet or empty or is_sparse):
             first = content.locate(int(np.argmax(is_left_out)))
             log.warning(
                 "%s: column '%s': %d of %d rows lack a number and are left out; the first is %s",
@@ -181,7 +228,7 @@ def open_signals(
             wanted.setdefault(table, {})[column] = None
     for table, columns in wanted.items():
         inside = {column: (table, column) for one, column in places.values() if one == table}
-        for text in list_time_columns(find_time(table)):
+        for text in clocks.list_time_columns(find_time(table)):
             columns |= dict.fromkeys(list_names(text, inside, opened.path))
     for run in opened.read_runs(wanted, None):
         yield RunSignals(run, places, find_time, opened.keep_whole, gap_s)
@@ -216,6 +263,12 @@ def _refuse_missing(name: str, places: Places, where: object) -> None:
         raise RecordingError(
             f"{where}: column '{name}' is missing or holds no numbers; {list_choices(name, places)}"
         )
+
+
+def _compute_column(columns: Mapping[str, np.ndarray], text: str) -> np.ndarray:
+    if text in columns:
+        return np.asarray(columns[text], dtype=float)
+    return parse_expression(text).evaluate(columns)
 
 
 def locate(run: LogRun, signal: Signal, row: int, column: str) -> str:

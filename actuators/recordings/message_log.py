@@ -161,18 +161,13 @@ class MessageLog(LogFile):
 class BagLog(MessageLog):
     """A bag of ROS 2 (a folder, or its `.db3`) or ROS 1 (`.bag`)."""
 
-    def _open(self) -> Any:
-        from rosbags.highlevel import AnyReader
+    def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
+        from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
 
-        # Bags from before 2023 have no definitions; messages of joints are the same in all versions.
-        return AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-
-    def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
-        from rosbags.highlevel import AnyReaderError
-
         try:
-            with self._open() as bag:
+            # Bags from before 2023 have no definitions; messages of joints are the same in all versions.
+            with AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
                 names = name_tables({one.id: one.topic for one in bag.connections})
                 chosen = []
                 for one in bag.connections:
@@ -192,8 +187,7 @@ class McapLog(MessageLog):
 
     def _list_known(self) -> set[str]:
         with self.path.open("rb") as file:
-            channels = _read_channels(file)
-        return set(name_tables({key: one.topic for key, one in channels.items()}).values())
+            return {*_name_channels(file).values()}
 
     def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
         from mcap.records import Channel, Message, Schema
@@ -201,8 +195,7 @@ class McapLog(MessageLog):
         schemas: dict[int, Any] = {}
         decoders: dict[int, Callable[[bytes], Any] | None] = {}
         with self.path.open("rb") as file:
-            listed = _read_channels(file)
-            names = name_tables({key: one.topic for key, one in listed.items()})
+            names = _name_channels(file)
             for place, record in self._read_records(file):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
@@ -250,15 +243,16 @@ def describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
-def _read_channels(file: IO[bytes]) -> Mapping[int, Any]:
-    """Return the channels that the summary of an MCAP file lists, none where it is missing or damaged."""
+def _name_channels(file: IO[bytes]) -> dict[int, str]:
+    """Return the table of each channel that the summary of an MCAP file lists, none where it is missing or damaged."""
     from mcap.reader import make_reader
 
     try:
         summary = make_reader(file, validate_crcs=True).get_summary()
     except Exception:  # the library raises what it stumbles over
         return {}
-    return summary.channels if summary is not None else {}
+    channels = summary.channels if summary is not None else {}
+    return name_tables({key: one.topic for key, one in channels.items()})
 
 
 def _find_decoder(encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
@@ -275,12 +269,8 @@ def _find_decoder(encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
         name = schema.name if schema.name.count("/") > 1 else schema.name.replace("/", "/msg/")
-        text = schema.data.decode()
-        own = (
-            get_types_from_idl(text)
-            if schema.encoding == "ros2idl"
-            else get_types_from_msg(text, name)
-        )
+        text, is_idl = schema.data.decode(), schema.encoding == "ros2idl"
+        own = get_types_from_idl(text) if is_idl else get_types_from_msg(text, name)
         store = get_typestore(Stores.EMPTY)
         # some writers leave out the definition of a time
         store.register({**get_typestore(Stores.ROS2_HUMBLE).fielddefs, **own})

@@ -186,8 +186,11 @@ def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayou
         RecordingError: The file cannot be read, has no rows of numbers, or its header does not fit them.
     """
     head, tail, encoding = _read_ends(path)
+    # Excel writes the delimiter into a line of its own; quotes hold 0,5 between commas
+    stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
+    delimiters = (stated[1],) if stated else DELIMITERS
     candidates = []
-    for delimiter, decimal in [signs] if signs else _list_signs(head):
+    for delimiter, decimal in [signs] if signs else itertools.product(delimiters, ".,"):
         rows = [split_line(line, delimiter) for line in head]
         good = [at for at, row in enumerate(rows) if _is_data(row, decimal)]
         if not good:
@@ -215,13 +218,6 @@ def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayou
     names = _find_names(path, head[:first], delimiter, width, samples)
     kept = tuple(tuple(row) for row in samples)
     return TextLayout(delimiter, decimal, encoding, first, _tell_apart(names), kept)
-
-
-def _list_signs(head: list[str]) -> list[tuple[str, str]]:
-    """Return delimiters and decimal signs to try; Excel writes the delimiter into a line of its own."""
-    stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
-    delimiters = (stated[1],) if stated else DELIMITERS
-    return [*itertools.product(delimiters, ".,")]  # quotes hold 0,5 between commas
 
 
 def _read_ends(path: Path) -> tuple[list[str], list[str], str]:

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from log_import import write_csv
 
 from actuators.recordings.column_map import AlignedTime, Column, ColumnMap, CommandColumn
-from actuators.recordings.expression import parse_expression
 from actuators.recordings.log_files import expand_logs, open_log
+from actuators.recordings.log_tables import parse_expression
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 
