@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -48,12 +48,14 @@ class BoardObservation:
         t_s: Its time.
         pose: The board.
         disparity: Its disparity; `None` without a right picture of it.
+        q: Joint positions then, `(J,)`, rad or m; `None` until they were looked up.
     """
 
     name: str
     t_s: float
     pose: BoardPose
     disparity: BoardDisparity | None
+    q: np.ndarray | None = None
 
 
 @spec
@@ -111,15 +113,14 @@ class BoardCalibration:
         clock = self._estimate_clock(machine, trajectory, observations)
         # Joint positions are read at the time of the exposure.
         shift_s = 0.0 if clock is None else clock.applied_s
-        known, positions = [], []
+        known = []
         for one in observations:
             q = trajectory.at(one.name, one.t_s + shift_s)
             if q is None:
                 reason = f"{self.joints} has no joint positions for it"
                 refused.append(evaluation.describe_residual(one.name, reason))
             else:
-                known.append(one)
-                positions.append(q)
+                known.append(replace(one, q=q))
         if len(known) < MIN_VIEWS:
             reasons = sorted({one["left_out"] for one in refused})[:3]
             raise FrameError(
@@ -130,28 +131,24 @@ class BoardCalibration:
         if len(known) > self.max_poses:
             # Evenly over the recording: neighbouring frames show nearly the same pose.
             chosen = np.linspace(0, len(known) - 1, self.max_poses).round().astype(int)
-            known, positions = [known[k] for k in chosen], [positions[k] for k in chosen]
-        q = np.stack(positions)
+            known = [known[k] for k in chosen]
+        q = np.stack([one.q for one in known])
         views = self._build_views(machine, trajectory, known, q, clock)
         solution = solve_hand_eye(views)
         assert solution is not None  # there are enough
-        used = np.flatnonzero(solution.used)
-        # Only poses that were used can determine the camera.
-        turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
-        missing = self._check_coverage(machine, views, solution, q)
-        zeros = {}
-        for name, mean in zip(views.shared_names, solution.guess.shared, strict=True):
-            if name != evaluation.CLOCK_NAME:
-                zeros[name] = (float(mean), self.zero_std_rad)
+        turns_rad, missing = self._check_coverage(machine, views, solution, q)
+        summary = evaluation.summarise_solution(views, solution, clock)
+        zeros = {name: one["mean"] for name, one in summary["joint_zeros"].items()}
+        judged = judge_fit(solution.used, solution.factor, zeros, self.zero_std_rad, missing)
         more = {
             "T_link_board": solution.guess.link_from_board.round(9).tolist(),
-            **evaluation.summarise_solution(views, solution, clock),
+            **summary,
             "corners_px": round(float(np.median([one.pose.error_px for one in known])), 3),
-            "turns_rad": turns.round(4).tolist(),
+            "turns_rad": turns_rad.round(4).tolist(),
             "missing": missing,
-            "verdict": judge_fit(len(used), len(q), solution.factor, zeros, missing).to_dict(),
+            "verdict": vars(judged),
         }
-        pairs = [known[k].disparity for k in used]
+        pairs = [known[k].disparity for k in np.flatnonzero(solution.used)]
         error = estimate_disparity_error([one for one in pairs if one is not None])
         if error is not None:
             more["disparity"] = error.to_dict()
@@ -236,24 +233,24 @@ class BoardCalibration:
 
     def _check_coverage(
         self, machine: Machine, views: HandEyeViews, solution: HandEyeSolution, q: np.ndarray
-    ) -> list[str]:
-        """Return which poses are missing; refuse poses that do not determine the camera."""
-        used = np.flatnonzero(solution.used)
+    ) -> tuple[np.ndarray, list[str]]:
+        """Return by how much the poses turn, `(3,)` rad, and which are missing.
+
+        Refuse poses that do not determine the camera; only those that were used can.
+        """
+        used = solution.used
         board = predict_board_poses(views, solution.guess)[used]
+        turns_rad, axes = evaluation.measure_rotation_ranges(views.base_from_link[used])
+        distance_m = np.linalg.norm(board[:, :3, 3], axis=1)
         missing = evaluation.list_missing_poses(
-            machine,
-            q[used],
-            views.base_from_link[used],
-            np.linalg.norm(board[:, :3, 3], axis=1),
-            self.least_turn_rad,
+            machine, q[used], turns_rad, axes, distance_m, self.least_turn_rad
         )
         # The problem is singular: more poses of the same kind would not help.
-        turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
-        if turns[1] < MIN_TURN_SHARE * self.least_turn_rad or len(used) < MIN_VIEWS:
+        if turns_rad[1] < MIN_TURN_SHARE * self.least_turn_rad or used.sum() < MIN_VIEWS:
             raise FrameError(
                 "calibration: the poses do not determine where the camera is: "
                 f"{'; '.join(missing) or 'too few agree'}"
             )
         for one in missing:
             log.warning("calibration: %s", one)
-        return missing
+        return turns_rad, missing

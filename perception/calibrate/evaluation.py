@@ -97,7 +97,8 @@ def measure_rotation_ranges(base_from_link: np.ndarray) -> tuple[np.ndarray, np.
 def list_missing_poses(
     machine: Machine,
     q: np.ndarray,
-    base_from_link: np.ndarray,
+    turns_rad: np.ndarray,
+    axes: np.ndarray,
     distance_m: np.ndarray,
     least_rad: float,
 ) -> list[str]:
@@ -106,17 +107,17 @@ def list_missing_poses(
     Args:
         machine: Names and travel of the joints.
         q: Joint positions of the poses that were used, `(N, J)`.
-        base_from_link: The link there, `(N, 4, 4)`.
+        turns_rad: Ranges of turns of the link, largest first; see `measure_rotation_ranges`.
+        axes: Their axes as rows.
         distance_m: From the camera to the board, `(N,)`.
         least_rad: Turn that the poses need about two axes.
     """
-    turns, axes = measure_rotation_ranges(base_from_link)
     missing = []
     for number, ordinal in enumerate(("", "second ")):
-        if turns[number] < least_rad:
+        if turns_rad[number] < least_rad:
             nearest = AXES[int(np.abs(axes[number]).argmax())]
             missing.append(
-                f"the poses turn by {np.degrees(turns[number]):.0f} degrees about their {ordinal}"
+                f"the poses turn by {np.degrees(turns_rad[number]):.0f} degrees about their {ordinal}"
                 f"axis (near the {nearest}), {np.degrees(least_rad):.0f} are needed"
             )
     if distance_m.max() < MIN_DISTANCE_RATIO * distance_m.min():
@@ -124,7 +125,7 @@ def list_missing_poses(
             f"the board is always {distance_m.min():.1f} to {distance_m.max():.1f} m away: add "
             "poses nearer and farther, by a fifth"
         )
-    if turns[1] >= least_rad:
+    if turns_rad[1] >= least_rad:
         return missing
     for joint, low, high in zip(machine.joints, q.min(0), q.max(0), strict=True):
         if joint.kind != "hinge" or high - low >= 0.5 * least_rad:

@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from brokk_rl.errors import FrameError
 
 log = logging.getLogger(__name__)
@@ -44,45 +46,41 @@ class Verdict:
     """
 
     status: VerdictStatus
-    reasons: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry of `calibration.yaml`."""
-        return {"status": self.status, "reasons": list(self.reasons)}
+    reasons: list[str]
 
 
 def judge_fit(
-    num_used: int,
-    num_views: int,
+    used: np.ndarray,
     arm_factor: float,
-    zeros: Mapping[str, tuple[float, float]],
+    zeros: Mapping[str, float],
+    zero_std: float,
     missing: Sequence[str],
 ) -> Verdict:
     """Return the verdict on a fit.
 
     Args:
-        num_used: Views that agree.
-        num_views: Those that could be used.
+        used: Views that agree, of those that could be used, `(N,)` bool.
         arm_factor: The arm's uncertainty over the assumed one.
-        zeros: Estimated zero and standard deviation of its prior by joint, rad or m.
+        zeros: Estimated zero by joint, rad or m.
+        zero_std: Standard deviation of its prior.
         missing: Motions that the poses lack, in words.
     """
-    reasons = []
+    reasons, num_used, num_views = [], int(used.sum()), len(used)
     if num_views - num_used > MAX_LEFT_OUT * num_views:
         reasons.append(f"{num_views - num_used} of {num_views} contradict the others")
     if arm_factor > MAX_ARM_FACTOR:
         reasons.append(f"the arm would be {arm_factor:.1f} times as inaccurate as assumed")
-    for name, (mean, std) in zeros.items():
-        if abs(mean) > MAX_ZERO_SIGMAS * std:
+    for name, mean in zeros.items():
+        if abs(mean) > MAX_ZERO_SIGMAS * zero_std:
             reasons.append(
-                f"the zero of {name} would be off by {mean:+.4f}, {abs(mean) / std:.1f} standard "
+                f"the zero of {name} would be off by {mean:+.4f}, {abs(mean) / zero_std:.1f} standard "
                 "deviations of what was assumed"
             )
     if reasons:
-        return Verdict(WRONG, (*reasons, CAUSES))
+        return Verdict(WRONG, [*reasons, CAUSES])
     if num_used < MIN_VIEWS_JUDGED:
-        return Verdict(OPEN, (f"{num_used} agree, {MIN_VIEWS_JUDGED} are needed for a verdict",))
-    return Verdict(OPEN, tuple(missing)) if missing else Verdict(GOOD)
+        return Verdict(OPEN, [f"{num_used} agree, {MIN_VIEWS_JUDGED} are needed for a verdict"])
+    return Verdict(OPEN if missing else GOOD, list(missing))
 
 
 def check_verdict(content: Mapping[str, Any], where: str) -> None:

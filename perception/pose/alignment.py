@@ -191,60 +191,34 @@ def align_plane(
     on = _find_face_pixels(both, face, frame, allowed, ellipse, inner, stride, u, v)
     if np.count_nonzero(on) < LEAST:
         return face
-    warp = _register_pictures(both, face, on, stride, u, v)
+    agreed, likeness, moved_px = _register_pictures(both, face, on, stride, u, v, cell_px)
     # Pictures of different scenes correlate little, whatever the plane.
-    if warp.likeness < ALIKE:
+    if likeness < ALIKE:
         return None
     # A step beyond the uncertainty of depth follows another surface, or a repeated pattern.
     largest_px = LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px
-    if not np.isfinite(warp.m).all() or warp.moved_px > largest_px:
+    if agreed is None or not np.isfinite(agreed.m).all() or moved_px > largest_px:
         return face
-    cov = warp.estimate_covariance(cell_px)
-    if cov is None:
-        return face
-    return merge_planes(face, replace(face, m=warp.m, cov=cov))
-
-
-@dataclass(frozen=True)
-class _PlaneWarp:
-    """The plane by which both pictures agree best, with the state of its last step.
-
-    Attributes:
-        m: Plane, `(3,)` 1/m.
-        likeness: Correlation of left and warped right picture.
-        moved_px: Largest shift on the face from the start, px.
-        u: Columns of the pixels compared, `(P,)`.
-        v: Their rows.
-        push: Derivatives of the warped picture, `(4, P)`; the last one is that of the gain.
-        heavy: Weighted instruments in their place, `(4, P)`.
-        off: Residuals, `(P,)`.
-        scale: Their robust standard deviation.
-    """
-
-    m: np.ndarray
-    likeness: float
-    moved_px: float
-    u: np.ndarray
-    v: np.ndarray
-    push: np.ndarray
-    heavy: np.ndarray
-    off: np.ndarray
-    scale: float
-
-    def estimate_covariance(self, cell_px: int) -> np.ndarray | None:
-        """Return the covariance of the plane, `(3, 3)`; errors may be correlated within cells."""
-        # Pixels of one cell share their error; a cell's number joins its row and column, which
-        # stay below 10,000.
-        row, column = self.v // cell_px, self.u // cell_px
-        cell = row.astype(np.int64) * 10_000 + column.astype(np.int64)
-        slopes = (self.push[:3] * compute_psi_slope(self.off / (TUKEY * self.scale))).T
-        return estimate_sandwich_covariance(slopes, self.heavy[:3].T, self.off, number_cells(cell))
+    weights = [np.linalg.inv(one.cov) for one in (face, agreed)]
+    cov = np.linalg.inv(weights[0] + weights[1])
+    return replace(face, m=cov @ (weights[0] @ face.m + weights[1] @ agreed.m), cov=cov)
 
 
 def _register_pictures(
-    both: StereoPatch, face: FacePlane, on: np.ndarray, stride: int, u: np.ndarray, v: np.ndarray
-) -> _PlaneWarp:
-    """Fit the plane by which the pictures agree best at the pixels `on`; see `align_plane`."""
+    both: StereoPatch,
+    face: FacePlane,
+    on: np.ndarray,
+    stride: int,
+    u: np.ndarray,
+    v: np.ndarray,
+    cell_px: int,
+) -> tuple[FacePlane | None, float, float]:
+    """Fit the plane by which the pictures agree best at the pixels `on`; see `align_plane`.
+
+    Returns:
+        The plane, `None` where the pixels determine none; the correlation of left and warped right
+            picture; and the largest shift on the face, px.
+    """
     at = np.flatnonzero(on)
     weight = on.astype(np.float32)
     window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
@@ -289,7 +263,12 @@ def _register_pictures(
             break
     likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
     moved_px = float(both.pull_px * np.abs((m - face.m) @ ray).max())
-    return _PlaneWarp(m, likeness, moved_px, u_on, v_on, push, heavy, off, scale)
+    # Pixels of one cell share their error; a cell's number joins its row and column, which stay
+    # below 10,000.
+    cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
+    slopes = (push[:3] * compute_psi_slope(np.divide(off, TUKEY * scale))).T
+    cov = estimate_sandwich_covariance(slopes, heavy[:3].T, off, number_cells(cell))
+    return None if cov is None else replace(face, m=m, cov=cov), likeness, moved_px
 
 
 def _find_face_pixels(
@@ -336,13 +315,6 @@ def _find_face_pixels(
         > 0
     )
     return on
-
-
-def merge_planes(first: FacePlane, second: FacePlane) -> FacePlane:
-    """Return the mean of two planes, weighted by their covariances."""
-    weights = [np.linalg.inv(one.cov) for one in (first, second)]
-    cov = np.linalg.inv(weights[0] + weights[1])
-    return replace(second, m=cov @ (weights[0] @ first.m + weights[1] @ second.m), cov=cov)
 
 
 def measure_parallax(

@@ -249,8 +249,8 @@ def judged(machine: Machine, joint: int, factor: float) -> verdict.Verdict:
     views = board.views(machine, replace(poses, q=q), EXACT, joint)[0]
     found = hand_eye.solve_hand_eye(views)
     assert found is not None
-    zeros = {n: (float(z), 0.0087) for n, z in zip(views.shared_names, found.guess.shared, strict=True)}  # fmt: skip
-    return verdict.judge_fit(int(found.used.sum()), len(q), found.factor, zeros, [])
+    zeros = dict(zip(views.shared_names, found.guess.shared.tolist(), strict=True))
+    return verdict.judge_fit(found.used, found.factor, zeros, 0.0087, [])
 
 
 @pytest.mark.parametrize(
@@ -265,18 +265,18 @@ def test_only_a_right_arm_is_called_good(
 
 
 def test_a_fit_is_judged_by_what_it_leaves_out_and_what_it_lacks() -> None:
-    right = {"q2": (0.02, 0.0087)}
-    assert verdict.judge_fit(30, 30, 1.0, right, []).status == "good"
-    assert verdict.judge_fit(15, 30, 1.5, right, []).status == "good"
+    def judge(num_used: int, num_views: int, factor: float, zero: float, *missing: str) -> Any:
+        used = np.arange(num_views) < num_used
+        return verdict.judge_fit(used, factor, {"q2": zero}, 0.0087, missing)
+
+    assert judge(30, 30, 1.0, 0.02).status == "good"
+    assert judge(15, 30, 1.5, 0.02).status == "good"
     for wrong in (
-        verdict.judge_fit(14, 30, 1.0, right, []),
-        verdict.judge_fit(30, 30, 1.51, right, []),
-        verdict.judge_fit(30, 30, 1.0, {"q2": (-0.0262, 0.0087)}, []),
-    ):
+        judge(14, 30, 1.0, 0.02), judge(30, 30, 1.51, 0.02), judge(30, 30, 1.0, -0.0262),
+    ):  # fmt: skip
         assert wrong.status == "not to be trusted" and len(wrong.reasons) == 2
-    assert verdict.judge_fit(7, 10, 1.0, right, []).status == "cannot tell"
-    lacking = verdict.judge_fit(30, 30, 1.0, right, ["turn more"])
-    assert lacking == verdict.Verdict("cannot tell", ("turn more",))
+    assert judge(7, 10, 1.0, 0.02).status == "cannot tell"
+    assert judge(30, 30, 1.0, 0.02, "turn more") == verdict.Verdict("cannot tell", ["turn more"])
 
 
 def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
