@@ -114,8 +114,6 @@ def _correlate_speeds(
         return -1.0
     begin, end = link(begin_s + shift_s), link(end_s + shift_s)
     speed = (begin.inv() * end).magnitude() / (end_s - begin_s)
-    scale = speed.std() * seen_rad_s.std()
-    if not scale > 1e-9:
+    if not speed.std() * seen_rad_s.std() > 1e-9:
         return -1.0
-    product = (speed - speed.mean()) * (seen_rad_s - seen_rad_s.mean())
-    return float(np.mean(product / scale))
+    return float(np.corrcoef(speed, seen_rad_s)[0, 1])

@@ -45,9 +45,4 @@ def compute_rotation_vectors(rotation: np.ndarray) -> np.ndarray:
 
 def build_cross_matrices(vector: np.ndarray) -> np.ndarray:
     """Return the matrices, `(…, 3, 3)`, of the cross product with vectors: `M(a) @ b = a x b`."""
-    matrix = np.zeros((*vector.shape, 3))
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    matrix[..., 0, 1], matrix[..., 0, 2] = -z, y
-    matrix[..., 1, 0], matrix[..., 1, 2] = z, -x
-    matrix[..., 2, 0], matrix[..., 2, 1] = -y, x
-    return matrix
+    return -np.cross(vector[..., None, :], np.eye(3))
