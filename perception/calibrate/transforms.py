@@ -43,6 +43,14 @@ def compute_rotation_vectors(rotation: np.ndarray) -> np.ndarray:
     return vectors.reshape(*rotation.shape[:-2], 3)
 
 
+def span_plane(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors that span a plane with a unit normal, `(3,)` each."""
+    # The axis that is least parallel to the normal, so that the cross product is well conditioned.
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first)
+
+
 def build_cross_matrices(vector: np.ndarray) -> np.ndarray:
     """Return the matrices, `(…, 3, 3)`, of the cross product with vectors: `M(a) @ b = a x b`."""
     return -np.cross(vector[..., None, :], np.eye(3))

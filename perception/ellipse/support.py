@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from brokk_rl.contracts.vision import Ellipse
 from perception.ellipse import conic
@@ -158,11 +159,7 @@ def measure_waviness(fit: CandidateFit) -> tuple[np.ndarray, np.ndarray]:
 
 def _sum_windows(values: np.ndarray) -> np.ndarray:
     """Return the sum of `WINDOW` neighbours around each place, `(C, P)`."""
-    half = WINDOW // 2
-    total = np.cumsum(
-        np.concatenate([values[:, -half:], values, values[:, :half]], axis=1, dtype=float), axis=1
-    )
-    return total[:, WINDOW:] - total[:, :-WINDOW]
+    return WINDOW * uniform_filter1d(values.astype(float), WINDOW, mode="wrap", origin=-1)
 
 
 def measure_largest_gap(fit: CandidateFit) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
+from perception.calibrate.transforms import span_plane
 
 NUM_RIM_POINTS = 16
 """Points of a rim: a part of it is then known to 6 %."""
@@ -62,10 +63,9 @@ class ArmShape:
 
 def sample_circle(center_m: np.ndarray, axis: np.ndarray, radius_m: float) -> np.ndarray:
     """Return points on a circle, `(P, 3)`."""
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    first = first / np.linalg.norm(first)
+    first, second = span_plane(axis)
     angle = np.linspace(0.0, 2.0 * np.pi, NUM_RIM_POINTS, endpoint=False)[:, None]
-    across = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
+    across = np.cos(angle) * first + np.sin(angle) * second
     return center_m + radius_m * across
 
 

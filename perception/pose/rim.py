@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from perception.calibrate.transforms import span_plane
 from perception.ellipse import conic
 
 # Each of these times 0.8 or 1.25 left every count of holes and discs in 8 rendered frames as it was,
@@ -112,11 +113,7 @@ class PlaneChart:
 def build_chart(origin: np.ndarray, m: np.ndarray, camera_matrix: np.ndarray) -> PlaneChart:
     """Return coordinates on the plane `m · P = 1` about one of its points, `(3,)`."""
     normal = m / np.linalg.norm(m)
-    # The axis that is least parallel to the normal, so that the cross product is well
-    # conditioned.
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    return PlaneChart(origin, first, np.cross(normal, first), m, camera_matrix)
+    return PlaneChart(origin, *span_plane(normal), m, camera_matrix)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from perception.calibrate.transforms import span_plane
 from perception.render.solids import Solid
 from perception.segment.window import Window
 
@@ -249,9 +250,7 @@ class Caster:
 
     def __init__(self, solid: Solid, to_sun: np.ndarray) -> None:
         self.solid, self._to_sun = solid, to_sun.astype(np.float32)
-        first = np.cross(to_sun, np.eye(3)[np.argmin(np.abs(to_sun))])
-        first /= np.linalg.norm(first)
-        self._across = np.stack([first, np.cross(to_sun, first)], 1).astype(np.float32)
+        self._across = np.stack(span_plane(to_sun), 1).astype(np.float32)
         # The silhouette's box is a cheap test before the exact one.
         corners = solid.corners_m @ self._across  # type: ignore[operator]
         self._low, self._high = corners.min(0).astype(np.float32), corners.max(0).astype(np.float32)
