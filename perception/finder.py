@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -135,17 +135,8 @@ class StagedPerception:
         return StagedFinder(self)
 
 
-@dataclass(frozen=True)
-class _Judged:
-    """Candidates of a frame that were judged.
-
-    Attributes:
-        found: Holes, with the candidates they come from.
-        rejected: Refused candidates.
-    """
-
-    found: list[tuple[Ellipse, HolePose]]
-    rejected: list[Rejection]
+Found = list[tuple[Ellipse, HolePose]]
+"""Holes, with the candidates they come from."""
 
 
 class StagedFinder:
@@ -165,9 +156,13 @@ class StagedFinder:
         """
         s = self.settings
         ms: dict[str, float] = {}
-        frame, fault = self._prepare(frame, ms)
-        if fault is not None:
-            return FrameDetections([], [fault], [], None, ms)
+        with _time_stage(ms, "frame"):
+            frame = rectify(frame)
+        if self._pair is not None:
+            with _time_stage(ms, "pair"):
+                fault = self._pair.find_fault(frame)
+            if fault is not None:
+                return FrameDetections([], [fault], [], None, ms)
         if s.depth is not None:
             with _time_stage(ms, "stereo"):
                 frame = s.depth.stereo.match_frame(frame)
@@ -178,20 +173,31 @@ class StagedFinder:
         share = cv2.countNonZero(on_block.view(np.uint8)) / on_block.size
         if share < s.smallest_block:
             reason = "part of the picture that is block"
-            refused = Rejection("segment", reason, share, s.smallest_block)
-            judged = self._doubt_scale(frame, _Judged([], [refused]), ms)
-            return FrameDetections([], judged.rejected, [], masks, ms)
-        judged = _Judged([], [])
+            rejected = [Rejection("segment", reason, share, s.smallest_block)]
+            rejected += self._doubt_scale(frame, [], ms)
+            return FrameDetections([], rejected, [], masks, ms)
         with _time_stage(ms, "ellipse"):
-            candidates, wrong_size = self._detect_ellipses(frame, on_block)
-        judged.rejected.extend(wrong_size)
+            candidates, rejected = self._detect_ellipses(frame, on_block)
         with _time_stage(ms, "pose"):
-            self._judge(frame, masks, candidates, judged)
+            found = self._judge(frame, masks, candidates, rejected)
         if frame.depth_shrink > 1:
-            judged = self._look_again(frame, judged, ms)
-        if all(pose.score < SURE_SCORE for _, pose in judged.found):
-            judged = self._doubt_scale(frame, judged, ms)
-        return self._conclude(judged, masks, frame, ms)
+            found = self._look_again(frame, found, rejected, ms)
+        if all(pose.score < SURE_SCORE for _, pose in found):
+            doubts = self._doubt_scale(frame, found, ms)
+            rejected += doubts
+            found = [] if doubts else found
+        found, doubles = self._remove_inner_rims(found)
+        if not found and not rejected:
+            rejected = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
+        # Doubles are holes too; they are told apart from rejected candidates only by their
+        # reason.
+        rejected += doubles
+        shown = [ellipse for ellipse, _ in found]
+        shown += [one.ellipse for one in rejected if one.ellipse is not None]
+        # The stages so far; what follows is negligible.
+        ms["total"] = sum(ms.values())
+        detections = FrameDetections([pose for _, pose in found], rejected, shown, masks, ms)
+        return detections.in_base_frame(frame)
 
     def find_ellipses(self, frame: Frame) -> tuple[FrameDetections, tuple[()]]:
         """Return the ellipses of the whole picture, of any size, without depth; no hole is tracked."""
@@ -200,37 +206,38 @@ class StagedFinder:
             ellipses = self.settings.ellipse.detect(convert_to_gray(frame), None, None)
         return FrameDetections([], [], ellipses, None, ms), ()
 
-    def _doubt_scale(self, frame: Frame, judged: _Judged, ms: dict[str, float]) -> _Judged:
-        """Return that a rim of another size is surer than all holes, in place of those."""
+    def _doubt_scale(self, frame: Frame, found: Found, ms: dict[str, float]) -> list[Rejection]:
+        """Return that a rim of another size is surer than all holes; nothing where none is."""
         s = self.settings
         if s.rims is None:
-            return judged
+            return []
         with _time_stage(ms, "scale"):
-            found = s.rims.measure_scale(frame, self.settings.ellipse, s.radius_m)
-        if found is None or any(pose.score > found[1] for _, pose in judged.found):
-            return judged
+            scale = s.rims.measure_scale(frame, s.ellipse, s.radius_m)
+        if scale is None or any(pose.score > scale[1] for _, pose in found):
+            return []
         reason = rim_scale.OF_DEPTH if frame.right is None else rim_scale.OF_PAIR
-        return _Judged([], [*judged.rejected, Rejection("ellipse", reason, found[0], 1.0)])
+        return [Rejection("ellipse", reason, scale[0], 1.0)]
 
-    def _look_again(self, frame: Frame, judged: _Judged, ms: dict[str, float]) -> _Judged:
+    def _look_again(
+        self, frame: Frame, found: Found, rejected: list[Rejection], ms: dict[str, float]
+    ) -> Found:
         """Return holes as they look where they are expected: coarse depth errs, and tells discs less."""
         if self.settings.depth is None or frame.right is None or frame.baseline_m is None:
-            return judged
-        again = _Judged([], judged.rejected)
-        for ellipse, pose in judged.found:
+            return found
+        again = []
+        for ellipse, pose in found:
             place = expect_rim(pose, frame)
             if place is None:
-                again.found.append((ellipse, pose))
+                again.append((ellipse, pose))
                 continue
             with _time_stage(ms, "stereo"):
                 closer, face = self.settings.depth.match_near(frame, *place)
-            near = _Judged([], again.rejected)
             # The expected rim is the candidate: it is known better than a detector would find it.
             # None of its edges has been seen yet, so that most of the circle must be.
             with _time_stage(ms, "pose"):
-                self._judge(closer, Masks(face, None), [place[0]], near)
+                near = self._judge(closer, Masks(face, None), [place[0]], rejected)
             # The score is that of the detected ellipse.
-            again.found.extend((ellipse, replace(one, score=pose.score)) for _, one in near.found)
+            again += [(ellipse, replace(one, score=pose.score)) for _, one in near]
         return again
 
     def explain(self, rejection: Rejection) -> str:
@@ -245,50 +252,21 @@ class StagedFinder:
         figures = f"{rejection.reason}: {value}, limit {rejection.limit:.4g}"
         return f"{subject}: {EXPLANATIONS.get(rejection.reason, 'it was refused.')} ({figures})"
 
-    def _prepare(self, frame: Frame, ms: dict[str, float]) -> tuple[Frame, Rejection | None]:
-        """Return a frame without distortion, and what is wrong with its pair."""
-        with _time_stage(ms, "frame"):
-            frame = rectify(frame)
-        if self._pair is None:
-            return frame, None
-        with _time_stage(ms, "pair"):
-            return frame, self._pair.find_fault(frame)
-
-    def _conclude(
-        self, judged: _Judged, masks: Masks, frame: Frame, ms: dict[str, float]
-    ) -> FrameDetections:
-        """Return the detections of a frame: each hole once, in the base frame where that is known."""
-        found, doubles = self._remove_inner_rims(judged.found)
-        rejected = judged.rejected
-        if not found and not rejected:
-            rejected = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
-        # Doubles are holes too; they are told apart from rejected candidates only by their
-        # reason.
-        rejected += doubles
-        shown = [ellipse for ellipse, _ in found]
-        shown += [one.ellipse for one in rejected if one.ellipse is not None]
-        # The stages so far; what follows is negligible.
-        ms["total"] = sum(ms.values())
-        detections = FrameDetections([pose for _, pose in found], rejected, shown, masks, ms)
-        return detections.in_base_frame(frame)
-
     def _judge(
-        self, frame: Frame, masks: Masks, candidates: Sequence[Ellipse], judged: _Judged
-    ) -> None:
-        """Add the holes among some candidates, and why the others are none."""
+        self, frame: Frame, masks: Masks, candidates: Sequence[Ellipse], rejected: list[Rejection]
+    ) -> Found:
+        """Return the holes among some candidates, and add to `rejected` why the others are none."""
+        found, reason = [], "candidates of a frame before it"
         # Every candidate is judged alone: holes do not compete until all are known.
         for number, candidate in enumerate(candidates):
-            if number >= MOST_CANDIDATES:
-                reason = "candidates of a frame before it"
-                judged.rejected.append(
-                    Rejection("ellipse", reason, float(number), MOST_CANDIDATES, candidate)
-                )
-                continue
-            pose = self._pose.estimate(frame, masks, candidate)
+            pose = Rejection("ellipse", reason, float(number), MOST_CANDIDATES, candidate)
+            if number < MOST_CANDIDATES:
+                pose = self._pose.estimate(frame, masks, candidate)
             if isinstance(pose, Rejection):
-                judged.rejected.append(pose)
+                rejected.append(pose)
             else:
-                judged.found.append((candidate, pose))
+                found.append((candidate, pose))
+        return found
 
     def _detect_ellipses(
         self, frame: Frame, on_block: np.ndarray
@@ -310,14 +288,12 @@ class StagedFinder:
                     wrong_size.append(Rejection("ellipse", reason, ellipse.a, limit_px, ellipse))
         return _remove_duplicates(ellipses), wrong_size
 
-    def _remove_inner_rims(
-        self, found: Sequence[tuple[Ellipse, HolePose]]
-    ) -> tuple[list[tuple[Ellipse, HolePose]], list[Rejection]]:
+    def _remove_inner_rims(self, found: Found) -> tuple[Found, list[Rejection]]:
         """Return each hole once, the surest first, and the refused rims.
 
         Of rims within each other the outer one is kept: it is the near end of the hole.
         """
-        kept: list[tuple[Ellipse, HolePose]] = []
+        kept: Found = []
         doubles = []
         limit_m = self.settings.apart * self.settings.radius_m
         best = max((ellipse.score for ellipse, _ in found), default=0.0)
@@ -398,14 +374,13 @@ def _remove_duplicates(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
     for one in sorted(ellipses, key=lambda one: -one.score):
         # The geometric mean semi-axis, as everywhere for the size.
         size = (one.a * one.b) ** 0.5
-        if not any(_is_same_ellipse(one, other, size) for other in kept):
+        for other in kept:
+            away = np.hypot(one.x - other.x, one.y - other.y) / size
+            if max(away, abs((other.a * other.b) ** 0.5 / size - 1)) < SAME_ELLIPSE:
+                break
+        else:
             kept.append(one)
     return kept
-
-
-def _is_same_ellipse(one: Ellipse, other: Ellipse, size: float) -> bool:
-    is_near = np.hypot(one.x - other.x, one.y - other.y) < SAME_ELLIPSE * size
-    return bool(is_near and abs((other.a * other.b) ** 0.5 / size - 1) < SAME_ELLIPSE)
 
 
 @contextmanager

@@ -127,15 +127,43 @@ def measure_stretch(
     # The steepest edge of each profile; the robust fit leaves out those that are not the rim's.
     steepest = np.argmax(np.where(known, profiles.strength, -1.0), axis=1)
     pixels = profiles.pixels[rows, steepest[rows]]
-    outline = (pixels, row, chart, face)
-    waves, distance_m = _expand_outline(*outline, 0.0)
+
+    def expand(logarithm: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return waves around the middle of edges, `(n, 7)`, and the distances of those, m, `(n,)`.
+
+        The focal length is that of the chart over the factor of this logarithm.
+        """
+        factor = float(np.exp(logarithm))
+        matrix = chart.camera_matrix.copy()
+        matrix[[0, 1], [0, 1]] /= factor
+        m = face.m * [1.0, 1.0, factor]
+        ray = np.linalg.solve(matrix, np.array([row[0], row[1], 1.0]))
+        flat = rim.build_chart(ray / (m @ ray), m, matrix)
+        away = flat.flat(pixels)
+        # The line of sight lies above the steepest direction of the face.
+        angle = np.arctan2(away[:, 1], away[:, 0])
+        angle = angle - np.arctan2(flat.second @ ray, flat.first @ ray)
+        waves = [np.ones(len(angle))]
+        for number in (1, 2, 3):
+            waves += [np.cos(number * angle), np.sin(number * angle)]
+        return np.column_stack(waves), np.linalg.norm(away, axis=1)
+
+    waves, distance_m = expand(0.0)
     floor_m = 1e-3 * float(np.median(distance_m))
     solution, cov = fit_linear(waves, distance_m, floor_m)
     away_m = distance_m - waves @ solution
     # The waves hold any oval, so that edges of something else are the same by all focal lengths.
     weight = compute_biweight(away_m, TUKEY * max(estimate_spread(away_m), floor_m))
+
+    def measure_oval(logarithm: float) -> np.ndarray:
+        """Return how oval weighted edges are, along the slope of the face and diagonally, in radii."""
+        waves, distance_m = expand(logarithm)
+        heavy = waves.T * weight
+        solution = np.linalg.lstsq(heavy @ waves, heavy @ distance_m, rcond=None)[0]
+        return solution[3:5] / solution[0]
+
     oval, std = solution[3:5] / solution[0], float(np.sqrt(cov[3, 3]) / solution[0])
-    rise = (_measure_oval(weight, *outline, NEARBY)[0] - oval[0]) / NEARBY
+    rise = (measure_oval(NEARBY)[0] - oval[0]) / NEARBY
     if not abs(rise) > 1e-3:
         return None
     logarithm = -oval[0] / rise
@@ -151,7 +179,7 @@ def measure_stretch(
         for reach, step in TRIALS:
             sizes = {}
             for trial in logarithm + np.arange(-reach, reach + step / 2, step):
-                sizes[float(trial)] = float(np.linalg.norm(_measure_oval(weight, *outline, trial)))
+                sizes[float(trial)] = float(np.linalg.norm(measure_oval(trial)))
             logarithm = min(sizes, key=sizes.__getitem__)
             least = sizes[logarithm]
         # Edges of something else are round with no focal length.
@@ -172,43 +200,6 @@ def measure_tilt_doubt(chart: PlaneChart, face: FacePlane) -> float:
     uphill /= sine
     tilt_std_rad = float(np.sqrt(uphill @ face.normal_cov_rad2() @ uphill))
     return tilt_std_rad / (sine * float(np.sqrt(1.0 - sine**2)))
-
-
-def _measure_oval(
-    weight: np.ndarray,
-    pixels: np.ndarray,
-    row: np.ndarray,
-    chart: PlaneChart,
-    face: FacePlane,
-    logarithm: float,
-) -> np.ndarray:
-    """Return how oval weighted edges are on a face, along its slope and diagonally, in radii.
-
-    The focal length is that of the chart over the factor of this logarithm.
-    """
-    waves, distance_m = _expand_outline(pixels, row, chart, face, logarithm)
-    heavy = waves.T * weight
-    solution = np.linalg.lstsq(heavy @ waves, heavy @ distance_m, rcond=None)[0]
-    return solution[3:5] / solution[0]
-
-
-def _expand_outline(
-    pixels: np.ndarray, row: np.ndarray, chart: PlaneChart, face: FacePlane, logarithm: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return waves around the middle of edges, `(n, 7)`, and the distances of those, m, `(n,)`."""
-    factor = float(np.exp(logarithm))
-    matrix = chart.camera_matrix.copy()
-    matrix[[0, 1], [0, 1]] /= factor
-    m = face.m * [1.0, 1.0, factor]
-    ray = np.linalg.solve(matrix, np.array([row[0], row[1], 1.0]))
-    flat = rim.build_chart(ray / (m @ ray), m, matrix)
-    away = flat.flat(pixels)
-    # The line of sight lies above the steepest direction of the face.
-    angle = np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(flat.second @ ray, flat.first @ ray)
-    waves = [np.ones(len(angle))]
-    for number in (1, 2, 3):
-        waves += [np.cos(number * angle), np.sin(number * angle)]
-    return np.column_stack(waves), np.linalg.norm(away, axis=1)
 
 
 def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float:
