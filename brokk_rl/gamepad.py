@@ -72,9 +72,8 @@ class Gamepad:
         """
         found = []
         for axis in axes:
-            value = (
-                self._values.get((AXIS, abs(axis)), 0) / FULL_SCALE * (-1.0 if axis < 0 else 1.0)
-            )
+            sign = -1.0 if axis < 0 else 1.0
+            value = sign * self._values.get((AXIS, abs(axis)), 0) / FULL_SCALE
             size = min(1.0, max(0.0, abs(value) - DEAD_ZONE) / (1.0 - DEAD_ZONE))
             found.append(size if value > 0 else -size)
         return found

@@ -114,13 +114,14 @@ def collect_comments(sources: Iterable[tuple[str, Path]]) -> dict[str, str]:
         is_head = True  # the comment at the top is about the file
         for line in path.read_text().splitlines():
             if line.lstrip().startswith("# "):
-                above.append(line.strip("# "))
+                if not is_head:
+                    above.append(line.strip("# "))
                 continue
             if entry := ENTRY.fullmatch(line):
                 indent, key, comment = entry.groups()
                 outer = {place: name for place, name in tables.items() if place < len(indent)}
                 tables = outer | {len(indent): key}
-                words = [comment.strip()] if comment else above * (not is_head)
+                words = [comment.strip()] if comment else above
                 if words:
                     name = ".".join(filter(None, (package, *tables.values())))
                     comments[name] = NOISE.sub("", " ".join(words))
