@@ -7,7 +7,7 @@ from itertools import chain
 from actuators.recordings import conversion
 from actuators.recordings.conversion import LogReader
 from actuators.recordings.inspection import InspectionThresholds
-from actuators.recordings.recording_checks import REMARK_HEAD, examine_recordings, tabulate_remarks
+from actuators.recordings.recording_checks import examine_recordings, tabulate_remarks
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, read_record
@@ -55,8 +55,9 @@ class Convert:
         conversion.write_recordings(pieces, folder)
         recordings = list(chain.from_iterable(pieces.values()))
         remarks = examine_recordings(recordings, self.machine, self.thresholds)
-        if rows := tabulate_remarks(remarks):
-            print_table(REMARK_HEAD, rows, "look at these first")
+        head, rows = tabulate_remarks(remarks)
+        if rows:
+            print_table(head, rows, "look at these first")
         choices = (read_record(self.session.folder) or {}).get("choices", {})
         print_text("then:")
         print_text(

@@ -86,10 +86,8 @@ class Identify:
         self.session.seed_all()
         stages = self._stages()
         judged = [recording for stage in stages for recording in list_recordings(stage.test)]
-        horizons_s = []
-        for h in HORIZONS_S:
-            if h <= open_loop.find_longest_horizon_s(judged, self.machine) + 1e-9:
-                horizons_s.append(h)
+        longest_s = open_loop.find_longest_horizon_s(judged, self.machine) + 1e-9
+        horizons_s = [horizon_s for horizon_s in HORIZONS_S if horizon_s <= longest_s]
         for stage in stages:
             if stage.test or not self.identify.folds:
                 stage.cut = self._cut(stage, horizons_s or HORIZONS_S[:1])
@@ -154,21 +152,20 @@ class Identify:
             "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)"
         )
         check_commanded(runs, self.machine, 3, purpose)
-        share = 1.0 / options.hold_out
-        parts = split_runs(runs, {"rest": 1.0 - share, "test": share})
-        rest, test = ({name: runs[name] for name in parts[part]} for part in ("rest", "test"))
-        return [self._stage("", folder, rest, test)]
+        return [self._stage("", folder, *self._split(runs))]
 
     def _stage(self, name: str, folder: Path, rest: Runs, test: Runs) -> FitStage:
         where = f"in {name} " if name else ""
         purpose = f"{where}one to fit to and one to stop the fit by"
         check_commanded(rest, self.machine, 2, purpose)
-        share = 1.0 / self.identify.hold_out
-        parts = split_runs(rest, {"train": 1.0 - share, "validation": share})
-        train = {key: rest[key] for key in parts["train"]}
-        validation = {key: rest[key] for key in parts["validation"]}
         seed = self.session.stream(f"fit {name}".strip())
-        return FitStage(name, folder, seed, train, validation, test)
+        return FitStage(name, folder, seed, *self._split(rest), test)
+
+    def _split(self, runs: Runs) -> tuple[Runs, Runs]:
+        """Return the runs without those that are held out, and these."""
+        share = 1.0 / self.identify.hold_out
+        kept, held = split_runs(runs, {"kept": 1.0 - share, "held out": share}).values()
+        return {name: runs[name] for name in kept}, {name: runs[name] for name in held}
 
     def _check_unseen(self, runs: Runs, test: Runs) -> None:
         files = []

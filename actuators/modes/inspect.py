@@ -12,12 +12,7 @@ import pandas as pd
 from actuators.identify import dead_time
 from actuators.motion_panels import draw_joint_track
 from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
-from actuators.recordings.recording_checks import (
-    REMARK_HEAD,
-    REMARKS,
-    list_remarks,
-    tabulate_remarks,
-)
+from actuators.recordings.recording_checks import REMARKS, list_remarks, tabulate_remarks
 from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import RecordingError
@@ -134,7 +129,7 @@ class Inspect:
         tables = {
             "recordings": (FILES, [_format_file_row(one) for one in inspected]),
             "joints, all recordings": self._figures(result),
-            "findings": (REMARK_HEAD, tabulate_remarks(remarks)),
+            "findings": tabulate_remarks(remarks),
         }
         pictures: dict[str, str] = {}
         for one in sorted(inspected, key=lambda one: -one.num_remarks)[: self.inspect.pictures]:

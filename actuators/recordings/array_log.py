@@ -59,7 +59,9 @@ class TableLog(LogFile):
         try:
             source = ds.dataset(self.path, format=kind)
             table = source.to_table() if max_rows is None else source.head(max_rows)
-            frame = flatten_table(table).to_pandas(ignore_metadata=True)
+            while any(pa.types.is_struct(one) for one in table.schema.types):
+                table = table.flatten()  # fields within others become `pose.x`
+            frame = table.to_pandas(ignore_metadata=True)
             for name, cells in frame.items():
                 is_text = cells.dtype.kind == "O"
                 filled = cells.dropna()[:HEAD_ROWS] if is_text else ()
@@ -229,13 +231,6 @@ def _read_labels(features: Mapping[str, Any]) -> dict[str, list[str]]:
         if isinstance(names, list):
             labels[feature] = [str(name) for name in names]
     return labels
-
-
-def flatten_table(table: pa.Table) -> pa.Table:
-    """Return a table with the fields within others as columns of their own, `pose.x`."""
-    while any(pa.types.is_struct(kind) for kind in table.schema.types):
-        table = table.flatten()
-    return table
 
 
 def _is_real(values: np.ndarray) -> bool:

@@ -46,7 +46,12 @@ class CanLog(MessageLog):
         super().__init__(path)
         self._channel = None if channel is None else str(channel)
         self._messages = {}
-        for message in load_dbc(dbc):
+        file = str(registry.resolve_package_path(dbc))
+        try:
+            database: Any = cantools.database.load_file(file, strict=False)
+        except Exception as error:  # cantools raises what its parser stumbles over
+            raise ConfigError(f"dbc={dbc}: cannot be read ({error})") from error
+        for message in database.messages:
             kind = EXTENDED if message.is_extended_frame else 0
             self._messages[message.frame_id | kind] = message
 
@@ -125,17 +130,3 @@ def read_candump(path: Path) -> str:
         elif line.lstrip().startswith("("):
             lines.append(line.strip())
     return "\n".join(lines) + "\n"
-
-
-def load_dbc(dbc: str) -> list[Any]:
-    """Return the messages of a DBC file.
-
-    Raises:
-        ConfigError: It cannot be read.
-    """
-    path = registry.resolve_package_path(dbc)
-    try:
-        database: Any = cantools.database.load_file(str(path), strict=False)
-    except Exception as error:  # cantools raises what its parser stumbles over
-        raise ConfigError(f"dbc={dbc}: cannot be read ({error})") from error
-    return list(database.messages)

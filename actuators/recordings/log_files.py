@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from actuators.recordings.array_log import FORMATS
 from actuators.recordings.guess import FOREIGN, Damaged, advise
@@ -22,7 +22,6 @@ READERS: dict[str, str] = {
     ".mcap": "message_log.McapLog",
 }
 """Readers of files by their ending."""
-FOLDER_READERS = {"lerobot": "array_log.LeRobotLog", "bag": "message_log.BagLog"}
 SIGNATURES = {
     b"\x89MCAP0\r\n": (".mcap", "an MCAP file"),
     b"LOGG": (".blf", "a BLF file"),
@@ -76,15 +75,15 @@ def open_log(
 
 
 def _find_folder_reader(path: Path) -> str:
-    kind = tell_folder(path)
-    if kind is not None:
-        return FOLDER_READERS[kind]
-    if len(_list_csv_files(path)) > 1:
-        return "text_log.CsvFolderLog"
-    raise RecordingError(
-        f"{path}: expected a folder with the CSV files of one run, a LeRobotDataset (meta/info.json) or a bag of "
-        "ROS 2 (metadata.yaml)"
-    )
+    reader = tell_folder(path)
+    if reader is None and len(_list_csv_files(path)) > 1:
+        reader = "text_log.CsvFolderLog"
+    if reader is None:
+        raise RecordingError(
+            f"{path}: expected a folder with the CSV files of one run, a LeRobotDataset (meta/info.json) or a bag of "
+            "ROS 2 (metadata.yaml)"
+        )
+    return reader
 
 
 def _find_reader(path: Path) -> str:
@@ -108,13 +107,11 @@ def _find_reader(path: Path) -> str:
     return READERS.get(ending, "text_log.TextLog")
 
 
-def tell_folder(path: Path) -> Literal["lerobot", "bag"] | None:
-    """Return the kind of log that a folder is, `None` for a folder of something else."""
+def tell_folder(path: Path) -> str | None:
+    """Return the reader of a folder that is one log, `None` for a folder of something else."""
     if (path / "meta" / "info.json").is_file():
-        return "lerobot"
-    if (path / "metadata.yaml").is_file():
-        return "bag"
-    return None
+        return "array_log.LeRobotLog"
+    return "message_log.BagLog" if (path / "metadata.yaml").is_file() else None
 
 
 def expand_logs(paths: list[Path]) -> list[Path]:

@@ -6,21 +6,16 @@ condition become a lock. Axes: `T` time, `J` joints.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import yaml
 
-from actuators.recordings.inspection import (
-    Inspection,
-    InspectionThresholds,
-    RecordingFinding,
-    inspect_recording,
-)
+from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -94,7 +89,6 @@ class RecordingRemark:
 
 MOST_ROWS = 40
 """Rows of the table of remarks; a page of a terminal."""
-REMARK_HEAD = ["remark", "joint", "run", "when", "what"]
 IGNORED = "command without motion"
 
 
@@ -123,14 +117,14 @@ def list_remarks(
     )
 
 
-def tabulate_remarks(remarks: Sequence[RecordingRemark]) -> list[list[str]]:
-    """Return the cells of a table below `REMARK_HEAD`: the most severe remarks, without notes."""
+def tabulate_remarks(remarks: Sequence[RecordingRemark]) -> tuple[list[str], list[list[str]]]:
+    """Return heading and cells of a table: the most severe remarks, without notes."""
     rows = []
     for one in remarks[:MOST_ROWS]:
         if one.kind.severity != "note":
             span = f"{one.from_s:.2f} to {one.to_s:.2f} s"
             rows.append([one.name, one.joint or "all", one.recording, span, one.amount])
-    return rows
+    return ["remark", "joint", "run", "when", "what"], rows
 
 
 def name_recording(recording: Recording) -> str:
@@ -143,12 +137,10 @@ def _group_findings(
 ) -> Iterator[RecordingRemark]:
     """Yield one remark for all stretches of one kind and joint."""
     recording = inspection.recording
-
-    def key(finding: RecordingFinding) -> tuple[str, str]:
-        return finding.kind, finding.joint or ""
-
-    for (name, joint), group in groupby(sorted(inspection.findings, key=key), key):
-        some = sorted(group, key=lambda finding: finding.row)
+    groups = defaultdict(list)
+    for finding in inspection.findings:
+        groups[finding.kind, finding.joint].append(finding)
+    for (name, joint), some in groups.items():
         seconds = sum(finding.num_rows for finding in some) / recording.rate_hz
         part = seconds / max(recording.duration_s, 1.0 / recording.rate_hz)
         if name == "jumps":  # each spoils the free run that it lies in
@@ -158,7 +150,7 @@ def _group_findings(
             name, text = "interlock", locks[joint]
         span_s = some[0].t_s, some[-1].t_s + some[-1].duration_s
         where = name_recording(recording)
-        yield RecordingRemark(name, joint or None, where, *span_s, len(some), text, part)
+        yield RecordingRemark(name, joint, where, *span_s, len(some), text, part)
 
 
 def _find_lock(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -103,14 +104,9 @@ def check_commanded(
     `why` says for which purpose; the message advises on recordings.
     """
     moving = {name: measure_commanded_s(recordings) > 0 for name, recordings in runs.items()}
-    minutes = (
-        sum(recording.duration_s for recordings in runs.values() for recording in recordings) / 60.0
-    )
+    minutes = sum(one.duration_s for one in chain.from_iterable(runs.values())) / 60.0
     for joint, name in enumerate(machine.joint_names):
-        where = []
-        for run, commanded in moving.items():
-            if commanded[joint]:
-                where.append(run)
+        where = [run for run, commanded in moving.items() if commanded[joint]]
         if len(where) >= needed:
             continue
         found = f"in {len(where)} ({', '.join(where)})" if where else "in none"
