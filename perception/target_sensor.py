@@ -120,10 +120,8 @@ class WatchedHole:
 
     def believe(self) -> HoleBelief:
         """Return what is known, for the choice of a view."""
-        if self.hole is not None:
-            return HoleBelief.take(self.hole)
         std_m = max(self._settings.hint_m, LEAST_HINT_M)
-        return HoleBelief.expect(self._hint_m, self.task_scene[5], std_m)
+        return HoleBelief.expect(self.hole, self._hint_m, self.task_scene[5], std_m)
 
     def aim(self, plan_q: np.ndarray, t_s: float) -> None:
         """Choose the next view by the arm's planned motion, `(T, J)`, and send the mount there."""

@@ -103,10 +103,10 @@ class ScoreCamera:
                 f"score_camera: no frame can be judged; the first: {next(iter(refused.values()), 'none')}"
             )
         errors = [one for some, _ in frames for one in some]
-        position_m = [one.position_m for one in errors]
-        median_m, high_m = (
-            float(np.percentile(position_m, part)) if errors else None for part in (50, 95)
-        )
+        median_m = high_m = normal_rad = None
+        if errors:
+            median_m, high_m = np.percentile([one.position_m for one in errors], (50, 95)).tolist()
+            normal_rad = float(np.median([one.normal_rad for one in errors]))
         row = {
             "kind": self.score.kind,
             "name": self.score.name,
@@ -117,9 +117,7 @@ class ScoreCamera:
             "false": sum(num_false for _, num_false in frames),
             "position_m_median": median_m,
             "position_m_p95": high_m,
-            "normal_rad_median": float(np.median([one.normal_rad for one in errors]))
-            if errors
-            else None,
+            "normal_rad_median": normal_rad,
             "inside_3_sigma": sum(one.sigmas <= 3.0 for one in errors),
             "truth_std_m": scene.std_m,
         }

@@ -51,13 +51,19 @@ class HoleBelief:
     cov_m2: np.ndarray
 
     @classmethod
-    def expect(cls, center_m: np.ndarray, radius_m: float, std_m: float) -> HoleBelief:
-        """Return the belief about a hole drilled from above that was never seen."""
-        return cls(center_m, UP, radius_m, std_m**2 * np.eye(3))
+    def expect(
+        cls, hole: TrackedHole | None, center_m: np.ndarray, radius_m: float, std_m: float
+    ) -> HoleBelief:
+        """Return the belief about a tracked hole; without one that about a hole drilled from above.
 
-    @classmethod
-    def take(cls, hole: TrackedHole) -> HoleBelief:
-        """Return the belief about a tracked hole."""
+        Args:
+            hole: The tracked hole, `None` before it was seen.
+            center_m: Where it is expected then, `(3,)`.
+            radius_m: Its radius then.
+            std_m: Standard deviation of each coordinate then.
+        """
+        if hole is None:
+            return cls(center_m, UP, radius_m, std_m**2 * np.eye(3))
         pose = hole.pose
         shared_m2 = np.zeros((3, 3)) if pose.shared_m2 is None else pose.shared_m2
         # Frames cannot reduce the shared part, and a covariance must stay invertible without it.

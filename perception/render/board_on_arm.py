@@ -21,7 +21,7 @@ from perception.label.camera_pose import Charuco
 from perception.render.printed_board import build_plate
 from perception.render.scene_ranges import Scene, SceneRanges
 from perception.render.scene_sampler import SceneSampler
-from perception.render.solids import build_rods
+from perception.render.solids import build_frame, build_rods
 from perception.render.stereo_camera import StereoRig, measure_disparity_error
 
 JOINTS, TRUTH = "joints.parquet", "truth.yaml"
@@ -154,10 +154,7 @@ class BoardScenes:
         tip = self._camera_from_base[:3, :3] @ link[:3, 3] + self._camera_from_base[:3, 3]
         middle = tip * (1.0 - settings.ahead_m / np.linalg.norm(tip))
         size_m = np.array([settings.board.columns, settings.board.rows]) * settings.board.square_m
-        z = middle / np.linalg.norm(middle)
-        x = np.cross([0.0, 1.0, 0.0], z)
-        x /= np.linalg.norm(x)
-        turn = np.stack([x, np.cross(z, x), z], 1)
+        turn = build_frame(middle, 0.0)
         corner = middle - turn[:, :2] @ (size_m / 2)
         return np.linalg.inv(link) @ self._rig.base_from_camera @ make_transform(turn, corner)
 

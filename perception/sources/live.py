@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from typing import Any, Protocol
 
@@ -52,6 +53,18 @@ class Freshness:
     timeout_s: Positive
     max_age_s: Positive
     least_known: Share
+
+
+def import_library(name: str, missing: str) -> Any:
+    """Return a camera's own library.
+
+    Raises:
+        FrameError: it is not installed, in the words of `missing`.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise FrameError(missing) from error
 
 
 class LiveSource:

@@ -77,9 +77,7 @@ class MovingSource:
             planner.num_missed = 0 if seen_s > self._seen_s else planner.num_missed + 1
         self._seen_s, self._is_taken = seen_s, False
         scene = s.camera.task_scene
-        belief = HoleBelief.expect(np.array(scene[:3]), scene[5], s.hint_m)
-        if hole is not None:
-            belief = HoleBelief.take(hole)
+        belief = HoleBelief.expect(hole, np.array(scene[:3]), scene[5], s.hint_m)
         step_s = s.next_view.horizon_s / (s.next_view.num_times - 1)
         plan_q = plan_approach_motion(s.machine, q, belief.center_m, s.next_view.num_times, step_s)
         return planner.aim(belief, plan_q, t_s)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 from typing import Any
 
@@ -13,7 +12,7 @@ from brokk_rl.spec import spec
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.camera import CameraModel, RawFrame
 from perception.sources import validation
-from perception.sources.live import Freshness, LiveSource
+from perception.sources.live import Freshness, LiveSource, import_library
 
 
 @spec
@@ -59,12 +58,8 @@ class RealSenseDevice:
         Raises:
             FrameError: there is no library, no camera, or it cannot run as configured.
         """
-        try:
-            rs = importlib.import_module("pyrealsense2")
-        except ImportError as error:
-            raise FrameError(
-                "RealSense camera: the Python package `pyrealsense2` is not installed"
-            ) from error
+        missing = "RealSense camera: the Python package `pyrealsense2` is not installed"
+        rs = import_library("pyrealsense2", missing)
         self._rs = rs
         settings, config = self._settings, rs.config()
         if settings.serial is not None:

@@ -139,22 +139,19 @@ class ExportedPictures:
             if pattern is not None:
                 files[kind] = self._list_files(kind, pattern)
         for number, path in sorted(files["color"].items()):
-            parts = {}
-            for kind in files:
-                if number not in files[kind]:
+            parts: dict[str, np.ndarray] = {}
+            for kind, some in files.items():
+                if number not in some:
                     raise FrameError(
                         f"{path}: no partner numbered {number} by capture.{kind}="
                         f"{getattr(self, kind)} in {self.folder}"
                     )
-                parts[kind] = files[kind][number]
-            right = depth_m = None
-            if "right" in parts:
-                right = validation.convert_color(read_picture(parts["right"]), str(parts["right"]))
-            if "depth" in parts:
-                picture, where = read_picture(parts["depth"]), str(parts["depth"])
-                depth_m = validation.convert_png_depth(picture, where, self.depth_unit_m)
-            color = validation.convert_color(read_picture(path), str(path))
-            yield RawFrame(color, right, depth_m, name=str(path))
+                picture, where = read_picture(some[number]), str(some[number])
+                if kind == "depth":
+                    parts[kind] = validation.convert_png_depth(picture, where, self.depth_unit_m)
+                else:
+                    parts[kind] = validation.convert_color(picture, where)
+            yield RawFrame(parts["color"], parts.get("right"), parts.get("depth"), name=str(path))
 
     def _list_files(self, kind: str, pattern: str) -> dict[int, Path]:
         """Return files by number."""

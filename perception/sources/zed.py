@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 from typing import Annotated, Any, Literal
 
@@ -14,7 +13,7 @@ from brokk_rl.spec import Positive, spec
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.camera import CameraModel, RawFrame
 from perception.sources import validation
-from perception.sources.live import Freshness, LiveSource
+from perception.sources.live import Freshness, LiveSource, import_library
 
 _RETRY_S = 0.005
 """Pause between two attempts to grab a frame."""
@@ -82,13 +81,11 @@ class ZedDevice:
         Raises:
             FrameError: there is no SDK, no camera, or it cannot run as configured.
         """
-        try:
-            sl = importlib.import_module("pyzed.sl")
-        except ImportError as error:
-            raise FrameError(
-                "ZED camera: the Python package `pyzed` is not installed; it comes with the ZED SDK "
-                "(get_python_api.py). Recorded frames replay without it: perception/source=folder"
-            ) from error
+        sl = import_library(
+            "pyzed.sl",
+            "ZED camera: the Python package `pyzed` is not installed; it comes with the ZED SDK "
+            "(get_python_api.py). Recorded frames replay without it: perception/source=folder",
+        )
         settings, init = self._settings, sl.InitParameters()
         init.camera_resolution = getattr(sl.RESOLUTION, settings.resolution)
         init.camera_fps = settings.rate_hz

@@ -24,7 +24,7 @@ HOLE_M = np.array([2.6, 0.0, 0.75])
 
 
 def believe(std_m: float = 0.01) -> HoleBelief:
-    return HoleBelief.expect(HOLE_M, 0.05, std_m)
+    return HoleBelief.expect(None, HOLE_M, 0.05, std_m)
 
 
 def plan(machine: Machine, name: str, **fields: Any) -> tuple[Any, Any]:
