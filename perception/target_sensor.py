@@ -19,7 +19,7 @@ import numpy as np
 from annotated_types import Ge
 
 from brokk_rl.contracts.target import MotionPlan, TargetReading
-from brokk_rl.contracts.vision import BoreholeFinder, FinderSpec, HolePose, TrackedHole, TrackerSpec
+from brokk_rl.contracts.vision import FinderSpec, HolePose, TrackedHole, TrackerSpec
 from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
@@ -270,9 +270,7 @@ class PerceivedTargets:
             else:
                 asked.append((int(number), exposure))
         with use_workers(self._settings.num_processes):
-            found = map_parallel(
-                lambda item: _search(self._settings, self._mount, self._finder, item[1]), asked
-            )
+            found = map_parallel(lambda item: self._search(item[1]), asked)
         for (number, exposure), holes in zip(asked, found, strict=True):
             self.watched[number].wait_for(holes, exposure.t_s)
 
@@ -304,18 +302,15 @@ class PerceivedTargets:
                     plan_q = np.repeat(q[number][None], s.num_times, 0)
                 one.aim(plan_q, t_s)
 
-
-def _search(
-    settings: PerceivedTarget, mount: CameraMount, finder: BoreholeFinder, exposure: _Exposure
-) -> list[HolePose]:
-    """Render a picture, and return the holes that are found in it, in the base frame."""
-    noise = np.random.default_rng(exposure.seed)
-    place = exposure.true_pose, exposure.part
-    shot = settings.camera.shoot(exposure.task_scene, exposure.chain_m, noise, *place)
-    believed = CameraExtrinsics(exposure.believed_pose, mount.error.covariance)
-    camera = settings.camera.rig.model.crop(exposure.part).place(believed)
-    frame = camera.build_frame(shot.color, shot.depth_m, exposure.t_s, shot.right)
-    try:
-        return list(finder.find(frame).in_base_frame(frame).holes)
-    except FrameError:  # the arm fills the picture: no depth
-        return []
+    def _search(self, exposure: _Exposure) -> list[HolePose]:
+        """Render a picture, and return the holes that are found in it, in the base frame."""
+        camera, noise = self._settings.camera, np.random.default_rng(exposure.seed)
+        place = exposure.true_pose, exposure.part
+        shot = camera.shoot(exposure.task_scene, exposure.chain_m, noise, *place)
+        believed = CameraExtrinsics(exposure.believed_pose, self._mount.error.covariance)
+        model = camera.rig.model.crop(exposure.part).place(believed)
+        frame = model.build_frame(shot.color, shot.depth_m, exposure.t_s, shot.right)
+        try:
+            return list(self._finder.find(frame).in_base_frame(frame).holes)
+        except FrameError:  # the arm fills the picture: no depth
+            return []

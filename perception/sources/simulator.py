@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.kinematics import rotate_about_axis
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
 from perception.mount.occlusion import ArmShape
@@ -73,7 +74,8 @@ class SimulatedCamera:
         """Return a frame of a scene, with its truth.
 
         Args:
-            task_scene: See `task_scene` above.
+            task_scene: See `task_scene` above; after it may stand how far the block leans, rad, as in
+                the task.
             chain_in_base_m: The arm as points in the base frame, `(P, 3)`: its joints in order,
                 then the tip of the tool (`brokk_rl.kinematics`); empty for none.
             noise: Noise of the pictures.
@@ -92,7 +94,8 @@ class SimulatedCamera:
         """Return a scene in the coordinates of the rig's own camera; see `shoot`."""
         kind = self.surroundings
         chance = np.random.default_rng(self.seed)  # the same stains and light for every frame
-        x, y, z, yaw, scale, radius_m = task_scene
+        x, y, z, yaw, scale, radius_m = task_scene[:6]
+        lean_rad = task_scene[6] if len(task_scene) > 6 else 0.0
         from_base = np.linalg.inv(self.rig.base_from_camera)
         target = from_base[:3, :3] @ [x, y, z] + from_base[:3, 3]
         if target[2] < 0.2:
@@ -101,9 +104,10 @@ class SimulatedCamera:
                 "camera"
             )
         half = np.array(self.block_m) / 2 * [scale, scale, 1.0]
-        turn = np.array(
-            [[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
-        )
+        # The block turns about its own axis, then leans away from the slew axis.
+        across = np.array([-y, x, 0.0]) / max(float(np.hypot(x, y)), 1e-6)
+        turn = rotate_about_axis(across, np.array(lean_rad))
+        turn = turn @ rotate_about_axis(np.array([0.0, 0.0, 1.0]), np.array(yaw))
         rotation = from_base[:3, :3] @ turn
         hole = DrilledHole(np.array([0.0, 0.0, half[2]]), radius_m, self.hole_depth_m, FRONT)
         pose = SolidPose(rotation, target - rotation @ hole.center_m)

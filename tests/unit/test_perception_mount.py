@@ -143,7 +143,7 @@ def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) ->
 def watch(machine: Machine) -> WatchedHole:
     settings = replace(option("target", "perceived"), delay_s=0.35, hint_m=0.03)
     mount, planner = plan(machine, "mast")
-    scene = np.array([*HOLE_M, 0.0, 1.0, 0.05])
+    scene = np.array([*HOLE_M, 0.0, 1.0, 0.05, 0.0])
     return WatchedHole(settings, mount, planner, scene, np.random.default_rng(0))
 
 

@@ -487,15 +487,14 @@ def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
         option("perception/source", "simulator"), rig=rig, num_frames=1
     )
     chain_m = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.6], [2.0, 0.0, 2.4], [2.0, 0.0, 1.6]])
-    shot = spec.shoot((2.4, 0.1, 0.7, 0.3, 1.0, 0.06), chain_m, np.random.default_rng(0))
+    shot = spec.shoot((2.4, 0.0, 0.7, 0.3, 1.0, 0.06, 0.1), chain_m, np.random.default_rng(0))
     with spec.build() as source:
         frame = source.read_latest()
         assert frame is not None and source.read_latest() is None
-    np.testing.assert_allclose(shot.truth.holes[0].center_in_base_m, [2.4, 0.1, 0.7], atol=1e-9)
-    np.testing.assert_allclose(shot.truth.holes[0].axis_in_base, [0.0, 0.0, 1.0], atol=1e-9)
-    assert (
-        shot.truth.holes[0].radius_m == 0.06 and shot.label.arm.any() and shot.label.hole_mask.any()
-    )
+    np.testing.assert_allclose(shot.truth.holes[0].center_in_base_m, [2.4, 0.0, 0.7], atol=1e-9)
+    axis = [np.sin(0.1), 0.0, np.cos(0.1)]  # the block leans away from the machine
+    np.testing.assert_allclose(shot.truth.holes[0].axis_in_base, axis, atol=1e-9)
+    assert shot.truth.holes[0].radius_m == 0.06 and shot.label.arm.any()
     pixel = np.round(rig.left.project(np.array(shot.truth.holes[0].center_m))).astype(int)
     assert shot.label.hole_mask[pixel[1], pixel[0]]
     np.testing.assert_array_equal(frame.camera_matrix, rig.left.matrix)
