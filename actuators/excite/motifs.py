@@ -8,14 +8,11 @@ from annotated_types import MinLen
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from actuators.excite.poses import draw_start_poses, move_joint
+from actuators.excite.poses import Program, draw_start_poses, move_joint
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
-
-Programs = list[tuple[str, np.ndarray]]
-"""Name and commands `(T, J)` of each program."""
 
 
 class Motif:
@@ -24,7 +21,7 @@ class Motif:
     share: float
     stop_margin: float
 
-    def programs(self, machine: Machine, generator: Generator) -> Programs:
+    def programs(self, machine: Machine, generator: Generator) -> list[Program]:
         """Return all that is played in one pose."""
         raise NotImplementedError
 
@@ -78,7 +75,7 @@ class Ramps(Motif):
     reach: float
     stop_margin: float
 
-    def programs(self, machine: Machine, generator: Generator) -> Programs:
+    def programs(self, machine: Machine, generator: Generator) -> list[Program]:
         """Return a ramp to one side, to the other and back, per joint and slope.
 
         The first side is random.
@@ -110,7 +107,7 @@ class Holds(Motif):
     hold_s: float
     stop_margin: float
 
-    def programs(self, machine: Machine, generator: Generator) -> Programs:
+    def programs(self, machine: Machine, generator: Generator) -> list[Program]:
         """Return one hold: the way to each pose does the rest."""
         steps = max(1, round(self.hold_s / machine.period_s))
         return [("holds", np.zeros((steps, machine.num_joints)))]
@@ -136,7 +133,7 @@ class Reversals(Motif):
     pause_s: float
     stop_margin: float
 
-    def programs(self, machine: Machine, generator: Generator) -> Programs:
+    def programs(self, machine: Machine, generator: Generator) -> list[Program]:
         """Return all reversals of a joint in one program."""
         parts = []
         pause = hold_levels([0.0], [self.pause_s], machine.period_s)

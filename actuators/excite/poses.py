@@ -13,6 +13,8 @@ from brokk_rl.contracts.actuator import Segment
 from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 
+Program = tuple[str, np.ndarray]
+"""Name and commands, `(T, J)`."""
 NUM_CANDIDATES = 128
 """Random poses among which the next one is chosen."""
 
@@ -46,9 +48,7 @@ def draw_start_poses(machine: Machine, margin: float, generator: Generator) -> I
         yield candidates[best]
 
 
-def move_joint(
-    name: str, machine: Machine, joint: int, commands: np.ndarray
-) -> tuple[str, np.ndarray]:
+def move_joint(name: str, machine: Machine, joint: int, commands: np.ndarray) -> Program:
     """Return name and commands, `(T, J)`, of a program of one joint, `(T,)`, with the others at rest."""
     u = np.zeros((len(commands), machine.num_joints))
     u[:, joint] = commands

@@ -113,10 +113,8 @@ class Collect:
         write_json(self.session.folder / "plan.json", summary)
         path = self.session.folder / "plan.png"
         plan_report.draw_plan(plan, track, machine, path)
-        unplayed = set()
-        for entry in chain.from_iterable(summary["runs"]):
-            if entry["cut_s"] > CUT * entry["program_s"]:
-                unplayed.add(entry["name"])
+        entries = chain.from_iterable(summary["runs"])
+        unplayed = {one["name"] for one in entries if one["cut_s"] > CUT * one["program_s"]}
         if unplayed:
             text = "plan: no time for %s in some of the runs; raise collect.run_minutes"
             log.warning(text, ", ".join(sorted(unplayed)))

@@ -72,13 +72,9 @@ class ImportLogs:
         paths = conversion.find_logs(self.log.input)
         name = self.log.name or _name_machine(paths[0])
         draft = log_draft.make_draft(paths, name, self.log)
-        picture = self.session.folder / PICTURE_FILE
-        log_draft.draw_draft(draft).savefig(picture, dpi=110)
-        log.info("picture: %s", picture)
-        self._write(draft, paths)
-
-    def _write(self, draft: Draft, paths: list[Path]) -> None:
         folder, guesses = self.session.folder, draft.list_guesses()
+        log_draft.draw_draft(draft).savefig(folder / PICTURE_FILE, dpi=110)
+        log.info("picture: %s", folder / PICTURE_FILE)
         write_text(folder / MAP_FILE, draft.format(log_draft.MAP_TEMPLATE))
         write_text(folder / MACHINE_FILE, draft.format(log_draft.MACHINE_TEMPLATE))
         unsure = [guess for guess in guesses if guess.sureness == "unsure"]

@@ -22,6 +22,7 @@ from actuators.recordings.joint_evidence import (
     MARGIN,
     ColumnEntry,
     Correlations,
+    Entries,
     JointGuess,
     weigh_correlation,
 )
@@ -33,9 +34,6 @@ from brokk_rl.errors import RecordingError
 
 SAME_NAME, OTHER_NAME = 3.0, -6.0
 """Log odds of a pair with one name of a joint, and of one in which a column shares it with another one."""
-
-
-Entries = Sequence[ColumnEntry]
 
 
 class ColumnTable:
@@ -68,11 +66,11 @@ class ColumnTable:
 
     def _judge_joints(self) -> None:
         """Weigh by the numbers what the columns of each joint are."""
-        commands = [one.u for one in self.joints]
-        matrix = Correlations(self._run, commands, [one.q for one in self.joints])
+        u, q = [one.u for one in self.joints], [one.q for one in self.joints]
+        matrix = Correlations(self._run, u, q)
         for at, joint in enumerate(self.joints):
             self._check_drive(joint)
-            joint.judge(matrix, at, self._given, [one.text for one in commands])
+            joint.judge(matrix, at, self._given)
 
     def _take(self, given: Mapping[str, tuple[str, str]]) -> list[JointGuess]:
         """Return the joints whose columns a person gives; refuse one that is missing."""

@@ -185,9 +185,8 @@ class _RecordingScan:
         """Return the figures of each joint."""
         size, found = np.abs(self._u), {}
         margin = self._limits.at_limit * self._travel
-        at_limit = (self._q < self._machine.lower + margin) | (
-            self._q > self._machine.upper - margin
-        )
+        low, high = self._machine.lower + margin, self._machine.upper - margin
+        at_limit = (self._q < low) | (self._q > high)
         for j, name in enumerate(self._machine.joint_names):
             figures = {
                 "lowest": np.nanmin(self._q[:, j]),
@@ -214,18 +213,16 @@ class _RecordingScan:
             yield from self._find_saturation(j, joint.name, joint.unit)
             over = np.fmax(self._q[:, j] - joint.upper.value, joint.lower.value - self._q[:, j])
             for row, count in find_stretches(over > self._visible[j]):
-                text = (
-                    f"up to {np.nanmax(over[row : row + count]):.2g} {joint.unit} beyond its limit"
-                )
+                most = np.nanmax(over[row : row + count])
+                text = f"up to {most:.2g} {joint.unit} beyond its limit"
                 yield self._finding("beyond limit", joint.name, row, count, text)
             if self._targets is not None:
                 yield from self._find_disobedience(j, self._targets[:, j], joint.name, joint.unit)
         same = np.append(False, (np.diff(self._q, axis=0) == 0).all(1))
         is_seen = (np.abs(self._v) * self._period_s > self._visible).any(1)
         for row, count in find_stretches(same & is_seen):
-            yield self._finding(
-                "lost frames", None, row, count, f"{count} rows repeat the one before"
-            )
+            text = f"{count} rows repeat the one before"
+            yield self._finding("lost frames", None, row, count, text)
         commanded = np.abs(self._u) > self._limits.commanded
         for j in np.flatnonzero(self._machine.is_exclusive):
             others = np.delete(commanded, j, axis=1).any(1)

@@ -13,7 +13,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from actuators.recordings.clocks import unwrap
+from actuators.recordings.clocks import put_near, unwrap
 from actuators.recordings.guess import CommandKind, Evidence, GivenColumns, Guess, advise
 from actuators.recordings.log_signals import RunSignals, Signal
 from actuators.recordings.log_tables import LogRun
@@ -52,6 +52,10 @@ UNIT_SHARES = {"rad": 0.65, "deg": 0.2, "turns": 0.15}
 """Shares of the units among positions whose names say none; by hand."""
 SI_SHARE, OTHER_SHARE = 6.0, 0.15
 """Share of rad where the program that made the name logs rad; that of counts, per cent and lengths."""
+
+
+REST_SPEED = 0.02
+"""Part of the top speed below which a joint counts as at rest."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,60 @@ class ColumnEntry:
         return replace(self, signal=replace(self.signal, values=values), wrap=wrap)
 
 
+Entries = Sequence[ColumnEntry]
+
+
+@dataclass
+class JointSurvey:
+    """Numbers of one joint over all logs, in the units of the logs.
+
+    Attributes:
+        lowest_command: Smallest command.
+        highest_command: Largest command.
+        lowest: Smallest position.
+        highest: Largest position.
+        top_speed: Fastest change of the position over a tenth of a second, per second.
+        target_speed: Fastest change of the command from row to row, per second.
+        rest: Most frequent command at rest; NaN where the joint never rests.
+        rest_share: Share of all rows that are at rest with it, in the log with the most.
+    """
+
+    lowest_command: float = np.inf
+    highest_command: float = -np.inf
+    lowest: float = np.inf
+    highest: float = -np.inf
+    top_speed: float = 0.0
+    target_speed: float = 0.0
+    rest: float = np.nan
+    rest_share: float = 0.0
+
+    def add(self, command: Signal, position: Signal, joint: JointGuess) -> None:
+        """Add a run; positions that begin again after a turn are put next to their targets, or to those before."""
+        u, q, t_s = command.values, position.values, position.t_s
+        if joint.q.modulus is not None:
+            near = np.median(q) if self.lowest == np.inf else (self.lowest + self.highest) / 2.0
+            if joint.kind == "position" and joint.target_wraps is None:
+                near = (joint.target_scale * np.median(u) + joint.target_offset) / joint.scale
+            q = put_near(q, float(near), joint.q.modulus)
+        if joint.target_wraps is not None:
+            u = put_near(u, float(np.median(np.interp(command.t_s, t_s, q))), joint.target_wraps)
+        self.lowest_command = min(self.lowest_command, float(u.min()))
+        self.highest_command = max(self.highest_command, float(u.max()))
+        self.lowest, self.highest = min(self.lowest, q.min()), max(self.highest, q.max())
+        target_speed = np.abs(np.diff(u) / np.diff(command.t_s)).max()
+        self.target_speed = max(self.target_speed, float(target_speed))
+        step = max(1, int(0.1 / float(np.median(np.diff(t_s)))))
+        if len(q) <= step:
+            return
+        speed = np.abs((q[step:] - q[:-step]) / (t_s[step:] - t_s[:-step]))
+        self.top_speed = max(self.top_speed, float(speed.max()))
+        at_rest = np.interp(command.t_s, t_s[step:], speed) <= REST_SPEED * self.top_speed
+        values, counts = np.unique(u[at_rest], return_counts=True)
+        if len(values) and counts.max() / len(u) > self.rest_share:
+            self.rest = float(values[counts.argmax()])
+            self.rest_share = float(counts.max() / len(u))
+
+
 @dataclass
 class JointGuess:
     """The columns of a joint, and what they are.
@@ -117,6 +175,7 @@ class JointGuess:
         full_plus: Full command towards larger positions; `None` without such commands.
         full_minus: The same towards smaller positions.
         guesses: How sure each part is; `unit of targets` where that is in question.
+        survey: Its numbers over all logs.
     """
 
     name: str
@@ -135,22 +194,20 @@ class JointGuess:
     full_plus: float | None = None
     full_minus: float | None = None
     guesses: dict[str, Guess] = field(default_factory=dict)
+    survey: JointSurvey = field(default_factory=JointSurvey)
 
     @property
     def target_wraps(self) -> float | None:
         """Value at which a target begins again."""
         return self.u.modulus if self.kind == "position" else None
 
-    def judge(
-        self, matrix: Correlations, at: int, given: GivenColumns, commands: Sequence[str]
-    ) -> None:
+    def judge(self, matrix: Correlations, at: int, given: GivenColumns) -> None:
         """Weigh kind, motion and units by the numbers.
 
         Args:
             matrix: Correlations of all joints.
             at: Its place among them.
             given: Meanings that a person gives.
-            commands: Names of the commands of all joints.
         """
         slope, rest = matrix.fit_target(at)
         r: dict[CommandKind, float] = {}
@@ -158,7 +215,7 @@ class JointGuess:
             r[kind] = float(several[at, at])
         self._judge_kind(r, slope, rest, given.command)
         if self.u.is_changing:
-            self._judge_motion(matrix, at, commands)
+            self._judge_motion(matrix, at)
             self._check_steps(slope, rest)
         else:
             text = "its command does not change in the beginning of the log"
@@ -219,7 +276,7 @@ class JointGuess:
                 evidence.append(("", -1.0))
         self.add_guess("command", KIND_TEXTS[chosen], evidence, given is not None)
 
-    def _judge_motion(self, matrix: Correlations, at: int, commands: Sequence[str]) -> None:
+    def _judge_motion(self, matrix: Correlations, at: int) -> None:
         """Add the evidence of correlations, and of another command that fits better."""
         r = float(matrix.r[self.kind][at, at])
         self.sign = -1 if self.kind == "velocity" and r < 0 else 1
@@ -239,7 +296,8 @@ class JointGuess:
         rival = int(np.argmax(size))
         if size[at] < CLEAR_CORRELATION and size[rival] > size[at] + MARGIN:
             weight = -6.0 if size[rival] > CLEAR_CORRELATION else -1.0
-            self.evidence.append((f"with the command {commands[rival]} {size[rival]:.2f}", weight))
+            text = f"with the command {matrix.commands[rival].text} {size[rival]:.2f}"
+            self.evidence.append((text, weight))
 
     def _check_steps(self, slope: float, rest: float) -> None:
         """Add the evidence of steps that no machine makes."""
@@ -342,14 +400,14 @@ class Correlations:
     """Commands and positions of a run on one grid, and how they follow each other.
 
     Attributes:
+        commands: The commands.
         r: Correlation at the best lag of each position, its speed or its acceleration with each command, by the
             kind of command that they follow, `(C, P)`.
         lag_s: That lag, `(C, P)`.
     """
 
-    def __init__(
-        self, run: LogRun, commands: Sequence[ColumnEntry], positions: Sequence[ColumnEntry]
-    ) -> None:
+    def __init__(self, run: LogRun, commands: Entries, positions: Entries) -> None:
+        self.commands = commands
         signals = [one.signal for one in (*commands, *positions)]
         begin_s = max(float(one.t_s[0]) for one in signals)
         end_s = min(float(one.t_s[-1]) for one in signals)

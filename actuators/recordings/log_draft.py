@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from actuators.recordings.clocks import put_near
 from actuators.recordings.column_assignment import ColumnTable
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.joint_evidence import JointGuess
@@ -59,7 +58,7 @@ class Draft:
         name: Name of the machine.
         times: Clock of each table that is used.
         joints: Joints whose command changes.
-        survey: Their numbers over all logs.
+        survey: Clocks and lengths of all logs.
         signs: Delimiter and decimal sign of text files.
         given: Meanings that a person gave.
         remarks: Further remarks.
@@ -106,10 +105,10 @@ class Draft:
 
     def find_reach(self, joint: JointGuess) -> tuple[float, float]:
         """Return the ends of the travel, rad or m: those of positions and targets, and some more."""
-        survey = self.survey.joints[joint.name]
-        ends = [joint.scale * survey.lowest, joint.scale * survey.highest]
+        numbers = joint.survey
+        ends = [joint.scale * numbers.lowest, joint.scale * numbers.highest]
         if joint.kind == "position":
-            for target in (survey.lowest_command, survey.highest_command):
+            for target in (numbers.lowest_command, numbers.highest_command):
                 ends.append(joint.target_scale * target + joint.target_offset)
         spare = SPARE * (max(ends) - min(ends))
         low, high = min(ends) - spare, max(ends) + spare
@@ -124,11 +123,10 @@ class Draft:
         unit = joint.u.name.speed_unit
         if joint.kind == "velocity" and unit is not None and joint.neutral == 0.0:
             return unit * max(abs(joint.full_plus or 0.0), abs(joint.full_minus or 0.0))
-        numbers = self.survey.joints[joint.name]
-        speed = abs(joint.scale) * numbers.top_speed
+        speed = abs(joint.scale) * joint.survey.top_speed
         if joint.kind == "position" and not self.has_targets:
             # beside joints commanded by speed the speed of the target is the command
-            speed = max(speed, abs(joint.target_scale) * numbers.target_speed)
+            speed = max(speed, abs(joint.target_scale) * joint.survey.target_speed)
         return _round_up(speed)
 
     def list_guesses(self) -> list[Guess]:
@@ -176,17 +174,16 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
     joints = [*best.values()]
     used = {one.u.signal.table for one in joints} | {one.q.signal.table for one in joints}
     times = {table: time for table, time in clocks.items() if table in used}
-    survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
+    survey = LogSurvey()
     for path in paths:
         opened = open_log(path, signs, given.dbc, given.damaged, given.channel)
         survey.add_log(opened, times, joints)
     moving = []
     for joint in joints:
-        numbers = survey.joints[joint.name]
-        if numbers.highest_command > numbers.lowest_command:
+        if joint.survey.highest_command > joint.survey.lowest_command:
             moving.append(joint)
             if joint.kind != "position":
-                _scale_command(joint, numbers)
+                _scale_command(joint)
         else:
             remarks[f"{joint.name} is left out: its command never changes"] = None
     if not moving:
@@ -198,8 +195,9 @@ def _rank(joint: JointGuess) -> tuple[float, float]:
     return joint.guesses["columns"].probability, joint.guesses["command"].probability
 
 
-def _scale_command(joint: JointGuess, survey: JointSurvey) -> None:
+def _scale_command(joint: JointGuess) -> None:
     """Choose neutral and full commands of a joint whose command sets its speed, or a force."""
+    survey = joint.survey
     low, high, neutral = survey.lowest_command, survey.highest_command, 0.0
     is_at_rest = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
     largest = max(abs(low), abs(high))
@@ -282,59 +280,6 @@ GAP_PERIODS = 4
 """Least number of periods without a sample that split a log; loggers without real time skip up to two."""
 LOST_PERIODS = 20
 """A longer time without a sample is no row that was lost by chance."""
-REST_SPEED = 0.02
-"""Part of the top speed below which a joint counts as at rest."""
-
-
-@dataclass
-class JointSurvey:
-    """Numbers of one joint over all logs, in the units of the logs.
-
-    Attributes:
-        lowest_command: Smallest command.
-        highest_command: Largest command.
-        lowest: Smallest position.
-        highest: Largest position.
-        top_speed: Fastest change of the position over a tenth of a second, per second.
-        target_speed: Fastest change of the command from row to row, per second.
-        rest: Most frequent command at rest; NaN where the joint never rests.
-        rest_share: Share of all rows that are at rest with it, in the log with the most.
-    """
-
-    lowest_command: float = np.inf
-    highest_command: float = -np.inf
-    lowest: float = np.inf
-    highest: float = -np.inf
-    top_speed: float = 0.0
-    target_speed: float = 0.0
-    rest: float = np.nan
-    rest_share: float = 0.0
-
-    def add(self, command: Signal, position: Signal, joint: JointGuess) -> None:
-        """Add a run; positions that begin again after a turn are put next to their targets, or to those before."""
-        u, q, t_s = command.values, position.values, position.t_s
-        if joint.q.modulus is not None:
-            near = np.median(q) if self.lowest == np.inf else (self.lowest + self.highest) / 2.0
-            if joint.kind == "position" and joint.target_wraps is None:
-                near = (joint.target_scale * np.median(u) + joint.target_offset) / joint.scale
-            q = put_near(q, float(near), joint.q.modulus)
-        if joint.target_wraps is not None:
-            u = put_near(u, float(np.median(np.interp(command.t_s, t_s, q))), joint.target_wraps)
-        self.lowest_command = min(self.lowest_command, float(u.min()))
-        self.highest_command = max(self.highest_command, float(u.max()))
-        self.lowest, self.highest = min(self.lowest, q.min()), max(self.highest, q.max())
-        target_speed = np.abs(np.diff(u) / np.diff(command.t_s)).max()
-        self.target_speed = max(self.target_speed, float(target_speed))
-        step = max(1, int(0.1 / float(np.median(np.diff(t_s)))))
-        if len(q) <= step:
-            return
-        speed = np.abs((q[step:] - q[:-step]) / (t_s[step:] - t_s[:-step]))
-        self.top_speed = max(self.top_speed, float(speed.max()))
-        at_rest = np.interp(command.t_s, t_s[step:], speed) <= REST_SPEED * self.top_speed
-        values, counts = np.unique(u[at_rest], return_counts=True)
-        if len(values) and counts.max() / len(u) > self.rest_share:
-            self.rest = float(values[counts.argmax()])
-            self.rest_share = float(counts.max() / len(u))
 
 
 @dataclass
@@ -342,7 +287,6 @@ class LogSurvey:
     """Numbers over all logs.
 
     Attributes:
-        joints: By joint.
         periods_s: Median periods of the positions, one a run.
         slowest_period_s: Median period of the slowest signal.
         gap_periods: Periods without a sample that split the logs.
@@ -352,7 +296,6 @@ class LogSurvey:
         gaps: Gaps that split the logs, as text.
     """
 
-    joints: dict[str, JointSurvey]
     periods_s: list[float] = field(default_factory=list)
     slowest_period_s: float = 0.0
     gap_periods: int = GAP_PERIODS
@@ -380,7 +323,7 @@ class LogSurvey:
             for joint in joints:
                 position = signals.read(joint.q.text, wraps=joint.q.modulus)
                 command = signals.read(joint.u.text, wraps=joint.target_wraps)
-                self.joints[joint.name].add(command, position, joint)
+                joint.survey.add(command, position, joint)
                 read += [position, command]
             self._add_clocks(signals.run.where, read)
 

@@ -43,6 +43,10 @@ NO_NUMBERS = ("layout", *LABELS)
 """Fields that describe their message; names of joints may be digits."""
 
 
+Numbers = dict[str, float]
+"""Numbers of a message by their path."""
+
+
 class LoggedMessage(NamedTuple):
     """A message as it lies in a log.
 
@@ -119,7 +123,7 @@ class MessageLog(LogFile):
 
     def _read_messages(
         self, tables: Collection[str] | None, most: int | None
-    ) -> Iterator[tuple[str, float, dict[str, float]]]:
+    ) -> Iterator[tuple[str, float, Numbers]]:
         """Yield table, time since the first message in s, and numbers of each message.
 
         Args:
@@ -143,9 +147,7 @@ class MessageLog(LogFile):
             where = f"after {counts.total()} messages, {elapsed_s:.3f} s from the first one"
             self.report_damage(f"damaged {where} ({describe(error)})", error)
 
-    def _read_message(
-        self, message: LoggedMessage, number: int, elapsed_s: float
-    ) -> dict[str, float]:
+    def _read_message(self, message: LoggedMessage, number: int, elapsed_s: float) -> Numbers:
         """Return the numbers of a message, none of a damaged one that is left out."""
         try:
             return self._list_numbers(message.decode(message.data))
