@@ -7,7 +7,6 @@ ask for the same one again. Axes: `N` rows, `T` samples of a run, `J` joints, `S
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Mapping
@@ -15,7 +14,6 @@ from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -32,8 +30,6 @@ from brokk_rl.spec import spec
 if TYPE_CHECKING:
     from diagnosis.mjcf.plant import MjcfPlant  # MuJoCo is not in every installation
 
-MAX_KEPT = 20_000
-"""Roll-outs that are kept: 60 MB at 250 samples of three joints."""
 SPEED_GAIN = 0.5
 """Share of the difference between measured and simulated motion that corrects the speed in the warm-up.
 Chosen by hand: with 1 the speed has the noise of a difference of positions, with 0 all faults of the
@@ -224,10 +220,6 @@ def correct_state(
     return plant.place(state, q, speed + SPEED_GAIN * (q - simulated) / period_s)
 
 
-_ROLL_OUTS: WeakKeyDictionary[Any, dict[bytes, np.ndarray]] = WeakKeyDictionary()
-"""Positions of runs by plant and by a hash of their commands."""
-
-
 def _roll_out(
     plant: FunctionPlant | MjcfPlant,
     known: np.ndarray,
@@ -236,45 +228,7 @@ def _roll_out(
     period_s: float,
     changes: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> np.ndarray:
-    """Return positions `(T + 1, N, J)` of runs under commands `(T, N, J)`, those in `known` first.
-
-    Equal rows are simulated once, those of earlier calls not again.
-    """
-    count = commands.shape[1]
-    kept = _ROLL_OUTS.setdefault(plant, {})
-    rows: dict[bytes, list[int]] = {}
-    for row in range(count):
-        key = hashlib.blake2b(str(first).encode(), digest_size=16)
-        key.update(np.ascontiguousarray(known[:, row]).tobytes())
-        key.update(np.ascontiguousarray(commands[:, row]).tobytes())
-        for name, values in changes.items():
-            key.update(name.encode() + values[row].tobytes())
-        rows.setdefault(key.digest(), []).append(row)
-    missing = [key for key in rows if key not in kept]
-    if missing:
-        if len(kept) + len(missing) > MAX_KEPT:
-            held = {key: kept[key] for key in rows if key in kept}
-            kept.clear()
-            kept.update(held)
-        chosen = [rows[key][0] for key in missing]
-        own = {name: values[chosen] for name, values in changes.items()}
-        paths = _simulate(plant, known[:, chosen], commands[:, chosen], first, period_s, own)
-        kept.update(zip(missing, paths.astype(np.float32), strict=True))
-    found = np.empty((len(commands) + 1, count, commands.shape[2]), dtype=np.float32)
-    for key, places in rows.items():
-        found[:, places] = kept[key][:, None]
-    return found
-
-
-def _simulate(
-    plant: FunctionPlant | MjcfPlant,
-    known: np.ndarray,
-    commands: np.ndarray,
-    first: int,
-    period_s: float,
-    changes: Mapping[str, np.ndarray],
-) -> np.ndarray:
-    """Return positions of runs, `(N, T + 1, J)`."""
+    """Return positions `(T + 1, N, J)` of runs under commands `(T, N, J)`, those in `known` first."""
     begin = len(known)
     at = first if plant.has_memory else max(first, begin - MIN_WARM_UP)
     state = plant.start(known[at - 1], (known[at - 1] - known[at - 2]) / period_s)
@@ -287,7 +241,7 @@ def _simulate(
         raise BrokkError(
             "the simulator gave NaN or infinity on the recorded commands; run it on one recording by itself"
         )
-    return np.concatenate([known.swapaxes(0, 1), paths], 1)
+    return np.concatenate([known, paths.swapaxes(0, 1)]).astype(np.float32)
 
 
 class FunctionPlant:

@@ -7,11 +7,11 @@ Axes: `T` samples, `N` increments, `P` numbers, `F` fitted numbers.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.engine.joint_model import JointModel
+from diagnosis.engine.descent import Simulate, descend, find_slopes
 from diagnosis.engine.measure import (
     PLAIN,
     IncrementMeasure,
@@ -33,8 +33,6 @@ six practice cranes, those from 1 on one. Friction that is not there begins at 0
 without friction ended worse than it had begun. Their spacing is chosen by hand."""
 POOLED = 0.15
 """Share of the mean of all joints in the variance of each."""
-ENOUGH = 2e-4
-"""Relative gain of a round below which a fit ends."""
 
 
 @dataclass
@@ -67,29 +65,30 @@ class JointBaseline:
     error: np.ndarray
 
 
+def list_simulated(
+    side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
+) -> Simulate:
+    """Return the increments of a joint with numbers `(P,)` as a function of its fitted ones."""
+
+    def simulate(trials: np.ndarray) -> np.ndarray:
+        varied = np.repeat(numbers[None], len(trials), 0)
+        varied[:, side.model.fitted] = trials
+        return measure(side.simulate(joint, varied))
+
+    return simulate
+
+
 def linearise(
     side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the increments of the simulated joint `(N,)` and their slopes over the fitted numbers `(F, N)`."""
-    fitted, step = side.model.fitted, side.model.list_fitted("step")
-    varied = np.repeat(numbers[None], 1 + len(fitted), 0)
-    fits = numbers[fitted] + step <= side.model.list_fitted("upper")
-    steps = np.where(fits, step, -step)
-    varied[1 + np.arange(len(fitted)), fitted] += steps
-    found = measure(side.simulate(joint, varied)).astype(float)
-    return found[0], (found[1:] - found[0]) / steps[:, None]
+    simulate = list_simulated(side, joint, numbers, measure)
+    return find_slopes(simulate, numbers[side.model.fitted], side.model.prior)
 
 
-def find_free(model: JointModel, numbers: np.ndarray, downhill: np.ndarray) -> np.ndarray:
-    """Return which fitted numbers are free to move: all but those that the data push against a bound, `(F,)` bool.
-
-    A step that takes them along is clipped, and no longer one downhill for the others. The square sums
-    of two servos in MuJoCo C stayed at 11,000 and 8,400 so; without them they end at 37.
-    """
-    now = numbers[model.fitted]
-    is_lowest = (now <= model.list_fitted("lower")) & (downhill < 0.0)
-    is_highest = (now >= model.list_fitted("upper")) & (downhill > 0.0)
-    return ~(is_lowest | is_highest)
+def multiply_plain(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the products `(A, B)` of increments `(A, N)` and `(B, N)` that are independent."""
+    return left @ right.T
 
 
 def fit_numbers(
@@ -100,42 +99,20 @@ def fit_numbers(
     rounds: int,
     fixed: Sequence[str] = (),
 ) -> np.ndarray:
-    """Return the numbers of a joint after some rounds of Levenberg's and Marquardt's method, `(P,)`."""
+    """Return the numbers of a joint, those that are not `fixed` fitted to the recordings, `(P,)`."""
     model = side.model
+    simulate = list_simulated(side, joint, numbers, measure)
     target = measure(side.q[:, joint]).astype(float)
-    mean, deviation = model.list_fitted("mean"), model.list_fitted("deviation")
-    lower, upper = model.list_values("lower"), model.list_values("upper")
+    prior = model.prior
     names = np.array(model.names)[model.fitted]
-    is_asked = ~np.isin(names, list(fixed))
-    precision = 1.0 / deviation**2
-
-    def compute_cost(tried: np.ndarray, increments: np.ndarray) -> float:
-        off = (tried[model.fitted] - mean) / deviation
-        return float(np.square(target - increments).sum() + np.square(off).sum())
-
-    damping = 1e-3
-    for _ in range(rounds):
-        base, slopes = linearise(side, joint, numbers, measure)
-        before = compute_cost(numbers, base)
-        downhill = slopes @ (target - base) - (numbers[model.fitted] - mean) * precision
-        rows = np.flatnonzero(is_asked & find_free(model, numbers, downhill))
-        normal = slopes[rows] @ slopes[rows].T + np.diag(precision[rows])
-        # All dampings are simulated at once: a step costs one call of the kernel.
-        trials = np.repeat(numbers[None], 4, 0)
-        for k, trial in enumerate(trials):
-            damped = normal + damping * 8.0**k * np.diag(np.diag(normal))
-            trial[model.fitted[rows]] += np.linalg.solve(damped, downhill[rows])
-        trials = np.clip(trials, lower, upper)
-        tried = measure(side.simulate(joint, trials)).astype(float)
-        costs = [compute_cost(one, row) for one, row in zip(trials, tried, strict=True)]
-        best = int(np.argmin(costs))
-        if costs[best] >= before:
-            break
-        numbers = trials[best]
-        damping *= 8.0**best / 6.0
-        if (before - costs[best]) / before < ENOUGH:
-            break
-    return numbers
+    own = np.isin(names, list(fixed))
+    held = numbers[model.fitted]
+    prior = replace(
+        prior, lower=np.where(own, held, prior.lower), upper=np.where(own, held, prior.upper)
+    )
+    found = numbers.copy()
+    found[model.fitted] = descend(simulate, target, multiply_plain, held, prior, rounds)
+    return found
 
 
 def guess_numbers(side: Side, joint: int) -> np.ndarray:
@@ -222,11 +199,11 @@ def _leave_out(
     every = split_parts(side)
     part = every[: len(residual)]
     model, fitted = side.model, side.model.fitted
-    precision = 1.0 / model.list_fitted("deviation") ** 2
-    most = 6.0 * model.list_fitted("step")
-    normal = slopes @ slopes.T + np.diag(precision)
-    downhill = slopes @ residual - (numbers[fitted] - model.list_fitted("mean")) * precision
-    rows = np.flatnonzero(find_free(model, numbers, downhill))
+    prior = model.prior
+    most = 6.0 * prior.step
+    normal = slopes @ slopes.T + np.diag(prior.precision)
+    downhill = slopes @ residual + prior.pull(numbers[fitted])
+    rows = prior.find_free(numbers[fitted], downhill)
     trials = np.repeat(numbers[None], NUM_PARTS, 0)
     for k, trial in enumerate(trials):
         own = part == k

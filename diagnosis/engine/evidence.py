@@ -12,14 +12,18 @@ from functools import cached_property
 import numpy as np
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, fit_reference, linearise
+from diagnosis.engine.descent import Prior, descend
 from diagnosis.engine.measure import IncrementMeasure, measure_motion
 from diagnosis.engine.nuisance import JointNuisance, compute_gain, count_part, estimate_nuisance
 from diagnosis.engine.rows import SHARED, Row
 from diagnosis.engine.side import Side
 
-FIRST_FACTORS = (0.78, 0.86, 0.93, 1.0, 1.08, 1.17, 1.28)
-SECOND_FACTORS = (0.955, 0.98, 1.0, 1.02, 1.045)
-SHAPE_FACTORS = (0.6, 0.8, 1.25, 1.6)
+LOG_STEP = 0.03
+"""Step of the finite difference of a size, as a logarithm."""
+LOG_MOST = 1.0
+"""Largest change of a size of the table, as a logarithm."""
+REFINEMENTS = 4
+"""Rounds of the search of sizes."""
 WORTH_REFINING = 3.0
 """Nats of the best row of an effect from which its size is searched."""
 SHARED_SPREAD = 0.08
@@ -107,18 +111,25 @@ class FieldJoint:
         return compute_gain(squares, self.squares, self.count)
 
     def refine(self, row: Row) -> tuple[float, Row]:
-        """Return gain and row where the size and the shape of a row fit best, searched in turn."""
-        best = (-np.inf, row)
-        for factors in (FIRST_FACTORS, SECOND_FACTORS):
-            searches = [(row.sizes, factors)]
-            searches += [(place, SHAPE_FACTORS) for place in row.shapes]
-            for places, tried_factors in searches:
-                tried = [best[1].resize(factor, places) for factor in tried_factors]
-                gains = self.score(tried)
-                top = int(np.argmax(gains))
-                if gains[top] > best[0]:
-                    best = (float(gains[top]), tried[top])
-        return best
+        """Return gain and row where the size and all shapes of a row fit best together."""
+        groups = [row.sizes, *row.shapes]
+
+        def resize(logs: np.ndarray) -> Row:
+            found = row
+            for places, factor in zip(groups, np.exp(logs), strict=True):
+                found = found.resize(float(factor), places)
+            return found
+
+        def simulate(logs: np.ndarray) -> np.ndarray:
+            return self.simulate([resize(one) for one in logs])
+
+        none = np.zeros(len(groups))
+        most = np.full(len(groups), LOG_MOST)
+        # The deviation only keeps a size without any slope where it is.
+        prior = Prior(none, 10.0 * most, LOG_STEP * most, -most, most)
+        multiply = self.projection.multiply
+        best = resize(descend(simulate, self.residual, multiply, none, prior, REFINEMENTS))
+        return float(self.score([best])[0]), best
 
 
 class RowEvidence:

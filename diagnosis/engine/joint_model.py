@@ -8,12 +8,14 @@ numbers; those that a healthy machine does not need are 0.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from diagnosis.engine.descent import Prior
 from diagnosis.engine.rows import Row, list_cross_talk
 
 
@@ -133,6 +135,12 @@ class JointModel:
     def list_fitted(self, name: str) -> np.ndarray:
         """Return one field of the fitted numbers, `(F,)`."""
         return self.list_values(name)[self.fitted]
+
+    @cached_property
+    def prior(self) -> Prior:
+        """What is known of the fitted numbers before any recording is seen."""
+        names = [one.name for one in fields(Prior)]
+        return Prior(**{name: self.list_fitted(name) for name in names})
 
     def list_ageing(self, numbers: np.ndarray) -> np.ndarray:
         """Return the standard deviation of the ageing of the fitted numbers of a joint `(P,)`, `(F,)`."""

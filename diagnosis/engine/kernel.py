@@ -23,6 +23,10 @@ NUM_LOAD = 4
 NUM_WAYS = 8
 """Four other joints, each opened one way or the other."""
 
+WAKING_DEMAND = 0.005
+"""Share of the flow at full speed from which on the pump gives its whole margin: it wakes as soon as a valve opens."""
+FULL_MARGIN = 0.71
+"""Share of the margin behind which a valve has its full flow; chosen by hand, as the demand above."""
 DRIFT_SPAN_S = wp.constant(wp.float64(600.0))
 """The drift is the change of speed over ten minutes, so that its prior is that of a working day."""
 
@@ -130,6 +134,7 @@ def simulate_path(
     load: wp.array[wp.float64],
     stops: wp.array[wp.int32],
     demand: wp.array[wp.float64],
+    pressing: wp.array[wp.float64],
     opened_others: wp.array2d[wp.float64],
     time_s: wp.array[wp.float64],
     period_s: wp.float64,
@@ -140,6 +145,8 @@ def simulate_path(
 ):
     """Integrate the speed behind the spool `which` of each candidate to a path, `(C, T)`; keep its demand of flow.
 
+    The pump rises to what the heaviest joint needs and a margin beyond it; pressures are counted in margins.
+    A joint begins to move when the pump bears its own load.
     Sub-steps begin and end with the delayed ones of the spool, so that no change of a command lies
     within one, and the path is a smooth function of the delay.
     """
@@ -258,16 +265,16 @@ def simulate_path(
                 cut /= numbers[c, Place.PUMP_LOAD] * total
             if numbers[c, Place.DEMAND_LIMIT] > zero and total > numbers[c, Place.DEMAND_LIMIT]:
                 cut *= numbers[c, Place.DEMAND_LIMIT] / total
-            if numbers[c, Place.PUMP_LAG_S] > zero:
-                # It wakes as soon as a valve opens: at 0.5 % of the demand at full speed.
-                wanted = wp.min(total / wp.float64(0.005), one)
-                pump += pumping * (wanted - pump)
-                cut *= wp.clamp((pump - wp.float64(0.3)) / half, zero, one)
             by_load = load_in
             helping = -load[k]
             if speed > zero:
                 by_load = load_out
                 helping = load[k]
+            if numbers[c, Place.PUMP_LAG_S] > zero:
+                needed = wp.max(-numbers[c, Place.PUMP_WEIGHT] * helping, zero)
+                wanted = wp.min(own / wp.float64(WAKING_DEMAND), one) * (one + needed)
+                pump += pumping * (wp.max(wanted, pressing[k]) - pump)
+                cut *= wp.clamp((pump - needed) / wp.float64(FULL_MARGIN), zero, one)
             speed *= by_pose * by_load * warm * cut
             alone = one
             if numbers[c, Place.LOAD_ALONE] > zero:

@@ -51,6 +51,11 @@ class Projection:
         total = np.einsum("cn,cn->c", scaled, scaled, dtype=float)
         return total - np.einsum("ck,kl,cl->c", shares, self.inverse, shares)
 
+    def multiply(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return the products `(A, B)` of increments `(A, N)` and `(B, N)` under the whole covariance."""
+        explained = (left @ self.columns.T) @ self.inverse @ (self.columns @ right.T)
+        return left @ right.T / self.spread - explained / self.spread
+
     def clean(self, increments: np.ndarray) -> np.ndarray:
         """Return increments `(N,)` over their deviation, less what the columns explain."""
         scaled = increments / np.sqrt(self.spread)

@@ -68,6 +68,7 @@ class Side:
         stops: 1 at the upper end of the travel, -1 at the lower, `(J, T)`.
         machine: The machine.
         demand: Flow that all other joints ask for, over that of one at full speed, `(J, T)`.
+        pressing: Pressure that the heaviest open other joint asks the pump for, over the pump's margin, `(J, T)`.
         others: How far the valves of up to four other joints are open out and in, 0 to 1, `(J, T, 8)`.
             The highest load pressure sets the pump, and no valve keeps its own flow quite the same.
     """
@@ -82,6 +83,7 @@ class Side:
     stops: np.ndarray
     machine: Machine = field(repr=False)
     demand: np.ndarray = field(repr=False)
+    pressing: np.ndarray = field(repr=False)
     others: np.ndarray = field(repr=False)
 
     @property
@@ -190,6 +192,7 @@ class Side:
                 load,
                 stops,
                 _send(self.demand[joint]),
+                _send(self.pressing[joint]),
                 _send(self.others[joint]),
                 time_s,
                 self.period_s,
@@ -222,6 +225,15 @@ class Side:
         found.__dict__["_own"] = self._own  # poses and stops are the same: they are not sent again
         return found
 
+    def _press(self, joint: int, numbers: np.ndarray, flow: np.ndarray) -> np.ndarray:
+        """Return what a joint with numbers `(P,)` and asked flow `(T,)` asks the pump for, over its margin, `(T,)`."""
+        if not self.model.integrates:
+            return np.zeros(self.num_samples)
+        lifted = -np.sign(flow) * self.load[joint]
+        needed = numbers[self.model.place["pump_weight"]] * np.maximum(lifted, 0.0)
+        is_open = np.minimum(np.abs(flow) / kernel.WAKING_DEMAND, 1.0)
+        return is_open * (1.0 + needed)
+
     def with_positions(self, q: np.ndarray) -> Side:
         """Return the same side in other poses `q` `(T, J)`, units; the demand is still to be asked for."""
         poses, loads, stops = describe_poses(q * measure_units(self.machine), self.machine)
@@ -232,6 +244,9 @@ class Side:
         signed = [self.simulate_flow(j, row)[1][0].astype(float) for j, row in enumerate(numbers)]
         flows = np.minimum(np.abs(signed), MAX_DEMAND)
         self.demand = flows.sum(0) - flows
+        asked = [self._press(j, row, signed[j]) for j, row in enumerate(numbers)]
+        others = [np.delete(asked, j, 0) for j in range(self.num_joints)]
+        self.pressing = np.stack([np.max(one, 0, initial=0.0) for one in others])
         ways = np.stack([signed, np.negative(signed)], 2)
         opened = np.clip(ways / OPEN_FLOW, 0.0, 1.0)
         self.others = np.zeros((self.num_joints, self.num_samples, kernel.NUM_WAYS))
@@ -275,6 +290,7 @@ def stack_side(recordings: Sequence[Recording], machine: Machine) -> Side:
         stops=stops,
         machine=machine,
         demand=np.zeros((machine.num_joints, count)),
+        pressing=np.zeros((machine.num_joints, count)),
         others=np.zeros((machine.num_joints, count, kernel.NUM_WAYS)),
     )
 

@@ -154,15 +154,35 @@ def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Ma
     assert ways == pytest.approx([1.5, 1.8, 1.35], rel=0.01)
 
 
+def test_a_joint_waits_until_the_pump_bears_its_load(two_joints: Machine) -> None:
+    """A pump with a lag of 0.2 s, worked by hand for a load of twice its margin.
+
+    It rises to 3 margins as 3 (1 - exp(-t / 0.2 s)). Behind 2 margins the speed grows with the rest of the pressure
+    and is full at 2.71, so that a full command loses the integral of 1 - (pressure - 2) / 0.71 up to there:
+    0.3187 s. Without a load the pressure rises to 1 margin from 0 on, and 0.0989 s are lost. A step of the
+    model, 25 ms, has the pressure of its end all along, so that one step less is lost.
+    """
+    side = make_side(two_joints, np.repeat([[0.0, 0.0], [1.0, 0.0]], [40, 120], 0))
+    heavy = pure_numbers(pump_lag_s=0.2, pump_weight=2.0)
+    none = side.simulate(0, pure_numbers())[0, -1]
+    for load, lost_s in ((-1.0, 0.3187), (1.0, 0.0989), (0.0, 0.0989)):
+        side.loads = np.full_like(side.loads, 0.25 * load)
+        side.__dict__.pop("load", None)
+        side.__dict__.pop("_own", None)
+        lost = none - side.simulate(0, heavy)[0, -1]  # at 1 unit a second
+        assert lost == pytest.approx(lost_s - 0.025, abs=0.0125)
+
+
 def test_a_pump_that_was_always_small_and_slow_to_start_is_found(two_joints: Machine) -> None:
-    places = [VALVE.place["pump_load"], VALVE.place["pump_lag_s"]]
+    names = ("pump_load", "pump_lag_s", "pump_weight")
+    places = [VALVE.place[name] for name in names]
     numbers = VALVE.list_values("mean")
-    numbers[places] = [0.8, 0.4]
+    numbers[places] = [0.8, 0.4, 2.0]
     side = make_side(two_joints, np.clip(2.0 * make_commands(120.0, 3), -1.0, 1.0))
     side.ask_others([numbers, numbers])
     side.q = np.stack([side.simulate(j, numbers)[0] for j in (0, 1)], 1).astype(float)
     for one in fit_reference(side):
-        assert one.numbers[places] == pytest.approx([0.8, 0.4], abs=0.05)
+        assert one.numbers[places[:2]] == pytest.approx([0.8, 0.4], abs=0.05)
 
 
 def test_rows_do_not_depend_on_those_simulated_beside_them(two_joints: Machine) -> None:
@@ -184,6 +204,9 @@ def test_the_nuisance_is_a_covariance() -> None:
     covariance = spread * np.eye(12) + columns.T @ columns
     exact = residual @ np.linalg.solve(covariance, residual)
     assert projection.measure_squares(residual)[0] == pytest.approx(exact, rel=1e-5)
+    others = generator.normal(size=(2, 12))
+    products = others @ np.linalg.solve(covariance, np.stack([residual, *others]).T)
+    assert projection.multiply(others, np.stack([residual, *others])) == pytest.approx(products)
     log_likelihood = multivariate_normal(cov=covariance).logpdf(residual)
     own = -0.5 * (exact + projection.log_determinant + 12 * np.log(2.0 * np.pi * spread))
     assert own == pytest.approx(log_likelihood)

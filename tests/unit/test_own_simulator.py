@@ -95,23 +95,6 @@ def test_a_file_with_the_fault_as_effect_is_the_faulty_machine(
         assert measure_errors(simulator, machine, recording, {}).max() > 20 * NOISE_RAD
 
 
-def test_effects_behind_the_simulator_do_not_run_it_again(pendulum: str) -> None:
-    machine = make_machine("hinge")
-    targets = draw_targets(np.random.default_rng(0), 400, 1)
-    t_s = np.arange(400) * machine.period_s
-    recording = make_motion(machine, "run", t_s, (targets / 1.5).astype(np.float32), targets)
-    simulator = api._load_simulator(pendulum)
-    plant = simulator.load(machine)
-    plain = measure_errors(simulator, machine, recording, {})
-    calls, run = [], plant.run
-    plant.run = lambda *given: calls.append(1) or run(*given)
-    assert measure_errors(simulator, machine, recording, {}) == plain
-    assert not calls
-    dead_time = {"dead_time": {"dead_time_s": np.full((1, 1), 0.04)}}
-    assert measure_errors(simulator, machine, recording, dead_time) != plain
-    assert calls
-
-
 def test_a_function_for_one_state_is_that_for_many(pendulum: str, tmp_path: Path) -> None:
     many, one = "np.stack([angle, speed], axis=-1)", "np.array([float(angle), speed])"
     (tmp_path / "my_single.py").write_text(PENDULUM.replace(many, one))
