@@ -85,19 +85,19 @@ class FieldJoint:
             scale = replace(scale, memory=memory, step=step, noise=noise)
         self.measure = IncrementMeasure(side, scale, measure_motion(side, healthy), used)
         self.increments, slopes = linearise(side, joint, numbers, self.measure)
-        self.path = side.simulate(joint, numbers)[0].astype(float)
-        self.projection = nuisance.project(
-            side, joint, self.path, slopes, self.measure, base.spread
-        )
+        path, flow = (one[0].astype(float) for one in side.simulate_flow(joint, numbers))
+        self.path = path
+        self.flow = flow
+        scatter = nuisance.list_columns(side, joint, path, flow)
+        self.projection = nuisance.project(slopes, scatter, self.measure, base.spread)
         self.residual = self.measure(side.q[:, joint]).astype(float) - self.increments
         self.squares = float(self.projection.measure_squares(self.residual)[0])
         self.count = self.measure.count
 
     def explain_nuisance(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the wander, `(T,)`."""
-        return self.nuisance.explain(
-            self.side, self.joint, self.path, self.projection, self.residual
-        )
+        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the scatter, `(T,)`."""
+        scatter = self.nuisance.list_columns(self.side, self.joint, self.path, self.flow)
+        return self.nuisance.explain(scatter, self.projection, self.residual)
 
     def simulate(self, tried: Sequence[Row]) -> np.ndarray:
         """Return the increments that rows add to the simulated joint, `(C, N)`."""

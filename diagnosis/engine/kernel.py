@@ -68,6 +68,8 @@ def simulate_spool(
     width = wp.max(numbers[d, Place.HYSTERESIS], zero)
     crosstalk = numbers[d, Place.CROSSTALK]
     other = int(numbers[d, Place.CROSSTALK_JOINT])
+    if other == joint:
+        crosstalk = zero
     limited = zero
     lagged = zero
     pilot = zero

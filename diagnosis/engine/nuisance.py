@@ -1,17 +1,20 @@
-"""Changes of a machine without any effect: its numbers age, and its speed wanders slowly.
+"""Changes of a machine without any effect: its numbers age, its speed wanders, and no two motions are the same.
 
-Both are columns with a prior in the covariance of the increments. What they explain costs nothing,
-and no hypothesis earns by it.
-Axes: `N` increments, `K` columns, `C` candidates.
+All are columns with a prior in the covariance of the increments. What they explain costs nothing, and
+no hypothesis earns by it: an effect has to show in many motions.
+Axes: `T` samples, `N` increments, `K` columns, `C` candidates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, linearise
+from diagnosis.engine.kernel import WAKING_DEMAND
 from diagnosis.engine.measure import IncrementMeasure
 from diagnosis.engine.side import Side
 
@@ -23,8 +26,12 @@ WEIGHT_UNITS = 0.2
 """Sag over the turn of another joint, of which the wander is a part."""
 STILL_UNITS_S = 0.02
 """Speed about which the direction of a servo changes, half travels a second."""
-WANDER_SIZES = (0.02, 0.04, 0.07, 0.12)
-"""Standard deviations of the wander that are tried on the reference, over the speed."""
+MOTION_S = 1.0
+"""A motion that begins sooner behind another one belongs to it."""
+LEAST_SQUARE = 1e-9
+"""Square sum from which on a column says anything of some increments."""
+SIZES = (0.0, 0.005, 0.01, 0.02, 0.04, 0.07, 0.12)
+"""Standard deviations that are tried on the reference: of factors of the speed, and of starts, s."""
 
 
 class Projection:
@@ -93,87 +100,149 @@ def find_direction(side: Side, path: np.ndarray) -> np.ndarray:
     return np.tanh(simulate_speed(side, path) / (STILL_UNITS_S * side.period_s))
 
 
-def list_wander(side: Side, joint: int, path: np.ndarray) -> np.ndarray:
-    """Return paths of a slow wander, `(K, T)`: of the speed, as large as it, or of a servo's friction and weight."""
+def number_motions(side: Side, flow: np.ndarray) -> np.ndarray:
+    """Return the number of the motion at each sample from the asked flow `(T,)`, `(T,)`: a valve that opens begins one."""
+    way = np.sign(flow) * (np.abs(flow) > WAKING_DEMAND)
+    before = np.roll(way, 1)
+    before[side.starts] = 0.0
+    begins = np.zeros(side.num_samples, dtype=int)
+    last = -side.count(MOTION_S)
+    for place in np.flatnonzero((way != 0.0) & (way != before)):
+        if place - last >= side.count(MOTION_S):
+            begins[place] = 1
+            last = place
+    return np.cumsum(begins)
+
+
+def list_scatter(side: Side, joint: int, path: np.ndarray, flow: np.ndarray) -> list[np.ndarray]:
+    """Return groups of columns of size 1, paths `(K, T)` each, from the simulated path and asked flow, `(T,)` each.
+
+    For a joint that takes speeds: a slow wander of the speed, a factor of the speed of each motion, and
+    how much later it starts. For a servo: a slow wander of its friction, and of its weight.
+    """
     at_s = np.arange(side.num_samples) * side.period_s
     knots = np.arange(0.0, at_s[-1] + WANDER_S, WANDER_S)
     hats = draw_hats(at_s, knots)
     if not side.model.integrates:
         friction = FRICTION_UNITS * find_direction(side, path) * hats
         others = np.delete(side.q, joint, 1).T
-        return np.concatenate([friction, WEIGHT_UNITS * (others - others.mean(1)[:, None])])
-    return np.cumsum(simulate_speed(side, path) * hats, -1)
+        return [np.concatenate([friction, WEIGHT_UNITS * (others - others.mean(1)[:, None])])]
+    step = simulate_speed(side, path)
+    gained = np.diff(step, append=step[-1])
+    gained[side.ends - 1] = 0.0
+    is_rising = np.abs(step + gained) > np.abs(step)
+    motion = number_motions(side, flow)
+    own = motion == np.arange(motion.max() + 1)[:, None]
+    columns = [step * hats, step * own, gained * is_rising / side.period_s * own]
+    return [np.cumsum(group, -1) for group in columns]
 
 
 @dataclass
 class JointNuisance:
-    """Ageing and wander of one joint, as the reference shows them.
+    """Ageing and scatter of one joint, as the reference shows them.
 
     Attributes:
         mix: Columns of ageing from the slopes of the fitted numbers, `(F, F)`.
-        wander: Standard deviation of the wander over the speed.
+        sizes: Standard deviation of each group of scatter.
         parts: Projection of each part of the reference.
     """
 
     mix: np.ndarray
-    wander: float
+    sizes: list[float]
     parts: list[Projection]
 
+    def list_columns(
+        self, side: Side, joint: int, path: np.ndarray, flow: np.ndarray
+    ) -> np.ndarray:
+        """Return the paths of the scatter of a joint, standard deviation 1, `(K, T)`."""
+        groups = list_scatter(side, joint, path, flow)
+        sized = [size * group for size, group in zip(self.sizes, groups, strict=True) if size]
+        return np.concatenate([np.empty((0, side.num_samples)), *sized])
+
     def project(
-        self,
-        side: Side,
-        joint: int,
-        path: np.ndarray,
-        slopes: np.ndarray,
-        measure: IncrementMeasure,
-        spread: float,
+        self, slopes: np.ndarray, scatter: np.ndarray, measure: IncrementMeasure, spread: float
     ) -> Projection:
-        """Return the projection of a joint on a side, from its simulated path and slopes."""
-        wander = measure(list_wander(side, joint, path)).astype(float)
-        return Projection(np.concatenate([self.mix @ slopes, self.wander * wander]), spread)
+        """Return the projection of a joint on a side, from its slopes and the paths of its scatter."""
+        return Projection(
+            np.concatenate([self.mix @ slopes, measure(scatter).astype(float)]), spread
+        )
 
     def explain(
-        self, side: Side, joint: int, path: np.ndarray, projection: Projection, residual: np.ndarray
+        self, scatter: np.ndarray, projection: Projection, residual: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the wander, `(T,)`.
+        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the scatter, `(T,)`.
 
         Args:
-            side: The recordings.
-            joint: Place of the joint.
-            path: Simulated path, `(T,)`.
-            projection: Made by `project` from the same path.
+            scatter: Paths of the scatter, `(K, T)`.
+            projection: Made by `project` from them.
             residual: Increments of the error, `(N,)`.
         """
         scaled = residual / np.sqrt(projection.spread)
         shares = projection.inverse @ (projection.columns @ scaled)
         size = len(self.mix)
-        wander = self.wander * (shares[size:] @ list_wander(side, joint, path))
-        return shares[:size] @ self.mix, wander
+        return shares[:size] @ self.mix, shares[size:] @ scatter
+
+
+class _PartScatter:
+    """One left-out part of the reference, with columns of all groups at size 1.
+
+    Args:
+        columns: Columns of each group, ageing first, `(K, N)` each.
+        base: The joint.
+        part: Number of the part.
+    """
+
+    def __init__(self, columns: Sequence[np.ndarray], base: JointBaseline, part: int) -> None:
+        own = base.part == part
+        self.columns = []
+        for group in columns:
+            some = group[:, own]
+            self.columns.append(some[np.square(some).sum(1) > LEAST_SQUARE])
+        every = np.concatenate(self.columns) / np.sqrt(base.spread)
+        residual = base.left_out[own] / np.sqrt(base.spread)
+        self._normal = every @ every.T
+        self._shares = every @ residual
+        self._square = float(residual @ residual)
+        self._count = count_part(base, part)
+        self._spread = base.spread
+
+    def weigh(self, sizes: Sequence[float]) -> float:
+        """Return the log evidence with a size for each group."""
+        size = np.concatenate(
+            [np.full(len(g), s) for g, s in zip(self.columns, sizes, strict=True)]
+        )
+        used = size > 0.0
+        size = size[used]
+        normal = np.eye(len(size)) + self._normal[np.ix_(used, used)] * np.outer(size, size)
+        root = np.linalg.cholesky(normal)
+        explained = solve_triangular(root, self._shares[used] * size, lower=True)
+        square = self._square - float(explained @ explained)
+        return -self._count * np.log(square + self._count) - float(np.log(np.diag(root)).sum())
+
+    def project(self, sizes: Sequence[float]) -> Projection:
+        """Return the projection with a size for each group."""
+        sized = [size * group for size, group in zip(sizes, self.columns, strict=True) if size]
+        return Projection(np.concatenate(sized), self._spread)
 
 
 def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisance:
-    """Return ageing and wander of a joint; the wander is the one that makes the left-out parts likeliest."""
+    """Return ageing and scatter of a joint; the sizes are those that make the left-out parts likeliest."""
     ageing = side.model.list_ageing(base.numbers)
     mix = np.linalg.cholesky(base.covariance + np.diag(ageing**2)).T
     _, slopes = linearise(side, joint, base.numbers, base.measure)
-    aged = mix @ slopes
-    path = side.simulate(joint, base.numbers)[0].astype(float)
-    wander = base.measure(list_wander(side, joint, path)).astype(float)
-    best = None
-    for size in WANDER_SIZES:
-        columns = np.concatenate([aged, size * wander])
-        evidence, parts = 0.0, []
-        for k in range(NUM_PARTS):
-            own = base.part == k
-            count = count_part(base, k)
-            part = Projection(columns[:, own], base.spread)
-            squares = part.measure_squares(base.left_out[own])[0]
-            evidence -= count * np.log(squares + count) + 0.5 * part.log_determinant
-            parts.append(part)
-        if best is None or evidence > best[0]:
-            best = (evidence, size, parts)
-    assert best is not None, "there is at least one size"
-    return JointNuisance(mix, best[1], best[2])
+    path, flow = (one[0].astype(float) for one in side.simulate_flow(joint, base.numbers))
+    groups = list_scatter(side, joint, path, flow)
+    columns = [mix @ slopes, *(base.measure(group).astype(float) for group in groups)]
+    parts = [_PartScatter(columns, base, k) for k in range(NUM_PARTS)]
+    sizes = [1.0, *[0.0] * len(groups)]
+    best = sum(part.weigh(sizes) for part in parts)
+    for place in 2 * list(range(1, len(sizes))):
+        for size in SIZES:
+            tried = [*sizes[:place], size, *sizes[place + 1 :]]
+            evidence = sum(part.weigh(tried) for part in parts)
+            if evidence > best:
+                best, sizes = evidence, tried
+    return JointNuisance(mix, sizes[1:], [part.project(sizes) for part in parts])
 
 
 def count_part(base: JointBaseline, part: int) -> float:
