@@ -7,14 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, fit_reference, linearise
 from diagnosis.engine.descent import Prior, descend
 from diagnosis.engine.measure import IncrementMeasure, measure_motion
-from diagnosis.engine.nuisance import JointNuisance, compute_gain, count_part, estimate_nuisance
+from diagnosis.engine.nuisance import (
+    JointNuisance,
+    compute_gain,
+    count_part,
+    estimate_nuisance,
+    list_scatter,
+)
 from diagnosis.engine.rows import SHARED, Row
 from diagnosis.engine.side import Side
 
@@ -24,8 +29,8 @@ LOG_MOST = 1.0
 """Largest change of a size of the table, as a logarithm."""
 REFINEMENTS = 4
 """Rounds of the search of sizes."""
-WORTH_REFINING = 3.0
-"""Nats of the best row of an effect from which its size is searched."""
+WORTH_REFINING = 6.0
+"""Nats of the best row of an effect from which its size and its price are searched: no joint costs less."""
 SHARED_SPREAD = 0.08
 """Standard deviation of the logarithm of a common size between joints."""
 LOSS_LIMIT = -20.0
@@ -87,17 +92,11 @@ class FieldJoint:
         self.increments, slopes = linearise(side, joint, numbers, self.measure)
         path, flow = (one[0].astype(float) for one in side.simulate_flow(joint, numbers))
         self.path = path
-        self.flow = flow
-        scatter = nuisance.list_columns(side, joint, path, flow)
-        self.projection = nuisance.project(slopes, scatter, self.measure, base.spread)
+        scatter = list_scatter(side, joint, path, flow, self.measure)
+        self.projection = nuisance.project(slopes, scatter, base.spread)
         self.residual = self.measure(side.q[:, joint]).astype(float) - self.increments
         self.squares = float(self.projection.measure_squares(self.residual)[0])
         self.count = self.measure.count
-
-    def explain_nuisance(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the scatter, `(T,)`."""
-        scatter = self.nuisance.list_columns(self.side, self.joint, self.path, self.flow)
-        return self.nuisance.explain(scatter, self.projection, self.residual)
 
     def simulate(self, tried: Sequence[Row]) -> np.ndarray:
         """Return the increments that rows add to the simulated joint, `(C, N)`."""
@@ -153,35 +152,28 @@ class RowEvidence:
         self.steps = np.zeros(reference.num_joints)
         self.noises = np.zeros(reference.num_joints)
         self._viewed: dict[tuple[int, int, bytes], FieldJoint] = {}
+        self._prices: dict[tuple[int, str], np.ndarray] = {}
         self._weighed: dict[FieldJoint, tuple[np.ndarray, dict[str, JointRow]]] = {}
 
-    @cached_property
-    def parts(self) -> list[np.ndarray]:
-        """Gain of each row on each part of the reference, nats a second, of each joint `(parts, C)`."""
-        return [self._price_joint(j) for j in range(self.reference.num_joints)]
-
-    def _price_joint(self, joint: int) -> np.ndarray:
-        base, side = self.bases[joint], self.reference
-        tried = np.ones(len(self.every), dtype=bool)
-        for name in np.unique(self.names):
-            # Every second size is enough for the largest gain.
-            if name not in SHARED:
-                tried[np.flatnonzero(self.names == name)[1::2]] = False
-        places = np.flatnonzero(tried)
-        some = [self.every[place] for place in places]
-        paths = side.simulate(joint, side.model.change(base.numbers, some))
-        healthy = side.simulate(joint, base.numbers)
-        added = base.measure(paths) - base.measure(healthy)
-        found = np.full((NUM_PARTS, len(self.every)), -9.0)
-        for k in range(NUM_PARTS):
-            own = base.part == k
-            part, count = self.nuisances[joint].parts[k], count_part(base, k)
-            residual = base.left_out[own].astype(np.float32)
-            before = float(part.measure_squares(residual)[0])
-            gains = compute_gain(part.measure_squares(residual - added[:, own]), before, count)
-            seconds = count * base.measure.interval * side.period_s
-            found[k, places] = gains / seconds
-        return found
+    def _price(self, joint: int, name: str) -> np.ndarray:
+        """Return the gain of each row of an effect on each part of the reference, nats a second, `(parts, C)`."""
+        key = (joint, name)
+        if key not in self._prices:
+            base, side = self.bases[joint], self.reference
+            rows = [self.every[place] for place in np.flatnonzero(self.names == name)]
+            paths = side.simulate(joint, side.model.change(base.numbers, rows))
+            added = base.measure(paths) - base.measure(side.simulate(joint, base.numbers))
+            found = []
+            for k in range(NUM_PARTS):
+                own = base.part == k
+                part, count = self.nuisances[joint].parts[k], count_part(base, k)
+                residual = base.left_out[own].astype(np.float32)
+                before = float(part.measure_squares(residual)[0])
+                squares = part.measure_squares(residual - added[:, own])
+                seconds = count * base.measure.interval * side.period_s
+                found.append(compute_gain(squares, before, count) / seconds)
+            self._prices[key] = np.stack(found)
+        return self._prices[key]
 
     def view_field(
         self,
@@ -235,11 +227,11 @@ class RowEvidence:
             best = places[np.argmax(gains[places])]
             if name in SHARED or gains[best] < LOSS_LIMIT:
                 continue
-            gain, row = float(gains[best]), self.every[best]
+            gain, row, price = float(gains[best]), self.every[best], 0.0
             if gain > WORTH_REFINING:
                 gain, row = joint.refine(row)
-            most = float(self.parts[joint.joint][:, places].max())
-            found[name] = JointRow(row, gain, max(most * seconds, 0.0))
+                price = max(float(self._price(joint.joint, name).max()) * seconds, 0.0)
+            found[name] = JointRow(row, gain, price)
         self._weighed[joint] = (gains, found)
         return gains, found
 
@@ -255,7 +247,8 @@ class RowEvidence:
         """Return the rows of an effect that has about one size on all joints; its price is on the first."""
         total = np.sum([np.maximum(gains[places], LOSS_LIMIT) for gains in tables], 0)
         seconds = joints[0].count * joints[0].measure.interval * self.field.period_s
-        parts = [np.maximum(self.parts[j.joint][:, places], -5.0 / seconds) for j in joints]
+        name = str(self.names[places[0]])
+        parts = [np.maximum(self._price(j.joint, name), -5.0 / seconds) for j in joints]
         prices = np.maximum(np.sum(parts, 0).max(0) * seconds, 0.0)
         best = int(np.argmax(total - prices))
         row = self.every[places[best]]

@@ -114,8 +114,10 @@ def number_motions(side: Side, flow: np.ndarray) -> np.ndarray:
     return np.cumsum(begins)
 
 
-def list_scatter(side: Side, joint: int, path: np.ndarray, flow: np.ndarray) -> list[np.ndarray]:
-    """Return groups of columns of size 1, paths `(K, T)` each, from the simulated path and asked flow, `(T,)` each.
+def list_scatter(
+    side: Side, joint: int, path: np.ndarray, flow: np.ndarray, measure: IncrementMeasure
+) -> list[np.ndarray]:
+    """Return groups of columns of size 1, `(K, N)` each, from the simulated path and asked flow, `(T,)` each.
 
     For a joint that takes speeds: a slow wander of the speed, a factor of the speed of each motion, and
     how much later it starts. For a servo: a slow wander of its friction, and of its weight.
@@ -126,7 +128,8 @@ def list_scatter(side: Side, joint: int, path: np.ndarray, flow: np.ndarray) -> 
     if not side.model.integrates:
         friction = FRICTION_UNITS * find_direction(side, path) * hats
         others = np.delete(side.q, joint, 1).T
-        return [np.concatenate([friction, WEIGHT_UNITS * (others - others.mean(1)[:, None])])]
+        weight = WEIGHT_UNITS * (others - others.mean(1)[:, None])
+        return [measure(np.concatenate([friction, weight])).astype(float)]
     step = simulate_speed(side, path)
     gained = np.diff(step, append=step[-1])
     gained[side.ends - 1] = 0.0
@@ -134,7 +137,14 @@ def list_scatter(side: Side, joint: int, path: np.ndarray, flow: np.ndarray) -> 
     motion = number_motions(side, flow)
     own = motion == np.arange(motion.max() + 1)[:, None]
     columns = [step * hats, step * own, gained * is_rising / side.period_s * own]
-    return [np.cumsum(group, -1) for group in columns]
+    return [measure(np.cumsum(group, -1)).astype(float) for group in columns]
+
+
+def scale_columns(columns: Sequence[np.ndarray], sizes: Sequence[float]) -> np.ndarray:
+    """Return the columns of groups `(K, N)` each, those of a group times its size, `(K, N)`."""
+    return np.concatenate(
+        [size * group for size, group in zip(sizes, columns, strict=True) if size]
+    )
 
 
 @dataclass
@@ -143,7 +153,7 @@ class JointNuisance:
 
     Attributes:
         mix: Columns of ageing from the slopes of the fitted numbers, `(F, F)`.
-        sizes: Standard deviation of each group of scatter.
+        sizes: Standard deviation of each group of columns; that of ageing is 1.
         parts: Projection of each part of the reference.
     """
 
@@ -151,36 +161,17 @@ class JointNuisance:
     sizes: list[float]
     parts: list[Projection]
 
-    def list_columns(
-        self, side: Side, joint: int, path: np.ndarray, flow: np.ndarray
-    ) -> np.ndarray:
-        """Return the paths of the scatter of a joint, standard deviation 1, `(K, T)`."""
-        groups = list_scatter(side, joint, path, flow)
-        sized = [size * group for size, group in zip(self.sizes, groups, strict=True) if size]
-        return np.concatenate([np.empty((0, side.num_samples)), *sized])
-
     def project(
-        self, slopes: np.ndarray, scatter: np.ndarray, measure: IncrementMeasure, spread: float
+        self, slopes: np.ndarray, scatter: Sequence[np.ndarray], spread: float
     ) -> Projection:
-        """Return the projection of a joint on a side, from its slopes and the paths of its scatter."""
-        return Projection(
-            np.concatenate([self.mix @ slopes, measure(scatter).astype(float)]), spread
-        )
+        """Return the projection of a joint on a side, from increments of its slopes and of its scatter."""
+        return Projection(scale_columns([self.mix @ slopes, *scatter], self.sizes), spread)
 
-    def explain(
-        self, scatter: np.ndarray, projection: Projection, residual: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the likeliest ageing of the fitted numbers, `(F,)`, and the path of the scatter, `(T,)`.
-
-        Args:
-            scatter: Paths of the scatter, `(K, T)`.
-            projection: Made by `project` from them.
-            residual: Increments of the error, `(N,)`.
-        """
+    def explain_ageing(self, projection: Projection, residual: np.ndarray) -> np.ndarray:
+        """Return the likeliest ageing of the fitted numbers, `(F,)`, from increments of the error, `(N,)`."""
         scaled = residual / np.sqrt(projection.spread)
         shares = projection.inverse @ (projection.columns @ scaled)
-        size = len(self.mix)
-        return shares[:size] @ self.mix, shares[size:] @ scatter
+        return shares[: len(self.mix)] @ self.mix
 
 
 class _PartScatter:
@@ -221,8 +212,7 @@ class _PartScatter:
 
     def project(self, sizes: Sequence[float]) -> Projection:
         """Return the projection with a size for each group."""
-        sized = [size * group for size, group in zip(sizes, self.columns, strict=True) if size]
-        return Projection(np.concatenate(sized), self._spread)
+        return Projection(scale_columns(self.columns, sizes), self._spread)
 
 
 def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisance:
@@ -231,10 +221,9 @@ def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisa
     mix = np.linalg.cholesky(base.covariance + np.diag(ageing**2)).T
     _, slopes = linearise(side, joint, base.numbers, base.measure)
     path, flow = (one[0].astype(float) for one in side.simulate_flow(joint, base.numbers))
-    groups = list_scatter(side, joint, path, flow)
-    columns = [mix @ slopes, *(base.measure(group).astype(float) for group in groups)]
+    columns = [mix @ slopes, *list_scatter(side, joint, path, flow, base.measure)]
     parts = [_PartScatter(columns, base, k) for k in range(NUM_PARTS)]
-    sizes = [1.0, *[0.0] * len(groups)]
+    sizes = [1.0, *[0.0] * (len(columns) - 1)]
     best = sum(part.weigh(sizes) for part in parts)
     for place in 2 * list(range(1, len(sizes))):
         for size in SIZES:
@@ -242,7 +231,7 @@ def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisa
             evidence = sum(part.weigh(tried) for part in parts)
             if evidence > best:
                 best, sizes = evidence, tried
-    return JointNuisance(mix, sizes[1:], [part.project(sizes) for part in parts])
+    return JointNuisance(mix, sizes, [part.project(sizes) for part in parts])
 
 
 def count_part(base: JointBaseline, part: int) -> float:

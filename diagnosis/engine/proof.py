@@ -78,8 +78,7 @@ class Floor:
     """Error of the unchanged machine under the motion of the field.
 
     On the reference the error of the left-out parts over a window is fitted as a function of how
-    far the joint goes. What the likeliest ageing of the numbers and the likeliest wander add is
-    simulated on the field itself.
+    far the joint goes. What the likeliest ageing of the numbers adds is simulated on the field itself.
 
     Args:
         reference: The machine as it was.
@@ -110,12 +109,11 @@ class Floor:
         """
         found = []
         for joint, law in zip(joints, self._laws, strict=True):
-            ageing, wander = joint.explain_nuisance()
             model, aged = joint.side.model, joint.numbers.copy()
-            aged[model.fitted] += ageing
+            aged[model.fitted] += joint.nuisance.explain_ageing(joint.projection, joint.residual)
             aged = np.clip(aged, model.list_values("lower"), model.list_values("upper"))
             path = joint.side.simulate(joint.joint, aged)[0]
-            moved = windows.cut(path - joint.path + wander)
+            moved = windows.cut(path - joint.path)
             motion = _describe_motion(joint.path, windows)
             found.append(motion @ law + np.square(moved).mean(1))
         return np.stack(found, 1) * np.square(measure_units(joints[0].side.machine))
