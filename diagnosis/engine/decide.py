@@ -44,9 +44,6 @@ SHOWN_NATS = 1e3
 JITTER_FACTOR = 2.0
 """Jitter can copy lost frames, so it earns so much more, unless it delays most of the time."""
 MOSTLY = 0.8
-STARTS_LIMIT = 1.15
-"""Held commands delay starts and stops alike; what helps starts so much more is no held command."""
-STOPS_FACTOR = 4.0
 OUTSIDE_NATS = 45.0
 """The cause is unknown where a row outside the library earns more than this, or flexible columns earn so much more than
 the best effect. The row must also earn `LEAST_NATS` more than that effect: of 346 opened cases, 15 with a cause outside
@@ -288,11 +285,9 @@ def _add_up(effect: str, rows: Mapping[int, JointRow]) -> EffectFinding:
 
 
 def _weigh_hold(hold: HeldCourse, num_joints: int) -> EffectFinding:
-    nats = min(hold.gain, STOPS_FACTOR * max(min(hold.starts, hold.stops), 0.0))
-    if hold.starts > STARTS_LIMIT * hold.stops:
-        nats = min(nats, max(hold.stops, 0.0))
     joints = tuple(range(num_joints))
-    return EffectFinding(hold.course.effect, joints, nats - hold.price - JOINT_NATS, {}, hold)
+    nats = hold.gain - hold.price - JOINT_NATS
+    return EffectFinding(hold.course.effect, joints, nats, {}, hold)
 
 
 def _choose_hold(holds: Mapping[str, HeldCourse]) -> HeldCourse | None:

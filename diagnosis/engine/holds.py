@@ -23,7 +23,7 @@ from diagnosis.engine.baseline import JointBaseline
 from diagnosis.engine.evidence import FieldJoint, RowEvidence
 from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Scale, measure_motion
-from diagnosis.engine.nuisance import Projection, compute_gain
+from diagnosis.engine.nuisance import compute_gain
 from diagnosis.engine.side import DEVICE, Side
 
 LONGEST_S = 0.9
@@ -55,8 +55,6 @@ class HeldCourse:
         delays: Additional delay of each sample of the field, in samples, `(T,)`.
         gain: What it earns on the field less its prior, nats.
         price: The same on the reference, at the length of the field, nats.
-        starts: Gain while the arm speeds up, nats.
-        stops: Gain while it slows down, nats.
         weights: Share of each sample in what is seen of the delays, `(T,)`.
     """
 
@@ -64,8 +62,6 @@ class HeldCourse:
     delays: np.ndarray
     gain: float
     price: float
-    starts: float
-    stops: float
     weights: np.ndarray
 
     @property
@@ -312,18 +308,14 @@ class HeldCommands:
     def find(self, joints: Sequence[FieldJoint]) -> dict[str, HeldCourse]:
         """Return the best course of each effect beside the numbers of the joints, where one earns anything."""
         side, reference = joints[0].side, self._evidence.reference
-        rising = _find_rising(side, joints)
         found: dict[str, HeldCourse] = {}
-        for course, gain, delays, gains in self._search(joints):
+        for course, gain, delays in self._search(joints):
             if gain < LEAST_NATS:
                 continue
             price = self._prices.get(course, 0.0) * side.num_samples / reference.num_samples
             best = found.get(course.effect)
             if best is None or gain - price > best.gain - best.price:
-                starts, stops = float(gains[rising].sum()), float(gains[~rising].sum())
-                found[course.effect] = HeldCourse(
-                    course, delays, gain, price, starts, stops, _weigh_samples(side)
-                )
+                found[course.effect] = HeldCourse(course, delays, gain, price, _weigh_samples(side))
         return found
 
     @cached_property
@@ -332,54 +324,24 @@ class HeldCommands:
         evidence = self._evidence
         healthy = [base.numbers for base in evidence.bases]
         found: dict[Course, float] = {}
-        for course, gain, *_ in self._search(evidence.view_field(healthy, evidence.reference)):
+        for course, gain, _ in self._search(evidence.view_field(healthy, evidence.reference)):
             found[course] = max(gain, found.get(course, 0.0))
         return found
 
-    def _search(
-        self, joints: Sequence[FieldJoint]
-    ) -> Iterator[tuple[Course, float, np.ndarray, np.ndarray]]:
-        """Yield courses with their gain in all, their delays and the gain at each sample."""
+    def _search(self, joints: Sequence[FieldJoint]) -> Iterator[tuple[Course, float, np.ndarray]]:
+        """Yield courses with their gain in all and their delays."""
         side = joints[0].side
         numbers = [joint.numbers for joint in joints]
         for course, delays, law in _search_courses(side, self._evidence.bases, numbers):
             if not delays.any():
                 continue
             held = hold_commands(side, delays)
-            gains = np.zeros(side.num_samples)
+            usual = law[0, 0] if side.model.integrates else 0.0
+            gain = _price_course(delays, law, course.parts, usual)
             for joint in joints:
                 path = held.simulate(joint.joint, joint.numbers)[0]
                 left = joint.residual - (joint.measure(path).astype(float) - joint.increments)
                 count = joint.count * (1.0 if side.model.integrates else joint.measure.interval)
-                own = _share_gain(joint.projection, joint.residual, left, count)
-                gains[: len(own)] += own
-            usual = law[0, 0] if side.model.integrates else 0.0
-            prior = _price_course(delays, law, course.parts, usual)
-            yield course, float(gains.sum()) + prior, delays, gains
-
-
-def _share_gain(
-    projection: Projection, before: np.ndarray, after: np.ndarray, count: float
-) -> np.ndarray:
-    """Return the gain of a change of residuals, shared among the increments, `(N,)`."""
-    root = np.sqrt(projection.spread)
-    first = before / root * projection.clean(before)
-    second = after / root * projection.clean(after)
-    squares, changed = float(first.sum()), float(second.sum())
-    weight = 0.5
-    if changed < squares:
-        gain = float(compute_gain(np.array(changed), squares, count))
-        weight = gain / (squares - changed)
-    return weight * (first - second)
-
-
-def _find_rising(side: Side, joints: Sequence[FieldJoint]) -> np.ndarray:
-    """Return at which samples the arm speeds up, `(T,)` bool."""
-    speed = np.zeros(side.num_samples)
-    for joint in joints:
-        step = np.abs(np.gradient(joint.path))
-        speed += step / max(float(step.max()), 1e-9)
-    ahead, behind = side.count(0.5), side.count(0.2)
-    later = np.concatenate([speed[ahead:], np.zeros(ahead)])
-    earlier = np.concatenate([np.zeros(behind), speed[:-behind]])
-    return later > earlier
+                squares = joint.projection.measure_squares(left)
+                gain += float(compute_gain(squares, joint.squares, count)[0])
+            yield course, gain, delays

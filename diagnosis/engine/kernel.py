@@ -233,8 +233,6 @@ def simulate_path(
             at = k * substeps + i - delay_steps - 1
             if at >= begin * substeps:
                 x = wp.float64(spool[which[c], at])
-            if numbers[c, Place.POSE_PULL] != zero and wp.abs(x) > wp.float64(0.03):
-                x += numbers[c, Place.POSE_PULL] * poses[k, 0]
             if numbers[c, Place.STROKE] > zero:
                 x = wp.clamp(x, -numbers[c, Place.STROKE], numbers[c, Place.STROKE])
             if numbers[c, Place.START_COMMAND] > zero:
@@ -297,8 +295,6 @@ def simulate_path(
                 )
             slow += late * (speed - slow)
             speed = slow
-            if numbers[c, Place.SLIP] != zero and wp.abs(speed) > numbers[c, Place.SLIP_ABOVE]:
-                speed *= one - numbers[c, Place.SLIP]
             is_shut = opened <= zero
             if numbers[c, Place.BREAK_AWAY] > zero:
                 if is_shut and wp.abs(speed) < wp.float64(0.004):

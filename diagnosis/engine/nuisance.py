@@ -63,11 +63,6 @@ class Projection:
         explained = (left @ self.columns.T) @ self.inverse @ (self.columns @ right.T)
         return left @ right.T / self.spread - explained / self.spread
 
-    def clean(self, increments: np.ndarray) -> np.ndarray:
-        """Return increments `(N,)` over their deviation, less what the columns explain."""
-        scaled = increments / np.sqrt(self.spread)
-        return scaled - self.columns.T @ (self.inverse @ (self.columns @ scaled))
-
     def add(self, columns: np.ndarray) -> Projection:
         """Return the projection with more columns of standard deviation 1."""
         own = self.columns * np.sqrt(self.spread)

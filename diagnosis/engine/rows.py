@@ -59,7 +59,6 @@ FIXED = frozenset(
         "same_way_share",
         "crosstalk_joint",
         "thermal_grows",
-        "slip_above",
         "load_alone",
         "load_constant",
         "sector_place",

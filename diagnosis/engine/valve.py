@@ -72,9 +72,6 @@ NUMBERS = (
     JointNumber("thermal_s"),
     JointNumber("thermal_grows"),
     JointNumber("demand_limit"),
-    JointNumber("pose_pull"),
-    JointNumber("slip"),
-    JointNumber("slip_above"),
     JointNumber("play_slip"),
 )
 
@@ -179,13 +176,8 @@ def _list_outside_rows() -> list[Row]:
     rows = []
     for s in spread_sizes(0.015, 0.2, 8):
         rows.append(Row("hysteresis", (("hysteresis", "add", s),)))
-    for s in mirror_sizes((0.03, 0.07, 0.12, 0.2, 0.3)):
-        rows.append(Row("pose_pull", (("pose_pull", "add", s),)))
     for s in spread_sizes(0.04, 1.2, 9):
         rows.append(Row("slow_centring", (("closing_lag_s", "add", s),)))
-    for s in (0.1, 0.2, 0.35, 0.5):
-        for above in (0.05, 0.1, 0.15):
-            rows.append(Row("slip", (("slip", "add", s), ("slip_above", "add", above))))
     for s in spread_sizes(0.06, 0.9, 9):
         rows.append(Row("pump_lag", (("pump_lag_s", "add", s),)))
     return rows
