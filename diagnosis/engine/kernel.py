@@ -188,12 +188,9 @@ def simulate_path(
     ring_rate = zero
     driven = zero
     out = zero
-    volume = zero
     pump = zero
     x_before = zero
-    direction = zero
     moving = wp.int32(0)
-    stuck = wp.int32(1)
     begin = wp.int32(-1)
     for k in range(load.shape[0]):
         is_first = wp.int32(0)
@@ -205,11 +202,9 @@ def simulate_path(
             ring_rate = zero
             driven = zero
             out = zero
-            volume = zero
             pump = zero
             x_before = zero
             moving = wp.int32(0)
-            stuck = wp.int32(1)
         asked = zero
         by_pose = one
         load_out = one
@@ -295,24 +290,7 @@ def simulate_path(
                 )
             slow += late * (speed - slow)
             speed = slow
-            is_shut = opened <= zero
-            if numbers[c, Place.BREAK_AWAY] > zero:
-                if is_shut and wp.abs(speed) < wp.float64(0.004):
-                    stuck = wp.int32(1)
-                    volume = zero
-                    speed = zero
-                if stuck == 1 and not is_shut:
-                    volume += speed * step_s
-                    needed = numbers[c, Place.BREAK_AWAY]
-                    if numbers[c, Place.SAME_WAY_SHARE] > zero and speed * direction > zero:
-                        needed *= numbers[c, Place.SAME_WAY_SHARE]
-                    if wp.abs(volume) > needed:
-                        stuck = wp.int32(0)
-                        direction = speed
-                        speed = numbers[c, Place.CATCH_UP] * volume / step_s
-                    else:
-                        speed = zero
-            if is_shut:
+            if opened <= zero:
                 speed += numbers[c, Place.CREEP] + numbers[c, Place.CREEP_BY_LOAD] * load[k]
             if sag != zero and is_first == 0:
                 speed += sag * (load[k] - load[k - 1]) / period_s
@@ -326,12 +304,7 @@ def simulate_path(
                 speed = zero
             driven += step_s * speed
             out_before = out
-            if play > zero:
-                if numbers[c, Place.PLAY_SLIP] > zero:
-                    out += step_s * numbers[c, Place.PLAY_SLIP] * wp.sign(load[k])
-                out = wp.clamp(out, driven - half * play, driven + half * play)
-            else:
-                out = driven
+            out = wp.clamp(out, driven - half * play, driven + half * play)
             if i == 0:
                 path[c, k] = wp.float32(out_before + share * (out - out_before))
         flow[c, k] = wp.float32(asked)

@@ -54,15 +54,7 @@ class Row:
 
 
 FIXED = frozenset(
-    {
-        "catch_up",
-        "same_way_share",
-        "crosstalk_joint",
-        "thermal_grows",
-        "load_alone",
-        "load_constant",
-        "sector_place",
-    }
+    {"crosstalk_joint", "thermal_grows", "load_alone", "load_constant", "sector_place"}
 )
 """Numbers that choose a form; no size of them is searched."""
 CEILINGS = {"stop_ratio": 0.97, "damping": 0.7, "thermal_s": 700.0, "firmware_damping": 1.0}

@@ -1,6 +1,6 @@
 """Sizes of the named effects, as numbers of the registry, with intervals.
 
-A row may have a form that the registry lacks, such as a volume before a joint breaks away. The size
+A row may have a form that the registry lacks, such as a limit of the speed behind the valve. The size
 is then that of the registry's own form. Its proof shows how far that form goes.
 """
 

@@ -58,9 +58,6 @@ NUMBERS = (
     JointNumber("top_share"),
     JointNumber("start_command"),
     JointNumber("stop_ratio"),
-    JointNumber("break_away"),
-    JointNumber("catch_up"),
-    JointNumber("same_way_share"),
     JointNumber("load_opposing"),
     JointNumber("load_both"),
     JointNumber("load_alone"),
@@ -72,7 +69,6 @@ NUMBERS = (
     JointNumber("thermal_s"),
     JointNumber("thermal_grows"),
     JointNumber("demand_limit"),
-    JointNumber("play_slip"),
 )
 
 ValvePlace = list_places(NUMBERS)
@@ -105,24 +101,12 @@ def _list_effect_rows() -> list[Row]:
         rows.append(Row("lag", (("speed_lag_s", "add", s),)))
     for s in spread_sizes(0.005, 0.14, 10):
         rows.append(Row("backlash", (("play", "add", s),)))
-    for s in spread_sizes(0.01, 0.14, 8):
-        for slip in (0.008, 0.03):
-            rows.append(Row("backlash", (("play", "add", s), ("play_slip", "add", slip))))
     for s in spread_sizes(0.25, 4.0, 11):
         rows.append(Row("rate_limit", (("slope_time_s", "least", 1.0 / s),)))
     for s in spread_sizes(0.06, 0.6, 9):
         for ratio in (0.3, 0.6, 0.85):
             changes = (("start_command", "add", s), ("stop_ratio", "add", ratio))
             rows.append(Row("stiction", changes))
-    for s in spread_sizes(0.004, 0.12, 8):
-        for catch_up in (0.0, 0.5, 1.0):
-            for share in (1.0, 0.4):
-                changes = (
-                    ("break_away", "add", s),
-                    ("catch_up", "add", catch_up),
-                    ("same_way_share", "add", share),
-                )
-                rows.append(Row("stiction", changes))
     rows += _list_load_rows()
     for s in mirror_sizes(spread_sizes(0.0008, 0.03, 9)):
         rows.append(Row("creep", (("creep", "add", s),)))
