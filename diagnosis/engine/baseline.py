@@ -65,7 +65,7 @@ class JointBaseline:
     error: np.ndarray
 
 
-def list_simulated(
+def build_simulation(
     side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
 ) -> Simulate:
     """Return the increments of a joint with numbers `(P,)` as a function of its fitted ones."""
@@ -82,7 +82,7 @@ def linearise(
     side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the increments of the simulated joint `(N,)` and their slopes over the fitted numbers `(F, N)`."""
-    simulate = list_simulated(side, joint, numbers, measure)
+    simulate = build_simulation(side, joint, numbers, measure)
     return find_slopes(simulate, numbers[side.model.fitted], side.model.prior)
 
 
@@ -101,7 +101,7 @@ def fit_numbers(
 ) -> np.ndarray:
     """Return the numbers of a joint, those that are not `fixed` fitted to the recordings, `(P,)`."""
     model = side.model
-    simulate = list_simulated(side, joint, numbers, measure)
+    simulate = build_simulation(side, joint, numbers, measure)
     target = measure(side.q[:, joint]).astype(float)
     prior = model.prior
     names = np.array(model.names)[model.fitted]

@@ -27,7 +27,8 @@ WEIGHT_UNITS = 0.2
 STILL_UNITS_S = 0.02
 """Speed about which the direction of a servo changes, half travels a second."""
 MOTION_S = 1.0
-"""A motion that begins sooner behind another one belongs to it."""
+"""A motion that begins sooner behind another one belongs to it. Left-out parts of three machines of two makes are likelier
+by 319, 308 and 276 nats with motions of 0, 0.6 and 1.5 s at least; by 222 where only their starts scatter."""
 LEAST_SQUARE = 1e-9
 """Square sum from which on a column says anything of some increments."""
 SIZES = (0.0, 0.005, 0.01, 0.02, 0.04, 0.07, 0.12)
