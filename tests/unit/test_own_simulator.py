@@ -13,24 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from arm import (
-    ARM,
-    NOISE_RAD,
-    damp,
-    draw_targets,
-    keep,
-    limit_force,
-    make_machine,
-    record_arm,
-    rub,
-    weaken,
-)
+from arm import ARM, NOISE_RAD, damp, keep, limit_force, make_machine, record_arm, rub, weaken
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from actuators import open_loop
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording, make_motion
+from brokk_rl.record import Recording
 from brokk_rl.session import Session
 from diagnosis import api, effect_library
 from diagnosis.modes import why
