@@ -1,7 +1,7 @@
 """Ablations of the diagnosis: cases with known causes, answered with one ingredient switched off.
 
     python benchmarks/diagnosis/ablations.py <out.json> <exam> [<exam> …] --workers 32
-    python benchmarks/diagnosis/ablations.py <out.json> <exam> --without wander ageing
+    python benchmarks/diagnosis/ablations.py <out.json> <exam> --without scatter ageing
 
 An exam is a folder that `brokk mode=exam` made, with its labels; names count strictly. What is switched
 off, and how, stands in `ingredients.yaml`. Called again, the answers in `<out.json>` are kept.
@@ -36,7 +36,10 @@ from exam.dataset import open_labels
 INGREDIENTS = yaml.safe_load(Path(__file__).with_name("ingredients.yaml").read_text())
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "no ageing": lambda model, numbers: np.zeros(len(model.fitted)),
-    "no price": lambda evidence, joint: np.full((NUM_PARTS, len(evidence.every)), -np.inf),
+    "no price": lambda evidence, joint, name: np.full(
+        (NUM_PARTS, int((evidence.names == name).sum())), -np.inf
+    ),
+    "one motion": lambda side, flow: np.zeros(side.num_samples, dtype=int),
 }
 
 
