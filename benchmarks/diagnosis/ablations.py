@@ -29,16 +29,13 @@ from rich.progress import track
 from brokk_rl import extensions
 from diagnosis.case import load_case
 from diagnosis.effect_library import load_effects
-from diagnosis.engine.baseline import NUM_PARTS
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from exam.dataset import open_labels
 
 INGREDIENTS = yaml.safe_load(Path(__file__).with_name("ingredients.yaml").read_text())
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "no ageing": lambda model, numbers: np.zeros(len(model.fitted)),
-    "no price": lambda evidence, joint, name: np.full(
-        (NUM_PARTS, int((evidence.names == name).sum())), -np.inf
-    ),
+    "no price": lambda table, _, name: np.full((1, (table.names == name).sum()), -np.inf),
     "one motion": lambda side, flow: np.zeros(side.num_samples, dtype=int),
 }
 
