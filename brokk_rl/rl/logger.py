@@ -23,7 +23,6 @@ from brokk_rl.plot import GREY, draw_grid, make_figure, save_figure
 from brokk_rl.policy_folder import list_checkpoints
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.rl.settings import TrainingConfig
-from brokk_rl.session import write_bytes
 from brokk_rl.spec import spec
 
 if TYPE_CHECKING:
@@ -274,8 +273,9 @@ class TrainingLogger:
             SimulationError: More worlds diverged or overflowed than `max_fault_rate` allows.
             TrainingError: A loss, a gradient or a weight is not finite.
         """
-        before, self._clock = self._clock, time.perf_counter()
-        self.seconds += self._clock - before
+        now = time.perf_counter()
+        self.seconds += now - self._clock
+        self._clock = now
         self.env_steps += self.steps_per_iteration
         statistics = self._group.pool_statistics(self._loop.statistics())
         self._require_sound(it, statistics["fault_rate"], loss_dict | statistics)
@@ -355,7 +355,7 @@ class TrainingLogger:
 
         rows = pd.read_csv(self._path, dtype=str)
         kept: Any = rows[rows["env_steps"].astype(float) <= self.env_steps]
-        write_bytes(self._path, kept.to_csv(index=False, lineterminator="\r\n").encode())
+        kept.to_csv(self._path, index=False, lineterminator="\r\n")
 
 
 def draw_curves(

@@ -22,7 +22,7 @@ from brokk_rl.errors import (
     TrainingError,
 )
 from brokk_rl.machine import Machine
-from brokk_rl.policy_folder import find_checkpoint, list_checkpoints
+from brokk_rl.policy_folder import find_checkpoint, list_checkpoints, read_checkpoint
 from brokk_rl.rl.settings import TrainingBudget
 
 ITERATION = 16 * runs.STEPS
@@ -93,12 +93,11 @@ def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None
     assert find_checkpoint(str(tmp_path)).name == "model_100.pt"
 
 
-def test_a_full_disk_leaves_checkpoint_and_progress_as_they_were_and_nothing_half_written(
+def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runner = runs.train(machine, tmp_path, runs.small(max_env_steps=ITERATION))
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    counts = {"env_steps": 0.0, "seconds": 0.0}
+    before = (tmp_path / "model_1.pt").read_bytes()
 
     def fill_disk(path: Path, data: bytes) -> None:
         with path.open("wb") as file:
@@ -107,10 +106,11 @@ def test_a_full_disk_leaves_checkpoint_and_progress_as_they_were_and_nothing_hal
 
     monkeypatch.setattr(Path, "write_bytes", fill_disk)
     runner.current_learning_iteration += 1
-    for write in (runner.checkpoint, lambda: runner.logger.load_state_dict(counts)):
-        with pytest.raises(StorageError, match="nothing was left behind"):
-            write()
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    with pytest.raises(StorageError, match="nothing was left behind"):
+        runner.checkpoint()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model_1.pt", "progress.csv"]
+    assert (tmp_path / "model_1.pt").read_bytes() == before
+    read_checkpoint(tmp_path / "model_1.pt", "cpu")
 
 
 @pytest.fixture
