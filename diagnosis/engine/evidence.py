@@ -227,7 +227,9 @@ class RowEvidence:
             best = places[np.argmax(gains[places])]
             if name in SHARED or gains[best] < LOSS_LIMIT:
                 continue
-            gain, row, price = float(gains[best]), self.every[best], 0.0
+            gain = float(gains[best])
+            row = self.every[best]
+            price = 0.0
             if gain > WORTH_REFINING:
                 gain, row = joint.refine(row)
                 price = max(float(self._price(joint.joint, name).max()) * seconds, 0.0)

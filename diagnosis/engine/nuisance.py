@@ -226,7 +226,8 @@ def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisa
             tried = [*sizes[:place], size, *sizes[place + 1 :]]
             evidence = sum(part.weigh(tried) for part in parts)
             if evidence > best:
-                best, sizes = evidence, tried
+                best = evidence
+                sizes = tried
     return JointNuisance(mix, sizes, [part.project(sizes) for part in parts])
 
 
