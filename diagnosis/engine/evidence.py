@@ -90,9 +90,8 @@ class FieldJoint:
             scale = replace(scale, memory=memory, step=step, noise=noise)
         self.measure = IncrementMeasure(side, scale, measure_motion(side, healthy), used)
         self.increments, slopes = linearise(side, joint, numbers, self.measure)
-        path, flow = (one[0].astype(float) for one in side.simulate_flow(joint, numbers))
-        self.path = path
-        scatter = list_scatter(side, joint, path, flow, self.measure)
+        self.path, flow = (one[0].astype(float) for one in side.simulate_flow(joint, numbers))
+        scatter = list_scatter(side, joint, self.path, flow, self.measure)
         self.projection = nuisance.project(slopes, scatter, base.spread)
         self.residual = self.measure(side.q[:, joint]).astype(float) - self.increments
         self.squares = float(self.projection.measure_squares(self.residual)[0])
@@ -201,16 +200,14 @@ class RowEvidence:
 
     def weigh_rows(self, joints: Sequence[FieldJoint]) -> dict[str, dict[int, JointRow]]:
         """Return the best row of each effect on each joint, by effect and joint."""
-        weighed = [self._weigh_joint(joint) for joint in joints]
-        tables = [gains for gains, _ in weighed]
         found: dict[str, dict[int, JointRow]] = {}
         for name in dict.fromkeys(self.names.tolist()):
             if name in SHARED:
-                places = np.flatnonzero(self.names == name)
-                found[name] = self._weigh_shared(places, joints, tables)
+                found[name] = self.weigh_common(name, joints)
                 continue
             found[name] = {}
-            for joint, (_, rows) in zip(joints, weighed, strict=True):
+            for joint in joints:
+                _, rows = self._weigh_joint(joint)
                 if name in rows:
                     found[name][joint.joint] = rows[name]
         return found
@@ -238,18 +235,11 @@ class RowEvidence:
         return gains, found
 
     def weigh_common(self, name: str, joints: Sequence[FieldJoint]) -> dict[int, JointRow]:
-        """Return the rows of an effect with the same size on all joints."""
-        places = np.flatnonzero(self.names == name)
-        tables = [self._weigh_joint(joint)[0] for joint in joints]
-        return self._weigh_shared(places, joints, tables)
-
-    def _weigh_shared(
-        self, places: np.ndarray, joints: Sequence[FieldJoint], tables: Sequence[np.ndarray]
-    ) -> dict[int, JointRow]:
         """Return the rows of an effect that has about one size on all joints; its price is on the first."""
+        tables = [self._weigh_joint(joint)[0] for joint in joints]
+        places = np.flatnonzero(self.names == name)
         total = np.sum([np.maximum(gains[places], LOSS_LIMIT) for gains in tables], 0)
         seconds = joints[0].count * joints[0].measure.interval * self.field.period_s
-        name = str(self.names[places[0]])
         parts = [np.maximum(self._price(j.joint, name), -5.0 / seconds) for j in joints]
         prices = np.maximum(np.sum(parts, 0).max(0) * seconds, 0.0)
         best = int(np.argmax(total - prices))
