@@ -23,7 +23,7 @@ Multiply = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of some values before any recording is seen, `(F,)` each.
+    """Expectation of some values before any recording is seen, their steps and bounds, `(F,)` each.
 
     Attributes:
         mean: Expected values.

@@ -45,8 +45,9 @@ class JointRow:
         row: The row, its size searched.
         gain: Its gain on the field, nats.
         price: The most that any row of the effect gains on a part of the reference, at the length
-            of the field, nats. Of practice cases of three makes the largest part accuses 5 of 47
-            unchanged machines and names 94 of 123 effects first; the mean of the parts 8 and 94.
+            of the field, nats; 0 where the gain is too small to be searched. Of practice cases of
+            three makes the largest part accuses 5 of 47 unchanged machines and names 94 of 123
+            effects first; the mean of the parts 8 and 94.
     """
 
     row: Row

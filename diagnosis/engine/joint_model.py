@@ -138,7 +138,7 @@ class JointModel:
 
     @cached_property
     def prior(self) -> Prior:
-        """What is known of the fitted numbers before any recording is seen."""
+        """Expectation of the fitted numbers before any recording is seen."""
         names = [one.name for one in fields(Prior)]
         return Prior(**{name: self.list_fitted(name) for name in names})
 

@@ -47,8 +47,8 @@ NUMBERS = (
     JointNumber("damping", 0.7, 0.3, 0.03, 0.05, 0.05, 0.97),
     JointNumber("pump_load", 0.25, 0.1, 0.01, 0.01, 0.0, 1.5),
     JointNumber("pump_lag_s", 0.12, 0.08, 0.02, 0.03, 0.0, 1.5),
-    # Pressure that the weight of the stretched arm needs, over the margin of a load-sensing pump. With it left-out
-    # parts of nine machines of two makes are likelier by 3,580 nats; with deviations of 0.5 and 1.0 by 2,495 and 3,192.
+    # Pressure that the weight of the stretched arm needs, over the margin of a load-sensing pump; `FULL_MARGIN` says
+    # what it earns. The priors of both numbers are chosen by hand, and no others were tried.
     JointNumber("pump_weight", 1.2, 0.8, 0.1, 0.1, 0.0, 6.0, is_relative=True),
     JointNumber("play", 0.002, 0.004, 0.001, 0.0007, 0.0, 0.2),
     JointNumber("drift", 0.0, 0.03, 0.005, 0.015, -0.3, 0.3),

@@ -146,7 +146,7 @@ def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Ma
     u = np.full((300, 2), 0.5)
     u[:, 1] = np.repeat([0.0, 0.5, -0.5], 100)
     side = make_side(two_joints, u)
-    numbers = pure_numbers(others_out_1=0.2, others_out_2=-0.1)
+    numbers = pure_numbers(others_out_1=0.2, others_out_2=-0.1, crosstalk=0.2)  # with itself: none
     side.ask_others([numbers, pure_numbers()])
     path = side.simulate(0, numbers)[0]
     ways = [np.ptp(path[first : first + 61]) for first in (20, 120, 220)]
@@ -172,19 +172,19 @@ def test_a_joint_waits_until_the_pump_bears_its_load(two_joints: Machine) -> Non
 
 
 def test_a_pump_that_was_always_small_and_slow_to_start_is_found(two_joints: Machine) -> None:
-    names = ("pump_load", "pump_lag_s", "pump_weight")
-    places = [VALVE.place[name] for name in names]
+    places = [VALVE.place[name] for name in ("pump_load", "pump_lag_s", "pump_weight")]
     numbers = VALVE.list_values("mean")
     numbers[places] = [0.8, 0.4, 2.0]
     side = make_side(two_joints, np.clip(2.0 * make_commands(120.0, 3), -1.0, 1.0))
+    side = replace(side, loads=np.full_like(side.loads, -0.25))
     side.ask_others([numbers, numbers])
     side.q = np.stack([side.simulate(j, numbers)[0] for j in (0, 1)], 1).astype(float)
     for one in fit_reference(side):
-        assert one.numbers[places[:2]] == pytest.approx([0.8, 0.4], abs=0.05)
+        assert one.numbers[places] == pytest.approx([0.8, 0.4, 2.0], rel=0.1)
 
 
 def test_motions_that_start_late_or_run_unlike_each_other_are_known(two_joints: Machine) -> None:
-    """Of 40 motions the first joint starts each up to 0.1 s late, the second is 5 % faster or slower."""
+    """In 40 motions one joint starts up to 0.1 s late each time; the other runs 5 % faster or slower each time."""
     generator = np.random.default_rng(5)
     u, late = np.zeros((2, 2440, 2))
     for begin in 20 + 60 * np.arange(40):
