@@ -7,5 +7,5 @@ run_cases          candidates; one process a case
 examiner           the repair of an answer, simulated on withheld recordings
 score              one answer against one label
 answer_scoring     answers of a candidate, their scores, published answers
-metrics            rates with intervals, calibration, confusion; one page with the table
+metrics            rates with intervals, confusion; one page with the table
 """

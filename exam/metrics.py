@@ -1,14 +1,15 @@
-"""Metrics of an exam: rates with Wilson intervals, others with bootstrap intervals over cases; one page with their table."""
+"""Metrics of an exam: rates with Wilson intervals, medians with bootstrap intervals over cases; one page with their table."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from brokk_rl.console_table import MISSING
 from brokk_rl.session import write_text
@@ -18,11 +19,8 @@ from exam.score import CaseScore
 
 NUM_DRAWS = 1000
 """Bootstrap draws; the usual number for 95 % intervals."""
-NUM_BINS = 10
-"""Bins of the expected calibration error; the usual number."""
-
-COUNTS = ("right", "wrong", "missed")
-"""Ways in which an effect can be named."""
+SURE = 0.9
+"""Stated probability from which a statement counts as sure: of calibrated ones nine in ten or more are true."""
 
 Metric = dict[str, Any]
 """`value`, `of` and `ci95`; `None` where there is nothing to count."""
@@ -36,25 +34,24 @@ class MetricDefinition:
         title: Its label.
         kinds: Kinds of cases that count.
         collect: Numbers of a case; a case may have none or several.
-        compute: The metric of the numbers of all cases, with an interval by bootstrap over cases;
-            `None`: the rate of true ones, with Wilson's.
+        is_median: The median of one number a case, not the rate of true ones.
     """
 
     title: str
     kinds: tuple[str, ...]
     collect: Callable[[CaseScore], Sequence[Any]]
-    compute: Callable[[np.ndarray], float | None] | None = None
+    is_median: bool = False
 
 
-def compute_ece(rows: np.ndarray) -> float:
-    """Return the expected calibration error of probabilities (first column) of statements (second: 1 if true).
+def list_sure(score: CaseScore) -> list[bool]:
+    """Return which of the statements with a probability of `SURE` or more are true."""
+    return [one.is_true for one in score.claims if one.probability >= SURE]
 
-    It is the mean distance of stated probability and rate of true statements over the bins,
-    weighted by their statements.
-    """
-    place = np.minimum((rows[:, 0] * NUM_BINS).astype(int), NUM_BINS - 1)
-    apart = np.bincount(place, rows[:, 0] - rows[:, 1], NUM_BINS)
-    return float(np.abs(apart).sum() / len(rows))
+
+def list_errors(score: CaseScore) -> list[float]:
+    """Return the median error of the parameters of a case, if it has any."""
+    errors = [one.error for one in score.numbers]
+    return [float(np.median(errors))] if errors else []
 
 
 ONE, SEVERAL, KNOWN = ("one",), ("several",), ("one", "several")
@@ -73,11 +70,10 @@ ROWS: dict[str, tuple[Any, ...]] = {
     "unknown_recall": ("outside causes: said unknown", ("outside",), lambda s: [s.verdict == "unknown"]),
     "unknown_wrongly": ("effects called unknown", KNOWN, lambda s: [s.verdict == "unknown"]),
     "missed": ("effects called none", KNOWN, lambda s: [s.verdict == "none"]),
-    "ece": ("calibration error", KINDS, lambda s: s.claims, compute_ece),
-    "parameter_error": ("size: median error", KINDS, lambda s: [one.error for one in s.numbers], np.median),
+    "sure": ("said with 0.9 or more: right", KINDS, list_sure),
+    "parameter_error": ("size: median error", KINDS, list_errors, True),
     "cover_90": ("size: inside 90 %", KINDS, lambda s: [one.in_90 for one in s.numbers]),
-    "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: [] if s.examined is None else [s.examined], np.median),
-    "closed_missing": ("named without closing", KINDS, lambda s: [s.closed is None] if s.named else []),
+    "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: [] if s.examined is None else [s.examined], True),
 }  # fmt: skip
 METRICS = {key: MetricDefinition(*row) for key, row in ROWS.items()}
 """All metrics of the report's table, in its order."""
@@ -100,16 +96,13 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
     }
     for key, metric in METRICS.items():
         parts = [metric.collect(score) for score in scores if score.kind in metric.kinds]
-        if metric.compute is None:
-            found[key] = compute_rate(list(chain.from_iterable(parts)))
-        else:
-            found[key] = bootstrap_cases(parts, metric.compute)
+        values = list(chain.from_iterable(parts))
+        found[key] = compute_median(values) if metric.is_median else compute_rate(values)
     seconds = [score.seconds for score in scores if score.seconds is not None]
     median = float(np.median(seconds)) if seconds else None
     return found | {
         "seconds": {"median": median, "most": max(seconds, default=None)},
-        "by_effect": count_effects(scores),
-        "said": count_answers([*by_kind["one"], *by_kind["outside"]]),
+        "said": count_answers(scores),
     }
 
 
@@ -120,54 +113,41 @@ def compute_rate(right: Sequence[bool]) -> Metric:
     return {"value": value, "of": len(right), "ci95": list(interval)}
 
 
-def bootstrap_cases(
-    numbers: Sequence[Sequence[Any]], compute: Callable[[np.ndarray], float | None], seed: int = 0
-) -> Metric:
-    """Return a metric of the numbers of each case with its percentile bootstrap interval over cases."""
-    parts = [np.array(of_case, dtype=float) for of_case in numbers]
-
-    def compute_of(rows: Iterable[int]) -> float | None:
-        given = [parts[row] for row in rows if len(parts[row])]
-        return compute(np.concatenate(given)) if given else None
-
-    value = compute_of(range(len(parts)))
-    if value is None:
-        return {"value": None, "of": len(parts), "ci95": None}
-    generator = np.random.default_rng(seed)
-    draws = generator.integers(len(parts), size=(NUM_DRAWS, len(parts)))
-    drawn = [one for one in map(compute_of, draws.tolist()) if one is not None]
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    interval = np.percentile(drawn, [tail, 100.0 - tail]).tolist()
-    return {"value": value, "of": len(parts), "ci95": interval}
-
-
-def count_effects(scores: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
-    """Return how often each effect was named rightly, wrongly and missed, over all cases but those below the noise."""
-    found: dict[str, dict[str, int]] = {}
-    for score in scores:
-        truth, named = {*score.truth}, {*score.named}
-        for effect in sorted(truth | named) if score.kind != "faint" else ():
-            counts = found.setdefault(effect, dict.fromkeys(COUNTS, 0))
-            right = "right" if effect in truth else "wrong"
-            counts[right if effect in named else "missed"] += 1
-    return dict(sorted(found.items()))
+def compute_median(values: Sequence[float]) -> Metric:
+    """Return the median of one number a case, their number, and the percentile bootstrap interval."""
+    if not values:
+        return {"value": None, "of": 0, "ci95": None}
+    interval = [values[0], values[0]]
+    if len(values) > 1:
+        drawn = stats.bootstrap(
+            (values,),
+            np.median,
+            n_resamples=NUM_DRAWS,
+            confidence_level=CONFIDENCE,
+            method="percentile",
+            rng=np.random.default_rng(0),
+        )
+        interval = list(drawn.confidence_interval)
+    return {"value": float(np.median(values)), "of": len(values), "ci95": interval}
 
 
 def count_answers(scores: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
-    """Return how often each answer was given to a cause that was alone."""
+    """Return how often each answer was given to each cause, over all cases but those below the noise."""
     found: dict[str, dict[str, int]] = {}
     for score in scores:
-        said = found.setdefault(score.outside or score.truth[0], {})
-        answer = "+".join(score.named) or score.verdict
-        said[answer] = said.get(answer, 0) + 1
-    return found
+        if score.kind != "faint":
+            cause = score.outside or "+".join(score.truth) or "none"
+            said = found.setdefault(cause, {})
+            answer = "+".join(score.named) or score.verdict
+            said[answer] = said.get(answer, 0) + 1
+    return dict(sorted(found.items()))
 
 
 REPORT_FILE = "exam.md"
 STRICT = (
     "Figures are strict: only the true effect counts. Rows with equivalents also count the effects that the "
     "exam lists as hard to tell apart, and those that an answer names as the same. Rates have 95 % Wilson "
-    "intervals, other metrics bootstrap intervals over cases."
+    "intervals, medians bootstrap intervals over cases."
 )
 OPEN = "A development seed: the authors of the candidates may have looked at its cases."
 
@@ -209,7 +189,7 @@ def format_markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> s
 def write_report(
     folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Write `exam.md`: the exam, the table of all candidates, and by effect what each of them said."""
+    """Write `exam.md`: the exam, the table of all candidates, and by cause what each of them said."""
     kinds = next(iter(tables.values()))["cases"]
     cases = _join_counts({kind: count for kind, count in kinds.items() if count})
     # labels of the first exams name neither
@@ -223,19 +203,11 @@ def write_report(
         format_markdown(["", *tables], build_rows(tables)),
     ]
     for name, table in tables.items():
-        parts += [f"## {name}", f"Commit {table['commit'] or MISSING}.", _format_causes(table)]
+        said = [[cause, _join_counts(counts)] for cause, counts in table["said"].items()]
+        parts += [f"## {name}", f"Commit {table['commit'] or MISSING}."]
+        parts.append(format_markdown(["cause", "said"], said))
     parts.append(f"Labels, SHA-256: {exam['labels_sha256']}.")
     write_text(folder / REPORT_FILE, "\n\n".join(part.rstrip() for part in parts) + "\n")
-
-
-def _format_causes(table: Mapping[str, Any]) -> str:
-    """Return a row for each cause: how often it was named, and what was said where it was alone."""
-    rows, by_effect, said = [], table["by_effect"], table["said"]
-    for cause in [*by_effect, *(one for one in said if one not in by_effect)]:
-        counts = by_effect.get(cause, {})
-        numbers = [str(counts.get(key, MISSING)) for key in COUNTS]
-        rows.append([cause, *numbers, _join_counts(said.get(cause, {}))])
-    return format_markdown(["cause", *COUNTS, "said where it was alone"], rows)
 
 
 def _join_counts(counts: Mapping[str, int]) -> str:

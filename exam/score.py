@@ -52,7 +52,6 @@ class CaseScore:
             that joints can have.
         claims: Statements whose truth the label knows.
         numbers: Parameters of strictly right names.
-        closed: Share of the gap closed, by the answer's own account.
         examined: Share of the gap closed on withheld recordings, by the examiner's simulation of
             `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
         seconds: Time the answer took.
@@ -68,7 +67,6 @@ class CaseScore:
     joints_right: tuple[bool, ...]
     claims: tuple[Claim, ...]
     numbers: tuple[ParameterScore, ...]
-    closed: float | None
     examined: float | None
     seconds: float | None
     outside: str | None
@@ -137,8 +135,6 @@ def score_answer(
     right_kinds = {"none": ("none", "faint"), "unknown": ("outside",)}
     if answer is not None and verdict in right_kinds:
         claims.append(Claim(read_probability(answer), kind in right_kinds[verdict]))
-    gap = answer.gap if answer else None
-    closed = gap.closed.mean if gap and gap.closed else None
     examined = examination["closed"] if examination is not None else None
     return CaseScore(
         kind=kind,
@@ -149,7 +145,6 @@ def score_answer(
         joints_right=tuple(joints_right),
         claims=tuple(claims),
         numbers=tuple(numbers),
-        closed=closed,
         examined=examined,
         seconds=seconds,
         outside=outside["ailment"] if outside else None,

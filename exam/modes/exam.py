@@ -54,10 +54,8 @@ class ExamSettings:
         field: How the machine as it is is recorded.
         withheld: How it is recorded for the examiner, who simulates the repair there.
         approach: How start poses are taken up.
-        first_sealed_seed: Seeds (`session.seed`) from here on are for exams, smaller ones for
-            development.
-        sealed: Allows a seed of an exam; its cases cannot be made again from the seed without the
-            salt among the labels.
+        sealed: The cases depend on a secret salt among the labels, too: nobody can make them again
+            from `session.seed`.
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
     """
 
@@ -74,7 +72,6 @@ class ExamSettings:
     field: HalfPlan
     withheld: HalfPlan
     approach: Approach
-    first_sealed_seed: int
     sealed: bool
     salt: str | None
 
@@ -128,12 +125,6 @@ class Exam:
     def _make(self) -> None:
         """Write `cases/`, `labels.sealed.json` (mode 0600), `labels.sha256` and `exam.json`."""
         settings, folder = self.exam, self.session.folder
-        is_exam = self.session.seed >= settings.first_sealed_seed
-        if is_exam != settings.sealed:
-            raise ConfigError(
-                f"session.seed={self.session.seed} with exam.sealed={str(settings.sealed).lower()}: seeds from "
-                f"{settings.first_sealed_seed} on are for exams and need exam.sealed=true, smaller ones are for development"
-            )
         salt = settings.salt or dataset.read_salt(folder) or secrets.token_hex(16)
         questions, labels = self.questions(salt), []
         for number, one in enumerate(questions):
@@ -142,7 +133,7 @@ class Exam:
         facts = {
             "schema": 2,
             "seed": self.session.seed,
-            "sealed": is_exam,
+            "sealed": settings.sealed,
             "machine": self.machine.name,
             "makes": list(settings.plants.makes),
             "roughness": settings.roughness,

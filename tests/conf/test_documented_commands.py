@@ -27,7 +27,6 @@ BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.M | re.S)
 INLINE = re.compile(r"`((?:\.venv/bin/)?brokk [^`]+)`")
 NOT_COMPOSED = {
     "session.seed=<random, 1000 or more>": "a rule for a number instead of one",
-    "session.seed=<below 1000>": "a rule for a number instead of one",
     "effect.<name>.<number>=<size>": "a pattern for any number of any effect",
     "-sc install=": "completion of a shell composes nothing",
     "mode=<mode>": "any mode",

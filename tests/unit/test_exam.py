@@ -214,26 +214,15 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
         shutil.rmtree(answers / first.name, ignore_errors=True)  # from then on nobody has begun it
 
 
-def test_seeds_of_exams_need_to_be_sealed_and_those_of_development_not(
-    brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    for seed, sealed in ((1000, "false"), (1, "true")):
-        done = brokk(
-            *SMALL, f"session.seed={seed}", f"exam.sealed={sealed}", f"session.out={tmp_path / 'x'}"
-        )
-        assert done.code != 0 and "exam.sealed=" in done.err and not (tmp_path / "x").exists()
-
-
 def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_alone(
     tmp_path: Path,
 ) -> None:
-    def drawn(seed: int, salt: str) -> str:
-        given = (f"session.seed={seed}", f"exam.sealed={'true' if seed >= 1000 else 'false'}")
-        mode = load_mode(*SMALL, f"session.out={tmp_path}", *given)
+    def drawn(protocol: str, salt: str) -> str:
+        mode = load_mode(*SMALL, f"session.out={tmp_path}", f"exam_protocol={protocol}")
         return repr(mode.questions(salt))
 
-    assert drawn(1000, "a") == drawn(1000, "a") != drawn(1000, "b")
-    assert drawn(1, "a") == drawn(1, "b")
+    assert drawn("sealed", "a") == drawn("sealed", "a") != drawn("sealed", "b")
+    assert drawn("development", "a") == drawn("development", "b")
 
 
 class Recorder:
