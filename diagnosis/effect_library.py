@@ -6,7 +6,6 @@ Axes: `C` candidates, `J` joints.
 
 from __future__ import annotations
 
-import importlib
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -15,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
 from actuators.models.linear import Hold
-from brokk_rl import registry
+from brokk_rl import build, registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.errors import ConfigError, group_by_reason, list_choices
 from brokk_rl.history import History
@@ -141,17 +139,8 @@ def load_effects(
         ConfigError: a name is unknown, or an effect cannot be imported.
     """
     found = {}
-    for option in registry.list_options():
-        if option.group != "effect":
-            continue
-        path = (yaml.safe_load(option.path.read_text()) or {}).get("_target_", "")
-        module, _, attribute = str(path).rpartition(".")
-        try:
-            target = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigError(
-                f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}"
-            ) from error
+    for option in registry.list_options("effect"):
+        target = build.load_class(option.target, f"effect={option.name}") if option.target else None
         if not hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
             continue
         target = getattr(target, "find_variant", lambda _, own=target: own)(machine)

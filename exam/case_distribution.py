@@ -141,13 +141,10 @@ class CaseDistribution:
                 faults = [self._fault(name, machine, self.sizes, generator) for name in names]
             elif kind == "outside":
                 size = float(generator.uniform(*self.sizes))
-                # much of it shows in company only
-                chosen = self._some(np.flatnonzero(~machine.is_exclusive), generator)
                 name = next(strange)
                 hidden = np.isin(machine.joint_names, outside_not_on.get(name, ()))
-                # drawn anew only then: cases of earlier exams can be made again from their salt
-                if hidden[chosen].any():
-                    chosen = self._some(np.flatnonzero(~machine.is_exclusive & ~hidden), generator)
+                # much of it shows in company only
+                chosen = self._some(np.flatnonzero(~machine.is_exclusive & ~hidden), generator)
                 has = np.isin(np.arange(machine.num_joints), chosen)
                 joints = tuple(machine.joint_names[j] for j in chosen)
                 faults = [CaseFault(name, joints, size, {SEVERITY: size * has}, {})]

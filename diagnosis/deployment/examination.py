@@ -8,7 +8,6 @@ the training's observations, and the motion under the recorded commands.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +46,6 @@ UNLISTED = "unlisted"
 """Kind of a departure that no distortion explains."""
 SCHEMA = 1
 ANSWER_FILE = "doctor.json"
-GOLDEN = "golden.json"
 RATE_TOLERANCE = 0.02
 """Relative difference of rates that is a clock's; chosen by hand."""
 
@@ -208,7 +206,7 @@ class Deployment:
         log = read_run_log(recording, contract, self.target_m)
         is_sent = self.is_sent and not log.is_measured
         notes, stages = list[str](), list[StageResult]()
-        findings = _check_without_replay(self.policy, log)
+        findings = _check_without_replay(contract, log)
         is_other = any(finding.kind == "network" for finding in findings)
         for stage in () if is_other else self._list_stages(log, is_sent, generator):
             result = judge_stage(stage)
@@ -386,19 +384,10 @@ def _list_lacking(log: RunLog, is_sent: bool) -> list[str]:
     return found
 
 
-def _check_without_replay(policy: LoadedPolicy, log: RunLog) -> list[Finding]:
-    """Return what bundle, rate and length of the logged vector show."""
-    contract, found = policy.contract, list[Finding]()
+def _check_without_replay(contract: PolicyContract, log: RunLog) -> list[Finding]:
+    """Return what rate and length of the logged vector show."""
+    found = list[Finding]()
     whole_s = (float(log.t_s[0]), float(log.t_s[-1]))
-    path = contract.source.parent / GOLDEN
-    if path.is_file():
-        # Answers that the training recorded.
-        golden = json.loads(path.read_text())
-        answers = policy.network.answer(np.array(golden["observation"]))
-        difference = np.abs(answers - np.array(golden["command"])).max()
-        if difference > TOLERANCE:
-            text = f"the bundle is mixed: its network departs from {GOLDEN} by {difference:.2g}"
-            found.append(Finding("network", "bundle", "network", text, whole_s))
     rate_hz = 1.0 / float(np.median(np.diff(log.t_s)))
     if abs(contract.rate_hz / rate_hz - 1.0) > RATE_TOLERANCE:
         text = (

@@ -15,10 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from actuators.effects.simulator import EFFECTS
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
 from diagnosis.answer import Selected
-from diagnosis.mjcf.plant import MjcfPlant, limit_force_range
+from diagnosis.mjcf.plant import MjcfPlant
 
 
 @dataclass(frozen=True)
@@ -45,17 +46,30 @@ class MjcfChange:
 
 
 class _Editor:
-    """One joint and its drive in a spec, with the record of their changes."""
+    """One joint and its drive in a spec, with the record of their changes.
+
+    Args:
+        spec: The file.
+        plant: The same, compiled.
+        machine: The machine.
+        finding: What is put into the file.
+        joint: Where.
+        searched: Changes of the plant by earlier findings, as `MjcfPlant.change_model` takes them.
+    """
 
     def __init__(
-        self, spec: Any, plant: MjcfPlant, machine: Machine, finding: Selected, joint: str
+        self,
+        spec: Any,
+        plant: MjcfPlant,
+        machine: Machine,
+        finding: Selected,
+        joint: str,
+        searched: dict[str, np.ndarray],
     ) -> None:
-        place = machine.joint_names.index(joint)
-        self.finding, self.machine, self.place = finding, machine, place
-        self.unit = {name: float(row[place]) for name, row in plant.read_references().items()}
+        self.plant, self.machine, self.finding, self.searched = plant, machine, finding, searched
+        self.place = machine.joint_names.index(joint)
         self.joint = spec.joint(joint)
-        self.drive = spec.actuators[int(plant.drives[place])]
-        self.is_limited = bool(plant.model.actuator_forcelimited[plant.drives[place]])
+        self.drive = spec.actuators[int(plant.drives[self.place])]
         self.timestep_s = float(plant.model.opt.timestep)
         self.changes: list[MjcfChange] = []
 
@@ -65,6 +79,14 @@ class _Editor:
         if size is None:
             return [0.0]
         return [size.mean, *(size.ci95 if size.has_interval else ())]
+
+    def read(self, model: mujoco.MjModel, element: str, attribute: str, index: int) -> float:
+        """Return an attribute of the joint or its drive in a compiled model."""
+        if element == "joint":
+            values = getattr(model, f"dof_{attribute}")[self.plant.dofs[self.place]]
+        else:
+            values = getattr(model, f"actuator_{attribute}")[self.plant.drives[self.place]]
+        return float(np.ravel(values)[index])
 
     def put(self, element: str, attribute: str, index: int, values: Sequence[float]) -> None:
         """Set an attribute to the first of some values; the others are those at the ends of the interval."""
@@ -108,13 +130,15 @@ def write_changed_mjcf(
     if spec.textures:
         spec.texturedir = str((source.parent / (spec.texturedir or ".")).resolve())
     changes, left = [], {}
-    for finding in findings:
+    searched: dict[str, np.ndarray] = {}
+    # Effects inside of the file come first: the others act on a joint that has them.
+    for finding in sorted(findings, key=lambda one: one.effect not in EFFECTS):
         rule, interface = RULES.get(finding.effect), machine.interface
         if rule is None or interface not in INTERFACES.get(finding.effect, (interface,)):
             left[finding.effect] = REASONS.get(finding.effect, NO_ELEMENT)
             continue
         for joint in finding.joints or machine.joint_names:
-            editor = _Editor(spec, plant, machine, finding, joint)
+            editor = _Editor(spec, plant, machine, finding, joint, searched)
             if reason := rule(editor):
                 left[f"{finding.effect} on {joint}"] = reason
             changes += editor.changes
@@ -164,52 +188,34 @@ REASONS = {
     "quantisation": "it belongs where observations are made",
 }
 """Reasons why an effect is no change of the file."""
+SEARCHED = (
+    ("joint", "frictionloss", 0), ("joint", "damping", 0), ("joint", "armature", 0), ("actuator", "gainprm", 0),
+    ("actuator", "biasprm", 1), ("actuator", "biasprm", 2), ("actuator", "forcerange", 0), ("actuator", "forcerange", 1),
+)  # fmt: skip
+"""Attributes that `MjcfPlant.change_model` changes: element, name and place."""
 
 
-def _add_friction(to: _Editor) -> None:
-    unit = to.unit["friction"]
-    to.write("joint", "frictionloss", 0, "part", lambda old, new: old + new * unit)
-
-
-def _add_damping(to: _Editor) -> str | None:
-    unit = to.unit["damping"]
-    if float(np.ravel(to.joint.damping)[0]) + to.list_sizes("part")[0] * unit >= 0.0:
-        to.write("joint", "damping", 0, "part", lambda old, new: old + new * unit)
-        return None
-    if to.machine.interface == "torque":
-        return "less damping than the joint has in the file was found, and the drive has none"
-    # A joint has no damping below 0; the drive has the rest of it.
-    gear = float(to.drive.gear[0])
-    to.write("actuator", "biasprm", 2, "part", lambda old, new: old - new * unit / gear**2)
-    return None
-
-
-def _add_armature(to: _Editor) -> None:
-    unit = to.unit["armature"]
-    to.write("joint", "armature", 0, "part", lambda old, new: old + new * unit)
-
-
-def _scale_drive(to: _Editor) -> None:
-    places = [("gainprm", 0), ("biasprm", 1)]
-    if to.machine.interface == "speed":
-        places.append(("biasprm", 2))
-    for attribute, index in places:
-        to.write("actuator", attribute, index, "gain", lambda old, new: old * new)
-
-
-def _limit_force(to: _Editor) -> str | None:
-    sizes = to.list_sizes("shortage")
-    if sizes[0] <= 0.0:
-        return "no limit was found there"
-    held = np.array(to.drive.forcerange) if to.is_limited else None
-    if held is None:  # MJCF: a range of 0 is none
-        to.drive.forcerange = np.zeros(2)
-    most = to.unit["limit"] / np.maximum(sizes, 1e-9)
-    ranges = np.stack([limit_force_range(held, float(one)) for one in most])
-    for side in (0, 1):
-        if held is None or ranges[0, side] != held[side]:
-            to.put("actuator", "forcerange", side, ranges[:, side].tolist())
-    to.drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+def _change_as_in_search(to: _Editor) -> str | None:
+    """Take over what the effect changed in the model that the search simulated."""
+    kind = EFFECTS[to.finding.effect]
+    ((number, quantity),) = kind.drives.items()
+    neutral = np.full(to.machine.num_joints, kind.numbers[number].none)
+    trials = []
+    for size in to.list_sizes(number):
+        row = to.searched.get(quantity, neutral).copy()
+        row[to.place] = size
+        trials.append({**to.searched, quantity: row})
+    before = to.plant.change_model(to.searched)
+    models = [to.plant.change_model(trial) for trial in trials]
+    to.searched.update(trials[0])
+    for element, attribute, index in SEARCHED:
+        values = [to.read(one, element, attribute, index) for one in models]
+        if values[0] != to.read(before, element, attribute, index):
+            to.put(element, attribute, index, values)
+    if not to.changes:
+        return "its size changes no number of the file"
+    if quantity == "limit":
+        to.drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     return None
 
 
@@ -256,12 +262,8 @@ RULES: Mapping[str, Callable[[_Editor], str | None]] = {
     "flow_gain": _scale_command,
     "lag": _add_lag,
     "sag": _add_sag,
-    "joint_friction": _add_friction,
-    "joint_damping": _add_damping,
-    "joint_armature": _add_armature,
-    "drive_gain": _scale_drive,
-    "drive_limit": _limit_force,
     "dead_time": _add_delay,
+    **dict.fromkeys(EFFECTS, _change_as_in_search),
 }
 """Change of the file for an effect."""
 INTERFACES = {"flow_gain": ("speed",), "lag": ("position", "torque"), "sag": ("position",)}

@@ -8,7 +8,7 @@ state.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -29,7 +29,7 @@ QUANTITIES = ("friction", "damping", "armature", "gain", "limit")
 
 
 MAX_DAMPING_LOSS = 0.95
-"""Largest share of the damping of joint and drive that an effect takes away."""
+"""Largest share of the damping of joint and drive that an effect takes away: a rest keeps joints stable."""
 
 
 class MjcfPlant:
@@ -175,11 +175,14 @@ class MjcfPlant:
         if "friction" in changes:
             model.dof_frictionloss[dofs] += changes["friction"] * unit["friction"]
         if "damping" in changes:
-            extra = np.maximum(changes["damping"] * unit["damping"], self._measure_least_damping())
-            if model.dof_damping.ndim > 1:  # MuJoCo 4: linear and higher orders
-                model.dof_damping[dofs, 0] += extra
-            else:
-                model.dof_damping[dofs] += extra
+            damping = model.dof_damping.reshape(model.nv, -1)[:, 0]  # MuJoCo 4 has higher orders
+            square = np.square(model.actuator_gear[drives, 0])
+            held = damping[dofs] - model.actuator_biasprm[drives, 2] * square
+            least = -MAX_DAMPING_LOSS * np.maximum(held, 0.0)
+            total = damping[dofs] + np.maximum(changes["damping"] * unit["damping"], least)
+            damping[dofs] = np.maximum(total, 0.0)
+            # A joint has no damping below 0: the drive loses the rest of it.
+            model.actuator_biasprm[drives, 2] -= np.minimum(total, 0.0) / square
         if "armature" in changes:
             model.dof_armature[dofs] += changes["armature"] * unit["armature"]
         if "gain" in changes:
@@ -192,21 +195,13 @@ class MjcfPlant:
             for place in np.flatnonzero(changes["limit"] > 0.0):
                 drive = drives[place]
                 most = unit["limit"][place] / changes["limit"][place]
-                held = (
-                    model.actuator_forcerange[drive] if model.actuator_forcelimited[drive] else None
-                )
-                model.actuator_forcerange[drive] = limit_force_range(held, float(most))
+                limits = np.array([-most, most])
+                if model.actuator_forcelimited[drive]:
+                    limits = np.clip(limits, *model.actuator_forcerange[drive])
+                model.actuator_forcerange[drive] = limits
                 model.actuator_forcelimited[drive] = True
         mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by
         return model
-
-    def _measure_least_damping(self) -> np.ndarray:
-        """Return the largest damping that can be taken away, `(J,)`, negative: a rest keeps joints stable."""
-        held = self.model.dof_damping[self.dofs]
-        held = held[:, 0] if held.ndim > 1 else held
-        gear = self.model.actuator_gear[self.drives, 0]
-        held = held - self.model.actuator_biasprm[self.drives, 2] * gear**2
-        return -MAX_DAMPING_LOSS * np.maximum(held, 0.0)
 
     def _list_models(
         self, count: int, changes: Mapping[str, np.ndarray] | None
@@ -224,12 +219,6 @@ class MjcfPlant:
                 self._models[key] = self.change_model(dict(zip(names, row, strict=True)))
             models.append(self._models[key])
         return models
-
-
-def limit_force_range(held: Sequence[float] | np.ndarray | None, most: float) -> np.ndarray:
-    """Return the range of a drive's force, `(2,)`, within `most` both ways and the range `held` before."""
-    low, high = (-np.inf, np.inf) if held is None else held
-    return np.array([max(low, -most), min(high, most)])
 
 
 def _find_joint(model: mujoco.MjModel, path: Path, name: str) -> int:

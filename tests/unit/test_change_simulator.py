@@ -101,16 +101,19 @@ def test_the_changed_file_is_the_faulty_machine(tmp_path: Path) -> None:
     assert api._load_option("effect", path).joints == ("shoulder", "elbow")
 
 
-CHANGES: tuple[tuple[str, dict[str, float]], ...] = (
-    ("dead_time", {"dead_time_s": 0.05}),
-    ("lag", {"time_constant_s": 0.08}),
-    ("sag", {"sag_rad": 0.05, "sag_slope": 0.04}),
-    ("drive_gain", {"gain": 0.7}),
-    ("joint_damping", {"part": 0.3}),
+SAG = {"sag_rad": 0.05, "sag_slope": 0.04}
+CHANGES: tuple[dict[str, dict[str, float]], ...] = (
+    {"dead_time": {"dead_time_s": 0.05}},
+    {"lag": {"time_constant_s": 0.08}},
+    {"sag": SAG},
+    {"drive_gain": {"gain": 0.7}},
+    {"joint_damping": {"part": 0.3}},
     # More than the joints have in the file: the drives lose it.
-    ("joint_damping", {"part": -0.15}),
-    ("joint_armature", {"part": 0.8}),
-    ("drive_limit", {"shortage": 2.0}),
+    {"joint_damping": {"part": -0.15}},
+    {"joint_armature": {"part": 0.8}},
+    {"drive_limit": {"shortage": 2.0}},
+    # Both change the gain of the drive.
+    {"sag": SAG, "drive_gain": {"gain": 0.7}},
 )
 
 
@@ -125,20 +128,22 @@ def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> Non
         return runs.simulate(effects)[0]
 
     plain = simulate(source, [])
-    names = list(dict(CHANGES))
-    known = effect_library.load_effects(machine, names, api._load_simulator(source))
+    known = effect_library.load_effects(machine, None, api._load_simulator(source))
     kinds = {kind.name: kind for kind in known}
-    for name, numbers in CHANGES:
-        kind = kinds[name]
-        sizes: dict[str, Any] = {}
-        for number, value in numbers.items():
-            sizes[number] = dict.fromkeys(machine.joint_names, estimate(value, 0.0))
+    for effects in CHANGES:
+        findings, simulated = [], []
+        for name, numbers in effects.items():
+            sizes: dict[str, Any] = {}
+            for number, value in numbers.items():
+                sizes[number] = dict.fromkeys(machine.joint_names, estimate(value, 0.0))
+            findings.append(name_effect(name, sizes))
+            values = {number: np.full((1, 2), value) for number, value in numbers.items()}
+            simulated.append((kinds[name], values))
         changed = tmp_path / "changed.xml"
-        assert write_changed_mjcf(source, machine, [name_effect(name, sizes)], changed)[1] == {}
-        values = {name: np.full((1, 2), value) for name, value in numbers.items()}
-        with_effect = simulate(source, [(kind, values)])
+        assert write_changed_mjcf(source, machine, findings, changed)[1] == {}
+        with_effect = simulate(source, simulated)
         left = with_effect - simulate(changed, [])
-        assert np.square(left).mean() < 0.01 * np.square(with_effect - plain).mean(), kind.name
+        assert np.square(left).mean() < 0.01 * np.square(with_effect - plain).mean(), effects
 
 
 def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
