@@ -6,7 +6,7 @@ Two kinds of files are read. `policy.json` of this project's bundles names its t
     {"rate_hz": 50, "joints": ["hip", "knee"],
      "observation": {"terms": [
        {"name": "q", "columns": ["q_hip_rad", "q_knee_rad"], "samples": 3, "newest": 0,
-        "mean": [0, 0.4], "std": 1, "clip": null, "before": "first"}]},
+        "mean": [0, 0.4], "std": 1, "clip": null}]},
      "command": {"columns": ["u_hip", "u_knee"]}}
 
 `docs/doctor.md` explains each field.
@@ -20,7 +20,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -37,7 +37,6 @@ TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
 PITCH_COLUMN = "target_pitch_rad"
 OBSERVATION_COLUMN = "obs_{}"
 """Column of the observation vector as the network got it, by number."""
-Filling = Literal["first", "zero"]
 
 
 def name_advice_column(joint: str) -> str:
@@ -58,7 +57,6 @@ class ObservationTerm:
         mean: Subtracted, `(C,)`.
         std: Divisor after that, `(C,)`.
         clip: Bound of the normalised values; `None` without one.
-        before: Samples before the first row: the first one, or zero.
     """
 
     name: str
@@ -68,7 +66,6 @@ class ObservationTerm:
     mean: np.ndarray
     std: np.ndarray
     clip: float | None
-    before: Filling
 
     @property
     def size(self) -> int:
@@ -266,7 +263,7 @@ def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str,
     units = dict(zip(machine.joint_names, (joint.unit for joint in machine.joints), strict=True))
     scale = data["observation"]
     pitch, target = scale.get("pitch", {}), scale["target"]
-    before = {"samples": samples, "newest": -1, "before": "zero"}
+    earlier = {"samples": samples, "newest": -1}
     known = {
         "target_in_base_m": {
             "name": "target",
@@ -280,7 +277,7 @@ def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str,
             "samples": samples,
             **scale["q"],
         },
-        "u": {"name": "u", "columns": [*map(name_command_column, joints)], **scale["u"], **before},
+        "u": {"name": "u", "columns": [*map(name_command_column, joints)], **scale["u"], **earlier},
         "pitch_rad": {
             "name": "pitch",
             "columns": [PITCH_COLUMN],
@@ -288,7 +285,7 @@ def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str,
             "std": pitch.get("std_rad", 1.0),
         },
         "proposals": {
-            "name": "proposals", "columns": [*map(name_advice_column, joints)], **before
+            "name": "proposals", "columns": [*map(name_advice_column, joints)], **earlier
         },
     }  # fmt: skip
     return [known[part.split()[0]] for part in scale["order"]]
@@ -296,11 +293,9 @@ def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str,
 
 def _read_term(term: Mapping[str, Any]) -> ObservationTerm:
     """Return a term of a contract for any network."""
-    columns, before = tuple(term["columns"]), term.get("before", "first")
+    columns = tuple(term["columns"])
     samples, newest = int(term.get("samples", 1)), int(term.get("newest", 0))
     std = np.broadcast_to(np.asarray(term.get("std", 1.0), float), (len(columns),))
-    if before not in ("first", "zero"):
-        raise ValueError(f"'before' of term {term['name']} is {before}, expected first or zero")
     if samples < 1 or newest > 0 or not (std > 0.0).all():
         raise ValueError(
             f"term {term['name']}: expected samples of 1 or more, newest of 0 or less and std above 0, got {samples}, "
@@ -314,5 +309,4 @@ def _read_term(term: Mapping[str, Any]) -> ObservationTerm:
         mean=np.broadcast_to(np.asarray(term.get("mean", 0.0), float), (len(columns),)),
         std=std,
         clip=term.get("clip"),
-        before=before,
     )

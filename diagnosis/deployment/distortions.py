@@ -1,8 +1,8 @@
 """Mistakes of deployment code: one table of distortions, each put at its places on the way from log to valve.
 
-A distortion is a kind (order, sign, scale, frame, rate, delay, stale, clip, default_pose, history, filter,
-network), a function that spoils values, and at most one number. `diagnosis.deployment.replay` names the places
-and runs a policy with it.
+A distortion is a kind (order, sign, scale, frame, rate, delay, stale, clip, default_pose, filter, network), a
+function that spoils values, and at most one number. `diagnosis.deployment.replay` names the places and runs a
+policy with it.
 Axes: `T` rows, `R` rows that are asked for, `H` samples (oldest first), `C` columns, `J` joints.
 """
 
@@ -223,10 +223,6 @@ ALL_FILLED = Distortion(
 )  # fmt: skip
 ALL_LATE = replace(LATE, text="the whole {field} is {value} periods old")
 CLIPPED = Distortion("clip", "the {field} is clipped at ±{value}", clip, LEVELS, "bound", True)
-STARTS = (
-    Distortion("history", "the history begins with zeros", lambda mean, *_: 0.0 * mean),
-    Distortion("history", "the history begins with zeros after scaling", keep),
-)
 
 
 def spread(
@@ -356,21 +352,18 @@ def list_matched_orders(
 
 
 def _list_shared_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
-    """Yield mistakes that several terms share, and those of the start."""
+    """Yield mistakes that several terms share."""
     terms, names = policy.contract.terms, list(policy.contract.joints)
     by_joint = [term for term in terms if _name_columns(term) == names]
-    if len(by_joint) > 1:
-        for order in list_orders(names):
-            yield from make_orders(by_joint, names, order)
-            yield from make_orders(
-                by_joint, names, order, Place("answer", order=invert_order(order))
-            )
-        yield from spread([SIGN], "joints", names, *map(_watch, by_joint))
-        long = [Place(f"scaled {term.name}") for term in terms if term.samples > 1]
-        yield ALL_FILLED.put("observation", *long)
-        yield ALL_LATE.put("observation", *map(_watch, terms))
-    for row in STARTS:
-        yield row.put("observation", Place("before"))
+    if len(by_joint) < 2:
+        return
+    for order in list_orders(names):
+        yield from make_orders(by_joint, names, order)
+        yield from make_orders(by_joint, names, order, Place("answer", order=invert_order(order)))
+    yield from spread([SIGN], "joints", names, *map(_watch, by_joint))
+    long = [Place(f"scaled {term.name}") for term in terms if term.samples > 1]
+    yield ALL_FILLED.put("observation", *long)
+    yield ALL_LATE.put("observation", *map(_watch, terms))
 
 
 def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:

@@ -23,6 +23,7 @@ from diagnosis.deployment import distortions
 from diagnosis.deployment.contract import LoadedPolicy, PolicyContract
 from diagnosis.deployment.distortions import MAX_DELAY, Distortion
 from diagnosis.deployment.fault_search import (
+    LEAST_ROWS,
     NUM_RANKED,
     FittedDistortion,
     ReplayStage,
@@ -85,7 +86,6 @@ class RunExamination:
         findings: Mistakes in the code, in the order of the way.
         task: Whether the run lies where training has been.
         cannot_tell: What the log lacks, in words.
-        notes: Further remarks.
     """
 
     log: RunLog
@@ -93,12 +93,12 @@ class RunExamination:
     findings: tuple[Finding, ...]
     task: RangeEvidence
     cannot_tell: tuple[str, ...]
-    notes: tuple[str, ...]
 
     @property
     def is_judged(self) -> bool:
         """True if at least the way from observation to command could be replayed."""
-        return any(one.stage.name in ("policy", "network") for one in self.stages)
+        whole = [one for one in self.stages if one.stage.name in ("policy", "network")]
+        return any(one.num_rows >= LEAST_ROWS for one in whole)
 
     def to_json(self) -> dict[str, Any]:
         """Return it as plain JSON data, as `doctor.json` holds it."""
@@ -113,7 +113,6 @@ class RunExamination:
                 "cannot_tell": self.task.cannot_tell or None,
             },
             "cannot_tell": self.cannot_tell,
-            "notes": self.notes,
         }
 
 
@@ -202,26 +201,21 @@ class Deployment:
 
     def examine_run(self, recording: Recording, generator: np.random.Generator) -> RunExamination:
         """Examine one log; the generator draws its rounding."""
-        contract, machine = self.policy.contract, self.machine
+        contract = self.policy.contract
         log = read_run_log(recording, contract, self.target_m)
         is_sent = self.is_sent and not log.is_measured
-        notes, stages = list[str](), list[StageResult]()
+        lacking, stages = list(_list_lacking(log, is_sent)), list[StageResult]()
         findings = _check_without_replay(contract, log)
         is_other = any(finding.kind == "network" for finding in findings)
         for stage in () if is_other else self._list_stages(log, is_sent, generator):
             result = judge_stage(stage)
             stages.append(result)
-            rests = log.rests_at_start(machine.dead_time_s, machine.upper - machine.lower)
-            if result.only_start and not result.named and not rests:
-                notes.append(
-                    "the log begins while the machine moves: its first "
-                    f"{contract.num_samples / contract.rate_hz:.2g} s cannot be judged"
-                )
-            elif result.departs:
+            if result.num_rows < LEAST_ROWS:
+                lacking.append(f"the log is too short for a history of {contract.num_samples} rows")
+            if result.departs:
                 findings += _describe_findings(result, log)
         task = compare_with_training(log, contract)
-        lacking = tuple(_list_lacking(log, is_sent))
-        return RunExamination(log, tuple(stages), tuple(findings), task, lacking, tuple(notes))
+        return RunExamination(log, tuple(stages), tuple(findings), task, tuple(lacking))
 
     def _list_stages(
         self, log: RunLog, is_sent: bool, generator: np.random.Generator
@@ -297,9 +291,10 @@ def _list_inputs(
     policy: LoadedPolicy, log: RunLog, nominal: np.ndarray, logged: np.ndarray, floor: np.ndarray
 ) -> list[Distortion]:
     """Return mistakes before the network; something may be stale from shortly before the first departure on."""
+    start = policy.contract.num_samples
     with np.errstate(invalid="ignore"):
-        departed = np.flatnonzero((np.abs(nominal - logged) > floor).any(1))
-    first = int(departed[0]) if len(departed) else 0
+        departed = np.flatnonzero((np.abs(nominal - logged) > floor)[start:].any(1))
+    first = start + int(departed[0]) if len(departed) else 0
     rows = tuple(range(max(0, first - MAX_DELAY), first + 1))
     frames = distortions.list_frame_distortions(policy)
     return [*frames, *distortions.list_input_distortions(policy, log.signals, rows)]
@@ -323,9 +318,6 @@ def _describe_findings(result: StageResult, log: RunLog) -> list[Finding]:
         same = [{"kind": kind, "field": field} for kind, field in others[:NUM_RANKED]]
         return [dataclasses.replace(found[0], same_as=same), *found[1:]]
     time_s = _find_times(log, departed)
-    if result.only_start:
-        text = "only the beginning departs: the history did not begin as the contract says"
-        return [Finding("history", "observation", stage, text, time_s)]
     if stage == "network":
         text = (
             "the commands do not follow from what the network saw, and no change of the command "

@@ -24,8 +24,6 @@ LEAST_ROWS = 3
 """Departing rows below which nothing is found: a mask's edge decides a row by the last bit."""
 LEAST_SHARE = 0.02
 """Share of departing rows below which nothing is found. The export allows a quarter of it; by hand."""
-LEAST_START_SHARE = 0.3
-"""Share of the rows at the beginning from which a departure there counts by itself. By hand."""
 EXPLAINED = 0.95
 """Share of rows that a named mistake explains. Chosen by hand; with exact logs it explains all."""
 EXPLAINED_DEPARTED = 0.9
@@ -67,7 +65,7 @@ class ReplayStage:
         floor: Largest difference that is rounding, `(T, D)`.
         labels: Names of the `D` numbers.
         distortions: Mistakes that it may hold.
-        num_start: Rows at the beginning whose history the log does not hold.
+        num_start: Rows at the beginning whose history the log does not hold: they are not compared.
     """
 
     name: str
@@ -81,7 +79,8 @@ class ReplayStage:
     @property
     def rows(self) -> np.ndarray:
         """Rows that can be compared."""
-        return np.flatnonzero(np.isfinite(self.logged).all(1))
+        rows = np.flatnonzero(np.isfinite(self.logged).all(1))
+        return rows[rows >= self.num_start]
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,6 @@ class StageResult:
         named: Mistakes that explain the log: none, one, or two at once.
         alike: Others that explain it as well as the first.
         ranking: All mistakes that come near, best first.
-        only_start: Only the beginning departs.
     """
 
     stage: ReplayStage
@@ -135,12 +133,11 @@ class StageResult:
     named: tuple[FittedDistortion, ...]
     alike: tuple[FittedDistortion, ...]
     ranking: tuple[FittedDistortion, ...]
-    only_start: bool
 
     @property
     def departs(self) -> bool:
         """True if more rows depart than rounding explains."""
-        return self.only_start or is_departure(len(self.departed), self.num_rows)
+        return is_departure(len(self.departed), self.num_rows)
 
     def rank_labels(self) -> list[tuple[str, float]]:
         """Return the compared numbers by their share of departing rows, largest first."""
@@ -185,18 +182,14 @@ def judge_stage(stage: ReplayStage) -> StageResult:
     residual[rows] = stage.predict((), rows) - stage.logged[rows]
     rows = rows[np.isfinite(residual[rows]).all(1)]
     departed = rows[(np.abs(residual[rows]) > stage.floor[rows]).any(1)]
-    later = departed[departed >= stage.num_start]
     settled = rows[rows >= stage.num_start + MAX_DELAY]
-    num_early = len(departed) - len(later)
-    is_start = num_early >= max(LEAST_ROWS, LEAST_START_SHARE * stage.num_start)
-    only_start = is_start and not is_departure(len(later), len(rows))
     named = alike = ranking = ()
-    if only_start or is_departure(len(departed), len(rows)):
-        judged = rows if only_start or len(settled) < LEAST_ROWS else settled
+    if is_departure(len(departed), len(rows)):
+        judged = rows if len(settled) < LEAST_ROWS else settled
         search = _FaultSearch(stage, residual, judged)
         ranking = search.rank(())
         named, alike = search.choose(ranking)
-    return StageResult(stage, len(rows), departed, residual, named, alike, ranking, only_start)
+    return StageResult(stage, len(rows), departed, residual, named, alike, ranking)
 
 
 class _FaultSearch:

@@ -4,8 +4,7 @@ A change spoils values at points of the way, by their names:
 
     signal <term> (T, C) → scaled <term> (R, H, C) → vector (R, O) → answer (R, J) → command (T, J)
 
-`before` are the values `(C,)` that stand before the first row of all terms, made of the mean, and `network`
-takes the place of the policy's own.
+`network` takes the place of the policy's own.
 Axes: `T` rows of the log, `R` rows that are asked for, `H` samples of history (oldest first), `C`
 columns of a term, `O` numbers of the vector, `J` joints.
 """
@@ -86,7 +85,7 @@ class PolicyReplay:
         parts = []
         for term in self.policy.contract.terms:
             values = apply_changes(changes, f"signal {term.name}", self.log.signals[term.name])
-            window = cut_history(values, term, rows, changes)
+            window = cut_history(values, term, rows)
             scaled = (window - term.mean) / term.std
             scaled = apply_changes(changes, f"scaled {term.name}", scaled)
             if term.clip is not None:
@@ -147,33 +146,20 @@ def apply_changes(changes: Sequence[Change], point: str, values: np.ndarray) -> 
     return values
 
 
-def cut_history(
-    values: np.ndarray, term: ObservationTerm, rows: np.ndarray, changes: Sequence[Change]
-) -> np.ndarray:
-    """Return the history of a term at rows of a log, `(R, H, C)`.
+def cut_history(values: np.ndarray, term: ObservationTerm, rows: np.ndarray) -> np.ndarray:
+    """Return the history of a term at rows of a log, `(R, H, C)`; the first row stands before itself.
 
     Args:
         values: The term's columns, `(T, C)`.
         term: The term.
         rows: Rows of the decisions, `(R,)`.
-        changes: Changes on the way.
     """
     index = rows[:, None] + term.newest + np.arange(1 - term.samples, 1)[None]
-    window = values[np.maximum(index, 0)]
-    if any("before" in change for change in changes):
-        first = apply_changes(changes, "before", term.mean)
-    elif term.before == "zero":
-        first = np.zeros_like(term.mean)
-    else:
-        return window
-    return np.where((index < 0)[:, :, None], first, window)
+    return values[np.maximum(index, 0)]
 
 
 CAPTURED = "capture:"
 """Begins the source of recordings that `mode=convert` made of a capture of the loop."""
-REST_SHARE = 0.002
-"""Share of a joint's travel within which it counts as resting over the dead time at the start;
-chosen by hand, 5 mrad on brokk170."""
 MAX_STEPS, STEP_TOLERANCE = 8, 0.05
 """Multiples of a step by which a rounded column is recognised, and how exact they are, of a step."""
 
@@ -212,16 +198,6 @@ class RunLog:
     def is_complete(self) -> bool:
         """True if every term of the observation was logged."""
         return not self.missing
-
-    def rests_at_start(self, dead_time_s: float, travel: np.ndarray) -> bool:
-        """Return whether the machine rests over the first dead time: no command is on its way.
-
-        Args:
-            dead_time_s: Time from command to motion.
-            travel: Travel of each joint, `(J,)`.
-        """
-        rows = max(2, round(dead_time_s * self.recording.rate_hz))
-        return bool((np.ptp(self.recording.q[:rows], axis=0) <= REST_SHARE * travel).all())
 
 
 def read_run_log(

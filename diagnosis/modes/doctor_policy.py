@@ -93,6 +93,6 @@ def print_answer(found: DoctorAnswer, folder: Path) -> None:
         for line in page.describe_remedies(found.findings):
             print_text(line)
     for run in found.runs:
-        for line in (*run.cannot_tell, *run.notes):
+        for line in run.cannot_tell:
             print_text(f"not judged: {line}")
     print_text(f"page: {folder / page.PAGE_FILE}, answer: {folder / ANSWER_FILE}")

@@ -18,6 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, write_recording
+from diagnosis.case import select_rows
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
 from diagnosis.deployment.examination import Deployment, DoctorAnswer
 from diagnosis.deployment.replay import measure_resolution
@@ -56,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Path:
     terms = [
         {"name": "target", "columns": ["target_x_m", "target_y_m", "target_z_m"], "mean": [2.5, 0, 0.7], "std": 0.5},
         {"name": "q", "columns": [f"q_{name}_rad" for name in names], "samples": SAMPLES, "mean": 0.3, "std": 0.7},
-        {"name": "u", "columns": [f"u_{name}" for name in names], "samples": SAMPLES, "newest": -1, "before": "zero"},
+        {"name": "u", "columns": [f"u_{name}" for name in names], "samples": SAMPLES, "newest": -1},
     ]  # fmt: skip
     ranges = {"target.distance": [2.0, 3.5], "q.q1": [-9.0, 9.0]}
     contract = {
@@ -155,6 +156,15 @@ def test_a_mistake_is_named_with_its_field(
 def test_a_right_loop_is_left_alone(detail: str, policy: LoadedPolicy, machine: Machine) -> None:
     found = ask(policy, run_loop(policy, machine, detail=detail), machine)
     assert (found.verdict, found.findings) == ("nothing", ())
+
+
+def test_a_log_that_begins_in_motion_is_judged_where_it_holds_the_history(
+    policy: LoadedPolicy, machine: Machine
+) -> None:
+    recording = run_loop(policy, machine)
+    for first, verdict in ((40, "nothing"), (NUM_ROWS - SAMPLES - 1, "cannot_tell")):
+        found = ask(policy, select_rows(recording, slice(first, None)), machine)
+        assert found.verdict == verdict, found.reason
 
 
 def test_a_fitted_number_is_the_true_one(policy: LoadedPolicy, machine: Machine) -> None:

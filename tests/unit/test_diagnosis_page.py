@@ -80,12 +80,3 @@ def test_an_answer_without_effects_has_a_report(
     assert "12.0 mrad before; the floor is 10.0 mrad" in page
     assert f"{30 - report.MAX_LISTED} more" in page
     assert "lies in q4" in report.write_headline(replace(bare, verdict="unknown"))[0]
-
-
-def test_an_answer_that_cannot_tell_says_why(machine: Machine, seen: Outcome) -> None:
-    bare = Answer(
-        verdict="unknown", selected=(), ranking=(), gap=Gap(0.01, 0.01, 0.01, None),
-        reason="cannot tell, because nothing moves",
-    )  # fmt: skip
-    assert "nothing moves" in report.write_headline(bare)[0]
-    assert report.draw_paths(Outcome(bare, seen.before, None), machine).axes

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from actuators.open_loop import FreeRunWindows
 from diagnosis import rivals
@@ -54,14 +53,6 @@ def test_no_window_is_predicted_by_a_fit_to_it() -> None:
     # its own positions after the start do not matter to its fold; those of other folds change
     np.testing.assert_allclose(first[same], second[same], atol=2e-3)
     assert np.abs(first[~same] - second[~same]).max() > 1e-3
-
-
-@pytest.mark.parametrize(("num_windows", "folds"), [(2, 2), (3, 3), (16, 4), (50, 4)])
-def test_folds_take_turns_in_blocks(num_windows: int, folds: int) -> None:
-    found = assign_folds(num_windows)
-    assert len(np.unique(found)) == folds and len(found) == num_windows
-    if num_windows == 50:
-        assert found[:8].tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
 
 
 def test_one_window_leaves_none_to_fit() -> None:
