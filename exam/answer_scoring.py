@@ -49,13 +49,6 @@ class GivenAnswer:
     labels_sha256: str | None = None
     examined: Mapping[str, Any] | None = None
 
-    @property
-    def seconds(self) -> float | None:
-        """Time that the answer took, where it is noted."""
-        if not self.note or self.note["error"]:
-            return None
-        return float(self.note["seconds"])
-
 
 def read_answers(path: Path) -> dict[str, GivenAnswer]:
     """Return the answers in the folder of `exam.do=run`, or in a published file, by case.
@@ -128,7 +121,7 @@ def build_table(
             continue
         one = given[case]
         answer = None if one.answer is None else parse_answer(one.answer, f"case {case}")
-        row = score.score_answer(label, answer, mix.classes, shared, one.seconds, one.examined)
+        row = score.score_answer(label, answer, mix.classes, shared, one.examined)
         scores.append(row)
     not_begun = len(labels) - len(scores)
     if not_begun:

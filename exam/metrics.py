@@ -12,6 +12,7 @@ import numpy as np
 from scipy import stats
 
 from brokk_rl.console_table import MISSING
+from brokk_rl.report import render_page
 from brokk_rl.session import write_text
 from brokk_rl.statistics import CONFIDENCE, compute_wilson_interval
 from exam.case_distribution import KINDS
@@ -98,12 +99,7 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
         parts = [metric.collect(score) for score in scores if score.kind in metric.kinds]
         values = list(chain.from_iterable(parts))
         found[key] = compute_median(values) if metric.is_median else compute_rate(values)
-    seconds = [score.seconds for score in scores if score.seconds is not None]
-    median = float(np.median(seconds)) if seconds else None
-    return found | {
-        "seconds": {"median": median, "most": max(seconds, default=None)},
-        "said": count_answers(scores),
-    }
+    return found | {"said": count_answers(scores)}
 
 
 def compute_rate(right: Sequence[bool]) -> Metric:
@@ -143,13 +139,8 @@ def count_answers(scores: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
     return dict(sorted(found.items()))
 
 
-REPORT_FILE = "exam.md"
-STRICT = (
-    "Figures are strict: only the true effect counts. Rows with equivalents also count the effects that the "
-    "exam lists as hard to tell apart, and those that an answer names as the same. Rates have 95 % Wilson "
-    "intervals, medians bootstrap intervals over cases."
-)
-OPEN = "A development seed: the authors of the candidates may have looked at its cases."
+REPORT_FILE = "exam.html"
+TEMPLATE = Path(__file__).with_name("exam.html.jinja")
 
 
 def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
@@ -157,16 +148,11 @@ def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     rows = []
     for key, metric in METRICS.items():
         rows.append([metric.title, *(_format_metric(table[key]) for table in tables.values())])
-    last = [["seconds a case, median (most)"], ["cases sat"], ["no answer"]]
+    sat, failed = ["cases sat"], ["no answer"]
     for table in tables.values():
-        sat, seconds = table["sat"], table["seconds"]
-        text = MISSING
-        if seconds["median"] is not None:
-            text = f"{seconds['median']:.0f} ({seconds['most']:.0f})"
-        last[0].append(text)
-        last[1].append(f"{sat['value']} of {sat['of']}")
-        last[2].append(str(table["failed"]))
-    return rows + last
+        sat.append(f"{table['sat']['value']} of {table['sat']['of']}")
+        failed.append(str(table["failed"]))
+    return [*rows, sat, failed]
 
 
 def _format_metric(metric: Mapping[str, Any]) -> str:
@@ -178,37 +164,14 @@ def _format_metric(metric: Mapping[str, Any]) -> str:
     return f"{value:.2f}{note}"
 
 
-def format_markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table as Markdown."""
-    lines = [list(headings), ["---"] * len(headings)]
-    for row in rows:
-        lines.append([cell.strip() for cell in row])
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def write_report(
     folder: Path, exam: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]
 ) -> None:
-    """Write `exam.md`: the exam, the table of all candidates, and by cause what each of them said."""
-    kinds = next(iter(tables.values()))["cases"]
-    cases = _join_counts({kind: count for kind, count in kinds.items() if count})
-    # labels of the first exams name neither
-    made = f"machine {exam['machine']} ({', '.join(exam['makes'])}), " if "makes" in exam else ""
-    parts = [
-        f"# Exam of {', '.join(tables)}",
-        f"{exam['num_cases']} cases ({cases}), {made}roughness {exam['roughness']}, seed {exam['seed']}.",
-        *([] if exam["sealed"] else [OPEN]),
-        STRICT,
-        *exam["ledger"],
-        format_markdown(["", *tables], build_rows(tables)),
-    ]
-    for name, table in tables.items():
-        said = [[cause, _join_counts(counts)] for cause, counts in table["said"].items()]
-        parts += [f"## {name}", f"Commit {table['commit'] or MISSING}."]
-        parts.append(format_markdown(["cause", "said"], said))
-    parts.append(f"Labels, SHA-256: {exam['labels_sha256']}.")
-    write_text(folder / REPORT_FILE, "\n\n".join(part.rstrip() for part in parts) + "\n")
-
-
-def _join_counts(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in counts.items())
+    """Write `exam.html`: the exam, the table of all candidates, and by cause what each of them said."""
+    values = {
+        "title": f"Exam of {', '.join(tables)}",
+        "exam": exam,
+        "tables": tables,
+        "rows": build_rows(tables),
+    }
+    write_text(folder / REPORT_FILE, render_page(TEMPLATE, values))

@@ -54,7 +54,6 @@ class CaseScore:
         numbers: Parameters of strictly right names.
         examined: Share of the gap closed on withheld recordings, by the examiner's simulation of
             `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
-        seconds: Time the answer took.
         outside: Name of the fault outside the library.
         other_hand: Whether another hand drives the field than the reference.
     """
@@ -68,7 +67,6 @@ class CaseScore:
     claims: tuple[Claim, ...]
     numbers: tuple[ParameterScore, ...]
     examined: float | None
-    seconds: float | None
     outside: str | None
     other_hand: bool
 
@@ -103,7 +101,6 @@ def score_answer(
     answer: Answer | None,
     classes: Sequence[Sequence[str]],
     of_machine: Sequence[str],
-    seconds: float | None = None,
     examination: Mapping[str, Any] | None = None,
 ) -> CaseScore:
     """Return the score of `answer`; `None` is a missing answer.
@@ -113,7 +110,6 @@ def score_answer(
         answer: The answer.
         classes: Effects that recordings of commands and positions cannot tell apart.
         of_machine: Effects that all joints have together; nobody is asked for their joints.
-        seconds: Time it took.
         examination: The examiner's own figures; see `examiner.examine_case`.
     """
     kind, outside = label["kind"], label["outside"]
@@ -146,7 +142,6 @@ def score_answer(
         claims=tuple(claims),
         numbers=tuple(numbers),
         examined=examined,
-        seconds=seconds,
         outside=outside["ailment"] if outside else None,
         other_hand=label.get("other_hand", False),
     )

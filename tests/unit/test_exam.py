@@ -139,7 +139,7 @@ def test_an_exam_is_sat_and_scored_and_its_ledger_knows_the_engine_before_the_la
         assert "registered before" in said and f"opened {count} times" in said
     table = found["candidates"]["none"]
     assert table["false_alarms_none"]["value"] == table["top1"]["value"] == table["failed"] == 0
-    assert "machine brokk170 (sensing)" in (marks / "exam.md").read_text()
+    assert "machine brokk170 (sensing)" in (marks / "exam.html").read_text()
     # labels and answers are published beside the score
     assert (marks / "labels.json").read_bytes() == (exam / dataset.LABELS_FILE).read_bytes()
     said = [json.loads(text) for text in (marks / "answers_none.jsonl").read_text().splitlines()]
