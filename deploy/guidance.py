@@ -8,8 +8,9 @@ than a hand can, and an axis passes through neutral before the button changes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Interval
@@ -131,3 +132,35 @@ class LeverDisplay:
         step = self._guidance.max_rate_rad_s * period_s
         self._angles_rad = self._angles_rad + np.clip(angles_rad - self._angles_rad, -step, step)
         return LeverAngles(self._angles_rad.copy(), self._button)
+
+
+class HandLag:
+    """Lag and dead zone of the hand that a policy counts on, where nobody moves the levers.
+
+    The same as `follower=filter`, without torch: the commands of a policy that learned behind a
+    person swing from sample to sample, and a hand smooths them.
+
+    Args:
+        advice: `advice` of the policy's contract.
+        machine: The machine.
+    """
+
+    def __init__(self, advice: dict[str, Any], machine: Machine) -> None:
+        lag = max(float(np.mean(advice["lag_s"])) / machine.period_s, 1e-6)  # 0 would divide
+        self._dead_zone, self._exclusive = float(np.mean(advice["dead_zone"])), machine.is_exclusive
+        self._left = math.exp(-1.0 / lag)
+        self._mean = lag * (1.0 - self._left)
+        self._hand = np.zeros(machine.num_joints)
+
+    def give(self, u: np.ndarray, guiding: bool) -> np.ndarray:
+        """Return the mean command, `(J,)`, of a period in which the hand moves towards `u`.
+
+        Without advice (`guiding` false, `u` zero) it lets go at once.
+        """
+        asked = np.abs(u) + 1e-6 * np.abs(self._hand)
+        alone = asked[self._exclusive].max(initial=0.0) > asked[~self._exclusive].max(initial=0.0)
+        held, away = self._exclusive == alone, (self._hand - u) * guiding
+        self._hand = np.where(held, u + away * self._left, 0.0)
+        deflection = np.where(held, u + away * self._mean, 0.0)
+        opened = (np.abs(deflection) - self._dead_zone).clip(min=0.0) / (1.0 - self._dead_zone)
+        return np.copysign(opened, deflection)

@@ -21,6 +21,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, restore_encoder
 from brokk_rl.plain_files import check_plain_file, parse_json, read_json
 from brokk_rl.registry import resolve_package_path
+from deploy.guidance import HandLag
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
 SCHEMA = 2
@@ -48,6 +49,8 @@ class PolicyBundle:
     Attributes:
         encoder: The training's own observation code, with the bundle's scaling.
         contract: Contents of `policy.json`.
+        hand: What stands between the policy and the valves where nobody does; `None` where it
+            learned without a person.
 
     Raises:
         CheckpointError: see the module; the message names the difference.
@@ -80,7 +83,8 @@ class PolicyBundle:
                 f"asks for {', '.join(observation['order'])}; run it in a loop of your own, as "
                 "examples/run_policy.py does"
             )
-        self.encoder = encoder
+        self.encoder, advice = encoder, observation.get("advice")
+        self.hand = HandLag(advice, machine) if advice else None
         expected = self.encoder.describe()
         for key, value in expected.items():
             if key != "size" and _is_different(value, observation.get(key)):
@@ -225,12 +229,9 @@ def _read(path: Path, folder: str) -> dict[str, Any]:
     try:
         return read_json(path, MOST_JSON_BYTES)
     except FileNotFoundError:
-        hint = (
-            "export it again (mode=export)"
-            if path.parent.is_dir()
-            else "give the folder of a trained policy"
-        )
-        raise CheckpointError(f"policy {folder}: {path.name} is missing; {hint}") from None
+        raise CheckpointError(
+            f"policy {folder}: {path.name} is missing; give the folder of an exported policy"
+        ) from None
     except (OSError, ValueError) as error:
         raise CheckpointError(
             f"policy {folder}: {path.name} cannot be read ({error}); export it again (mode=export)"
@@ -251,14 +252,11 @@ def _open_session(
         session = onnxruntime.InferenceSession(
             str(path), options, providers=["CPUExecutionProvider"]
         )
-    except FileNotFoundError:
-        raise CheckpointError(
-            f"policy {folder}: {ONNX} is missing; export it (mode=export)"
-        ) from None
-    except OSError as error:
-        raise CheckpointError(f"policy {folder}: {ONNX} cannot be read ({error})") from error
     except Exception as error:  # onnxruntime's errors have no base of their own
-        raise CheckpointError(f"policy {folder}: {_explain(str(error), path)}") from error
+        raise CheckpointError(
+            f"policy {folder}: {ONNX} cannot be read ({str(error).splitlines()[0]}); copy all files of the policy, "
+            f"update onnxruntime {onnxruntime.__version__}, or export it again (mode=export)"
+        ) from error
     metadata = session.get_modelmeta().custom_metadata_map
     said = {}
     for key in ("fingerprint", "task"):
@@ -271,20 +269,3 @@ def _open_session(
             f"policy {folder}: {CONTRACT} and {ONNX} do not belong together; export it again (mode=export)"
         )
     return session
-
-
-def _explain(text: str, path: Path) -> str:
-    """Return in words why onnxruntime does not open a network."""
-    line = text.splitlines()[0] if text else "no reason given"
-    if "IR version" in text or "opset" in text.lower():
-        return (
-            f"{ONNX} was written by a newer onnx than this onnxruntime {onnxruntime.__version__} reads "
-            f"({line}); update onnxruntime, or export with an older onnx"
-        )
-    if "external" in text.lower() or f"{ONNX}.data" in text:
-        files = ", ".join(sorted(one.name for one in path.parent.iterdir()))
-        return (
-            f"the weights of {ONNX} lie in a file of their own, which is missing or cut off ({line}); "
-            f"copy it, mostly {ONNX}.data, beside {ONNX}; the folder holds {files}"
-        )
-    return f"{ONNX} is damaged or truncated ({line})"

@@ -1,7 +1,8 @@
 """The policy process: in each control period from the state of the machine to an advice.
 
 It never touches the bus. Where commands are sent at all (`deploy=auto`) it also writes them into
-the request slot, which the guard reads; otherwise there is no such slot.
+the request slot, which the guard reads; otherwise there is no such slot. A policy that learned behind
+a person commands through the lag of a hand there.
 """
 
 from __future__ import annotations
@@ -229,6 +230,8 @@ class PolicyAdviser:
 
     def _build_request(self, status: AdviceStatus, u: np.ndarray, now_s: float) -> RequestedCommand:
         """Return the command to ask for; without advice the last one must not go on."""
+        if self._bundle.hand is not None:
+            u = self._bundle.hand.give(u, status is AdviceStatus.VALID)
         if status in (AdviceStatus.VALID, AdviceStatus.DONE):
             return RequestedCommand(now_s, u)
         if status is AdviceStatus.REJECTED:

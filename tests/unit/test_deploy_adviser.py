@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from composed import option
 
+from deploy.guidance import HandLag
 from deploy.kernel.guard import GuardTrip
 from deploy.policy import policy_process
 from deploy.policy.policy_process import PolicyAdviser, PolicyHistory, PolicyProcessConfig
@@ -46,6 +47,7 @@ class Bundle:
     def __init__(self) -> None:
         self.encoder, self.answer, self.asked = Encoder(), ANSWER, 0
         self.knows, self.done = True, False
+        self.hand: HandLag | None = None
 
     def is_trained_for(self, target_m: np.ndarray) -> bool:
         return self.knows
@@ -232,6 +234,13 @@ def test_where_nothing_is_ever_sent_nothing_is_asked_for() -> None:
     desk = Desk(commands=False).advised()
     assert desk.memory.request is None
     desk.memory.close()
+
+
+def test_what_is_sent_goes_through_the_hand_that_the_policy_counts_on(desk: Desk) -> None:
+    desk.bundle.hand = HandLag({"lag_s": [0.1, 0.2], "dead_zone": 0.025}, MACHINE)
+    assert 0.0 < desk.advised().request.u[0] < desk.advice.u[0] == ANSWER[0]
+    desk.go(q_plausible=False)
+    assert not desk.request.u.any()
 
 
 def test_the_display_moves_by_one_period_also_without_advice(desk: Desk) -> None:

@@ -22,6 +22,7 @@ from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.policy_choice import CLASSICAL, _insert_behaviour
 from brokk_rl.policy_folder import find_policy
 from brokk_rl.rl.loop import ControlLoop
+from deploy.policy.bundle import PolicyBundle
 
 CPU = torch.device("cpu")
 NEUTRAL: dict[str, Any] = {
@@ -167,6 +168,20 @@ def test_the_hand_changes_over_when_the_person_sees_it(machine: Machine) -> None
     found = follow(machine, proposed, delay_s=0.1, lag_s=0.1)
     assert (found[2:5, 1] > 0).all() and not found[5:, 1].any() and not found[:5, [0, 2]].any()
     assert (found[5:, [0, 2]] > 0).all(), "the hand comes back as it went, with its lag"
+
+
+def test_before_the_valves_of_a_machine_stands_the_same_filter(machine: Machine) -> None:
+    assert PolicyBundle("tasks:policies/borehole_insertion", machine).hand is None
+    hand = PolicyBundle("tasks:policies/unidentified_machine", machine).hand
+    assert hand is not None
+    model = option("follower", "filter").build(machine, 1, CPU)
+    proposed = exclusive_proposals(machine, 60)[:, 0]
+    proposed[20:25] = 0.0
+    for row in proposed:
+        expected = model.step(row[None])[0].tolist()
+        assert hand.give(row.numpy().astype(float), True) == pytest.approx(expected, abs=1e-6)
+    # let go, and not taken again
+    assert not any(hand.give(0.0 * row.numpy(), guiding).any() for guiding in (False, True))
 
 
 @settings(max_examples=30, deadline=None)
