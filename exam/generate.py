@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -223,15 +224,11 @@ class CaseRecorder:
                     f"exam: programs: no excitation '{name}'; {list_choices(name, self.excitations)}"
                 )
         chosen = {name: self.excitations[name] for name in job.programs}
-        stream = job.stream("plan")
-        tried = 1
-        while True:
-            try:
-                return plan_runs(chosen, self.machine, self.approach, 1, job.plan.file_s, stream)
-            except ConfigError:
-                if tried == NUM_PLANS:
-                    raise
-                tried += 1
+        about = (chosen, self.machine, self.approach, 1, job.plan.file_s, job.stream("plan"))
+        for _ in range(NUM_PLANS - 1):
+            with suppress(ConfigError):
+                return plan_runs(*about)
+        return plan_runs(*about)
 
     def _lacks_files(self, number: int, question: CaseDesign) -> bool:
         for half in self.halves:

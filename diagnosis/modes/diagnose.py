@@ -94,6 +94,10 @@ class Diagnose:
             RecordingError: there is too little data to fit a simulator to.
             ConfigError: an effect is unknown, or there is neither a reference nor an actuator.
         """
+        if self.base is None and not given.reference:
+            raise ConfigError(
+                "diagnosis.field needs a simulator to hold it against: add actuator=<name>, or simulator=<your own>"
+            )
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
         with (
             ItemProgress("fitting the simulator", SHARE) as progress,
@@ -153,20 +157,12 @@ class Diagnose:
         if subject.case is not None:
             return case.load_case(Path(subject.case), self.machine)
         assert subject.field is not None, "checked by Subject"
-        if self.base is None:
-            raise ConfigError(
-                "diagnosis.field needs a simulator to hold it against: add actuator=<name>, or simulator=<your own>"
-            )
         return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine))
 
     def _find_base(self, given: GapCase) -> Actuator:
         """Return the simulator: the one that was given, or one fitted to the reference."""
         if self.base is not None:
             return self.base
-        if not given.reference:
-            raise ConfigError(
-                "there is neither a reference nor an actuator to hold the field against"
-            )
         pieces = case.split_recordings(given.reference, self.machine)
         seed, device = self.session.stream("base"), self.session.torch_device()
         folder = self.session.folder / "base"
