@@ -13,13 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.effect_library import EffectType, EffectValues, list_shared_effects
-from diagnosis.engine.decide import JOINT_NATS, JOINT_SHARE, LEAST_NATS, SECOND_SHARE
+from diagnosis.engine.decide import JOINT_NATS, SECOND_SHARE
 from diagnosis.grown_effects import GrownEffect, list_candidates
 from diagnosis.simulator_runs import EffectSimulator, FreeRunLikelihood
 
 ROUNDS = 30
 """Steps of Levenberg and Marquardt at most, by which all numbers are fitted together: those of a mass
 and its friction trade against each other."""
+LEAST_NATS = 22.0
+"""An effect that earns less is not named. Free runs of a simulator err by more than the joint models do."""
+JOINT_SHARE = 0.1
+"""A joint that earns less, of what the best joint earns, does not have the effect."""
 LEAST_GAIN = 0.1
 """Nats below which these steps end."""
 MAX_EFFECTS = 6

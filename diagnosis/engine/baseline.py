@@ -31,8 +31,6 @@ LATE_FACTORS = np.array([0.0, 1.0, 1.4, 2.0, 2.8, 4.0])
 """Multiples of the mean from which numbers that are known late begin; 1 alone told a false lack of flow on two of
 six practice cranes, those from 1 on one. Friction that is not there begins at 0: from its mean the fit of a servo
 without friction ended worse than it had begun. Their spacing is chosen by hand."""
-POOLED = 0.15
-"""Share of the mean of all joints in the variance of each."""
 
 
 @dataclass
@@ -177,7 +175,7 @@ def fit_reference(side: Side) -> list[JointBaseline]:
     side.ask_others(every)
     first = [_leave_out(side, j, every[j], PLAIN, None) for j in joints]
     side.ask_others(every)
-    scales = _fit_scales(side, first)
+    scales = [_fit_scale(side, one) for one in first]
     found = []
     for j in joints:
         motion = measure_motion(side, side.simulate(j, every[j])[0])
@@ -235,22 +233,15 @@ def _leave_out(
     )
 
 
-def _fit_scales(side: Side, bases: Sequence[JointBaseline]) -> list[Scale]:
-    """Return variance and memory of each joint, the variance partly pooled over joints."""
+def _fit_scale(side: Side, base: JointBaseline) -> Scale:
+    """Return variance and memory of a joint."""
     part = split_parts(side)
-    rows = []
-    for base in bases:
-        h = base.measure.interval
-        # The parts were fitted apart, so that errors jump where one ends.
-        valid = base.measure.valid & (part[h:] == part[:-h])
-        kept = 1.0 if side.model.integrates else fit_kept(base.error, h, valid)
-        increments = base.error[h:] - kept * base.error[:-h]
-        rows.append((valid, kept, increments, fit_variance(increments, base.motion, valid)))
-    pooled = np.mean([variance for *_, variance in rows], 0)
-    found = []
-    for base, (valid, kept, increments, variance) in zip(bases, rows, strict=True):
-        mixed = Scale((1.0 - POOLED) * variance + POOLED * pooled, (), kept)
-        measure = IncrementMeasure(side, mixed, base.motion)
-        memory = fit_memory(increments * measure.weight, measure.interval, valid)
-        found.append(Scale(mixed.coefficients, memory, kept))
-    return found
+    h = base.measure.interval
+    # The parts were fitted apart, so that errors jump where one ends.
+    valid = base.measure.valid & (part[h:] == part[:-h])
+    kept = 1.0 if side.model.integrates else fit_kept(base.error, h, valid)
+    increments = base.error[h:] - kept * base.error[:-h]
+    scale = Scale(fit_variance(increments, base.motion, valid), (), kept)
+    measure = IncrementMeasure(side, scale, base.motion)
+    memory = fit_memory(increments * measure.weight, h, valid)
+    return replace(scale, memory=memory)

@@ -1,8 +1,8 @@
 """Flexible columns: what one quantity alone could explain, whatever the law.
 
 A group of columns lets the simulated speed follow any function of one quantity: place, level of the
-command, the other joints, what happened before, or a slow oscillation. Their marginal likelihood
-pays for their number. Where a group earns much more than any effect, the cause is unknown.
+command, the other joints, or a slow oscillation. Their marginal likelihood pays for their number.
+Where a group earns much more than any effect, the cause is unknown.
 Axes: `T` samples, `K` columns, `N` increments.
 """
 
@@ -14,6 +14,7 @@ from scipy import ndimage
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline
 from diagnosis.engine.evidence import FieldJoint, RowEvidence
 from diagnosis.engine.nuisance import (
+    LEAST_SQUARE,
     Projection,
     compute_gain,
     count_part,
@@ -28,9 +29,6 @@ LEVELS = np.array([0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """Knots of the place and of the speed over the top speed."""
 HUNTING_HZ = np.arange(0.1, 0.62, 0.03)
 """Slow oscillations of a pump controller."""
-HISTORY_S = (-0.3, -0.15, 0.1, 0.2, 0.35, 0.55, 0.8, 1.2)
-RISING_S = (-0.15, 0.15, 0.35, 0.7)
-"""Shifts of the simulated speed: at any time, and while it rises."""
 SMOOTHING_S = 0.25
 TARGET_HISTORY_S = (-0.1, 0.02, 0.06, 0.15, 0.3)
 """Shifts of the simulated path of a servo."""
@@ -56,10 +54,6 @@ def list_groups(
     groups["other joints"] = 0.1 * _view_others(side, joint, base, speed, top)
     waves = 2.0 * np.pi * HUNTING_HZ[:, None] * side.time_s
     groups["hunting"] = 0.2 * speed * np.concatenate([np.sin(waves), np.cos(waves)])
-    rising = np.abs(_shift(speed, -1)) > np.abs(speed)
-    before = [_shift(speed, _count(side, s)) - speed for s in HISTORY_S]
-    before += [(_shift(speed, _count(side, s)) - speed) * rising for s in RISING_S]
-    groups["history"] = 0.2 * np.stack(before)
     return {name: np.cumsum(columns, -1) - columns for name, columns in groups.items()}
 
 
@@ -114,7 +108,7 @@ def compute_evidence(
     projection: Projection, residual: np.ndarray, columns: np.ndarray, count: float
 ) -> float:
     """Return the log evidence of columns of prior deviation 1 beside the nuisance, nats."""
-    columns = columns[np.square(columns).sum(1) > 1e-9]
+    columns = columns[np.square(columns).sum(1) > LEAST_SQUARE]
     wide = projection.add(columns)
     before = float(projection.measure_squares(residual)[0])
     gain = float(compute_gain(wide.measure_squares(residual), before, count)[0])
@@ -143,8 +137,7 @@ class GenericCauses:
             gains = []
             for k in range(NUM_PARTS):
                 own, count = base.part == k, count_part(base, k)
-                residual = base.left_out[own]
-                gain = compute_evidence(parts[k], residual, increments[:, own], count)
+                gain = compute_evidence(parts[k], base.left_out[own], increments[:, own], count)
                 gains.append(gain / (count * base.measure.interval * side.period_s))
             found[name] = max(*gains, 0.0)
         return found

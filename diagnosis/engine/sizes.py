@@ -242,11 +242,12 @@ def describe_hold(hold: HeldCourse, machine: Machine) -> dict[str, tuple[float, 
         relative = float(np.hypot(spread, get_form_error("delay_jitter")))
         # Delays are uniform from none to the longest.
         return {"jitter_s": (2.0 * mean * machine.period_s, relative)}
-    seen = float(np.clip(weights @ (delays > 0), 1e-4, 0.9 * SEEN_SHARE))
+    is_late = delays > 0
+    seen = float(np.clip(weights @ is_late, 1e-4, 0.9 * SEEN_SHARE))
     share = seen / SEEN_SHARE
     spread = np.sqrt((1.0 - seen) / (seen * num_seen))
-    begins = max(int(((delays[1:] > 0) & (delays[:-1] == 0)).sum()), 1)
-    mean_frames = (delays > 0).sum() / begins
-    persistence = float(np.clip(1.0 - 1.0 / (mean_frames * (1.0 - hold.share)), 0.0, 0.95))
+    begins = max(int((is_late[1:] & ~is_late[:-1]).sum()), 1)
+    mean_frames = is_late.sum() / begins
+    persistence = float(np.clip(1.0 - 1.0 / (mean_frames * (1.0 - is_late.mean())), 0.0, 0.95))
     relative = float(np.hypot(spread, get_form_error("frame_loss")))
     return {"probability": (share, relative), "persistence": (persistence, relative)}

@@ -23,7 +23,9 @@ from diagnosis.answer import (
     Selected,
     Where,
 )
-from diagnosis.engine.decide import EffectFinding, judge_first
+from diagnosis.engine.decide import EffectFinding, find_owners, judge_first
+from diagnosis.engine.evidence import JointRow
+from diagnosis.engine.rows import Row
 from diagnosis.reference_diagnosis import propose_measurement, rank_effects
 
 
@@ -96,13 +98,24 @@ def test_training_takes_the_found_effects_as_they_are(
 
 def test_a_cause_is_named_or_unknown_by_what_it_earns() -> None:
     cases = [
-        ("lag", 22.0, 0.0, 0.0, "effects"), ("lag", 21.9, 0.0, 0.0, "none"),
+        ("lag", 16.0, 0.0, 0.0, "effects"), ("lag", 15.9, 0.0, 0.0, "none"),
         ("frame_loss", 60.0, 0.0, 0.0, "effects"), ("frame_loss", 59.9, 0.0, 0.0, "none"),
         # a row outside the library has to explain much, and much more
-        ("lag", 30.0, 52.0, 0.0, "effects"), ("lag", 30.0, 52.1, 0.0, "unknown"),
+        ("lag", 30.0, 46.0, 0.0, "effects"), ("lag", 30.0, 46.1, 0.0, "unknown"),
         ("lag", -9.0, 45.0, 0.0, "none"), ("lag", -9.0, 45.1, 0.0, "unknown"),
         # flexible columns explain a little more than any effect does
-        ("lag", 100.0, 0.0, 145.0, "effects"), ("lag", 100.0, 0.0, 145.1, "unknown"),
+        ("lag", 100.0, 0.0, 130.0, "effects"), ("lag", 100.0, 0.0, 130.1, "unknown"),
     ]  # fmt: skip
     for effect, nats, outside, generic, expected in cases:
-        assert judge_first(EffectFinding(effect, (1,), nats), outside, generic) == expected
+        best = EffectFinding(effect, (1,), nats)
+        assert judge_first(best, nats, outside, generic) == expected
+
+
+def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:
+    row = Row("lag", (("command_lag_s", "add", 0.2),))
+    lag = {0: JointRow(row, 50.0, 0.0), 1: JointRow(row, 30.0, 0.0), 2: JointRow(row, 5.0, 0.0)}
+    backlash = {0: JointRow(row, 49.0, 0.0), 1: JointRow(row, 40.0, 6.0)}
+    table = {"lag": lag, "backlash": backlash, "hysteresis": {0: JointRow(row, 99.0, 0.0)}}
+    # each pays 6 nats for a joint; backlash pays 6 more on the second one
+    expected = {0: ("lag", 44.0), 1: ("backlash", 28.0)}
+    assert find_owners(table, frozenset({"hysteresis"})) == expected

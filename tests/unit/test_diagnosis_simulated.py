@@ -16,6 +16,7 @@ import torch
 from gaps import diagnose
 from motion import make_recording
 from scipy.signal import lsim
+from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from brokk_rl.kinematics import Kinematics
@@ -199,17 +200,6 @@ def test_motions_that_start_late_or_run_unlike_each_other_are_known(two_joints: 
     assert 0.04 <= sizes[1][2] <= 0.07 and sizes[1][3] <= 0.01
 
 
-def test_rows_do_not_depend_on_those_simulated_beside_them(two_joints: Machine) -> None:
-    side = make_side(two_joints, make_commands(20.0, 1))
-    base = VALVE.list_values("mean")
-    changed = {"dead_time": "delay_s", "backlash": "play", "lag": "command_lag_s"}
-    rows = [Row(effect, ((name, "add", 0.2),)) for effect, name in changed.items()]
-    together = side.simulate(1, VALVE.change(base, rows))
-    for row, path in zip(rows, together, strict=True):
-        alone = side.simulate(1, VALVE.change(base, [row]))[0]
-        assert np.array_equal(path, alone)
-
-
 def test_the_nuisance_is_a_covariance() -> None:
     generator = np.random.default_rng(0)
     columns, residual = generator.normal(size=(3, 12)), generator.normal(size=12)
@@ -224,14 +214,6 @@ def test_the_nuisance_is_a_covariance() -> None:
     log_likelihood = multivariate_normal(cov=covariance).logpdf(residual)
     own = -0.5 * (exact + projection.log_determinant + 12 * np.log(2.0 * np.pi * spread))
     assert own == pytest.approx(log_likelihood)
-
-
-def test_a_resized_form_stays_where_its_effect_is_defined() -> None:
-    # a valve that stops sticking only above where it began is none
-    row = Row("stiction", (("start_command", "add", 0.2), ("stop_ratio", "add", 0.5)))
-    larger = row.resize(3.0).resize(3.0, (1,))
-    assert larger.size == pytest.approx(0.6)
-    assert larger.changes[1][2] < 1.0
 
 
 def test_the_variance_of_increments_is_that_of_what_was_drawn() -> None:
@@ -262,7 +244,7 @@ def test_share_and_persistence_of_losses_are_read_from_their_course(machine: Mac
         delays.append(delays[-1] + 1 if is_lost else 0)
     course = Course("frame_loss", probability, persistence)
     weights = np.full(len(delays), 1.0 / len(delays))
-    held = holds.HeldCourse(course, np.array(delays), 1.0, 0.0, weights)
+    held = holds.HeldCourse(course, np.array(delays), 1.0, weights)
     found = {name: value for name, (value, _) in sizes.describe_hold(held, machine).items()}
     # A course on a machine shows a part of the losses only.
     expected = {"probability": probability / sizes.SEEN_SHARE, "persistence": persistence}
@@ -288,8 +270,12 @@ def test_courses_are_the_likeliest_of_all(effect: str, chance: tuple[tuple[float
         def score(path: tuple[int, ...], told: np.ndarray = likelihood) -> float:
             return told[np.arange(6), path].sum() + law[path[:-1], path[1:]].sum()
 
-        best = max(product(range(3), repeat=6), key=score)
-        assert tuple(holds.follow_courses(likelihood, [law])[0]) == best
+        paths = list(product(range(3), repeat=6))
+        assert tuple(holds.follow_courses(likelihood / holds.TEMPER, law)) == max(paths, key=score)
+        # the evidence of the law is that of all courses, against no delay at all
+        every = [score(path, 0.5 * (likelihood - likelihood[:, :1])) for path in paths]
+        evidence = holds.weigh_laws(likelihood, [law, law], (1.0, 0.5))
+        assert evidence[1, 1] == pytest.approx(logsumexp(every))
 
 
 def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:
