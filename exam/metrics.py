@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from brokk_rl.console_table import MISSING
 from brokk_rl.report import render_page
@@ -115,15 +114,9 @@ def compute_median(values: Sequence[float]) -> Metric:
         return {"value": None, "of": 0, "ci95": None}
     interval = [values[0], values[0]]
     if len(values) > 1:
-        drawn = stats.bootstrap(
-            (values,),
-            np.median,
-            n_resamples=NUM_DRAWS,
-            confidence_level=CONFIDENCE,
-            method="percentile",
-            rng=np.random.default_rng(0),
-        )
-        interval = list(drawn.confidence_interval)
+        drawn = np.random.default_rng(0).choice(values, (NUM_DRAWS, len(values)))
+        tail = 0.5 * (1.0 - CONFIDENCE)
+        interval = np.quantile(np.median(drawn, 1), [tail, 1.0 - tail]).tolist()
     return {"value": float(np.median(values)), "of": len(values), "ci95": interval}
 
 
