@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "44 simulated machines, answered once. A person drives 21 fields.",
+        "44 simulated machines, answered once. A person drives 23 fields.",
         "exam_plants=valves exam_recording=operators", 44, "diagnosis", "valve",
     ),
     describe_exam(
