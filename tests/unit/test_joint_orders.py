@@ -38,7 +38,7 @@ def make_policy() -> LoadedPolicy:
         ("dq", [f"dq_{joint}" for joint in BY_KIND], np.zeros(12), 0),
         ("u", [f"u_{joint}" for joint in BY_KIND], np.zeros(12), -1),
     ):
-        terms.append(ObservationTerm(name, tuple(columns), 1, newest, mean, np.ones(12), None, "zero"))  # fmt: skip
+        terms.append(ObservationTerm(name, tuple(columns), 1, newest, mean, np.ones(12), None))
     commands = tuple(f"u_{joint}" for joint in BY_KIND)
     contract = PolicyContract(Path("a.json"), 50.0, tuple(BY_KIND), tuple(terms), commands, None)  # fmt: skip
     return LoadedPolicy(contract, cast(Any, TanhNetwork(36)))
