@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import nnls
 
 from actuators import open_loop
 from actuators.open_loop import FreeRunWindows, run_freely
@@ -192,8 +193,9 @@ def cut_simulator_runs(
 class FreeRunLikelihood:
     """Log likelihood of the errors of free runs with effects, joint by joint.
 
-    Each error keeps a share of the one before, and has a Laplace distribution. Share and deviation
-    are those that make the errors likeliest, for each candidate its own.
+    Each error keeps a share of the one before, and has a Laplace distribution whose deviation grows
+    with the motion. Share and deviation are those that make the errors likeliest, for each
+    candidate its own.
 
     Args:
         runs: The simulator in some windows.
@@ -211,6 +213,12 @@ class FreeRunLikelihood:
         self._adds_up = machine.interface != "position"
         self._floor = LEAST_DEVIATION * (machine.upper - machine.lower)
         self._measured = self._reduce(cut.measured)
+        self.settle(())
+
+    def settle(self, effects: Sequence[GrownEffect]) -> None:
+        """Let the deviation of the errors be that beside effects, and new candidates be put beside these."""
+        self._effects = effects
+        self._deviation = self._weigh_motion(self.simulate(effects))
 
     def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
         """Return free runs with effects, `(W, K, J)`."""
@@ -232,14 +240,31 @@ class FreeRunLikelihood:
         ends = paths[..., self._ends, :]
         if not self._adds_up:
             return ends
-        start = np.broadcast_to(self._start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
-        return np.diff(ends, axis=-2, prepend=start)
+        return np.diff(ends, axis=-2, prepend=self._lead(ends))
+
+    def _lead(self, ends: np.ndarray) -> np.ndarray:
+        """Return the beginnings of paths `(…, W, 1, J)`."""
+        return np.broadcast_to(self._start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
+
+    def _weigh_motion(self, paths: np.ndarray) -> np.ndarray:
+        """Return the deviation of each error of simulated `paths` `(W, K, J)` over that at rest, `(W, I, J)`."""
+        ends = paths[:, self._ends]
+        moved = np.abs(np.diff(ends, axis=1, prepend=self._lead(ends)))
+        size = np.abs(self._measured - self._reduce(paths))
+        found = np.ones_like(moved)
+        for j in range(paths.shape[2]):
+            columns = np.stack([np.ones(size[..., j].size), moved[..., j].ravel()], 1)
+            (rest, share), _ = nnls(columns, size[..., j].ravel())
+            rest = max(rest, float(self._floor[j]))
+            found[..., j] = 1.0 + share / rest * moved[..., j]
+        return found
 
     def _measure_errors(
         self, effects: Sequence[GrownEffect], trials: NumberTrials, used: np.ndarray | None
     ) -> np.ndarray:
-        """Return the errors of free runs, `(C, W, I, J)`."""
-        errors = self._measured - self._reduce(self._simulate_trials(effects, trials))
+        """Return the errors of free runs over their relative deviation, `(C, W, I, J)`."""
+        paths = self._simulate_trials(effects, trials)
+        errors = (self._measured - self._reduce(paths)) / self._deviation
         return errors if used is None else errors[:, used]
 
     def _weigh_memories(self, errors: np.ndarray) -> np.ndarray:
@@ -268,15 +293,13 @@ class FreeRunLikelihood:
         """
         return self._weigh_memories(self._measure_errors(effects, trials, used)).max(0)
 
-    def weigh_candidates(
-        self, beside: Sequence[GrownEffect], kind: EffectType, candidates: EffectValues
-    ) -> np.ndarray:
-        """Return what candidates of an effect earn beside other effects, nats, `(C, J)`."""
+    def weigh_candidates(self, kind: EffectType, candidates: EffectValues) -> np.ndarray:
+        """Return what candidates of an effect earn beside those that are there, nats, `(C, J)`."""
         first = {name: rows[0] for name, rows in candidates.items()}
         every = np.ones(self.runs.machine.num_joints, dtype=bool)
-        effects = [*beside, GrownEffect(kind, first, every, 0.0)]
-        trials = {(len(beside), name): rows for name, rows in candidates.items()}
-        return self._factor * (self.weigh(effects, trials) - self.weigh(beside))
+        beside = [*self._effects, GrownEffect(kind, first, every, 0.0)]
+        trials = {(len(self._effects), name): rows for name, rows in candidates.items()}
+        return self._factor * (self.weigh(beside, trials) - self.weigh(self._effects))
 
     def linearise(
         self, effects: Sequence[GrownEffect], used: np.ndarray | None = None
