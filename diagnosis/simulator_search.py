@@ -21,7 +21,7 @@ ROUNDS = 30
 """Steps of Levenberg and Marquardt at most, by which all numbers are fitted together: those of a mass
 and its friction trade against each other."""
 LEAST_NATS = 22.0
-"""An effect that earns less is not named. Free runs of a simulator err by more than the joint models do."""
+"""An effect that earns less is not named. The engine asks for less; that was not tried around a simulator."""
 JOINT_SHARE = 0.1
 """A joint that earns less, of what the best joint earns, does not have the effect."""
 LEAST_GAIN = 0.1

@@ -152,7 +152,7 @@ def _follow_law(
 
     The prior is what the evidence leaves of the likelihood: that of one course alone, and what it
     shares with all others that are nearly the same. It never adds to what the course itself earns:
-    a sound crane would have 130 nats for nothing.
+    a crane whose frames came in time would have 130 nats for nothing.
     """
     states = follow_courses(law.bank, law.chances)
     likelihood = law.bank[np.arange(side.num_samples), states] - law.bank[:, 0]
