@@ -114,7 +114,8 @@ def build_table(
         given: Answers by case.
         mix: Says which effects cannot be told apart, and which ones all joints have together.
     """
-    scores, shared = [], mix.list_shared()
+    scores = []
+    shared = [name for name, trouble in mix.troubles.items() if trouble.joints == "all"]
     for label in labels:
         case = label["case"]
         if case not in given:

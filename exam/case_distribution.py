@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
+from numpy.random import Generator
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import Count, spec
-from exam.plants.family import SEVERITY
+from brokk_rl.spec import Count, Range, spec
+from exam.plants.family import SEVERITY, DrawnPlants
 
 KINDS = ("none", "faint", "one", "several", "outside")
 """No gap; an effect too small to be seen; one effect; two or three; a fault outside the library."""
@@ -116,18 +116,14 @@ class CaseDistribution:
             raise ConfigError("exam.mix.troubles: expected one or more effects, got none")
 
     def questions(
-        self,
-        machine: Machine,
-        outside_faults: Sequence[str],
-        generator: np.random.Generator,
-        outside_not_on: Mapping[str, Sequence[str]] = MappingProxyType({}),
+        self, machine: Machine, plants: DrawnPlants, generator: Generator
     ) -> list[CaseDesign]:
         """Return the cases in random order; effects and outside faults are equally frequent."""
         kinds: list[str] = []
         for kind, count in self._counts().items():
             kinds += [kind] * count
         effects = _cycle_shuffled(list(self.troubles), generator)
-        strange = _cycle_shuffled(list(outside_faults), generator)
+        strange = _cycle_shuffled(list(plants.causes), generator)
         need_tool = [name for name, trouble in self.troubles.items() if trouble.needs_tool]
         found = []
         for kind in kinds:
@@ -142,7 +138,7 @@ class CaseDistribution:
             elif kind == "outside":
                 size = float(generator.uniform(*self.sizes))
                 name = next(strange)
-                hidden = np.isin(machine.joint_names, outside_not_on.get(name, ()))
+                hidden = np.isin(machine.joint_names, plants.outside_not_on.get(name, ()))
                 # much of it shows in company only
                 chosen = self._some(np.flatnonzero(~machine.is_exclusive & ~hidden), generator)
                 has = np.isin(np.arange(machine.num_joints), chosen)
@@ -152,10 +148,6 @@ class CaseDistribution:
             machine_seed, chance = generator.integers(2**62, size=2).tolist()
             found.append(CaseDesign(kind, machine_seed, chance, tuple(faults), tracked))
         return [found[i] for i in generator.permutation(len(found))]
-
-    def list_shared(self) -> list[str]:
-        """Return the effects that all joints have together."""
-        return [name for name, trouble in self.troubles.items() if trouble.joints == "all"]
 
     def _counts(self) -> dict[str, int]:
         """Return the number of cases of each kind by largest remainders."""
@@ -175,17 +167,11 @@ class CaseDistribution:
                 found.append(name)
         return found
 
-    def _some(self, able: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    def _some(self, able: np.ndarray, generator: Generator) -> np.ndarray:
         count = 1 + (len(able) > 1 and generator.random() < self.second_joint)
         return np.sort(generator.choice(able, count, replace=False))
 
-    def _fault(
-        self,
-        name: str,
-        machine: Machine,
-        sizes: tuple[float, float],
-        generator: np.random.Generator,
-    ) -> CaseFault:
+    def _fault(self, name: str, machine: Machine, sizes: Range, generator: Generator) -> CaseFault:
         trouble, size = self.troubles[name], float(generator.uniform(*sizes))
         able = np.flatnonzero(~np.isin(machine.joint_names, trouble.not_on))
         chosen = able if trouble.joints == "all" else self._some(able, generator)
@@ -201,16 +187,14 @@ class CaseDistribution:
             # where nothing changes a threshold is not there at all, rather than where it begins to
             # count
             away = none if none in (0.0, 1.0) else 0.0
-            parameters[key] = np.where(
-                has & (key in drawn), none + sign * size * (typical - none), away
-            )
+            changed = none + sign * size * (typical - none)
+            parameters[key] = np.where(has & (key in drawn), changed, away)
         nothing = {key: trouble.numbers[key][0] for key in drawn}
-        return CaseFault(
-            name, tuple(machine.joint_names[j] for j in chosen), size, parameters, nothing
-        )
+        joints = tuple(machine.joint_names[j] for j in chosen)
+        return CaseFault(name, joints, size, parameters, nothing)
 
 
-def _cycle_shuffled(names: list[str], generator: np.random.Generator) -> Iterator[str]:
+def _cycle_shuffled(names: list[str], generator: Generator) -> Iterator[str]:
     """Yield all names in random order, again and again."""
     while True:
         for i in generator.permutation(len(names)):

@@ -73,17 +73,16 @@ def open_labels(folder: Path) -> tuple[dict[str, Any], str]:
         RecordingError: labels or hash are missing, or do not belong together.
     """
     sealed, published = folder / LABELS_FILE, folder / OPENED_FILE
+    is_published = published.is_file() and not sealed.is_file()
     try:
-        if published.is_file() and not sealed.is_file():
-            text = published.read_text()
-            expected = hashlib.sha256(text.encode()).hexdigest()
-        else:
-            text, expected = sealed.read_text(), (folder / HASH_FILE).read_text().split()[0]
+        text = (published if is_published else sealed).read_text()
+        found = hashlib.sha256(text.encode()).hexdigest()
+        expected = found if is_published else (folder / HASH_FILE).read_text().split()[0]
     except (OSError, IndexError) as error:
         raise RecordingError(
             f"{folder}: expected {LABELS_FILE} and {HASH_FILE}, as exam.do=make leaves them, or {OPENED_FILE} of a score ({error})"
         ) from error
-    if hashlib.sha256(text.encode()).hexdigest() != expected:
+    if found != expected:
         raise RecordingError(
             f"{sealed} was changed after it was sealed: its SHA-256 is not that of {HASH_FILE}; make the exam again"
         )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
@@ -172,7 +173,11 @@ class CaseRecorder:
 
     def write_all(self, questions: Sequence[CaseDesign], workers: int) -> None:
         """Record all cases that are not yet, in blocks of machines of one make; `workers`: processes."""
-        todo = [number for number, one in enumerate(questions) if self._lacks_files(number, one)]
+        todo = []
+        for number, one in enumerate(questions):
+            jobs = chain.from_iterable(self.list_jobs(number, one, half) for half in self.halves)
+            if not all(job.is_finished for job in jobs):
+                todo.append(number)
         todo.sort(key=lambda number: self._find_make(questions[number]))
         # a block for each process at least, so that none is idle
         size = max(1, min(BLOCK_CASES, -(-len(todo) // workers)))
@@ -229,13 +234,6 @@ class CaseRecorder:
             with suppress(ConfigError):
                 return plan_runs(*about)
         return plan_runs(*about)
-
-    def _lacks_files(self, number: int, question: CaseDesign) -> bool:
-        for half in self.halves:
-            for job in self.list_jobs(number, question, half):
-                if not job.is_finished:
-                    return True
-        return False
 
     def _find_make(self, question: CaseDesign) -> str:
         """Return the make of a case's machine."""

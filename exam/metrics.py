@@ -43,11 +43,6 @@ class MetricDefinition:
     is_median: bool = False
 
 
-def list_sure(score: CaseScore) -> list[bool]:
-    """Return which of the statements with a probability of `SURE` or more are true."""
-    return [one.is_true for one in score.claims if one.probability >= SURE]
-
-
 def list_errors(score: CaseScore) -> list[float]:
     """Return the median error of the parameters of a case, if it has any."""
     errors = [one.error for one in score.numbers]
@@ -70,7 +65,7 @@ ROWS: dict[str, tuple[Any, ...]] = {
     "unknown_recall": ("outside causes: said unknown", ("outside",), lambda s: [s.verdict == "unknown"]),
     "unknown_wrongly": ("effects called unknown", KNOWN, lambda s: [s.verdict == "unknown"]),
     "missed": ("effects called none", KNOWN, lambda s: [s.verdict == "none"]),
-    "sure": ("said with 0.9 or more: right", KINDS, list_sure),
+    "sure": ("said with 0.9 or more: right", KINDS, lambda s: [one.is_true for one in s.claims if one.probability >= SURE]),
     "parameter_error": ("size: median error", KINDS, list_errors, True),
     "cover_90": ("size: inside 90 %", KINDS, lambda s: [one.in_90 for one in s.numbers]),
     "closed_examined": ("gap closed, withheld parts", KNOWN, lambda s: [] if s.examined is None else [s.examined], True),
@@ -141,11 +136,9 @@ def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     rows = []
     for key, metric in METRICS.items():
         rows.append([metric.title, *(_format_metric(table[key]) for table in tables.values())])
-    sat, failed = ["cases sat"], ["no answer"]
-    for table in tables.values():
-        sat.append(f"{table['sat']['value']} of {table['sat']['of']}")
-        failed.append(str(table["failed"]))
-    return [*rows, sat, failed]
+    sat = [f"{table['sat']['value']} of {table['sat']['of']}" for table in tables.values()]
+    failed = [str(table["failed"]) for table in tables.values()]
+    return [*rows, ["cases sat", *sat], ["no answer", *failed]]
 
 
 def _format_metric(metric: Mapping[str, Any]) -> str:

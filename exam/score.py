@@ -130,7 +130,8 @@ def score_answer(
     # A verdict without names is a statement too. An effect below the noise makes `none` true.
     right_kinds = {"none": ("none", "faint"), "unknown": ("outside",)}
     if answer is not None and verdict in right_kinds:
-        claims.append(Claim(read_probability(answer), kind in right_kinds[verdict]))
+        ranked = [one.probability for one in answer.ranking if one.effect == verdict]
+        claims.append(Claim(ranked[0] if ranked else 1.0, kind in right_kinds[verdict]))
     examined = examination["closed"] if examination is not None else None
     return CaseScore(
         kind=kind,
@@ -161,12 +162,6 @@ def match_effects(
                 equivalent.update(group)
         found[k] = next((e for e in true if e in equivalent and e not in found), "")
     return found
-
-
-def read_probability(answer: Answer) -> float:
-    """Return the probability of a verdict without names; where it is not ranked, 1."""
-    ranked = [one.probability for one in answer.ranking if one.effect == answer.verdict]
-    return ranked[0] if ranked else 1.0
 
 
 def score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterScore]:

@@ -13,9 +13,9 @@ from conftest import Done
 from mcap.writer import Writer
 
 from actuators.modes.import_logs import summarise
-from actuators.recordings import conversion, log_draft
+from actuators.recordings import log_draft
 from actuators.recordings.guess import GivenColumns
-from actuators.recordings.log_draft import Draft
+from actuators.recordings.log_files import find_logs
 from brokk_rl import extensions
 from brokk_rl.errors import BrokkError
 
@@ -33,16 +33,16 @@ def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
     Path(path).write_text("\n".join(lines) + "\n")
 
 
-def make_draft(*options: str) -> Draft:
+def make_draft(*options: str) -> log_draft.Draft:
     values: dict[str, Any] = {}
     for option in options:
         key, _, value = option.removeprefix("log.").partition("=")
         values[key] = yaml.safe_load(value)
-    paths = conversion.find_logs(values.pop("input"))
+    paths = find_logs(values.pop("input"))
     return log_draft.make_draft(paths, "leg", GivenColumns(**values))
 
 
-def describe_draft(draft: Draft) -> str:
+def describe_draft(draft: log_draft.Draft) -> str:
     """Returns what the command prints about a draft."""
     guesses = draft.list_guesses()
     lines = [f"{one.subject}: {one.value} ({one.sureness}) {one.reason}" for one in guesses]
@@ -71,8 +71,8 @@ def import_log(*options: str) -> tuple[Done, list[dict[str, np.ndarray]]]:
     machine, reader = made
     found = []
     (given,) = [one.partition("=")[2] for one in options if one.startswith("log.input=")]
-    for recordings in conversion.read_logs(given, reader, machine).values():
-        for one in recordings:
+    for path in find_logs(given):
+        for one in reader.read(path, machine):
             columns = {"t_s": one.t_s}
             for j, (name, unit) in enumerate(zip(one.joints, one.units, strict=True)):
                 columns[f"q_{name}_{unit}"] = one.q[:, j]

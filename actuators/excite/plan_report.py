@@ -43,13 +43,6 @@ class PlanTrack:
         for name in kept[0].extra:
             self.extra[name] = np.stack([sample.extra[name] for sample in kept], 1)
 
-    def list_actions(self, run: int) -> list[tuple[int, int]]:
-        """Return first sample and end of each way and each program of a run, in order."""
-        phase, segment = self.phase[:, run], self.segment[:, run]
-        changes = np.diff(segment * 2 + (phase >= PLAY))
-        edges = [0, *(np.flatnonzero(changes) + 1).tolist(), len(phase)]
-        return [(begin, end) for begin, end in pairwise(edges) if phase[begin] != DONE]
-
 
 def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> dict[str, Any]:
     """Return `plan.json`: the segments of each run with predicted times."""
@@ -123,11 +116,14 @@ def _draw_segments(
 ) -> None:
     """Draw the strip of segments on top, with the names that find room, and their colours below."""
     colors = dict(zip(plan.names, cycle((BLUE, ORANGE, *OTHERS))))
-    for begin, end in track.list_actions(0):
-        segment = plan.runs[0][track.segment[begin, 0]]
-        name = segment.name
+    phase, segment = track.phase[:, 0], track.segment[:, 0]
+    changes = np.diff(segment * 2 + (phase >= PLAY))  # ways and programs
+    for begin, end in pairwise([0, *(np.flatnonzero(changes) + 1).tolist(), len(phase)]):
+        if phase[begin] == DONE:
+            continue
+        name = plan.runs[0][segment[begin]].name
         color = colors.get(name.split("_")[0], GREY)
-        if track.phase[begin, 0] < PLAY:
+        if phase[begin] < PLAY:
             name, color = "", "white"
         start, stop = minutes[begin], minutes[min(end, len(minutes) - 1)]
         for axis, alpha in zip(axes, (0.9, *[0.13] * (len(axes) - 1)), strict=True):

@@ -108,19 +108,13 @@ def plan_runs(
             draws = np.random.default_rng(int(seed))  # the same seed draws the same
             for name, excitation in excitations.items():
                 segments += excitation.segments(machine, parts[name] * programs_s, draws)
-            needed_s = _estimate_duration_s(segments, machine, approach)
+            # motion within a segment is left out
+            starts = np.stack([segment.start for segment in segments])
+            ways_s = approach.duration_s(machine, np.stack([machine.home, *starts[:-1]]), starts)
+            steps = sum(len(segment.u) for segment in segments)
+            needed_s = float(ways_s.sum()) + steps * machine.period_s
             fill_s = needed_s if needed_s <= run_s else run_s - needed_s
             tries.append((fill_s, len(tries), tuple(segments)))
             programs_s *= run_s / needed_s
         runs.append(max(tries)[-1])
     return ExcitationPlan(runs=tuple(runs), run_s=run_s, names=tuple(excitations))
-
-
-def _estimate_duration_s(segments: list[Segment], machine: Machine, approach: Approach) -> float:
-    """Return the nominal time of programs and approaches, from home on.
-
-    Motion within a segment is left out.
-    """
-    at = np.stack([machine.home, *(segment.start for segment in segments[:-1])])
-    ways_s = approach.duration_s(machine, at, np.stack([segment.start for segment in segments]))
-    return float(ways_s.sum()) + sum(len(segment.u) for segment in segments) * machine.period_s

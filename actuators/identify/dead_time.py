@@ -221,9 +221,8 @@ def _compute_moments(
     """Return moments of curve features and increment per delay, `(D, F + 1, F + 1)`."""
     u, q = recording.u[:, joint].astype(np.float64), recording.q[:, joint].astype(np.float64)
     knots, reach = np.array(KNOTS), int(LONGEST_S / machine.period_s) + 1
-    curve = np.concatenate(
-        [np.maximum(u[:, None] - knots, 0.0), np.maximum(-u[:, None] - knots, 0.0)], 1
-    )[:-1]
+    sides = [np.maximum(sign * u[:, None] - knots, 0.0) for sign in (1.0, -1.0)]
+    curve = np.concatenate(sides, 1)[:-1]
     curve = np.stack([np.convolve(feature, SMOOTHING, mode="valid") for feature in curve.T], 1)
     moved = np.convolve(np.diff(q), SMOOTHING, mode="valid")
     margin = AT_STOP * (machine.upper[joint] - machine.lower[joint])

@@ -6,7 +6,6 @@ import copy
 import logging
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -98,14 +97,6 @@ class NetworkFit:
         return fitted
 
 
-class _HorizonStage(NamedTuple):
-    """Updates with one horizon."""
-
-    horizon_s: float
-    updates: int
-    batch: int
-
-
 class _NetworkFitting:
     """One fit at work: Adam on free runs, with a running average of the weights, which is validated and kept."""
 
@@ -125,47 +116,42 @@ class _NetworkFitting:
         steps, purpose = self._steps(config.validation_s), "held out to stop the fit by"
         held = TrainingWindows(task.validation, machine, steps, device, purpose)
         self._held = held.draw(VALIDATED, 0.2, self._generator)
-        self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
-        for horizon_s in config.horizons_s:
-            self._stages.append(_HorizonStage(horizon_s, config.updates, config.batch))
+        self._total = config.one_step_updates + len(config.horizons_s) * config.updates
 
     def run(self) -> None:
-        """Run all stages."""
-        before, total = 0, sum(stage.updates for stage in self._stages)
-        with ItemProgress("fit", total) as progress:
-            for stage in self._stages:
-                self._run_stage(stage, before, total, progress)
-                before += stage.updates
+        """Run single steps, then free runs over one horizon after another."""
+        config = self._config
+        with ItemProgress("fit", self._total) as self._progress:
+            self._run_stage(0.0, 0, config.one_step_updates, config.one_step_batch)
+            for number, horizon_s in enumerate(config.horizons_s):
+                before = config.one_step_updates + number * config.updates
+                self._run_stage(horizon_s, before, config.updates, config.batch)
 
     @property
     def result(self) -> tuple[dict[str, torch.Tensor], list[float]]:
         """The best averaged networks, with normalisation, and each joint's validation error."""
         return {**self._averaged.state_dict(), **self._kept}, self._best.tolist()
 
-    def _run_stage(
-        self, stage: _HorizonStage, before: int, total: int, progress: ItemProgress
-    ) -> None:
-        """Run a stage, after `before` of `total` updates, until it gains nothing more."""
+    def _run_stage(self, horizon_s: float, before: int, updates: int, batch: int) -> None:
+        """Run so many updates over a horizon, after those before, until they gain nothing more."""
         config, stale = self._config, 0
-        steps = max(1, self._steps(stage.horizon_s))
+        steps = max(1, self._steps(horizon_s))
         windows = TrainingWindows(self._train, self._machine, steps, self._device)
-        for done in range(1, stage.updates + 1):
+        for done in range(1, updates + 1):
             number = before + done - 1
-            fall = 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total))
+            fall = 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / self._total))
             self._adam.param_groups[0]["lr"] = config.learning_rate * fall
-            self._update(*windows.draw(stage.batch, config.still_share, self._generator))
+            self._update(*windows.draw(batch, config.still_share, self._generator))
             kept = min(config.average, (number + 1.0) / (number + 11.0))
+            pairs = zip(self._averaged.parameters(), self._networks.parameters(), strict=True)
             with torch.no_grad():
-                for mean, value in zip(
-                    self._averaged.parameters(), self._networks.parameters(), strict=True
-                ):
+                for mean, value in pairs:
                     mean.lerp_(value, 1.0 - kept)
-            if done % config.validate_every == 0 or done == stage.updates:
+            if done % config.validate_every == 0 or done == updates:
                 stale = 0 if self._validate() else stale + 1
-                error = self._best.mean().item()
-                note = f"free runs of {stage.horizon_s:g} s, error {error:.4f}"
-                progress.reach(number, note=note)
-            progress.reach(number + 1)
+                note = f"free runs of {horizon_s:g} s, error {self._best.mean().item():.4f}"
+                self._progress.reach(number, note=note)
+            self._progress.reach(number + 1)
             if stale >= config.patience:
                 break
 
@@ -285,8 +271,12 @@ class TrainingWindows:
                 f"too little data: the longest of {len(recordings)} recordings {purpose} has {longest} samples, one window needs "
                 f"{self._length} ({machine.num_history} of history and {horizon} to predict)"
             )
-        self._moving = [self._within(u.abs() > COMMANDED) for u in self.u]
-        for joint, found in zip(machine.joint_names, self._moving, strict=True):
+        self._moving = []
+        for joint, u in zip(machine.joint_names, self.u, strict=True):
+            # starts of windows in which the joint is commanded at some time
+            count = nn.functional.pad((u.abs() > COMMANDED).cumsum(0), (1, 0))
+            found = self.starts[count[self.starts + self._length] > count[self.starts]]
+            self._moving.append(found)
             if not len(found):
                 raise RecordingError(
                     f"too little data: joint {joint} is never commanded in the {len(recordings)} recordings {purpose}"
@@ -316,11 +306,6 @@ class TrainingWindows:
             u.append(self.u[joint].unfold(0, self._length, 1)[rows])
             q.append(self.q[joint].unfold(0, self._length, 1)[rows])
         return torch.stack(u), torch.stack(q)
-
-    def _within(self, condition: torch.Tensor) -> torch.Tensor:
-        """Return the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
-        count = nn.functional.pad(condition.cumsum(0), (1, 0))
-        return self.starts[count[self.starts + self._length] > count[self.starts]]
 
 
 NEEDED_S = 15.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,12 +57,6 @@ def find_least(models: Mapping[str, Any], horizon: str) -> float:
 COLOURS = {"hold": GREY, "arx": ORANGE}
 
 
-def assign_colours(names: Sequence[str], model: str) -> dict[str, str]:
-    """Return the colour of each model."""
-    others = iter(OTHERS * len(names))
-    return {name: BLUE if name == model else COLOURS.get(name) or next(others) for name in names}
-
-
 def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
     """Draw measured and predicted positions over commands: three windows per joint.
 
@@ -84,10 +78,10 @@ def _show_window(
     measured = cut.measured[window, :, joint]
     given = np.isfinite(measured)
     t_s = scores.machine.period_s * np.arange(1, len(measured) + 1)[given]
-    colour = assign_colours(list(scores.predicted), model)
-    paths = []
+    paths, others = [], iter(OTHERS * len(scores.predicted))
+    colour = {name: COLOURS.get(name) or next(others) for name in scores.predicted if name != model}
     for name in sorted(scores.predicted, key=lambda name: name == model):
-        style = {"color": colour[name], "label": name, "lw": 1.0, "ls": "--"}
+        style = {"color": colour.get(name, BLUE), "label": name, "lw": 1.0, "ls": "--"}
         if name == model:
             style |= {"lw": 1.6, "ls": "-"}
         paths.append((t_s, scores.predicted[name][window, given, joint], style))

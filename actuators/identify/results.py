@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from io import BytesIO
@@ -159,13 +159,15 @@ def _list_test_doubts(result: Mapping[str, Any]) -> Iterator[str]:
         yield f"No figure at {horizon} s: {reason}."
 
 
+Draw = Callable[[str], np.random.Generator]
+
+
 def build_results(
     machine: Machine,
     model: str,
     stages: Sequence[FitStage],
     horizons_s: Sequence[float],
-    resampling: np.random.Generator,
-    delaying: np.random.Generator,
+    draw: Draw,
 ) -> tuple[dict[str, Any], FreeRunScores]:
     """Return `identification.json` with its verdict, and the errors behind them.
 
@@ -174,8 +176,7 @@ def build_results(
         model: Name of the model that is kept; the others are compared with it.
         stages: Fits in their order; the last one made the model that is kept.
         horizons_s: Those of `HORIZONS_S` that fit into the recordings judged by.
-        resampling: Draws the resamples of the errors.
-        delaying: Draws those of the dead times.
+        draw: Returns the generator of a purpose.
 
     Raises:
         RecordingError: no recording is long enough to search for a dead time in.
@@ -185,13 +186,13 @@ def build_results(
     for name in judging[0][1]:
         predicted[name] = np.concatenate([fitted[name].predicted for _, fitted in judging])
     cut = open_loop.join_windows([one for one, _ in judging])
-    scores = FreeRunScores(predicted, cut, machine, resampling)
+    scores = FreeRunScores(predicted, cut, machine, draw("resample"))
     last = stages[-1]
     fitted_to = list_recordings(last.train) + list_recordings(last.validation)
     judged = []
     for stage in stages:
         judged += list_recordings(stage.test)
-    delays = dead_time.estimate_dead_times(fitted_to, machine, delaying)
+    delays = dead_time.estimate_dead_times(fitted_to, machine, draw("delay"))
     kept = last.fitted[model]
     result: dict[str, Any] = {
         "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
@@ -314,6 +315,39 @@ class FitStage:
                 state.update(recording.u.tobytes() + recording.q.tobytes())
         return state.hexdigest()
 
+    def fit(
+        self, name: str, fit: ActuatorFit, folder: Path, machine: Machine, device: torch.device
+    ) -> None:
+        """Fit a model and roll it out through the windows, or restore an earlier result.
+
+        Raises:
+            StorageError: another fit, or one to other recordings, has been done in this folder.
+            RecordingError: too little data to fit to.
+        """
+        path = folder / FREE_RUNS / f"{name}.npz"
+        shape = () if self.cut is None else self.cut.q.shape
+        stamp = repr((fit, machine.fingerprint(), self.digest, shape))
+        key = hashlib.sha256(stamp.encode()).hexdigest()
+        if path.exists():
+            self.fitted[name] = _restore(path, key)
+            return
+        where = f"{self.name}: " if self.name else ""
+        log.info("%sfitting %s to %d runs", where, name, len(self.train))
+        folder.mkdir(parents=True, exist_ok=True)
+        began = time.monotonic()
+        train, validation = list_recordings(self.train), list_recordings(self.validation)
+        actuator = fit.fit(FitTask(machine, train, validation, folder, self.seed, device))
+        seconds = time.monotonic() - began
+        predicted = np.zeros((0, 0, machine.num_joints))
+        if self.cut is not None:
+            predicted = open_loop.roll_out(actuator, machine, self.cut, device)
+        option, content = folder / f"{name}.yaml", BytesIO()
+        use = f"actuator=@{option}" if option.exists() else ""
+        self.fitted[name] = FittedModel(predicted, seconds, use)
+        predicted = predicted.astype(np.float32)
+        np.savez_compressed(content, predicted=predicted, seconds=seconds, use=use, key=key)
+        write_bytes(path, content.getvalue())
+
 
 @dataclass(frozen=True)
 class FittedModel:
@@ -335,45 +369,6 @@ def list_recordings(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
     found = []
     for recordings in part.values():
         found.extend(recordings)
-    return found
-
-
-def fit_or_restore(
-    stage: FitStage,
-    name: str,
-    fit: ActuatorFit,
-    folder: Path,
-    machine: Machine,
-    device: torch.device,
-) -> FittedModel:
-    """Fit a model and roll it out through windows, or restore an earlier result.
-
-    Raises:
-        StorageError: another fit, or one to other recordings, has been done in this folder.
-        RecordingError: too little data to fit to.
-    """
-    path = folder / FREE_RUNS / f"{name}.npz"
-    shape = () if stage.cut is None else stage.cut.q.shape
-    stamp = repr((fit, machine.fingerprint(), stage.digest, shape))
-    key = hashlib.sha256(stamp.encode()).hexdigest()
-    if path.exists():
-        return _restore(path, key)
-    where = f"{stage.name}: " if stage.name else ""
-    log.info("%sfitting %s to %d runs", where, name, len(stage.train))
-    folder.mkdir(parents=True, exist_ok=True)
-    began = time.monotonic()
-    train, validation = list_recordings(stage.train), list_recordings(stage.validation)
-    actuator = fit.fit(FitTask(machine, train, validation, folder, stage.seed, device))
-    seconds = time.monotonic() - began
-    predicted = np.zeros((0, 0, machine.num_joints))
-    if stage.cut is not None:
-        predicted = open_loop.roll_out(actuator, machine, stage.cut, device)
-    option = folder / f"{name}.yaml"
-    found = FittedModel(predicted, seconds, f"actuator=@{option}" if option.exists() else "")
-    content = BytesIO()
-    predicted = predicted.astype(np.float32)
-    np.savez_compressed(content, predicted=predicted, seconds=seconds, use=found.use, key=key)
-    write_bytes(path, content.getvalue())
     return found
 
 

@@ -97,9 +97,8 @@ class ServoFit:
             x, error = _JointRuns(pairs, machine.period_s, middle).fit(low, high)
             found.append(x)
             errors.append(error)
-        numbers, told = (
-            dict(zip(NUMBERS, np.array(one).T, strict=True)) for one in (found, errors)
-        )
+        numbers = dict(zip(NUMBERS, np.array(found).T, strict=True))
+        told = dict(zip(NUMBERS, np.array(errors).T, strict=True))
         return write_numbers(task.folder, self.name, self.actuator, machine, numbers, told)
 
 

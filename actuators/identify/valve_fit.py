@@ -196,16 +196,9 @@ class _ValveRuns:
             priors[len(self._bend) :, self._parts[1] :] = np.eye(len(x) - self._parts[1]) / POSE
             return np.vstack([-slopes * (free / noise)[:, None], priors])
 
-        slopes: Any = compute_slopes  # scipy's types know words only
-        found = least_squares(
-            compute_errors,
-            x,
-            slopes,
-            (low, high),
-            loss="soft_l1",
-            max_nfev=iterations,
-            x_scale="jac",
-        ).x
+        options: Any = {"jac": compute_slopes, "loss": "soft_l1", "x_scale": "jac"}
+        options |= {"bounds": (low, high), "max_nfev": iterations}
+        found = least_squares(compute_errors, x, **options).x
         left = self._way[j] - self._predict(j, found)
         # increments of a joint at rest fit anyway and would hide the typical error
         moves = np.abs(self._way[j]) > 0.1 * np.sqrt(np.mean(self._way[j] ** 2))
@@ -268,9 +261,8 @@ class _ValveRuns:
         low = int(np.clip(np.searchsorted(PLAYS, play, side="right") - 1, 0, len(PLAYS) - 2))
         part = (play - PLAYS[low]) / (PLAYS[low + 1] - PLAYS[low])
         behind = (1.0 - part) * played[low] + part * played[low + 1]
-        return lag_signal(
-            delay_signal(behind, dead_time_s / self._period_s), spool_s, self._period_s
-        )
+        late = delay_signal(behind, dead_time_s / self._period_s)
+        return lag_signal(late, spool_s, self._period_s)
 
     def _build_basis(self, spool: np.ndarray, j: int) -> np.ndarray:
         """Return signed hat functions of the spool times full step, `(T, 2 (K - 1))`."""
@@ -286,9 +278,8 @@ class _ValveRuns:
 
     def _collect(self, parts: Sequence[np.ndarray], speed_s: float) -> np.ndarray:
         """Return the increments of steps `(T, …)` of all recordings after the lag of the speed."""
-        return np.concatenate(
-            [self._sum(lag_signal(part, speed_s, self._period_s)) for part in parts]
-        )
+        late = [lag_signal(part, speed_s, self._period_s) for part in parts]
+        return np.concatenate([self._sum(part) for part in late])
 
     def _sum(self, steps: np.ndarray) -> np.ndarray:
         """Sum steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""

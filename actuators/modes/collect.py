@@ -106,9 +106,8 @@ class Collect:
     def _show(self, plan: ExcitationPlan) -> None:
         """Try the plan out on a nominal machine; writes picture and figures."""
         machine, count = self.machine, self.collect.num_runs
-        track = PlanTrack(
-            drive(NominalLink(machine, count), self._runner(plan), machine, count, plan.run_s)
-        )
+        link = NominalLink(machine, count)
+        track = PlanTrack(drive(link, self._runner(plan), machine, count, plan.run_s))
         summary = plan_report.summarise_plan(plan, track, machine)
         write_json(self.session.folder / "plan.json", summary)
         path = self.session.folder / "plan.png"
@@ -118,9 +117,8 @@ class Collect:
         if unplayed:
             text = "plan: no time for %s in some of the runs; raise collect.run_minutes"
             log.warning(text, ", ".join(sorted(unplayed)))
-        log.info(
-            "plan: %d segments in the first of %d runs; see %s", len(plan.runs[0]), count, path
-        )
+        text = "plan: %d segments in the first of %d runs; see %s"
+        log.info(text, len(plan.runs[0]), count, path)
 
 
 class Writer:
@@ -175,9 +173,7 @@ class Writer:
             run, t_s = f"{name} {self._created}", track.t_s - begin_s
             motion = record.make_motion(self._machine, run, t_s, track.u[:, n], track.q[:, n])
             created = record.add_seconds(self._created, begin_s - self._begin_s)
-            recording = replace(
-                motion,
-                extra={key: values[n] for key, values in track.extra.items()},
-                metadata={**self._metadata, "created": created, **motion.metadata},
-            )
-            record.write_recording(recording, self._folder / f"{name}_{self._part:02d}.parquet")
+            metadata = {**self._metadata, "created": created, **motion.metadata}
+            extra = {key: values[n] for key, values in track.extra.items()}
+            path = self._folder / f"{name}_{self._part:02d}.parquet"
+            record.write_recording(replace(motion, extra=extra, metadata=metadata), path)

@@ -2,23 +2,44 @@
 
 from __future__ import annotations
 
+import logging
 from itertools import chain
+from pathlib import Path
+from typing import Protocol
 
-from actuators.recordings import conversion
-from actuators.recordings.conversion import LogReader
 from actuators.recordings.inspection import InspectionThresholds
+from actuators.recordings.log_files import find_logs, name_log
 from actuators.recordings.recording_checks import examine_recordings, tabulate_remarks
+from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.record import DAMAGE, Recording
 from brokk_rl.session import Session, read_record
 from brokk_rl.spec import spec
 
+log = logging.getLogger(__name__)
+
+FOLDER = "recordings"
+"""Folder of the recordings in a run folder."""
 SIMULATORS = {
     "position": "actuator=servo",
     "torque": "actuator=force actuator.mass_kg=<of your simulator>",
     "speed": "actuator=ideal",
 }
 """Ideal simulator of each command interface, by which recordings are diagnosed first."""
+
+
+class LogReader(Protocol):
+    """A spec in `conf/import`: reads one kind of log of another machine or program."""
+
+    def read(self, path: Path, machine: Machine) -> list[Recording]:
+        """Return the gapless pieces of the log at `path`, in order; they share metadata `run`.
+
+        Raises:
+            RecordingError: the log cannot be used; names file, row and column.
+        """
+        ...
 
 
 @spec
@@ -50,9 +71,19 @@ class Convert:
                 at the end, something of one is lost.
             StorageError: a file could not be written.
         """
-        pieces = conversion.read_logs(self.convert.input, self.reader, self.machine)
-        folder = self.session.folder / conversion.FOLDER
-        conversion.write_recordings(pieces, folder)
+        pieces, damages = {}, []
+        for path in find_logs(self.convert.input):
+            pieces[path] = self.reader.read(path, self.machine)
+        folder = self.session.folder / FOLDER
+        for path, several in pieces.items():
+            for number, one in enumerate(several):
+                record.write_recording(one, folder / f"{name_log(path)}_{number:02d}.parquet")
+            minutes = sum(one.duration_s for one in several) / 60.0
+            log.info("%s: %d recordings, %.1f minutes", path, len(several), minutes)
+            if several and DAMAGE in several[0].metadata:
+                damages.append(f"{path}: {several[0].metadata[DAMAGE]}")
+        count = sum(map(len, pieces.values()))
+        log.info("%d recordings of %d logs in %s", count, len(pieces), folder)
         recordings = list(chain.from_iterable(pieces.values()))
         remarks = examine_recordings(recordings, self.machine, self.thresholds)
         head, rows = tabulate_remarks(remarks)
@@ -64,4 +95,7 @@ class Convert:
             f"brokk mode=diagnose machine={choices.get('machine', '…')} 'diagnosis.field={folder}/*' "
             f"{SIMULATORS[self.machine.interface]}"
         )
-        conversion.check_damage(pieces)
+        if damages:
+            raise RecordingError(
+                f"the recordings hold the rest, but something is lost of {'; '.join(damages)}"
+            )

@@ -19,7 +19,6 @@ from actuators.identify.results import (
     LINEAR,
     FitStage,
     build_results,
-    fit_or_restore,
     list_recordings,
 )
 from actuators.recordings.split import check_commanded, group_by_run, split_runs
@@ -98,13 +97,10 @@ class Identify:
             for name in models if stage.cut else (self.fit.name,):
                 is_kept = name == self.fit.name
                 folder = stage.folder if is_kept else stage.folder / "baselines" / name
-                stage.fitted[name] = fit_or_restore(
-                    stage, name, models[name], folder, self.machine, device
-                )
+                stage.fit(name, models[name], folder, self.machine, device)
         result, scores = build_results(
-            self.machine, self.fit.name, stages, horizons_s,
-            self.session.generator("resample"), self.session.generator("delay"),
-        )  # fmt: skip
+            self.machine, self.fit.name, stages, horizons_s, self.session.generator
+        )
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
         folder = self.session.folder
         write_json(folder / "identification.json", result)

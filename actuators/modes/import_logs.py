@@ -6,9 +6,10 @@ import logging
 import re
 from pathlib import Path
 
-from actuators.recordings import conversion, log_draft
+from actuators.recordings import log_draft
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.log_draft import Draft
+from actuators.recordings.log_files import find_logs
 from actuators.recordings.name_evidence import UNITS, read_unit
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
@@ -69,7 +70,7 @@ class ImportLogs:
             RecordingError: No log matches, or one cannot be used; names its place.
             StorageError: A file could not be written.
         """
-        paths = conversion.find_logs(self.log.input)
+        paths = find_logs(self.log.input)
         name = self.log.name or _name_machine(paths[0])
         draft = log_draft.make_draft(paths, name, self.log)
         folder, guesses = self.session.folder, draft.list_guesses()
@@ -78,19 +79,22 @@ class ImportLogs:
         write_text(folder / MAP_FILE, draft.format(log_draft.MAP_TEMPLATE))
         write_text(folder / MACHINE_FILE, draft.format(log_draft.MACHINE_TEMPLATE))
         unsure = [guess for guess in guesses if guess.sureness == "unsure"]
-        write_json(
-            folder / GUESS_FILE,
-            {
-                "schema": 1,
-                "machine": draft.name,
-                "logs": [str(path) for path in paths],
-                "minutes": draft.survey.minutes,
-                "guesses": [guess.plain() for guess in guesses],
-                "num_unsure": len(unsure),
-                "remarks": list(draft.remarks),
-            },
+        result = {
+            "schema": 1,
+            "machine": draft.name,
+            "logs": [str(path) for path in paths],
+            "minutes": draft.survey.minutes,
+            "guesses": [guess.plain() for guess in guesses],
+            "num_unsure": len(unsure),
+            "remarks": list(draft.remarks),
+        }
+        write_json(folder / GUESS_FILE, result)
+        logs = self.log.input
+        given = logs if isinstance(logs, str) else f"[{','.join(logs)}]"
+        command = (
+            f"brokk mode=convert machine=@{folder / MACHINE_FILE} import=@{folder / MAP_FILE} "
+            f"'convert.input={given}' session.out={folder.with_name(f'{folder.name}_recordings')}"
         )
-        command = _format_next(folder, self.log.input)
         summary = summarise(draft, guesses)
         values = {
             "title": f"Logs of {draft.name}",
@@ -114,15 +118,6 @@ def _name_machine(path: Path) -> str:
     words = re.findall(r"[a-z0-9]+", path.resolve().parent.name.lower())
     name = "_".join(words)
     return name if name[:1].isalpha() else f"machine_{name}".rstrip("_")
-
-
-def _format_next(folder: Path, patterns: str | tuple[str, ...]) -> str:
-    """Return the command that makes recordings with the drafts."""
-    given = patterns if isinstance(patterns, str) else f"[{','.join(patterns)}]"
-    return (
-        f"brokk mode=convert machine=@{folder / MACHINE_FILE} import=@{folder / MAP_FILE} "
-        f"'convert.input={given}' session.out={folder.with_name(f'{folder.name}_recordings')}"
-    )
 
 
 def summarise(draft: Draft, guesses: list[Guess]) -> str:

@@ -79,6 +79,8 @@ class InspectedFile:
         seen = self.inspection
         recording = seen.recording if seen else None
         metadata = recording.metadata if recording else {}
+        oil_c = recording.extra.get("oil_c", np.empty(0)) if recording else np.empty(0)
+        oil_c = oil_c[np.isfinite(oil_c)]
         return {
             "path": str(self.path),
             "run": recording.run if recording else None,
@@ -86,7 +88,7 @@ class InspectedFile:
             "source": metadata.get("source"),
             "created": metadata.get("created"),
             "resampled_from": metadata.get("resampled_from"),
-            "oil_c": _find_range(recording.extra.get("oil_c")) if recording else None,
+            "oil_c": [float(oil_c.min()), float(oil_c.max())] if len(oil_c) else None,
             "breaches": [asdict(breach) for breach in self.breaches],
             "timing": seen.timing if seen else None,
             "joints": seen.joints if seen else None,
@@ -154,9 +156,9 @@ class Inspect:
 
     def _look(self, path: Path) -> InspectedFile:
         recording, breaches = record.examine_recording(path, self.machine)
-        if recording is None or recording.num_samples < 2:
-            return InspectedFile(path, breaches, None)
-        found = inspect_recording(recording, self.machine, self.thresholds)
+        found = None
+        if recording is not None and recording.num_samples > 1:
+            found = inspect_recording(recording, self.machine, self.thresholds)
         return InspectedFile(path, breaches, found)
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -217,11 +219,6 @@ def _format_file_row(one: InspectedFile) -> list[str]:
     ]
 
 
-def _find_range(values: np.ndarray | None) -> list[float] | None:
-    there = values[np.isfinite(values)] if values is not None else np.empty(0)
-    return [float(there.min()), float(there.max())] if len(there) else None
-
-
 def _format_number(value: float | None) -> str:
     return "–" if value is None else f"{value:.2g}"
 
@@ -244,10 +241,8 @@ def draw_recording(
         draw_joint_track(axis, t_s, recording.q[:, j], recording.u[:, j], machine, j)
         for finding in inspection.findings:
             if finding.joint in (joint.name, None):
-                width_s = max(finding.duration_s, THINNEST * span_s)
-                axis.axvspan(
-                    finding.t_s, finding.t_s + width_s, color=FINDING, alpha=0.35, linewidth=0
-                )
+                end_s = finding.t_s + max(finding.duration_s, THINNEST * span_s)
+                axis.axvspan(finding.t_s, end_s, color=FINDING, alpha=0.35, linewidth=0)
         own = {f"u_{joint.name}", f"q_{joint.name}_{joint.unit}", "t_s"}
         for breach in breaches:
             if breach.row is not None and breach.column in own and np.isfinite(t_s[breach.row]):

@@ -71,9 +71,9 @@ class TableLog(LogFile):
                 column, labels = "timestamp" if is_index else name, self._labels.get(name, ())
                 found |= convert_column(column, cells, tell_column(filled, "."), labels=labels)
         except FileNotFoundError as error:
-            raise RecordingError(f"{self.path}: no such log") from error
+            self.refuse("no such log", error)
         except TABLE_ERRORS as error:
-            raise RecordingError(f"{self.path}: cannot be read as {kind} ({error})") from error
+            self.refuse(f"cannot be read as {kind} ({error})", error)
         return {"": Table(found)}
 
 
@@ -85,25 +85,22 @@ class LeRobotLog(LogFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        place = f"{path}/meta/info.json"
         try:
             info = json.loads((path / "meta" / "info.json").read_text())
             labels = _read_labels(info["features"])
             version = str(info["codebase_version"])
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RecordingError(
-                f"{place}: expected the description of a LeRobotDataset ({error!r})"
+                f"{path}/meta/info.json: expected the description of a LeRobotDataset ({error!r})"
             ) from error
         if not version.startswith(("v2", "v3")):
             raise RecordingError(
-                f"{place}: codebase_version is '{version}', expected v2.x or v3.x; "
+                f"{path}/meta/info.json: codebase_version is '{version}', expected v2.x or v3.x; "
                 "LeRobot's own converter brings an older dataset to v3.0"
             )
         self._files = [TableLog(file, labels) for file in sorted(path.glob("data/**/*.parquet"))]
         if not self._files:
-            raise RecordingError(
-                f"{path}: no data/**/*.parquet; a LeRobotDataset keeps its rows there"
-            )
+            self.refuse("no data/**/*.parquet; a LeRobotDataset keeps its rows there")
 
     def read_runs(self, wanted: Wanted | None, max_rows: int | None) -> Iterator[LogRun]:
         """Yield each episode as a run."""
@@ -111,7 +108,7 @@ class LeRobotLog(LogFile):
             columns = file.read_tables(None, max_rows)[""].columns
             numbers = columns.get(EPISODE, np.empty(0))
             if not len(numbers):
-                raise RecordingError(f"{file.path}: column '{EPISODE}' is missing or has no rows")
+                file.refuse(f"column '{EPISODE}' is missing or has no rows")
             edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
             for begin, end in pairwise(edges):
                 number = int(numbers[begin])
@@ -125,7 +122,8 @@ class ArrayLog(LogFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        tables = _read_matlab(path) if path.suffix.lower() == ".mat" else _read_npz(path)
+        is_matlab = path.suffix.lower() == ".mat"
+        tables = self._read_matlab() if is_matlab else self._read_npz()
         self._tables: dict[str, dict[str, np.ndarray]] = {}
         for table, arrays in tables.items():
             sizes = Counter(size for values in arrays.values() for size in {*values.shape})
@@ -148,52 +146,44 @@ class ArrayLog(LogFile):
             tables[table] = Table({name: values[:max_rows] for name, values in columns.items()})
         return tables
 
+    def _read_npz(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return the real vectors and matrices of a NumPy archive; pickled objects are never loaded."""
+        found, name = {}, ""
+        try:
+            with self.path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                for name in archive.files:
+                    try:
+                        values = archive[name]
+                    except ValueError as error:
+                        if "allow_pickle" not in str(error):
+                            raise
+                        continue
+                    if values.dtype.kind in "mM":  # times
+                        values = values.astype(f"{values.dtype.kind}8[ns]").astype(float) * 1e-9
+                    if _is_real(values) and values.ndim in (1, 2) and len(values) > 1:
+                        found[name] = values
+        except NPZ_ERRORS as error:
+            place = f"array '{name}' is damaged" if name else "cannot be read as a NumPy archive"
+            self.refuse(f"{place} ({error})", error)
+        return {"": found}
 
-def _read_npz(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Return the real vectors and matrices of a NumPy archive; pickled objects are never loaded."""
-    found, name = {}, ""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            for name in archive.files:
-                try:
-                    values = archive[name]
-                except ValueError as error:
-                    if "allow_pickle" not in str(error):
-                        raise
-                    continue
-                if values.dtype.kind in "mM":  # times
-                    values = values.astype(f"{values.dtype.kind}8[ns]").astype(float) * 1e-9
-                if _is_real(values) and values.ndim in (1, 2) and len(values) > 1:
-                    found[name] = values
-    except NPZ_ERRORS as error:
-        place = f"array '{name}' is damaged" if name else "cannot be read as a NumPy archive"
-        raise RecordingError(f"{path}: {place} ({error})") from error
-    return {"": found}
-
-
-def _read_matlab(path: Path) -> dict[str, dict[str, np.ndarray]]:
-    """Return the arrays of a MATLAB file up to version 7, those of Simulink structures by their labels."""
-    tables: dict[str, dict[str, np.ndarray]] = {"": {}}
-    name = ""
-    try:
-        for name, *_ in matlab.whosmat(path):
-            content = matlab.loadmat(path, variable_names=[name], simplify_cells=True)
-            _add_array(tables, name, content.get(name))
-    except NotImplementedError as error:
-        raise RecordingError(
-            f"{path}: a MATLAB file of version 7.3; save it again with save(…, '-v7')"
-        ) from error
-    except Exception as error:  # SciPy raises what its parser stumbles over
-        place = f"array '{name}' " if name else ""
-        raise RecordingError(
-            f"{path}: {place}cannot be read as a MATLAB file up to version 7 ({error})"
-        ) from error
-    if not any(tables.values()):
-        raise RecordingError(
-            f"{path}: holds no array of numbers that can be read; save arrays or structures with time, "
-            "for objects (timeseries, Dataset) Simulink's format 'Structure With Time'"
-        )
-    return {name: arrays for name, arrays in tables.items() if arrays}
+    def _read_matlab(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return the arrays of a MATLAB file up to version 7, those of Simulink structures by their labels."""
+        tables: dict[str, dict[str, np.ndarray]] = {"": {}}
+        name = ""
+        try:
+            for name, *_ in matlab.whosmat(self.path):
+                content = matlab.loadmat(self.path, variable_names=[name], simplify_cells=True)
+                _add_array(tables, name, content.get(name))
+        except NotImplementedError as error:
+            self.refuse("a MATLAB file of version 7.3; save it again with save(…, '-v7')", error)
+        except Exception as error:  # SciPy raises what its parser stumbles over
+            place = f"array '{name}' " if name else ""
+            self.refuse(f"{place}cannot be read as a MATLAB file up to version 7 ({error})", error)
+        if not any(tables.values()):
+            mend = "save arrays or structures with time, for objects (timeseries, Dataset) Simulink's format"
+            self.refuse(f"holds no array of numbers that can be read; {mend} 'Structure With Time'")
+        return {name: arrays for name, arrays in tables.items() if arrays}
 
 
 def _add_array(tables: dict[str, dict[str, np.ndarray]], name: str, value: Any) -> None:

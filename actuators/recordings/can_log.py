@@ -22,7 +22,7 @@ import cantools
 from actuators.recordings.guess import advise
 from actuators.recordings.message_log import HEAD_UNLISTED, LoggedMessage, MessageLog
 from brokk_rl import registry
-from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.errors import ConfigError
 
 EXTENDED = 1 << 31
 """Bit of an identifier that has 29 bits, as in DBC files."""
@@ -62,9 +62,8 @@ class CanLog(MessageLog):
             with self._open() as reader:
                 found = sorted({read_identifier(frame) for frame in islice(reader, HEAD_UNLISTED)})
             ids = [f"0x{one & ~EXTENDED:X}{'x' if one & EXTENDED else ''}" for one in found[:8]]
-            raise RecordingError(
-                f"{self.path}: no message of the DBC is in this log; its identifiers are {', '.join(ids) or 'none'}"
-            )
+            listed = ", ".join(ids) or "none"
+            self.refuse(f"no message of the DBC is in this log; its identifiers are {listed}")
         return tables
 
     def _list_units(self, table: str) -> Mapping[str, str]:
@@ -99,10 +98,8 @@ class CanLog(MessageLog):
                 table = self._messages[frame_id].name
                 if channels.setdefault(frame_id, channel) != channel:
                     both = sorted((channel, channels[frame_id]))
-                    raise RecordingError(
-                        f"{self.path}: message '{table}' comes on the channels {', '.join(both)}, which are two sources; "
-                        f"{advise('channel', channel=both[0])}"
-                    )
+                    text = f"message '{table}' comes on the channels {', '.join(both)}, which are two sources"
+                    self.refuse(f"{text}; {advise('channel', channel=both[0])}")
                 time_ns = round(frame.timestamp * 1e9)
                 decode = decoders[frame_id]
                 yield LoggedMessage(table, time_ns, bytes(frame.data), decode, f", frame {number}")
@@ -119,14 +116,10 @@ def read_candump(path: Path) -> str:
     for line in path.read_text(errors="replace").splitlines():
         printed = PRINTED_LINE.match(line)
         if printed:
-            is_date = "-" in printed[1]  # candump -t A
-            stamp_s = (
-                datetime.fromisoformat(f"{printed[1]}+00:00").timestamp()
-                if is_date
-                else float(printed[1])
-            )
-            data = "".join(printed[4].split())
-            lines.append(f"({stamp_s:.6f}) {printed[2]} {printed[3]}#{data}")
+            stamp, data = printed[1], "".join(printed[4].split())
+            if "-" in stamp:  # candump -t A
+                stamp = datetime.fromisoformat(f"{stamp}+00:00").timestamp()
+            lines.append(f"({float(stamp):.6f}) {printed[2]} {printed[3]}#{data}")
         elif line.lstrip().startswith("("):
             lines.append(line.strip())
     return "\n".join(lines) + "\n"

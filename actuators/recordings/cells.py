@@ -115,10 +115,9 @@ def _convert_times(texts: Any) -> np.ndarray:
         whole = "00:" + texts if first.count(":") == 1 else texts
         elapsed: Any = pd.to_timedelta(whole, errors="coerce")
         return elapsed.dt.total_seconds().to_numpy(dtype=float)
-    is_iso = ISO_TIME.fullmatch(first) is not None
-    form: Any = (
-        {"format": "ISO8601"} if is_iso else {"dayfirst": "/" not in first, "format": "mixed"}
-    )
+    form: Any = {"dayfirst": "/" not in first, "format": "mixed"}
+    if ISO_TIME.fullmatch(first):
+        form = {"format": "ISO8601"}
     return _count_seconds(pd.to_datetime(texts, utc=True, errors="coerce", **form))
 
 

@@ -18,7 +18,7 @@ from scipy.stats import theilslopes
 from actuators.recordings.guess import Evidence, GivenColumns, Guess, advise
 from actuators.recordings.log_tables import LogRun, Table, index_columns
 from actuators.recordings.name_evidence import TIME_UNITS, WORDS, read_words, split_unit
-from brokk_rl.errors import RecordingError, list_choices
+from brokk_rl.errors import list_choices
 from brokk_rl.spec import Positive, spec
 
 CLOCK_POINTS = 200
@@ -225,18 +225,16 @@ def guess_times(run: LogRun, given: GivenColumns) -> dict[str, Guess]:
             faults += found
     columns = index_columns({name: [*table.columns] for name, table in run.tables.items()})
     if not columns:
-        raise RecordingError(f"{run.where}: no column of numbers can be read in it")
+        run.refuse("no column of numbers can be read in it")
     if not times:
         rate = f"{advise('rate', rate_hz=50.0)} where they are at 50 Hz"
         broken = "; ".join(faults) or f"columns: {', '.join(columns)}; {rate}"
-        raise RecordingError(
-            f"{run.where}: no column is the time: none increases at a rate of {RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz; {broken}"
-        )
+        rates = f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz"
+        run.refuse(f"no column is the time: none increases at a rate of {rates}; {broken}")
     for name in given.clock_offset_s or {}:
         if name not in times:
-            raise RecordingError(
-                f"{run.where}: log.clock_offset_s: table '{name}' is missing or has no clock; {list_choices(name, times)}"
-            )
+            known = list_choices(name, times)
+            run.refuse(f"log.clock_offset_s: table '{name}' is missing or has no clock; {known}")
     return times
 
 
@@ -285,12 +283,11 @@ def _guess_own_clock(subject: str, table: Table, clock: str) -> Guess:
             evidence.append((f"{text}: two programs send on one topic", -8.0))
         return Guess(subject, clock, evidence, choice=anchor)
     scatter_s = np.quantile(late_s, 0.95) - late_s.min()
-    reason = (
-        f"the sensor's own clock; behind the recorder's by {np.median(late_s):.4g} s, drift {1e6 * drift:.3g} ppm, "
-        f"scatter of the transport {1000 * scatter_s:.3g} ms"
-    )
+    behind = f"behind the recorder's by {np.median(late_s):.4g} s, drift {1e6 * drift:.3g} ppm"
+    scatter = f"scatter of the transport {1000 * scatter_s:.3g} ms"
+    evidence = [(f"the sensor's own clock; {behind}, {scatter}", 5.0)]
     time = AlignedTime(column="header.stamp", scale=1.0, anchor=anchor)
-    return Guess(subject, "header.stamp", ((reason, 5.0),), (clock,), choice=time)
+    return Guess(subject, "header.stamp", evidence, (clock,), choice=time)
 
 
 def _list_clocks(table: Table, given: Sequence[str] | None) -> Iterator[tuple[str, np.ndarray]]:
@@ -347,9 +344,8 @@ def _judge_clock(
             return None
         if not words.isdisjoint(("dt", "delta", "diff", "period")):
             rate_hz = float(f"{1.0 / max(float(np.mean(values)), 1e-9):.3g}")
-            return (
-                f"'{text}' holds the time since the row before; {advise('rate', rate_hz=rate_hz)}"
-            )
+            mend = advise("rate", rate_hz=rate_hz)
+            return f"'{text}' holds the time since the row before; {mend}"
         if not fault.is_damage:  # damage is refused, or skipped, where the whole log is read
             place = table.locate(int(fault.rows[0]))
             return f"'{text}': {fault.text}, first in {place}; {fault.advice}"

@@ -62,15 +62,11 @@ class ColumnTable:
         )
         self.remarks: list[str] = []
         self.joints = self._find() if given.joints is None else self._take(given.joints)
-        self._judge_joints()
-
-    def _judge_joints(self) -> None:
-        """Weigh by the numbers what the columns of each joint are."""
         u, q = [one.u for one in self.joints], [one.q for one in self.joints]
-        matrix = Correlations(self._run, u, q)
+        matrix = Correlations(run, u, q)
         for at, joint in enumerate(self.joints):
             self._check_drive(joint)
-            joint.judge(matrix, at, self._given)
+            joint.judge(matrix, at, given)
 
     def _take(self, given: Mapping[str, tuple[str, str]]) -> list[JointGuess]:
         """Return the joints whose columns a person gives; refuse one that is missing."""
@@ -158,7 +154,10 @@ class ColumnTable:
 
     def _assign(self, commands: Entries, positions: Entries) -> list[JointGuess]:
         """Return the pairs of the assignment with the most evidence."""
-        names = _weigh_names(commands, positions)
+        u, q = (np.array([one.name.key for one in several]) for several in (commands, positions))
+        is_same = u[:, None] == q[None]
+        has_other = is_same.any(1)[:, None] | is_same.any(0)[None]
+        names = np.where(is_same, SAME_NAME, np.where(has_other, OTHER_NAME, 0.0))
         size = Correlations(self._run, commands, positions).size
         numbers = np.vectorize(weigh_correlation)(size) + size
         numbers[[not one.is_changing for one in commands]] = -1.0  # another log may move it
@@ -166,7 +165,7 @@ class ColumnTable:
         pairs = list(zip(*linear_sum_assignment(-score), strict=True))
         chosen: dict[str, tuple[int, int]] = {}
         for pair in sorted(pairs, key=lambda pair: -score[pair]):
-            if names[pair] == SAME_NAME:
+            if is_same[pair]:
                 chosen.setdefault(commands[pair[0]].name.key, pair)
         found = [(*pair, "same name", SAME_NAME) for pair in chosen.values()]
         rows, columns = _list_rest(commands, chosen), _list_rest(positions, chosen)
@@ -182,9 +181,9 @@ class ColumnTable:
             self._refuse(text, list(zip(commands, positions, strict=False)))
         joints = []
         for row, column, text, weight in sorted(found):
-            u, q = commands[row], positions[column]
-            name = name_joint(q.name.joint or u.name.joint)
-            joints.append(JointGuess(name, u, q, [(text, weight)], self.signals))
+            command, position = commands[row], positions[column]
+            name = name_joint(position.name.joint or command.name.joint)
+            joints.append(JointGuess(name, command, position, [(text, weight)], self.signals))
         return joints
 
     def _list_followers(self, entries: Entries) -> list[tuple[ColumnEntry, ColumnEntry]]:
@@ -207,9 +206,8 @@ class ColumnTable:
         """Raise a `RecordingError` with the columns of each joint as they are given by hand."""
         proposed = [f'joint_{at}: ["{u.text}", "{q.text}"]' for at, (u, q) in enumerate(pairs, 1)]
         joints = ", ".join(proposed) or 'boom: ["<command>", "<position>"]'
-        raise RecordingError(
-            f"{self._run.where}: {text}{advise('joints', joints=joints)}; its columns are {', '.join(self._places)}"
-        )
+        columns = ", ".join(self._places)
+        self._run.refuse(f"{text}{advise('joints', joints=joints)}; its columns are {columns}")
 
     def _check_drive(self, joint: JointGuess) -> None:
         """Add the evidence of a drive that is off by a column that says so, and remark it."""
@@ -225,9 +223,8 @@ class ColumnTable:
                 t_s = signal.t_s[off] - signal.t_s[0]
                 text = f"its drive is off in {off.mean():.0%} of the rows"
                 joint.evidence.append((text, -0.5))
-                self.remarks.append(
-                    f"{joint.name}: {text}, first at {t_s[0]:.2f} s, last at {t_s[-1]:.2f} s ({full_name} = 0)"
-                )
+                times = f"first at {t_s[0]:.2f} s, last at {t_s[-1]:.2f} s"
+                self.remarks.append(f"{joint.name}: {text}, {times} ({full_name} = 0)")
 
 
 def _choose_roles(entries: Entries) -> tuple[list[ColumnEntry], list[ColumnEntry]]:
@@ -240,14 +237,6 @@ def _choose_roles(entries: Entries) -> tuple[list[ColumnEntry], list[ColumnEntry
             positions.append(one)
     named = [one for one in positions if (one.name.quantity, one.name.role) != ("unknown", None)]
     return commands, named or positions
-
-
-def _weigh_names(commands: Entries, positions: Entries) -> np.ndarray:
-    """Return the log odds of each pair by the names of its joint, `(C, P)`."""
-    u, q = (np.array([one.name.key for one in several]) for several in (commands, positions))
-    is_same = u[:, None] == q[None]
-    has_other = is_same.any(1)[:, None] | is_same.any(0)[None]
-    return np.where(is_same, SAME_NAME, np.where(has_other, OTHER_NAME, 0.0))
 
 
 def _prefer(commands: Entries, positions: Entries) -> np.ndarray:

@@ -33,7 +33,6 @@ from actuators.recordings.log_signals import (
     locate,
     open_signals,
 )
-from actuators.recordings.log_tables import LogRun
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -181,10 +180,18 @@ class ColumnMap:
                 f"import: the map names the joints {', '.join(self.joints)}, machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
-        self._check_interface(machine)
         texts = [column.column for column in self.optional.values()]
-        for joint in self.joints.values():
+        for name, joint in self.joints.items():
             texts += [joint.command.column, joint.position.column]
+            if not isinstance(joint.command, TargetColumn):
+                continue
+            is_position = joint.command.full_speed is None
+            if is_position != (machine.interface == "position"):
+                mend = "a number" if is_position else "null"
+                raise ConfigError(
+                    f"import: machine '{machine.name}' is commanded by {machine.interface}; give joints.{name}.command.full_speed "
+                    f"as {mend} in the column map"
+                )
         signs = (self.delimiter, self.decimal)
         opened = open_log(path, signs, self.dbc, self.damaged, self.channel)
         find_time = partial(self.find_time, where=path)
@@ -197,19 +204,6 @@ class ColumnMap:
                 "mend longest_gap_s or the scale of time in the column map"
             )
         return found
-
-    def _check_interface(self, machine: Machine) -> None:
-        """Raise a `ConfigError` where targets are read as another quantity than the machine's command."""
-        for name, joint in self.joints.items():
-            if not isinstance(joint.command, TargetColumn):
-                continue
-            is_position = joint.command.full_speed is None
-            if is_position != (machine.interface == "position"):
-                mend = "a number" if is_position else "null"
-                raise ConfigError(
-                    f"import: machine '{machine.name}' is commanded by {machine.interface}; give joints.{name}.command.full_speed "
-                    f"as {mend} in the column map"
-                )
 
     def find_time(self, table: str, where: object) -> TimeColumn:
         """Return the time of a table.
@@ -236,31 +230,34 @@ class ColumnMap:
             optional[name] = read_column(signals, column, None, empty=True)
         # arithmetic has the clock of its first column, and gaps of the others count too
         clocks = [signal.t_s for signal in (*commands, *positions)]
-        spans_s, num_left_out = [], 0
-        for begin_s, end_s in record.split_at_gaps(clocks, self.longest_gap_s):
-            if end_s - begin_s >= max(self.shortest_s, machine.period_s) - 1e-9:
-                spans_s.append((begin_s, end_s))
-            else:
-                num_left_out += 1
-        if num_left_out:
+        spans_s = [*record.split_at_gaps(clocks, self.longest_gap_s)]
+        shortest_s = max(self.shortest_s, machine.period_s) - 1e-9
+        whole_s = [one for one in spans_s if one[1] - one[0] >= shortest_s]
+        if num_left_out := len(spans_s) - len(whole_s):
             text = "%s: %d pieces shorter than %g s left out"
             log.warning(text, signals.run.where, num_left_out, self.shortest_s)
         found = []
-        for begin_s, end_s in spans_s:
+        for begin_s, end_s in whole_s:
             num_rows = int((end_s - begin_s) / machine.period_s + TICK_TOLERANCE) + 1
             t_s = np.arange(num_rows) * machine.period_s
             read = Signal.average if machine.interface == "torque" else Signal.hold
             u = [read(command, begin_s + t_s, machine.period_s) for command in commands]
             q = [position.interpolate(begin_s + t_s) for position in positions]
-            made = record.make_motion(
-                machine, signals.run.name, t_s, np.stack(u, 1), np.stack(q, 1)
-            )
+            motion = (np.stack(u, 1), np.stack(q, 1))
+            made = record.make_motion(machine, signals.run.name, t_s, *motion)
             extra = {}
             for name, signal in optional.items():
                 extra[name] = signal.interpolate(begin_s + t_s).astype(np.float32)
+            metadata = {
+                "source": f"log: {Path(signals.run.where).name}",
+                "run": signals.run.name,
+                "fingerprint": record.format_fingerprint(machine),
+            }
             clock_s = positions[0].t_s
-            inside_s = clock_s[(clock_s >= begin_s) & (clock_s <= end_s)]
-            metadata = describe_source(signals.run, machine, inside_s)
+            period_s = np.diff(clock_s[(clock_s >= begin_s) & (clock_s <= end_s)])
+            if len(period_s):
+                periods = f"periods of {period_s.min():.3f} to {period_s.max():.3f} s"
+                metadata["resampled_from"] = f"{1.0 / np.median(period_s):.1f} Hz, {periods}"
             found.append(replace(made, extra=extra, metadata=metadata))
         return found
 
@@ -325,18 +322,3 @@ def read_column(
     if column.wraps is not None and middle is not None:
         values = put_near(values, (middle - column.offset) / column.scale, column.wraps)
     return replace(signal, values=column.scale * values + column.offset)
-
-
-def describe_source(run: LogRun, machine: Machine, clock_s: np.ndarray) -> dict[str, str]:
-    """Return the metadata of a recording of a run; `clock_s` is the clock that it is resampled from."""
-    metadata = {
-        "source": f"log: {Path(run.where).name}",
-        "run": run.name,
-        "fingerprint": record.format_fingerprint(machine),
-    }
-    if len(clock_s) > 1:
-        period_s = np.diff(clock_s)
-        metadata["resampled_from"] = (
-            f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"
-        )
-    return metadata

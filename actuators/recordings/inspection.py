@@ -164,9 +164,8 @@ class _RecordingScan:
         self._idle = np.stack([find_held(np.abs(u) < least, self._lead) for u in self._u.T], 1)
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
         self._step = np.array([estimate_step(q) for q in self._q.T])
-        self._visible = thresholds.steps * np.fmax(
-            np.nan_to_num(self._step), np.nan_to_num(self._noise)
-        )
+        grain = np.fmax(np.nan_to_num(self._step), np.nan_to_num(self._noise))
+        self._visible = thresholds.steps * grain
 
     def timing(self) -> dict[str, float | None]:
         """Return duration, rate and jitter."""
@@ -340,9 +339,8 @@ class _RecordingScan:
         median_s = float(np.median(periods_s))
         if np.mean(np.abs(periods_s / median_s - 1.0) > 0.1) > MAX_IRREGULAR_SHARE:
             low, high = 1e3 * np.percentile(periods_s, (5, 95))
-            text = (
-                f"periods of {low:.1f} to {high:.1f} ms (5 to 95 %), median {1e3 * median_s:.1f} ms"
-            )
+            text = f"periods of {low:.1f} to {high:.1f} ms (5 to 95 %)"
+            text += f", median {1e3 * median_s:.1f} ms"
             yield self._finding("irregular clock", None, 0, len(self._t_s), text)
 
     def _find_long(self, condition: np.ndarray) -> list[tuple[int, int]]:

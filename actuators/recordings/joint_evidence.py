@@ -25,7 +25,6 @@ from actuators.recordings.signal_checks import (
     find_spikes,
     find_wrap,
 )
-from brokk_rl.errors import RecordingError
 
 KIND_TEXTS: dict[CommandKind, str] = {
     "velocity": "sets the speed",
@@ -196,6 +195,10 @@ class JointGuess:
     guesses: dict[str, Guess] = field(default_factory=dict)
     survey: JointSurvey = field(default_factory=JointSurvey)
 
+    def rank(self) -> tuple[float, float]:
+        """Return how sure its columns and its kind are, by which guesses from several logs are compared."""
+        return self.guesses["columns"].probability, self.guesses["command"].probability
+
     @property
     def target_wraps(self) -> float | None:
         """Value at which a target begins again."""
@@ -210,9 +213,7 @@ class JointGuess:
             given: Meanings that a person gives.
         """
         slope, rest = matrix.fit_target(at)
-        r: dict[CommandKind, float] = {}
-        for kind, several in matrix.r.items():
-            r[kind] = float(several[at, at])
+        r = {kind: float(several[at, at]) for kind, several in matrix.r.items()}
         self._judge_kind(r, slope, rest, given.command)
         if self.u.is_changing:
             self._judge_motion(matrix, at)
@@ -243,7 +244,7 @@ class JointGuess:
         self.guesses[what] = guess.advise(advise(what)) if what in GIVEN_BY_KEY else guess
 
     def _judge_kind(
-        self, r: Mapping[CommandKind, float], slope: float, rest: float, given: CommandKind | None
+        self, r: Mapping[str, float], slope: float, rest: float, given: CommandKind | None
     ) -> None:
         """Choose which quantity the command sets."""
         named, size = self.u.name.quantity, {kind: abs(value) for kind, value in r.items()}
@@ -259,9 +260,8 @@ class JointGuess:
         if named != "torque":  # an acceleration that follows a target is that of a servo
             weights["torque"] = -math.inf
         self.kind = chosen = given or max(weights, key=lambda kind: weights[kind])
-        text = (
-            f"correlation with position {size['position']:.2f}, with speed {size['velocity']:.2f}"
-        )
+        with_speed = f"with speed {size['velocity']:.2f}"
+        text = f"correlation with position {size['position']:.2f}, {with_speed}"
         if given is not None:
             is_refuted = given != "torque" and self.u.is_changing and size[given] < NO_CORRELATION
             evidence = [("as given by log.command", 5.0), (text, -6.0 if is_refuted else 0.0)]
@@ -285,10 +285,8 @@ class JointGuess:
             weight = 1.0 if abs(r) >= NO_CORRELATION else -2.0
         else:
             self.lag_s = matrix.find_lag(at, self.kind == "position")
-        text = (
-            f"correlation of {FOLLOWED[self.kind]} with command {r:.2f}, {self.lag_s:.2f} s later"
-        )
-        self.evidence.append((text, weight))
+        text = f"correlation of {FOLLOWED[self.kind]} with command {r:.2f}"
+        self.evidence.append((f"{text}, {self.lag_s:.2f} s later", weight))
         if self.lag_s > LAST_LAG * LONGEST_LAG_S:
             text = "no longer lag is tried: its delay is longer, or it is no pair"
             self.evidence.append((text, -5.0))
@@ -312,18 +310,14 @@ class JointGuess:
         if len(spikes):
             is_mixed = len(spikes) > SPIKE_SHARE * len(q)
             asked = "two sources, or lost bits?" if is_mixed else "lost bits?"
-            text = (
-                f"{len(spikes)} of {len(q)} samples leave their neighbours and come back, first at "
-                f"{t_s[spikes[0]] - t_s[0]:.2f} s: {asked}"
-            )
+            text = f"{len(spikes)} of {len(q)} samples leave their neighbours and come back"
+            text += f", first at {t_s[spikes[0]] - t_s[0]:.2f} s: {asked}"
             self.evidence.append((text, -8.0 if is_mixed else -0.5))
         if len(jumps):
             row = jumps[0]
-            text = (
-                f"{len(jumps)} jumps that no command causes, the first by {abs(q[row + 1] - q[row]):.4g} at "
-                f"{t_s[row] - t_s[0]:.2f} s: a reset, a wrap or another source?"
-            )
-            self.evidence.append((text, -6.0))
+            first = f"the first by {abs(q[row + 1] - q[row]):.4g} at {t_s[row] - t_s[0]:.2f} s"
+            text = f"{len(jumps)} jumps that no command causes, {first}"
+            self.evidence.append((f"{text}: a reset, a wrap or another source?", -6.0))
 
     def _judge_unit(self, given: str | None, slope: float) -> None:
         """Choose the unit of the position: as given, named, that of its target, or by its travel."""
@@ -485,13 +479,10 @@ def weigh_correlation(size: float) -> float:
 def _refuse_clocks(run: LogRun, signals: Sequence[Signal]) -> NoReturn:
     """Raise a `RecordingError` with the clocks, which have no time in common."""
     spans = {one.table: (float(one.t_s[0]), float(one.t_s[-1])) for one in signals}
-    listed = ", ".join(
-        f"{table}: {begin:.12g} to {end:.12g} s" for table, (begin, end) in spans.items()
-    )
+    texts = [f"{table}: {begin:.12g} to {end:.12g} s" for table, (begin, end) in spans.items()]
+    listed = ", ".join(texts)
     first = min(spans, key=lambda table: spans[table])
     last = max(spans, key=lambda table: spans[table])
     apart_s = spans[first][0] - spans[last][0]
-    raise RecordingError(
-        f"{run.where}: the clocks of its tables have no time in common ({listed}); "
-        f"{advise('offset', table=last, offset_s=apart_s)}"
-    )
+    mend = advise("offset", table=last, offset_s=apart_s)
+    run.refuse(f"the clocks of its tables have no time in common ({listed}); {mend}")

@@ -161,7 +161,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
     for path in paths[:SAMPLED_LOGS]:
         opened = open_log(path, None, given.dbc, given.damaged, given.channel)
         if isinstance(opened, TextLog):
-            signs = (opened.layout.delimiter, opened.layout.decimal)
+            signs = opened.signs
         run = next(opened.read_runs(None, SAMPLED_ROWS), None)
         if run is None:
             raise RecordingError(f"{path}: no row")
@@ -170,7 +170,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
             clocks.setdefault(table, time)
         remarks |= dict.fromkeys(sample.remarks)
         for joint in sample.joints:
-            best[joint.name] = max(best.get(joint.name, joint), joint, key=_rank)
+            best[joint.name] = max(best.get(joint.name, joint), joint, key=JointGuess.rank)
     joints = [*best.values()]
     used = {one.u.signal.table for one in joints} | {one.q.signal.table for one in joints}
     times = {table: time for table, time in clocks.items() if table in used}
@@ -191,15 +191,12 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
     return Draft(name, times, moving, survey, signs, given, [*remarks, *survey.gaps])
 
 
-def _rank(joint: JointGuess) -> tuple[float, float]:
-    return joint.guesses["columns"].probability, joint.guesses["command"].probability
-
-
 def _scale_command(joint: JointGuess) -> None:
     """Choose neutral and full commands of a joint whose command sets its speed, or a force."""
     survey = joint.survey
     low, high, neutral = survey.lowest_command, survey.highest_command, 0.0
     is_at_rest = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
+    largest_of_logs = "full commands are the largest of the logs"
     largest = max(abs(low), abs(high))
     value = None
     if joint.kind == "torque":  # a joint at rest may be held by a force, so 0 is neutral
@@ -211,11 +208,9 @@ def _scale_command(joint: JointGuess) -> None:
     elif is_at_rest:
         neutral = survey.rest
         text = f"neutral {neutral:.6g} is the command of {survey.rest_share:.0%} of the rows, all at rest"
-        evidence = [(f"{text}; full commands are the largest of the logs", 2.0)]
+        evidence = [(f"{text}; {largest_of_logs}", 2.0)]
     elif low <= 0.0 <= high:
-        text = (
-            "neutral 0: no command is frequent at rest; full commands are the largest of the logs"
-        )
+        text = f"neutral 0: no command is frequent at rest; {largest_of_logs}"
         evidence = [(text, 2.0)]
     else:
         evidence = [("no command is frequent at rest, and none is 0", -1.0)]
@@ -339,11 +334,10 @@ class LogSurvey:
         gaps = np.flatnonzero(periods_s > self.gap_periods * slowest_s)
         if len(gaps):
             longest = gaps[np.argmax(periods_s[gaps])]
-            self.gaps.append(
-                f"{where}: {len(gaps)} gaps, {periods_s[gaps].sum():.4g} s without samples; the longest is "
-                f"{periods_s[longest]:.4g} s "
-                f"from {t_s[longest] - t_s[0]:.2f} s on: lost rows, or a clock that was set; the log is split there"
-            )
+            text = f"{len(gaps)} gaps, {periods_s[gaps].sum():.4g} s without samples"
+            place = f"{periods_s[longest]:.4g} s from {t_s[longest] - t_s[0]:.2f} s on"
+            cause = "lost rows, or a clock that was set; the log is split there"
+            self.gaps.append(f"{where}: {text}; the longest is {place}: {cause}")
         self.minutes += float(t_s[-1] - t_s[0] - periods_s[gaps].sum()) / 60.0
         edges_s = np.concatenate([t_s[:1], t_s[gaps], t_s[-1:]])
         self.longest_s = max(self.longest_s, float(np.diff(edges_s).max()))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from actuators.recordings.array_log import FORMATS
 from actuators.recordings.guess import FOREIGN, Damaged, advise
 from actuators.recordings.log_tables import LogFile
+from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError
 
 TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".log", ".lvm")
@@ -114,14 +116,14 @@ def tell_folder(path: Path) -> str | None:
     return "message_log.BagLog" if (path / "metadata.yaml").is_file() else None
 
 
-def expand_logs(paths: list[Path]) -> list[Path]:
-    """Return the logs among files and folders; a folder that is no log gives the logs below it.
+def find_logs(patterns: str | Sequence[str]) -> list[Path]:
+    """Return the logs that match one or several globs; a folder that is no log gives the logs below it.
 
     Raises:
-        RecordingError: A folder holds none.
+        RecordingError: None matches, a folder holds none, or two would become the same recording.
     """
     found: list[Path] = []
-    for path in paths:
+    for path in record.find_files(patterns, "log"):
         inside = _expand_log(path)
         if not inside:
             there = sorted({entry.suffix for entry in path.iterdir()} - {""})
@@ -132,7 +134,16 @@ def expand_logs(paths: list[Path]) -> list[Path]:
                 f"{path}: no log in this folder{ends}; logs end in {', '.join(READERS)} or are folders of their own"
             )
         found += inside
+    by_name: dict[str, Path] = {}
+    for path in found:
+        if (other := by_name.setdefault(name_log(path), path)) is not path:
+            raise RecordingError(f"{other} and {path} would become the same recording; rename one")
     return found
+
+
+def name_log(path: Path) -> str:
+    """Return the first part of the names of a log's recordings."""
+    return path.resolve().name if path.is_dir() else path.stem
 
 
 def _expand_log(path: Path) -> list[Path]:

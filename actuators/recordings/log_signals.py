@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NoReturn
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from actuators.recordings.guess import advise
 from actuators.recordings.log_tables import (
     LogFile,
     LogRun,
+    Table,
     index_columns,
     parse_expression,
     warn_once,
@@ -105,41 +107,34 @@ class RunSignals:
         return self.times_s[name]
 
     def _read_times(self, name: str, time: TimeColumn) -> np.ndarray:
-        table, where = self.run.tables[name], self.run.where
+        table = self.run.tables[name]
         num_rows = len(next(iter(table.columns.values())))
         if num_rows < 2:
-            raise RecordingError(
-                f"{where}: table '{name}' has {num_rows} rows; a log has at least 2"
-            )
+            self.run.refuse(f"table '{name}' has {num_rows} rows; a log has at least 2")
         if isinstance(time, clocks.RowTime):
             return np.arange(num_rows) / time.rate_hz
-        wraps, offset_s = (
-            (time.wraps, time.offset) if isinstance(time, clocks.Column) else (None, 0.0)
-        )
-        t_s = time.scale * unwrap(_compute_column(table.columns, time.column), wraps) + offset_s
+        t_s = _compute_column(table.columns, time.column)
+        if isinstance(time, clocks.Column):
+            t_s = time.scale * unwrap(t_s, time.wraps) + time.offset
+        else:
+            t_s = time.scale * t_s
         known = np.isfinite(t_s)
         if not known.all() and not self.skip:
-            row = int(np.argmin(known))
-            cell = (
-                table.show_cell(row, time.column) if time.column in table.columns else "the value"
-            )
-            raise RecordingError(
-                f"{where}: {table.locate(row)}, column '{time.column}': {cell} is not a number; {advise('damaged')}"
-            )
+            self._refuse_cell(table, known, time.column, time.column)
         fault = clocks.find_fault(t_s, table, time.column)
         if fault is not None:
             row = int(fault.rows[0])
-            place = f"{where}: {table.locate(row)}, column '{time.column}'"
+            place = f"{table.locate(row)}, column '{time.column}'"
             if not (self.skip and fault.is_damage):
-                before_s = t_s[max(row - 1, 0)]
-                raise RecordingError(
-                    f"{place}: time does not increase ({before_s:g} s, then {t_s[row]:g} s): {fault.text}; {fault.advice}"
-                )
+                times = f"{t_s[max(row - 1, 0)]:g} s, then {t_s[row]:g} s"
+                text = f"{place}: time does not increase ({times}): {fault.text}; {fault.advice}"
+                self.run.refuse(text)
             for at in fault.rows if fault.kind == "back" else ():
                 t_s[at:] += t_s[at - 1] - t_s[at] + 2.0 * self.gap_s
             later = clocks.is_later(t_s)
             if not self.quiet:
-                warn_once(f"{place}: {fault.text}; {np.sum(~later)} of {num_rows} rows left out")
+                count = f"{np.sum(~later)} of {num_rows} rows left out"
+                warn_once(f"{self.run.where}: {place}: {fault.text}; {count}")
             t_s = np.where(later, t_s, np.nan)
         if isinstance(time, clocks.AlignedTime):
             kept = np.isfinite(t_s)
@@ -182,28 +177,25 @@ class RunSignals:
         lacking = ~np.isfinite(values)
         is_sparse = content.is_sparse or lacking.mean() >= SPARSE_SHARE
         if lacking.any() and not (empty or self.skip or is_sparse):
-            row = int(np.argmax(lacking))
-            cell = content.show_cell(row, column)
-            raise RecordingError(
-                f"{self.run.where}: {content.locate(row)}, column '{name}': {cell} is not a number; {advise('damaged')}"
-            )
+            self._refuse_cell(content, ~lacking, column, name)
         is_left_out = lacking & np.isfinite(t_s)
         if is_left_out.any() and not (self.quiet or empty or is_sparse):
             first = content.locate(int(np.argmax(is_left_out)))
-            log.warning(
-                "%s: column '%s': %d of %d rows lack a number and are left out; the first is %s",
-                self.run.where,
-                name,
-                int(is_left_out.sum()),
-                len(values),
-                first,
-            )
+            count = f"{is_left_out.sum()} of {len(values)} rows"
+            text = "%s: column '%s': %s lack a number and are left out; the first is %s"
+            log.warning(text, self.run.where, name, count, first)
         rows = np.flatnonzero(np.isfinite(t_s) if empty else np.isfinite(t_s) & ~lacking)
         if len(rows) < 2:
-            raise RecordingError(
-                f"{self.run.where}: column '{name}' has {len(rows)} values with a time; a log has at least 2"
-            )
+            count = f"{len(rows)} values with a time"
+            self.run.refuse(f"column '{name}' has {count}; a log has at least 2")
         return Signal(table, t_s[rows], values[rows], rows, name)
+
+    def _refuse_cell(self, table: Table, known: np.ndarray, column: str, name: str) -> NoReturn:
+        """Refuse the first row of a column that is not `known`, `(T,)`; `name`: its full name."""
+        row = int(np.argmin(known))
+        cell = table.show_cell(row, column) if column in table.columns else "the value"
+        place = f"{table.locate(row)}, column '{name}'"
+        self.run.refuse(f"{place}: {cell} is not a number; {advise('damaged')}")
 
 
 def open_signals(

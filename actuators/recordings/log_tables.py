@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType
+from typing import NoReturn
 
 import numpy as np
 
@@ -47,9 +48,9 @@ class Table:
 
     def locate(self, row: int) -> str:
         """Return the place of a row in its file, for a message."""
-        return (
-            f"row {row}" if self.find_line is None else f"line {self.find_line(row)[0]} (row {row})"
-        )
+        if self.find_line is None:
+            return f"row {row}"
+        return f"line {self.find_line(row)[0]} (row {row})"
 
     def show_cell(self, row: int, column: str) -> str:
         """Return the value of a cell as its file has it, for a message; two quotes for an empty one."""
@@ -74,6 +75,10 @@ class LogRun:
     where: str
     tables: Mapping[str, Table]
 
+    def refuse(self, text: str) -> NoReturn:
+        """Raise a `RecordingError` that names the run."""
+        raise RecordingError(f"{self.where}: {text}")
+
 
 Wanted = Mapping[str, Collection[str]]
 """Columns by table."""
@@ -96,6 +101,10 @@ class LogFile:
     def __init__(self, path: Path) -> None:
         self.path = path
 
+    def refuse(self, text: str, error: Exception | None = None) -> NoReturn:
+        """Raise a `RecordingError` that names the log; `error`: what a library raised."""
+        raise RecordingError(f"{self.path}: {text}") from error
+
     def report_damage(self, text: str, error: Exception | None) -> None:
         """Raise a `RecordingError` for a damaged part, or warn that it is left out.
 
@@ -104,7 +113,7 @@ class LogFile:
             error: What a library raised.
         """
         if not self.keep_whole:
-            raise RecordingError(f"{self.path}: {text}; {advise('damaged')}") from error
+            self.refuse(f"{text}; {advise('damaged')}", error)
         warn_once(f"{self.path}: {text}: left out")
 
     def list_tables(self) -> dict[str, list[str]]:

@@ -181,7 +181,7 @@ class BagLog(MessageLog):
                     decode = lambda raw, kind=kind: bag.deserialize(raw, kind)  # noqa: E731
                     yield LoggedMessage(names[connection.id], time_ns, data, decode, "")
         except AnyReaderError as error:
-            raise RecordingError(f"{self.path}: {describe(error)}") from error
+            self.refuse(describe(error), error)
 
 
 class McapLog(MessageLog):

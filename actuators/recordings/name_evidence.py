@@ -135,7 +135,12 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     outer, words = split_words(table), _split_numbers(split_words(plain))
     stated = (unit or in_brackets or "").lower()
     if not stated:
-        stated, words = _take_unit(words)
+        stated = next((word for word in reversed(words) if word in UNITS), "")
+        if len(words) > 1 and words[-2] in UNITS and words[-1] == "s":  # of a speed, `rad_s`
+            stated, words = f"{words[-2]}/s", words[:-2]
+    bracketed = UNIT_SUFFIX.fullmatch(column)
+    if column.endswith("]") and not re.search(r"\s\[", column):
+        bracketed = None  # an index, or the name of an item
     quantity = _find_quantity(words)
     if quantity == "unknown":
         quantity = _find_quantity(outer)
@@ -152,22 +157,8 @@ def read_column_name(table: str, column: str, unit: str | None = None) -> Column
     joint, source = ("_".join(one for one in each if one not in known) for each in (words, outer))
     return ColumnName(
         column, _find_role(words) or _find_role(outer), quantity, stated if stated in UNITS else None,
-        joint, source, speed_unit, unit or _find_bracketed(column), is_si,
+        joint, source, speed_unit, unit or (bracketed and bracketed[2]), is_si,
     )  # fmt: skip
-
-
-def _find_bracketed(column: str) -> str | None:
-    """Return the text in brackets behind a name; an index or the name of an item in `[]` is none."""
-    found = UNIT_SUFFIX.fullmatch(column)
-    is_item = column.endswith("]") and not re.search(r"\s\[", column)
-    return found[2] if found and not is_item else None
-
-
-def _take_unit(words: list[str]) -> tuple[str, list[str]]:
-    """Return the unit that is one of the words, or empty, and the words without that of a speed, `rad_s`."""
-    if len(words) > 1 and words[-2] in UNITS and words[-1] == "s":
-        return f"{words[-2]}/s", words[:-2]
-    return next((word for word in reversed(words) if word in UNITS), ""), words
 
 
 def _split_numbers(words: list[str]) -> list[str]:

@@ -44,10 +44,8 @@ def list_sources(recordings: Sequence[Recording]) -> list[str]:
 
 def measure_commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
     """Return for how long each joint is commanded in all recordings together, s, shape `(J,)`."""
-    return np.sum(
-        [(np.abs(recording.u) > COMMANDED).sum(0) / recording.rate_hz for recording in recordings],
-        0,
-    )
+    each = [(np.abs(one.u) > COMMANDED).sum(0) / one.rate_hz for one in recordings]
+    return np.sum(each, 0)
 
 
 def split_runs(
@@ -71,12 +69,11 @@ def split_runs(
     """
     names = sorted(runs, key=lambda name: hashlib.sha256(name.encode()).hexdigest())
     # the last column, the length of the runs, distributes those in which nothing is commanded
-    seconds = np.stack(
-        [
-            np.append(measure_commanded_s(runs[name]), sum(r.duration_s for r in runs[name]))
-            for name in names
-        ]
-    )
+    rows = []
+    for name in names:
+        duration_s = sum(one.duration_s for one in runs[name])
+        rows.append(np.append(measure_commanded_s(runs[name]), duration_s))
+    seconds = np.stack(rows)
     left = np.ones(len(names), dtype=bool)
     scale = np.maximum(seconds.sum(0), 1.0) ** 2
     need = np.array(list(shares.values()))[:, None] * seconds.sum(0)

@@ -14,16 +14,14 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pandas as pd
 
 from actuators.recordings.cells import MISSING, CellKind, convert_column, tell_column, tell_kind
 from actuators.recordings.log_tables import LogFile, Table, Wanted
 from actuators.recordings.name_evidence import is_unit
-from brokk_rl.errors import RecordingError
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +33,10 @@ COMMENT_MARKS = "#%;/!*"
 FIRST_ROWS = 3
 """Rows on end from which data begin; a block of describing lines may hold some numbers too."""
 
+COMMAS = {
+    ",": "; if the comma is both delimiter and decimal sign, export again with a decimal point, or with ; or tab between the cells"
+}
+"""What else may be wrong with a delimiter."""
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
 
@@ -50,45 +52,119 @@ class CsvFolderLog(LogFile):
         return tables
 
 
-@dataclass(frozen=True)
-class TextLayout:
-    """Place and form of the rows of a text log.
+class TextLog(LogFile):
+    """A text file as a log with one table; its layout is told from both of its ends.
+
+    Args:
+        path: The file.
+        signs: Its delimiter and decimal sign; `None` to tell them.
 
     Attributes:
-        delimiter: Between the cells of a line; a space stands for any white space.
-        decimal: Decimal sign of the numbers.
-        encoding: Encoding of the text.
-        first_line: Number of lines before the first row of data.
-        names: Names of the columns; repeated ones are told apart by `#1`, `#2`.
-        samples: Cells of some rows, those of the first row at the beginning.
+        signs: Delimiter between the cells of a line, a space for any white space, and decimal sign.
+
+    Raises:
+        RecordingError: The file cannot be read, has no rows of numbers, or its header does not fit them.
     """
 
-    delimiter: str
-    decimal: str
-    encoding: str
-    first_line: int
-    names: tuple[str, ...]
-    samples: tuple[tuple[str, ...], ...]
-
-    @functools.cached_property
-    def kinds(self) -> list[CellKind]:
-        """Kinds of the columns: each that of most of its cells."""
-        columns = zip(*self.samples, strict=True)
-        return [tell_column(cells, self.decimal) for cells in columns]
-
-
-class TextLog(LogFile):
-    """A text file as a log with one table."""
-
     def __init__(self, path: Path, signs: tuple[str, str] | None = None) -> None:
-        """Open a text file.
-
-        Args:
-            path: The file.
-            signs: Its delimiter and decimal sign; `None` to tell them.
-        """
         super().__init__(path)
-        self.layout = detect_layout(path, signs)
+        head, tail, self._encoding = self._read_ends()
+        # Excel writes the delimiter into a line of its own; quotes hold 0,5 between commas
+        stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
+        pairs = itertools.product((stated[1],) if stated else DELIMITERS, ".,")
+        candidates = []
+        for delimiter, decimal in [signs] if signs else pairs:
+            rows = [split_line(line, delimiter) for line in head]
+            good = [at for at, row in enumerate(rows) if _is_data(row, decimal)]
+            if not good:
+                continue
+            width = Counter(len(rows[at]) for at in good).most_common(1)[0][0]
+            fitting = {at: rows[at] for at in good if len(rows[at]) == width}
+            samples = [*fitting.values()]
+            ends = [split_line(line, delimiter) for line in tail]
+            samples += [row for row in ends if len(row) == width and _is_data(row, decimal)]
+            cells = itertools.chain.from_iterable(samples)
+            score = sum(
+                cell not in MISSING and tell_kind(cell, decimal) != "text" for cell in cells
+            )
+            begins = [at for at in fitting if all(at + k in fitting for k in range(FIRST_ROWS))]
+            first = min(begins or fitting)
+            candidates.append((score, (delimiter, decimal), first, samples))
+        if not candidates:
+            self._refuse_head(head)
+        _, self.signs, self._first_line, samples = max(candidates, key=lambda one: one[0])
+        names = self._find_names(head[: self._first_line], samples)
+        self._names = _tell_apart(names)
+        self._kinds: list[CellKind] = [
+            tell_column(cells, self.signs[1]) for cells in zip(*samples, strict=True)
+        ]
+
+    def _read_ends(self) -> tuple[list[str], list[str], str]:
+        """Return whole lines at the beginning and at the end of the file, and its encoding."""
+        try:
+            with self.path.open("rb") as file:
+                head = file.read(SNIFFED_BYTES)
+                size = file.seek(0, 2)
+                file.seek(max(len(head), size - SNIFFED_BYTES) // 2 * 2)
+                tail = file.read()
+        except OSError as error:
+            self.refuse(f"cannot be read as text ({error})", error)
+        encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+        try:
+            first = head.decode(encoding, errors="strict" if size <= SNIFFED_BYTES else "ignore")
+        except UnicodeDecodeError:
+            encoding = "cp1252"
+            first = head.decode(encoding, errors="replace")
+        if "\0" in first:
+            known = "neither text nor a kind of log that is known by its ending"
+            self.refuse(f"{known} (it holds bytes of 0)")
+        last = tail.decode(encoding.removesuffix("-sig"), errors="ignore")
+        lines = first.splitlines()
+        return lines if size <= SNIFFED_BYTES else lines[:-1], last.splitlines()[1:-1], encoding
+
+    def _refuse_head(self, head: list[str]) -> NoReturn:
+        """Refuse a file without rows of numbers; `head`: its first lines."""
+        filled = [line for line in head if line.strip()]
+        if len(filled) < 2:
+            self.refuse("0 rows of data below the header; a log has at least 2")
+        expected = "expected rows of numbers between , ; tab, space or |"
+        begin = f"the file begins with '{filled[0][:60]}'"
+        self.refuse(f"no column of numbers can be read: {expected}, {begin}")
+
+    def _find_names(self, above: list[str], samples: list[list[str]]) -> list[str]:
+        """Return the names of the columns from the lines above the data, with their units."""
+        delimiter, width = self.signs[0], len(samples[0])
+        is_padded = all(row[-1] == "" for row in samples)
+        units: list[str] = []
+        filled = [line for line in above if line.strip()]
+        for line in reversed(filled):
+            mark = line.lstrip()[0]
+            is_comment = mark in COMMENT_MARKS
+            plain = line.lstrip().lstrip(COMMENT_MARKS) if is_comment else line
+            cells = split_line(plain, delimiter)
+            if len(cells) == 1 and delimiter == " ":
+                cells = split_line(plain, ",")
+            if len(cells) == width - 1 and is_padded:
+                cells.append("")
+            if len(cells) == width + 1 and cells[-1] == "Comment":  # LabVIEW leaves empty ones out
+                cells.pop()
+            if len(cells) != width:
+                is_near = (
+                    line is filled[-1] and not is_comment and width <= 2 * len(cells) <= 4 * width
+                )
+                if is_near and len(cells) > 1:
+                    counts = f"{len(cells)} cells, the rows below it have {width}"
+                    mend = f"mend the header, or the delimiter '{delimiter}'{COMMAS.get(delimiter, '')}"
+                    self.refuse(f"the header has {counts}: '{line.strip()[:80]}'; {mend}")
+                continue
+            if not units and all(cell in MISSING or is_unit(cell) for cell in cells):
+                units = [cell.strip("[](){}") for cell in cells]
+                continue
+            if not units:
+                return cells
+            pairs = zip(cells, units, strict=True)
+            return [f"{name} [{unit}]" if unit not in MISSING else name for name, unit in pairs]
+        return [f"column_{at + 1}" for at in range(width)]
 
     def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
         """Return the rows of the file with all columns of numbers, times, flags and lists.
@@ -98,43 +174,41 @@ class TextLog(LogFile):
         Raises:
             RecordingError: The file is damaged; names the line.
         """
-        layout, columns = self.layout, {}
+        columns = {}
         for at, cells in self._read_cells(max_rows).items():
-            columns |= convert_column(layout.names[at], cells, layout.kinds[at], layout.decimal)
+            columns |= convert_column(self._names[at], cells, self._kinds[at], self.signs[1])
         return {"": Table(columns, find_line=self.find_line)}
 
     def find_line(self, row: int) -> tuple[int, dict[str, str]]:
         """Return number, from 1, and cells by column of the line of a row of data."""
         number, cells, _ = next(itertools.islice(self._iterate_lines(), row, None))
-        return number, dict(
-            zip(self.layout.names, cells, strict=False)
-        )  # a damaged line may have fewer
+        return number, dict(zip(self._names, cells, strict=False))  # a damaged line may have fewer
 
     def _iterate_lines(self) -> Iterator[tuple[int, list[str], bool]]:
         """Yield number, from 1, and cells of each line of data, and whether the line has its end."""
-        with self.path.open(encoding=self.layout.encoding, errors="replace") as file:
+        with self.path.open(encoding=self._encoding, errors="replace") as file:
             for number, line in enumerate(file, 1):
-                if number > self.layout.first_line and line.strip():
-                    cells = split_line(line, self.layout.delimiter)
+                if number > self._first_line and line.strip():
+                    cells = split_line(line, self.signs[0])
                     yield number, cells, line.endswith("\n")
 
     def _read_cells(self, max_rows: int | None) -> dict[int, Any]:
         """Return the cells of all columns but text; numbers are numbers already where all of them are."""
-        layout, width = self.layout, len(self.layout.samples[0])
-        places = [at for at, name in enumerate(layout.names) if name and layout.kinds[at] != "text"]
+        (delimiter, decimal), width = self.signs, len(self._names)
+        places = [at for at, name in enumerate(self._names) if name and self._kinds[at] != "text"]
         read = functools.partial(
             pd.read_csv,
             self.path,
-            sep=r"\s+" if layout.delimiter == " " else layout.delimiter,
-            decimal=layout.decimal,
+            sep=r"\s+" if delimiter == " " else delimiter,
+            decimal=decimal,
             header=None,
             names=range(width),
             usecols=sorted({*places, width - 1}),
-            dtype={at: str for at in places if layout.kinds[at] != "number"},
+            dtype={at: str for at in places if self._kinds[at] != "number"},
             na_values=MISSING,
             keep_default_na=False,
-            encoding=layout.encoding,
-            skiprows=layout.first_line,
+            encoding=self._encoding,
+            skiprows=self._first_line,
             low_memory=False,
             skipinitialspace=True,
             nrows=max_rows,
@@ -147,14 +221,12 @@ class TextLog(LogFile):
             self._report_bad_line(width, error)
             frame = read(on_bad_lines="skip")
         except (OSError, ValueError) as error:
-            raise RecordingError(f"{self.path}: cannot be read as text ({error})") from error
+            self.refuse(f"cannot be read as text ({error})", error)
         if (max_rows is None or len(frame) < max_rows) and self._is_cut_off(width):
             frame = frame.iloc[:-1]
         if len(frame) < 2:
-            raise RecordingError(
-                f"{self.path}: {len(frame)} rows of data below the header; a log has at least 2"
-            )
-        if frame[width - 1].isna().any() and layout.names[-1]:
+            self.refuse(f"{len(frame)} rows of data below the header; a log has at least 2")
+        if frame[width - 1].isna().any() and self._names[-1]:
             self._report_bad_line(width, None)
         return {at: frame[at] for at in places}
 
@@ -162,7 +234,7 @@ class TextLog(LogFile):
         """Report the first line that has another number of cells than the others."""
         for row, (number, cells, is_whole) in enumerate(self._iterate_lines()):
             if len(cells) != width and is_whole:
-                text = f"{len(cells)} cells, the header has {len(self.layout.names)}"
+                text = f"{len(cells)} cells, the header has {len(self._names)}"
                 self.report_damage(f"line {number} (row {row}): {text}", error)
                 return
 
@@ -170,8 +242,8 @@ class TextLog(LogFile):
         """Return whether a crash cut off the last line, and warn: a number may be cut off too, and still look like one."""
         with self.path.open("rb") as file:
             file.seek(-min(self.path.stat().st_size, SNIFFED_BYTES), 2)
-            tail = file.read().decode(self.layout.encoding, errors="replace")
-        cells = split_line((tail.splitlines() or [""])[-1], self.layout.delimiter)
+            tail = file.read().decode(self._encoding, errors="replace")
+        cells = split_line((tail.splitlines() or [""])[-1], self.signs[0])
         if len(cells) >= width and tail.endswith(("\n", "\r")):
             return False
         text = f"is cut off or lacks its end ({len(cells)} of {width} cells): left out"
@@ -179,117 +251,11 @@ class TextLog(LogFile):
         return True
 
 
-def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayout:
-    """Return the layout of a text file, told from both of its ends.
-
-    Raises:
-        RecordingError: The file cannot be read, has no rows of numbers, or its header does not fit them.
-    """
-    head, tail, encoding = _read_ends(path)
-    # Excel writes the delimiter into a line of its own; quotes hold 0,5 between commas
-    stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
-    delimiters = (stated[1],) if stated else DELIMITERS
-    candidates = []
-    for delimiter, decimal in [signs] if signs else itertools.product(delimiters, ".,"):
-        rows = [split_line(line, delimiter) for line in head]
-        good = [at for at, row in enumerate(rows) if _is_data(row, decimal)]
-        if not good:
-            continue
-        width = Counter(len(rows[at]) for at in good).most_common(1)[0][0]
-        fitting = {at: rows[at] for at in good if len(rows[at]) == width}
-        samples = [*fitting.values()]
-        ends = [split_line(line, delimiter) for line in tail]
-        samples += [row for row in ends if len(row) == width and _is_data(row, decimal)]
-        cells = itertools.chain.from_iterable(samples)
-        score = sum(cell not in MISSING and tell_kind(cell, decimal) != "text" for cell in cells)
-        begins = [at for at in fitting if all(at + k in fitting for k in range(FIRST_ROWS))]
-        first = min(begins or fitting)
-        candidates.append((score, delimiter, decimal, first, width, samples))
-    if not candidates:
-        num_lines = sum(bool(line.strip()) for line in head)
-        if num_lines < 2:
-            raise RecordingError(f"{path}: 0 rows of data below the header; a log has at least 2")
-        text = next((line for line in head if line.strip()), "")[:60]
-        raise RecordingError(
-            f"{path}: no column of numbers can be read: expected rows of numbers between , ; tab, space or |, "
-            f"the file begins with '{text}'"
-        )
-    _, delimiter, decimal, first, width, samples = max(candidates, key=lambda one: one[0])
-    names = _find_names(path, head[:first], delimiter, width, samples)
-    kept = tuple(tuple(row) for row in samples)
-    return TextLayout(delimiter, decimal, encoding, first, _tell_apart(names), kept)
-
-
-def _read_ends(path: Path) -> tuple[list[str], list[str], str]:
-    """Return whole lines at the beginning and at the end of a file, and its encoding."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(SNIFFED_BYTES)
-            size = file.seek(0, 2)
-            file.seek(max(len(head), size - SNIFFED_BYTES) // 2 * 2)
-            tail = file.read()
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read as text ({error})") from error
-    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    try:
-        first = head.decode(encoding, errors="strict" if size <= SNIFFED_BYTES else "ignore")
-    except UnicodeDecodeError:
-        encoding = "cp1252"
-        first = head.decode(encoding, errors="replace")
-    if "\0" in first:
-        raise RecordingError(
-            f"{path}: neither text nor a kind of log that is known by its ending (it holds bytes of 0)"
-        )
-    last = tail.decode(encoding.removesuffix("-sig"), errors="ignore")
-    lines = first.splitlines()
-    return lines if size <= SNIFFED_BYTES else lines[:-1], last.splitlines()[1:-1], encoding
-
-
 def _is_data(row: list[str], decimal: str) -> bool:
     """Return whether most of the cells of a row are numbers, times or lists."""
     filled = [cell for cell in row if cell not in MISSING]
     values = [cell for cell in filled if tell_kind(cell, decimal) not in ("text", "flag")]
     return bool(values) and 2 * len(values) > len(filled) and len(row) > 1
-
-
-def _find_names(
-    path: Path, above: list[str], delimiter: str, width: int, samples: list[list[str]]
-) -> list[str]:
-    """Return the names of the columns from the lines above the data, with their units."""
-    is_padded = all(row[-1] == "" for row in samples)
-    units: list[str] = []
-    filled = [line for line in above if line.strip()]
-    for line in reversed(filled):
-        mark = line.lstrip()[0]
-        is_comment = mark in COMMENT_MARKS
-        plain = line.lstrip().lstrip(COMMENT_MARKS) if is_comment else line
-        cells = split_line(plain, delimiter)
-        if len(cells) == 1 and delimiter == " ":
-            cells = split_line(plain, ",")
-        if len(cells) == width - 1 and is_padded:
-            cells.append("")
-        if len(cells) == width + 1 and cells[-1] == "Comment":  # LabVIEW leaves empty ones out
-            cells.pop()
-        if len(cells) != width:
-            is_near = line is filled[-1] and not is_comment and width <= 2 * len(cells) <= 4 * width
-            if is_near and len(cells) > 1:
-                commas = (
-                    "; if the comma is both delimiter and decimal sign, export again with a decimal point, or with ; or tab "
-                    "between the cells"
-                )
-                raise RecordingError(
-                    f"{path}: the header has {len(cells)} cells, the rows below it have {width}: '{line.strip()[:80]}'; "
-                    f"mend the header, or the delimiter '{delimiter}'{commas if delimiter == ',' else ''}"
-                )
-            continue
-        if not units and all(cell in MISSING or is_unit(cell) for cell in cells):
-            units = [cell.strip("[](){}") for cell in cells]
-            continue
-        if not units:
-            return cells
-        pairs = zip(cells, units, strict=True)
-        return [f"{name} [{unit}]" if unit not in MISSING else name for name, unit in pairs]
-    return [f"column_{at + 1}" for at in range(width)]
 
 
 def _tell_apart(names: list[str]) -> tuple[str, ...]:

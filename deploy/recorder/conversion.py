@@ -42,7 +42,7 @@ class CaptureLogReader:
     shortest_s: NonNegative
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Return the pieces of the capture at `path`; see `actuators.recordings.conversion.LogReader`.
+        """Return the pieces of the capture at `path`; see `actuators.modes.convert.LogReader`.
 
         Raises:
             RecordingError: it cannot be read, was made on another machine, or holds no piece that

@@ -17,6 +17,7 @@ Axes: `T` rows of a log, `H` samples of history (oldest first), `C` columns of a
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +38,10 @@ TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
 PITCH_COLUMN = "target_pitch_rad"
 OBSERVATION_COLUMN = "obs_{}"
 """Column of the observation vector as the network got it, by number."""
+
+
+NEWEST = {"q": 0, "u": -1, "proposals": -1}
+"""Row of the newest sample of the terms of a bundle that have a history."""
 
 
 def name_advice_column(joint: str) -> str:
@@ -136,9 +141,8 @@ class PolicyNetwork:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = ERRORS_ONLY
         try:
-            self._session = onnxruntime.InferenceSession(
-                path.read_bytes(), options, providers=["CPUExecutionProvider"]
-            )
+            content, providers = path.read_bytes(), ["CPUExecutionProvider"]
+            self._session = onnxruntime.InferenceSession(content, options, providers=providers)
         except FileNotFoundError:
             raise CheckpointError(
                 f"{path} is missing; give a folder with {CONTRACT} and {ONNX}"
@@ -224,9 +228,8 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
                 f"the {ONNX} beside a contract that names them (docs/doctor.md)"
             )
         is_own = "order" in observation
-        if is_own and (
-            unknown := [name for name in data["joints"] if name not in machine.joint_names]
-        ):
+        unknown = [name for name in data["joints"] if name not in machine.joint_names]
+        if is_own and unknown:
             raise CheckpointError(
                 f"{path}: the policy commands {', '.join(data['joints'])}, but machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}, without {', '.join(unknown)}; give the policy's machine=…"
@@ -259,36 +262,25 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
 
 def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str, Any]]:
     """Return the terms of a bundle of this project, as a contract for any network lists them."""
-    joints, samples = tuple(data["joints"]), data["history"]["samples"]
-    units = dict(zip(machine.joint_names, (joint.unit for joint in machine.joints), strict=True))
-    scale = data["observation"]
-    pitch, target = scale.get("pitch", {}), scale["target"]
-    earlier = {"samples": samples, "newest": -1}
-    known = {
-        "target_in_base_m": {
-            "name": "target",
-            "columns": TARGET_COLUMNS,
-            "mean": target["mean_m"],
-            "std": target["std_m"],
-        },
-        "q": {
-            "name": "q",
-            "columns": [name_position_column(name, units[name]) for name in joints],
-            "samples": samples,
-            **scale["q"],
-        },
-        "u": {"name": "u", "columns": [*map(name_command_column, joints)], **scale["u"], **earlier},
-        "pitch_rad": {
-            "name": "pitch",
-            "columns": [PITCH_COLUMN],
-            "mean": pitch.get("mean_rad", 0.0),
-            "std": pitch.get("std_rad", 1.0),
-        },
-        "proposals": {
-            "name": "proposals", "columns": [*map(name_advice_column, joints)], **earlier
-        },
-    }  # fmt: skip
-    return [known[part.split()[0]] for part in scale["order"]]
+    joints, observation = data["joints"], data["observation"]
+    units = {joint.name: joint.unit for joint in machine.joints}
+    columns = {
+        "target": TARGET_COLUMNS,
+        "q": [name_position_column(name, units[name]) for name in joints],
+        "u": [*map(name_command_column, joints)],
+        "pitch": [PITCH_COLUMN],
+        "proposals": [*map(name_advice_column, joints)],
+    }
+    terms = []
+    for part in observation["order"]:
+        name = re.split(r"\W|_", part)[0]  # `pitch_rad (1)`
+        term = {"name": name, "columns": columns[name]}
+        if name in NEWEST:
+            term |= {"samples": data["history"]["samples"], "newest": NEWEST[name]}
+        for key, value in observation.get(name, {}).items():
+            term[key.partition("_")[0]] = value  # `mean_rad`
+        terms.append(term)
+    return terms
 
 
 def _read_term(term: Mapping[str, Any]) -> ObservationTerm:
@@ -301,12 +293,6 @@ def _read_term(term: Mapping[str, Any]) -> ObservationTerm:
             f"term {term['name']}: expected samples of 1 or more, newest of 0 or less and std above 0, got {samples}, "
             f"{newest} and {std.tolist()}"
         )
-    return ObservationTerm(
-        name=str(term["name"]),
-        columns=columns,
-        samples=samples,
-        newest=newest,
-        mean=np.broadcast_to(np.asarray(term.get("mean", 0.0), float), (len(columns),)),
-        std=std,
-        clip=term.get("clip"),
-    )
+    mean = np.broadcast_to(np.asarray(term.get("mean", 0.0), float), (len(columns),))
+    name, clip = str(term["name"]), term.get("clip")
+    return ObservationTerm(name, columns, samples, newest, mean, std, clip)

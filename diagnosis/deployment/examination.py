@@ -259,32 +259,25 @@ def decide_verdict(
         texts = list(dict.fromkeys(finding.text for finding in findings))
         return "code", "; ".join(texts) + "."
     outside = [one for run in runs if run.task.blamed for one in run.task.outside]
-    places = ", ".join(
-        "{} from {:.3g} to {:.3g}, in training {:.3g} to {:.3g}".format(
-            one.field, *one.log, *one.training
-        )
-        for one in outside[:3]
-    )
+    form = "{} from {:.3g} to {:.3g}, in training {:.3g} to {:.3g}"
+    places = ", ".join(form.format(one.field, *one.log, *one.training) for one in outside[:3])
     is_judged = all(run.is_judged for run in runs)
     code = "The code does what the contract says. " if is_judged else ""
     if motion.blamed and not outside:
-        joints = ", ".join(motion.blamed)
-        return "actuator", (
-            f"{code}Under the recorded commands {joints} moved otherwise than all machines that the "
-            "training draws."
+        moved = (
+            f"{', '.join(motion.blamed)} moved otherwise than all machines that the training draws"
         )
+        return "actuator", f"{code}Under the recorded commands {moved}."
     if outside:
         also = f" {', '.join(motion.blamed)} moved otherwise too." if motion.blamed else ""
         return "task", f"{code}The run lies outside of the training: {places}.{also}"
     if not is_judged:
         reasons = "; ".join(dict.fromkeys(text for run in runs for text in run.cannot_tell))
         return "cannot_tell", f"The policy cannot be replayed: {reasons}."
-    return "nothing", (
-        f"{code}The run lies within the training's range, and the machine moves as those of the "
-        "training, as far as could be judged."
-        if not motion.cannot_tell
-        else f"{code}Motion was not judged: {motion.cannot_tell}."
-    )
+    if motion.cannot_tell:
+        return "nothing", f"{code}Motion was not judged: {motion.cannot_tell}."
+    moves = "the machine moves as those of the training, as far as could be judged"
+    return "nothing", f"{code}The run lies within the training's range, and {moves}."
 
 
 def _list_inputs(
@@ -319,17 +312,13 @@ def _describe_findings(result: StageResult, log: RunLog) -> list[Finding]:
         return [dataclasses.replace(found[0], same_as=same), *found[1:]]
     time_s = _find_times(log, departed)
     if stage == "network":
-        text = (
-            "the commands do not follow from what the network saw, and no change of the command "
-            "explains them: another network"
-        )
+        text = "the commands do not follow from what the network saw"
+        text += ", and no change of the command explains them: another network"
         return [Finding("network", "network", stage, text, time_s, 0.0)]
     labels = [label for label, _ in result.rank_labels()[:3]]
     departing = "observation" if stage == "observation" else "command"
-    text = (
-        f"the {departing} departs in {len(departed) / result.num_rows:.0%} of the rows, most in "
-        f"{', '.join(labels)}, by none of the mistakes that are known here"
-    )
+    share = f"{len(departed) / result.num_rows:.0%} of the rows, most in {', '.join(labels)}"
+    text = f"the {departing} departs in {share}, by none of the mistakes that are known here"
     return [Finding(UNLISTED, labels[0] if labels else stage, stage, text, time_s, 0.0)]
 
 
@@ -343,15 +332,9 @@ def _describe_named(one: FittedDistortion, result: StageResult, log: RunLog) -> 
     if distortion.parameter == "row":
         parameters = {"since_s": float(log.t_s[int(number)])}
         text = distortion.text.replace("row {value}", f"{parameters['since_s']:.2f} s")
-    return Finding(
-        distortion.kind,
-        distortion.field,
-        result.stage.name,
-        text,
-        _find_times(log, inside if len(inside) else result.departed),
-        one.explained,
-        parameters,
-    )
+    times_s = _find_times(log, inside if len(inside) else result.departed)
+    told = (distortion.kind, distortion.field, result.stage.name, text)
+    return Finding(*told, times_s, one.explained, parameters)
 
 
 def _find_times(log: RunLog, rows: np.ndarray) -> tuple[float, float]:
@@ -364,9 +347,8 @@ def _list_lacking(log: RunLog, is_sent: bool) -> list[str]:
     found = []
     missing = f"the log has no column {', '.join(log.missing)}"
     if log.missing and log.observed is None:
-        found.append(
-            f"{missing}; give doctor.target_in_base_m where only the target is missing, or record it"
-        )
+        mend = "give doctor.target_in_base_m where only the target is missing, or record it"
+        found.append(f"{missing}; {mend}")
     elif log.missing:
         found.append(f"the observation cannot be checked: {missing}")
     if log.commanded is None and not is_sent:
@@ -382,15 +364,12 @@ def _check_without_replay(contract: PolicyContract, log: RunLog) -> list[Finding
     whole_s = (float(log.t_s[0]), float(log.t_s[-1]))
     rate_hz = 1.0 / float(np.median(np.diff(log.t_s)))
     if abs(contract.rate_hz / rate_hz - 1.0) > RATE_TOLERANCE:
-        text = (
-            f"the loop ran at {rate_hz:.4g} Hz, the policy was trained at {contract.rate_hz:g} Hz"
-        )
+        trained = f"the policy was trained at {contract.rate_hz:g} Hz"
+        text = f"the loop ran at {rate_hz:.4g} Hz, {trained}"
         number = {"rate_hz": rate_hz}
         found.append(Finding("rate", "loop", "policy", text, whole_s, parameters=number))
     if log.num_observed not in (0, contract.size):
-        text = (
-            f"the network got {log.num_observed} numbers, the contract has {contract.size}: another "
-            "policy ran"
-        )
+        stated = f"the contract has {contract.size}: another policy ran"
+        text = f"the network got {log.num_observed} numbers, {stated}"
         found.append(Finding("network", "observation", "observation", text, whole_s))
     return found

@@ -152,13 +152,10 @@ class StageResult:
         """Return it as plain JSON data, with times of the rows `(T,)`."""
         ranking = []
         for one in self.ranking[:NUM_RANKED]:
-            ranking.append(
-                {
-                    "kind": one.distortion.kind, "field": one.distortion.field,
-                    "value": one.value if one.distortion.parameter else None,
-                    "explained": one.explained, "removes": one.gain,
-                }
-            )  # fmt: skip
+            mistake = one.distortion
+            number = one.value if mistake.parameter else None
+            row = {"kind": mistake.kind, "field": mistake.field, "value": number}
+            ranking.append(row | {"explained": one.explained, "removes": one.gain})
         labels = self.rank_labels()[:NUM_RANKED]
         return {
             "stage": self.stage.name,

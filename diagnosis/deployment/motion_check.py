@@ -70,9 +70,8 @@ class JointMotion:
 
     def to_json(self) -> dict[str, Any]:
         """Return all but its name as plain JSON data, as `doctor.json` holds it."""
-        return {key: value for key, value in vars(self).items() if key != "joint"} | {
-            "blamed": self.blamed
-        }
+        figures = {key: value for key, value in vars(self).items() if key != "joint"}
+        return figures | {"blamed": self.blamed}
 
 
 @dataclass(frozen=True)
@@ -127,9 +126,8 @@ def check_motion(
         return MotionEvidence((), horizon_s, str(error))
     free = np.isfinite(cut.q).all((1, 2))
     if not free.any():
-        return MotionEvidence(
-            (), horizon_s, f"no {horizon_s:g} s without an end of travel or possible contact"
-        )
+        lacking = f"no {horizon_s:g} s without an end of travel or possible contact"
+        return MotionEvidence((), horizon_s, lacking)
     cut = replace(cut, u=cut.u[free], q=cut.q[free], run=cut.run[free])
     torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
     cpu = torch.device("cpu")
@@ -139,9 +137,8 @@ def check_motion(
     many = open_loop.join_windows([cut] * NUM_MACHINES)
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)
-        drawn = open_loop.roll_out(
-            _DrawnMachines(actuator, effects, len(cut.q)), machine, many, cpu
-        )
+        machines = _DrawnMachines(actuator, effects, len(cut.q))
+        drawn = open_loop.roll_out(machines, machine, many, cpu)
     drawn = drawn.reshape(NUM_MACHINES, *plain.shape)
     rmse, of_training = _measure_rms(cut.measured - plain), _measure_rms(drawn - plain)
     moved = np.ptp(np.concatenate([plain, cut.measured], 1), axis=1).max(0)
@@ -159,19 +156,14 @@ def _cut_out_contact(recording: Recording, machine: Machine) -> Recording:
     q = recording.q.astype(float)
     free = np.all((q > machine.lower + margin) & (q < machine.upper - margin), 1, keepdims=True)
     if machine.has_bodies:
-        free = free & ~_may_touch(recording, machine)[:, None]
+        tip_m = compute_tool_kinematics(machine, q).tip_in_base_m
+        touching = tip_m[:, 2] < GROUND_M
+        if all(name in recording.extra for name in TARGET_COLUMNS):
+            target_m = np.stack([recording.extra[name] for name in TARGET_COLUMNS], 1)
+            near = np.hypot(*(tip_m - target_m)[:, :2].T) < NEAR_M
+            touching |= near & (tip_m[:, 2] < target_m[:, 2] + ABOVE_M)
+        free = free & ~touching[:, None]
     return replace(recording, q=np.where(free, recording.q, np.nan))
-
-
-def _may_touch(recording: Recording, machine: Machine) -> np.ndarray:
-    """Return the rows in which the tool is near the ground, or in or beside its target, `(T,)`."""
-    tip_m = compute_tool_kinematics(machine, recording.q.astype(float)).tip_in_base_m
-    touching = tip_m[:, 2] < GROUND_M
-    if all(name in recording.extra for name in TARGET_COLUMNS):
-        target_m = np.stack([recording.extra[name] for name in TARGET_COLUMNS], 1)
-        near = np.hypot(*(tip_m - target_m)[:, :2].T) < NEAR_M
-        touching |= near & (tip_m[:, 2] < target_m[:, 2] + ABOVE_M)
-    return touching
 
 
 def _measure_rms(difference: np.ndarray) -> np.ndarray:

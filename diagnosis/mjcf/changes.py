@@ -21,6 +21,11 @@ from brokk_rl.session import write_text
 from diagnosis.answer import Selected
 from diagnosis.mjcf.plant import MjcfPlant
 
+Rule = Callable[[float, float], float]
+"""Returns a number of the file by the number that it was and that of a finding."""
+Searched = dict[str, np.ndarray]
+"""Changes of a plant, as `MjcfPlant.change_model` takes them."""
+
 
 @dataclass(frozen=True)
 class MjcfChange:
@@ -51,23 +56,17 @@ class _Editor:
     Args:
         spec: The file.
         plant: The same, compiled.
-        machine: The machine.
         finding: What is put into the file.
         joint: Where.
         searched: Changes of the plant by earlier findings, as `MjcfPlant.change_model` takes them.
     """
 
     def __init__(
-        self,
-        spec: Any,
-        plant: MjcfPlant,
-        machine: Machine,
-        finding: Selected,
-        joint: str,
-        searched: dict[str, np.ndarray],
+        self, spec: Any, plant: MjcfPlant, finding: Selected, joint: str, searched: Searched
     ) -> None:
-        self.plant, self.machine, self.finding, self.searched = plant, machine, finding, searched
-        self.place = machine.joint_names.index(joint)
+        self.plant, self.machine = plant, plant.machine
+        self.finding, self.searched = finding, searched
+        self.place = self.machine.joint_names.index(joint)
         self.joint = spec.joint(joint)
         self.drive = spec.actuators[int(plant.drives[self.place])]
         self.timestep_s = float(plant.model.opt.timestep)
@@ -100,18 +99,11 @@ class _Editor:
         told = (self.finding.effect, self.joint.name, element, name)
         self.changes.append(MjcfChange(*told, before, float(values[0]), interval))
 
-    def write(
-        self,
-        element: str,
-        attribute: str,
-        index: int,
-        number: str,
-        rule: Callable[[float, float], float],
-    ) -> None:
-        """Set an attribute to `rule(before, value)`, where the value is that of a number of the finding."""
-        owner = self.joint if element == "joint" else self.drive
-        before = float(np.ravel(getattr(owner, attribute))[index])
-        self.put(element, attribute, index, [rule(before, one) for one in self.list_sizes(number)])
+    def write(self, attribute: str, index: int, number: str, rule: Rule) -> None:
+        """Set an attribute of the drive to `rule(before, value)`, with the value of a number of the finding."""
+        before = float(np.ravel(getattr(self.drive, attribute))[index])
+        values = [rule(before, one) for one in self.list_sizes(number)]
+        self.put("actuator", attribute, index, values)
 
 
 def write_changed_mjcf(
@@ -130,7 +122,7 @@ def write_changed_mjcf(
     if spec.textures:
         spec.texturedir = str((source.parent / (spec.texturedir or ".")).resolve())
     changes, left = [], {}
-    searched: dict[str, np.ndarray] = {}
+    searched: Searched = {}
     # Effects inside of the file come first: the others act on a joint that has them.
     for finding in sorted(findings, key=lambda one: one.effect not in EFFECTS):
         rule, interface = RULES.get(finding.effect), machine.interface
@@ -138,7 +130,7 @@ def write_changed_mjcf(
             left[finding.effect] = REASONS.get(finding.effect, NO_ELEMENT)
             continue
         for joint in finding.joints or machine.joint_names:
-            editor = _Editor(spec, plant, machine, finding, joint, searched)
+            editor = _Editor(spec, plant, finding, joint, searched)
             if reason := rule(editor):
                 left[f"{finding.effect} on {joint}"] = reason
             changes += editor.changes
@@ -220,13 +212,13 @@ def _change_as_in_search(to: _Editor) -> str | None:
 
 
 def _scale_command(to: _Editor) -> None:
-    to.write("actuator", "gainprm", 0, "gain", lambda old, new: old * new)
+    to.write("gainprm", 0, "gain", lambda old, new: old * new)
 
 
 def _add_delay(to: _Editor) -> str | None:
     if to.list_sizes("dead_time_s")[0] < 0.0:
         return "the machine answers sooner than the file; lower its own delay"
-    to.write("actuator", "delay", 0, "dead_time_s", lambda old, new: old + max(0.0, new))
+    to.write("delay", 0, "dead_time_s", lambda old, new: old + max(0.0, new))
     to.drive.nsample = max(to.drive.nsample, math.ceil(to.drive.delay / to.timestep_s) + 2)
     to.drive.interp = 1  # a delay that is no multiple of the time step would be rounded up
     return None
@@ -240,21 +232,18 @@ def _add_lag(to: _Editor) -> str | None:
     # The effect holds each period's last value, half a period ahead of a continuous filter.
     ahead_s = 0.5 * to.machine.period_s
     later = lambda old, new: max(new - ahead_s, to.timestep_s)  # noqa: E731
-    to.write("actuator", "dynprm", 0, "time_constant_s", later)
+    to.write("dynprm", 0, "time_constant_s", later)
     return None
 
 
 def _add_sag(to: _Editor) -> str | None:
     if "load_rad" in to.finding.parameters:
         return "the sag follows the weight; lower kp instead"
-    lower, upper = (limit[to.place] for limit in (to.machine.lower, to.machine.upper))
-    stiffness = float(to.drive.gainprm[0])
-    gear = float(to.drive.gear[0])
-    middle = 0.5 * (lower + upper) * gear * stiffness * to.list_sizes("sag_slope")[0]
-    to.write(
-        "actuator", "biasprm", 0, "sag_rad", lambda old, new: old + middle - stiffness * gear * new
-    )
-    to.write("actuator", "gainprm", 0, "sag_slope", lambda old, new: old * (1.0 - new))
+    middle = 0.5 * float(to.machine.lower[to.place] + to.machine.upper[to.place])
+    stiffness = float(to.drive.gainprm[0] * to.drive.gear[0])
+    slope = to.list_sizes("sag_slope")[0]
+    to.write("biasprm", 0, "sag_rad", lambda old, new: old + stiffness * (middle * slope - new))
+    to.write("gainprm", 0, "sag_slope", lambda old, new: old * (1.0 - new))
     return None
 
 

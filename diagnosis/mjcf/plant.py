@@ -26,6 +26,8 @@ REFERENCE_TRAVEL = 0.05
 hand: a drive that holds an arm errs by a few percent."""
 QUANTITIES = ("friction", "damping", "armature", "gain", "limit")
 """Numbers that a row may change; see `MjcfPlant.read_references`."""
+ModelChanges = Mapping[str, np.ndarray]
+"""Changes of these by name."""
 
 
 MAX_DAMPING_LOSS = 0.95
@@ -49,22 +51,16 @@ class MjcfPlant:
             self.model = mujoco.MjModel.from_xml_path(str(path))
         except ValueError as error:
             raise ConfigError(f"simulator={path}: MuJoCo cannot compile it: {error}") from error
-        self._machine = machine
-        names = machine.joint_names
-        joints = [_find_joint(self.model, path, name) for name in names]
-        self.drives = np.array(
-            [
-                _find_drive(self.model, path, name, joint)
-                for name, joint in zip(names, joints, strict=True)
-            ]
-        )
-        self.joints = np.array(joints)
+        self.machine = machine
+        joints, drives = [], []
+        for name in machine.joint_names:
+            joints.append(_find_joint(self.model, path, name))
+            drives.append(_find_drive(self.model, path, name, joints[-1]))
+        self.drives = np.array(drives)
         self.dofs = self.model.jnt_dofadr[joints]
         self.substeps = round(machine.period_s / self.model.opt.timestep)
-        if (
-            abs(self.substeps * self.model.opt.timestep - machine.period_s)
-            > 1e-6 * machine.period_s
-        ):
+        apart_s = self.substeps * self.model.opt.timestep - machine.period_s
+        if abs(apart_s) > 1e-6 * machine.period_s:
             raise ConfigError(
                 f"simulator={path}: the control period {machine.period_s:g} s of machine '{machine.name}' is no multiple of the "
                 f"time step {self.model.opt.timestep:g} s; change <option timestep> or the machine's period_s"
@@ -102,10 +98,7 @@ class MjcfPlant:
         return state[..., self._q_at], state[..., self._speed_at]
 
     def run(
-        self,
-        state: np.ndarray,
-        commands: np.ndarray,
-        changes: Mapping[str, np.ndarray] | None = None,
+        self, state: np.ndarray, commands: np.ndarray, changes: ModelChanges | None = None
     ) -> np.ndarray:
         """Return the states after each control period, `(N, T, S)`.
 
@@ -138,7 +131,7 @@ class MjcfPlant:
         in that torque over the full speed, armature in the inertia of the joint, gain in itself. A limit
         is counted in the same force of the drive, as if its force had no range.
         """
-        model, machine = self.model, self._machine
+        model, machine = self.model, self.machine
         gain = np.abs(model.actuator_gainprm[self.drives, 0] * model.actuator_gear[self.drives, 0])
         gain = np.where(gain > 0.0, gain, 1.0)
         full = {
@@ -146,23 +139,20 @@ class MjcfPlant:
             "speed": gain * machine.max_speed,
             "torque": machine.max_force,
         }[machine.interface]
-        unlimited = full
-        if machine.interface == "torque":
-            unlimited = full / np.abs(model.actuator_gear[self.drives, 0])
+        is_torque = machine.interface == "torque"
+        unlimited = full / np.abs(model.actuator_gear[self.drives, 0]) if is_torque else full
         limited = model.actuator_forcelimited[self.drives].astype(bool)
         limit = np.abs(model.actuator_forcerange[self.drives]).max(1)
         full = np.where(limited, np.minimum(full, limit), full)
-        inertia = model.dof_M0[self.dofs]
-        ones = np.ones(machine.num_joints)
         return {
             "friction": full,
             "damping": full / machine.max_speed,
-            "armature": inertia,
-            "gain": ones,
+            "armature": model.dof_M0[self.dofs],
+            "gain": np.ones(machine.num_joints),
             "limit": unlimited,
         }
 
-    def change_model(self, changes: Mapping[str, np.ndarray]) -> mujoco.MjModel:
+    def change_model(self, changes: ModelChanges) -> mujoco.MjModel:
         """Return the model with numbers of its joints changed, each `(J,)`.
 
         Args:
@@ -189,7 +179,7 @@ class MjcfPlant:
             # Both terms of a position drive: the force is gain (target - position) - damping speed.
             model.actuator_gainprm[drives, 0] *= changes["gain"]
             model.actuator_biasprm[drives, 1] *= changes["gain"]
-            if self._machine.interface == "speed":
+            if self.machine.interface == "speed":
                 model.actuator_biasprm[drives, 2] *= changes["gain"]
         if "limit" in changes:
             for place in np.flatnonzero(changes["limit"] > 0.0):
@@ -203,9 +193,7 @@ class MjcfPlant:
         mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by
         return model
 
-    def _list_models(
-        self, count: int, changes: Mapping[str, np.ndarray] | None
-    ) -> list[mujoco.MjModel]:
+    def _list_models(self, count: int, changes: ModelChanges | None) -> list[mujoco.MjModel]:
         if not changes:
             return [self.model] * count
         names = sorted(changes)

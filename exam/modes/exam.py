@@ -150,23 +150,19 @@ class Exam:
     def questions(self, salt: str) -> list[CaseDesign]:
         """Return the cases; those of a sealed exam depend on the secret salt too."""
         settings = self.exam
-        entropy = [self.session.seed, *(salt.encode() if settings.sealed else b"")]
-        return settings.mix.questions(
-            self.machine,
-            settings.plants.causes,
-            np.random.default_rng(entropy),
-            settings.plants.outside_not_on,
-        )
+        secret = salt.encode() if settings.sealed else b""
+        generator = np.random.default_rng([self.session.seed, *secret])
+        return settings.mix.questions(self.machine, settings.plants, generator)
 
     def _run(self) -> None:
         """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case, and `run.json`."""
         settings, facts, out = self.exam, self._read_facts(), self.session.folder
         cases = [self._folder / CASES_FOLDER / f"{n:04d}" for n in range(facts["num_cases"])]
-        files = [
-            {str(path.relative_to(case)) for path in case.rglob("*.parquet")} for case in cases
-        ]
-        whole = set[str]().union(*files)
-        damaged = [case.name for case, there in zip(cases, files, strict=True) if there != whole]
+        files = {}
+        for case in cases:
+            files[case.name] = {str(path.relative_to(case)) for path in case.rglob("*.parquet")}
+        whole = set[str]().union(*files.values())
+        damaged = [name for name, there in files.items() if there != whole]
         if damaged or not whole:
             raise RecordingError(
                 f"exam.folder={self._folder}: expected the same files in all {len(cases)} folders of {CASES_FOLDER}/, but "
@@ -190,9 +186,8 @@ class Exam:
             entry = {"labels_sha256": facts["labels_sha256"], "run": run}
             dataset.append_entry(self._folder, dataset.BEGUN, entry)
         write_json(out / answer_scoring.RUN_FILE, run)
-        failed = run_cases.answer_cases(
-            settings.candidate, cases, out, self.machine, settings.workers
-        )
+        candidate, workers = settings.candidate, settings.workers
+        failed = run_cases.answer_cases(candidate, cases, out, self.machine, workers)
         if failed:
             text = "%d of %d cases have no answer; why stands in their %s"
             log.warning(text, failed, len(cases), run_cases.NOTE_FILE)

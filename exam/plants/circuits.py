@@ -6,7 +6,6 @@ machine has numbers of its own, and an effect or a cause changes these numbers w
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +19,7 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import NonNegative, spec
 from exam.plants.changes import PlantParameters
-from exam.plants.family import DrawnPlants, PlantBatch, share
+from exam.plants.family import DrawnPlants, PlantBatch, change_spec, share
 from exam.plants.hydraulics import SPOOL_STEP
 from exam.plants.linkage import Arm
 from exam.plants.valve_arm import ValveArm
@@ -80,10 +79,9 @@ class CircuitValves:
         torque = numbers["supply_ratio"] * self._yield_force
         stiffness = np.array([body.stiffness.value for body in machine.bodies])
         soft_hz = 1.0 / np.hypot(1.0 / numbers["mode_hz"], numbers["soft_s"])
-        ringing = (
-            numbers["soft_damping"] * stiffness * machine.max_speed / (np.pi * soft_hz * torque)
-        )
-        is_soft = numbers["soft_s"] > 0
+        damping = numbers["soft_damping"] * stiffness * machine.max_speed
+        ringing = damping / (np.pi * soft_hz * torque)
+        is_soft, viscous = numbers["soft_s"] > 0, numbers["viscous"]
         # a spool trails by twice its damping over its frequency
         trail_s = numbers["spool_damping"] / (np.pi * numbers["spool_hz"]) + numbers["pilot_s"]
         is_linked = numbers["linkage_lower_rad"] < numbers["linkage_upper_rad"]
@@ -92,9 +90,7 @@ class CircuitValves:
             "linkage_lower_rad": numbers["linkage_lower_rad"] + narrowed_rad,
             "linkage_upper_rad": numbers["linkage_upper_rad"] - narrowed_rad,
             "mode_hz": soft_hz,
-            "viscous": np.where(
-                is_soft, np.minimum(ringing, numbers["viscous"]), numbers["viscous"]
-            ),
+            "viscous": np.where(is_soft, np.minimum(ringing, viscous), viscous),
             "coulomb": numbers["coulomb"] * np.where(is_soft, SOFT_FRICTION, 1.0),
             "spool_hz": numbers["spool_damping"] / (np.pi * trail_s),
             "flow_share": numbers["demand"],
@@ -102,17 +98,8 @@ class CircuitValves:
         }
         self._sinking = numbers["supply_ratio"] / machine.max_speed * numbers["sink_rad_s"]
         self._ajar = numbers["supply_ratio"] / AJAR_LOAD
-        stepped = replace(  # pyright: ignore[reportCallIssue]
-            machine,  # pyright: ignore[reportArgumentType]
-            period_s=STEP_S,
-            dead_time_s=0.0,
-            num_history=2,
-        )
-        at_once = replace(  # pyright: ignore[reportCallIssue]
-            circuit,  # pyright: ignore[reportArgumentType]
-            transport_s=0.0,
-            outrigger_nm_rad=0.0,
-        )
+        stepped = change_spec(machine, period_s=STEP_S, dead_time_s=0.0, num_history=2)
+        at_once = change_spec(circuit, transport_s=0.0, outrigger_nm_rad=0.0)
         self._model = SteppedCircuit(at_once, stepped, shape[0], torch.device("cpu"))
         for name in self._model.parameters:
             self._set(name, changed[name])
@@ -121,9 +108,8 @@ class CircuitValves:
         home = torch.as_tensor(np.tile(machine.home, (shape[0], 1)), dtype=torch.float32)
         self._history.reset(torch.ones(shape[0], dtype=torch.bool), home)
         self._ramp, self._moved = np.zeros(shape), np.zeros(shape, dtype=bool)
-        self._reach = np.where(
-            numbers["stroke_s"] > 0, STEP_S / np.maximum(numbers["stroke_s"], STEP_S), np.inf
-        )
+        stroke_s = numbers["stroke_s"]
+        self._reach = np.where(stroke_s > 0, STEP_S / np.maximum(stroke_s, STEP_S), np.inf)
 
     def _set(self, name: str, value: np.ndarray) -> None:
         self._model.parameters[name].copy_(torch.as_tensor(value))
@@ -165,10 +151,8 @@ class CircuitValves:
     def stop(self, where: np.ndarray, q: np.ndarray) -> None:
         """Hold joints at their stops `q`; both `(N, J)`, `where` bool."""
         if where.any():
-            held = torch.as_tensor(q, dtype=torch.float32)
-            self._history.q[:, -1] = torch.where(
-                torch.as_tensor(where), held, self._history.q[:, -1]
-            )
+            held, last = torch.as_tensor(q, dtype=torch.float32), self._history.q[:, -1]
+            last.copy_(torch.where(torch.as_tensor(where), held, last))
 
 
 @spec

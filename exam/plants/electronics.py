@@ -21,11 +21,10 @@ class CommandBus:
 
     Args:
         numbers: `transport_s`, `jitter_s`, `loss`, each `(N, J)`.
-        period_s: Time between two frames.
     """
 
-    def __init__(self, numbers: PlantParameters, period_s: float) -> None:
-        self._numbers, self._period_s = numbers, period_s
+    def __init__(self, numbers: PlantParameters) -> None:
+        self._numbers = numbers
         shape = numbers["transport_s"].shape
         self._u = np.zeros((NUM_FRAMES, *shape))
         self._due_s = np.full((NUM_FRAMES, *shape), -np.inf)

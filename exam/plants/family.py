@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
@@ -12,7 +13,7 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import NonNegative, Range, spec
-from exam.plants.changes import Change, PlantParameters, apply_changes
+from exam.plants.changes import Change, PlantParameters
 from exam.plants.linkage import Arm
 
 TRACKER_SPREAD = (0.0015, 0.0015, 0.0015, 0.001)
@@ -79,6 +80,11 @@ class PlantBatch:
 def share(values: Mapping[str, float], machine: Machine) -> PlantParameters:
     """Return numbers that all joints share."""
     return {name: np.full(machine.num_joints, value) for name, value in values.items()}
+
+
+def change_spec(spec: Any, **numbers: Any) -> Any:
+    """Return a spec with other values of some fields, such as a machine in shorter steps."""
+    return dataclasses.replace(spec, **numbers)
 
 
 class PlantLink:
@@ -189,11 +195,16 @@ class DrawnPlants:
         numbers |= self.complete(numbers, machine, make, generator)
         of_day = np.random.default_rng([run.seed, run.day, *b"ageing"])
         for name, spread in self.ageing.items():
-            numbers[name] = numbers[name] * np.exp(
-                roughness * spread * of_day.standard_normal(count)
-            )
-        effects = {name: size for name, size in run.faults.items() if name not in self.causes}
-        return make, apply_changes(numbers, effects, self.table, f"a machine of make '{make}'")
+            aged = roughness * spread * of_day.standard_normal(count)
+            numbers[name] = numbers[name] * np.exp(aged)
+        for effect, size in run.faults.items():
+            if effect in self.causes:
+                continue
+            if effect not in self.table:
+                known = list_choices(effect, self.table)
+                raise ConfigError(f"exam: a machine of make '{make}' lacks '{effect}'; {known}")
+            self.table[effect](numbers, size)
+        return make, numbers
 
     def complete(
         self, drawn: PlantParameters, machine: Machine, make: str, chance: np.random.Generator

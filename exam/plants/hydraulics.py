@@ -56,11 +56,6 @@ EPSILON = 1e-4
 """Drop below which an orifice is laminar, so that its slope is finite."""
 
 
-def compute_orifice(drop: np.ndarray, nominal: float | np.ndarray) -> np.ndarray:
-    """Return flow over area, 1 at the nominal drop: the root of the drop, linear close to 0."""
-    return drop / np.sqrt((np.abs(drop) + EPSILON) * nominal)
-
-
 SIDE_RATIO = 0.3
 """Short over long side of the triangle; chosen by hand: cylinders of booms have 0.2 to 0.4."""
 
@@ -83,9 +78,8 @@ class PilotedSpools:
         self.pilot, self.spool = np.zeros(shape), np.zeros(shape)
         # of an orifice that fills a chamber in 2 T the mean delay is two thirds of T
         self._fill_s = 1.5 * (numbers["fill_s"] + numbers["pilot_s"])
-        self._slope = np.where(
-            numbers["stroke_s"] > 0, 1.0 / np.maximum(numbers["stroke_s"], 1e-6), np.inf
-        )
+        stroke_s = numbers["stroke_s"]
+        self._slope = np.where(stroke_s > 0, 1.0 / np.maximum(stroke_s, 1e-6), np.inf)
 
     def step(self, u: np.ndarray, sticking: np.ndarray, drop: np.ndarray) -> np.ndarray:
         """Return the signed metering areas after a step, `(N, J)`.
@@ -134,11 +128,10 @@ class SensingValves:
         self.speed = np.zeros(shape)
         self._bore, self._rod = np.zeros(shape), np.zeros(shape)
         self._supply = np.full((shape[0], 1), STANDBY)
-        force, inertia = [], []
-        for body in machine.bodies:
-            force.append(FORCE_RATIO * body.yield_force.value)
-            inertia.append(body.stiffness.value / (2.0 * np.pi * FIRST_MODE_HZ) ** 2)
-        self._push = np.array(force) / (np.array(inertia) * machine.max_speed)  # 1/s
+        force = FORCE_RATIO * np.array([body.yield_force.value for body in machine.bodies])
+        stiffness = np.array([body.stiffness.value for body in machine.bodies])
+        inertia = stiffness / (2.0 * np.pi * FIRST_MODE_HZ) ** 2
+        self._push = force / (inertia * machine.max_speed)  # 1/s
         period_s = np.hypot(1.0 / numbers["mode_hz"], numbers["soft_s"])
         omega = 2.0 * np.pi / period_s
         self._stiffness = omega**2 / self._push / (1.0 + numbers["rod_area"])  # 1/s
@@ -180,10 +173,8 @@ class SensingValves:
         n, dt, area, lever, force = self._n, STEP_S, self._area, self._lever, self._force
         extends, opened, ratio = area > 0, np.abs(area), n["rod_area"]
         spring = flow**2  # flow grows with the root of the drop
-        p_in, p_out = (
-            np.where(extends, self._bore, self._rod),
-            np.where(extends, self._rod, self._bore),
-        )
+        p_in = np.where(extends, self._bore, self._rod)
+        p_out = np.where(extends, self._rod, self._bore)
         is_open = opened > OPEN
         # a loose compensator lets the drop change with the load that its inlet feels
         usual = np.where(extends, 0.12 * ratio, 0.12)
@@ -192,28 +183,22 @@ class SensingValves:
         head = self._supply - p_in
         drop = np.minimum(NOMINAL_DROP * relaxed, head)
         side = np.where(extends, 1.0, ratio)  # both edges give the same speed
-        inlet = side * opened * compute_orifice(drop, NOMINAL_DROP)
+        # flow over area: the root of the drop, linear close to 0
+        inlet = side * opened * (drop / np.sqrt((np.abs(drop) + EPSILON) * NOMINAL_DROP))
         back_flow = self._causes.back_flow
         inlet = np.where(inlet < 0, back_flow * inlet, inlet)
         throttled = head < NOMINAL_DROP * relaxed
-        slope_in = np.where(
-            throttled & ((head > 0) | (back_flow > 0)),
-            side * opened * 0.5 / np.sqrt(NOMINAL_DROP * (np.abs(head) + EPSILON)),
-            0.0,
-        )
+        is_sloped = throttled & ((head > 0) | (back_flow > 0))
+        steepest = side * opened * 0.5 / np.sqrt(NOMINAL_DROP * (np.abs(head) + EPSILON))
+        slope_in = np.where(is_sloped, steepest, 0.0)
         # the outlet regulator: with the same loose spring it passes more under more pressure
         passed = n["outlet"] * np.where(extends, ratio, 1.0) * opened * flow
-        passed = passed * np.sqrt(
-            np.clip(1.0 + FORCE_RATIO * n["sensitivity"] * (p_out - 0.12), 0.05, 2.0)
-        )
-        regulated = np.sqrt(np.maximum(p_out, 0.0) / (np.maximum(p_out, 0.0) + OUTLET_PRESSURE))
-        outlet = passed * regulated
-        slope_out = (
-            passed
-            * 0.5
-            * OUTLET_PRESSURE
-            / ((np.maximum(p_out, 0.0) + OUTLET_PRESSURE) ** 1.5 * np.sqrt(np.maximum(p_out, 1e-3)))
-        )
+        felt = FORCE_RATIO * n["sensitivity"] * (p_out - 0.12)
+        passed = passed * np.sqrt(np.clip(1.0 + felt, 0.05, 2.0))
+        drained = np.maximum(p_out, 0.0) + OUTLET_PRESSURE
+        outlet = passed * np.sqrt(np.maximum(p_out, 0.0) / drained)
+        steepest = drained**1.5 * np.sqrt(np.maximum(p_out, 1e-3))
+        slope_out = passed * 0.5 * OUTLET_PRESSURE / steepest
         bled = np.where(is_open, n["bleed"] * np.sqrt(np.maximum(p_in, 0.0)), 0.0)
         inlet = inlet - bled
         sink = self._sink + self._causes.leak(is_open)
@@ -248,9 +233,8 @@ class SensingValves:
         extra = self._coulomb * (n["static"] - 1.0) + n["breakaway"]
         # a seized pin lets go at once; usual friction falls with the speed
         still = np.abs(self.speed)
-        return moving + np.where(
-            n["breakaway"] > 0, extra * (still < STILL), extra * np.exp(-((still / STRIBECK) ** 2))
-        )
+        usual = np.exp(-((still / STRIBECK) ** 2))
+        return moving + np.where(n["breakaway"] > 0, extra * (still < STILL), extra * usual)
 
     def _follow_load(self, sensed: np.ndarray, flow: np.ndarray, slope: np.ndarray) -> None:
         """Move the pump's pressure on by a step."""

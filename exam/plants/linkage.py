@@ -36,9 +36,8 @@ class Arm:
         longer = np.concatenate([np.ones((len(longer), 1)), longer], 1)
         self._reach_m = (drawn_m * longer[..., None])[..., None]
         pitch, roll = numbers["pitch_rad"][:, 0], numbers["roll_rad"][:, 0]
-        self._base = rotate_about_axis(np.array([0.0, 1.0, 0.0]), pitch) @ rotate_about_axis(
-            np.array([1.0, 0.0, 0.0]), roll
-        )
+        pitched = rotate_about_axis(np.array([0.0, 1.0, 0.0]), pitch)
+        self._base = pitched @ rotate_about_axis(np.array([1.0, 0.0, 0.0]), roll)
         self._down = self._base.transpose(0, 2, 1) @ np.array([0.0, 0.0, -GRAVITY_M_S2])
 
     def load(self, q: np.ndarray) -> np.ndarray:

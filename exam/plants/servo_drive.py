@@ -142,9 +142,8 @@ class DryFriction:
         """Return the torque against the motion, `(N, J)`, with this much more Coulomb friction."""
         n = self._n
         slow = np.exp(-np.square(speed / n["stribeck_rad_s"]))
-        return (extra_n_m + self._own * (n["static_ratio"] - 1.0) * slow) * np.tanh(
-            speed / SOFT_RAD_S
-        )
+        most = extra_n_m + self._own * (n["static_ratio"] - 1.0) * slow
+        return most * np.tanh(speed / SOFT_RAD_S)
 
 
 FRICTIONS = {"bristle": BristleFriction, "dry": DryFriction}

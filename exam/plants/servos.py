@@ -6,7 +6,6 @@ quantised reading drives motors with back EMF against friction, and weight comes
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from diagnosis.mjcf.plant import MjcfPlant
 from exam.plants import servo_faults
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus
-from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
+from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, change_spec, share
 from exam.plants.servo_drive import FRICTIONS, STEP_S, PositionLoop, TargetFilter
 from exam.plants.servo_faults import CAUSES, ServoCauses
 
@@ -35,15 +34,8 @@ COGS = 40.0
 def restrict_to_torques(machine: Machine) -> Machine:
     """Return the machine with joints that take 1 Nm a command, once a time step."""
     unit = Dimension(value=1.0, source="unit of the torque", confidence="high")
-    joints = []
-    for joint in machine.joints:
-        joints.append(dataclasses.replace(joint, command="torque", max_force=unit))  # pyright: ignore[reportArgumentType]
-    return dataclasses.replace(  # pyright: ignore[reportCallIssue]
-        machine,  # pyright: ignore[reportArgumentType]
-        period_s=STEP_S,
-        dead_time_s=0.0,
-        joints=tuple(joints),
-    )
+    joints = [change_spec(joint, command="torque", max_force=unit) for joint in machine.joints]
+    return change_spec(machine, period_s=STEP_S, dead_time_s=0.0, joints=tuple(joints))
 
 
 class ServoArm(PlantLink):
@@ -55,15 +47,14 @@ class ServoArm(PlantLink):
 
     def __init__(self, batch: PlantBatch) -> None:
         machine = batch.machine
-        super().__init__(
-            batch, [draw_chance(run.chance, machine, batch.steps) for run in batch.runs]
-        )
+        chance = [draw_chance(run.chance, machine, batch.steps) for run in batch.runs]
+        super().__init__(batch, chance)
         n = self._n
         self._plant = MjcfPlant(ARM, restrict_to_torques(machine))
         self._causes = ServoCauses(machine, batch.place_causes(CAUSES))
         q = np.tile(machine.home, (len(batch.runs), 1))
         self._state = self._plant.start(q, np.zeros_like(q))
-        self._bus = CommandBus(n, machine.period_s)
+        self._bus = CommandBus(n)
         # the servos held their pose before; a second is more than any delay
         rest = find_rest(q, machine)
         luck = np.ones((len(q), 1))

@@ -44,19 +44,15 @@ class ValveArm(PlantLink):
         step_s: float,
         hydraulics: Callable[[PlantParameters, Machine, OutsideCauses], Any],
     ) -> None:
-        chance = []
-        for run, one in zip(batch.runs, batch.numbers, strict=True):
-            chance.append(draw_chance(run.chance, one, batch.steps))
+        pairs = zip(batch.runs, batch.numbers, strict=True)
+        chance = [draw_chance(run.chance, one, batch.steps) for run, one in pairs]
         super().__init__(batch, chance)
         n, machine = self._n, batch.machine
         drawn = self._chance["phase"][0], self._chance["luck"]
         self._causes = OutsideCauses(machine, batch.place_causes(CAUSES), *drawn, step_s)
-        bus = {
-            "transport_s": n["transport_s"],
-            "jitter_s": 0.5 * n["jitter_s"],  # mean delay of the effect, whose delays are uniform
-            "loss": n["loss"],
-        }
-        self._bus = CommandBus(bus, machine.period_s)
+        # mean delay of the effect, whose delays are uniform
+        bus = n | {"jitter_s": 0.5 * n["jitter_s"]}
+        self._bus = CommandBus(bus)
         self._hydraulics = hydraulics(n, machine, self._causes)
         self._arm, self._encoders = Arm(machine, n), SteppedEncoders(n)
         self._q = np.tile(machine.home, (len(chance), 1))

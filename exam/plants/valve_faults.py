@@ -36,9 +36,9 @@ def compute_notch_area(opening: np.ndarray, notch: np.ndarray) -> np.ndarray:
     proportion. The slope has no jump.
     """
     full = 2.0 - notch
-    return np.where(
-        opening < notch, opening**2 / (notch * full), (2.0 * opening - notch) / full
-    ) * (opening > 0)
+    land = (2.0 * opening - notch) / full
+    area = np.where(opening < notch, opening**2 / (notch * full), land)
+    return area * (opening > 0)
 
 
 SEIZED = 0.08
@@ -118,10 +118,8 @@ class OutsideCauses:
         is_upper = machine.upper - machine.home >= machine.home - machine.lower
         upper = np.where(is_upper, np.maximum(machine.upper - cut, machine.home), machine.upper)
         lower = np.where(is_upper, machine.lower, np.minimum(machine.lower + cut, machine.home))
-        self.lower, self.upper = (
-            np.broadcast_to(lower, none.shape),
-            np.broadcast_to(upper, none.shape),
-        )
+        self.lower = np.broadcast_to(lower, none.shape)
+        self.upper = np.broadcast_to(upper, none.shape)
         self.mounting_rad = MOUNTING_RAD * self._of["moved_mounting"]
         self.back_flow = BACK_FLOW * self._of["back_flow"]
         self.pump_lag = 1.0 + WAKING * self._of["back_flow"].max(1, keepdims=True)

@@ -12,8 +12,8 @@ import pytest
 from composed import option
 from conftest import Done
 
-from actuators.recordings import conversion
 from actuators.recordings.column_map import Column, ColumnMap, CommandColumn
+from actuators.recordings.log_files import find_logs
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
@@ -174,4 +174,4 @@ def test_two_logs_of_one_name_are_refused(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         logged(tmp_path / folder, lines())
     with pytest.raises(RecordingError, match="would become the same recording"):
-        conversion.find_logs(f"{tmp_path}/*/dig.csv")
+        find_logs(f"{tmp_path}/*/dig.csv")

@@ -27,13 +27,14 @@ from exam import dataset, generate, run_cases
 from exam.case_distribution import CaseDesign, CaseDistribution
 from exam.dataset import BEGUN, read_ledger
 from exam.generate import CASES_FOLDER, UNCHANGED_FOLDER, WITHHELD_FOLDER, CaseRecorder
+from exam.plants.valve_faults import CAUSES
 from exam.run_cases import ConstantAnswer
 
 SEALED = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234")
 
 
 def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDesign]:
-    return mix.questions(machine, ("fading", "interlock"), np.random.default_rng(seed))
+    return mix.questions(machine, option("exam_plants", "valves"), np.random.default_rng(seed))
 
 
 def test_cases_have_the_shares_effects_and_sizes_of_their_kinds(machine: Machine) -> None:
@@ -44,7 +45,7 @@ def test_cases_have_the_shares_effects_and_sizes_of_their_kinds(machine: Machine
     single = Counter(one.faults[0].effect for one in found if one.kind == "one")
     assert set(single.values()) <= {1, 2, 3} and len(single) >= 20
     strange = Counter(one.faults[0].effect for one in found if one.kind == "outside")
-    assert strange == {"fading": 10, "interlock": 10}
+    assert strange == dict.fromkeys(CAUSES, 2)
     for one in found:
         names = {fault.effect for fault in one.faults}
         allowed = {"none": {0}, "several": {2, 3}}.get(one.kind, {1})
@@ -292,9 +293,8 @@ def test_another_hand_drives_the_field_of_half_of_the_cases_and_never_the_refere
     mode = load_mode(*SMALL, *words, "exam.mix.num_cases=20", f"session.out={tmp_path}")
     exam, questions = mode.exam, mode.questions("")
     halves: dict[generate.Half, Any] = {"reference": exam.reference, "field": exam.field}
-    recorder = CaseRecorder(
-        mode.machine, exam.plants, "mild", mode.excitation, exam.approach, halves, tmp_path
-    )
+    about = (mode.machine, exam.plants, "mild", mode.excitation, exam.approach)
+    recorder = CaseRecorder(*about, halves, tmp_path)
 
     def name_first(number: int, half: generate.Half) -> str:
         job = recorder.list_jobs(number, questions[number], half)[0]

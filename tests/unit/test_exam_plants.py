@@ -17,7 +17,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from diagnosis.effect_library import load_effects
 from exam.plants import servo_faults
-from exam.plants.changes import PlantParameters, apply_changes
+from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus, SteppedEncoders, draw_bursts
 from exam.plants.family import SEVERITY, DrawnPlants, PlantBatch, PlantLink, PlantRun
 from exam.plants.hydraulics import STEP_S, SensingValves
@@ -47,7 +47,8 @@ def clean(machine: Machine) -> PlantParameters:
 
 
 def change(numbers: PlantParameters, effect: str, **sizes: np.ndarray) -> PlantParameters:
-    return apply_changes(numbers, {effect: sizes}, CHANGES, "a machine")
+    CHANGES[effect](changed := dict(numbers), sizes)
+    return changed
 
 
 def played(machine: Machine, runs: list[tuple[PlantParameters, np.ndarray]]) -> np.ndarray:
@@ -123,9 +124,8 @@ def test_a_fault_in_time_costs_the_way_of_that_time(machine: Machine) -> None:
     well = clean(machine)
     runs = [(well, push(machine, 1.0))]
     for effect, (name, value, _) in late.items():
-        runs.append(
-            (change(well, effect, **{name: on_q3(machine, 0.0, value)}), push(machine, 1.0))
-        )
+        slower = change(well, effect, **{name: on_q3(machine, 0.0, value)})
+        runs.append((slower, push(machine, 1.0)))
     q = played(machine, runs)[:, :, Q3]
     lost_s = (q[-1, 0] - q[-1, 1:]) / ((q[50, 0] - q[40, 0]) / (10 * machine.period_s))
     # a ramp of 0.5 s costs half of it and a little for the overlap and the notches
@@ -176,7 +176,7 @@ def test_a_coarse_encoder_keeps_its_reading_within_its_band() -> None:
 
 
 def test_lost_frames_hold_the_command_before_and_late_ones_keep_their_order() -> None:
-    line = CommandBus({"transport_s": one(0.1), "jitter_s": one(0.1), "loss": one(0.5)}, 0.05)
+    line = CommandBus({"transport_s": one(0.1), "jitter_s": one(0.1), "loss": one(0.5)})
     # command, luck, lateness
     frames = [(1.0, 0.9, 0.0), (2.0, 0.4, 0.0), (3.0, 0.9, 1.0), (4.0, 0.9, 0.0)]
     for k, (u, luck, late) in enumerate(frames):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from log_import import write_csv
 
 from actuators.recordings.column_map import AlignedTime, Column, ColumnMap, CommandColumn
-from actuators.recordings.log_files import expand_logs, open_log
+from actuators.recordings.log_files import find_logs, open_log
 from actuators.recordings.log_tables import parse_expression
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
@@ -114,10 +114,10 @@ def test_a_folder_of_folders_gives_the_logs_below_it(tmp_path: Path) -> None:
             write_csv(tmp_path / "raw" / name / f"{source}.csv", make_signals())
     (tmp_path / "raw" / "notes").mkdir()
     write_csv(tmp_path / "raw" / "c.csv", make_signals())
-    found = expand_logs([tmp_path / "raw"])
+    found = find_logs(str(tmp_path / "raw"))
     assert [path.name for path in found] == ["a", "b", "c.csv"]
     with pytest.raises(RecordingError, match="no log in this folder"):
-        expand_logs([tmp_path / "raw" / "notes"])
+        find_logs(str(tmp_path / "raw" / "notes"))
 
 
 def test_arithmetic_stands_in_the_place_of_a_column(tmp_path: Path, carriage: Machine) -> None:
