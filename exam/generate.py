@@ -249,8 +249,8 @@ class CaseRecorder:
         runs = tuple(plan.runs[0] for _, plan in files)
         plan = ExcitationPlan(runs=runs, run_s=file_s, names=tuple(self.excitations))
         guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
-        # a faulty machine may be slow on its ways to start poses
-        player = PlanPlayer(plan, machine, self.approach, guards, level=logging.DEBUG)
+        player = PlanPlayer(plan, machine, self.approach, guards)
+        player.level = logging.DEBUG  # a faulty machine may be slow on its ways to start poses
         with link as opened:
             track = PlanTrack(drive(opened, player, machine, len(jobs), file_s))
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)

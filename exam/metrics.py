@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -14,8 +15,12 @@ from brokk_rl.console_table import MISSING
 from brokk_rl.report import render_page
 from brokk_rl.session import write_text
 from brokk_rl.statistics import CONFIDENCE, compute_wilson_interval
-from exam.case_distribution import KINDS
-from exam.score import CaseScore
+from diagnosis.answer import parse_answer
+from exam.case_distribution import KINDS, CaseDistribution
+from exam.run_cases import GivenAnswer
+from exam.score import CaseScore, score_answer
+
+log = logging.getLogger(__name__)
 
 NUM_DRAWS = 1000
 """Bootstrap draws; the usual number for 95 % intervals."""
@@ -125,6 +130,30 @@ def count_answers(scores: Sequence[CaseScore]) -> dict[str, dict[str, int]]:
             answer = "+".join(score.named) or score.verdict
             said[answer] = said.get(answer, 0) + 1
     return dict(sorted(found.items()))
+
+
+def build_table(
+    labels: Sequence[Mapping[str, Any]], given: Mapping[str, GivenAnswer], mix: CaseDistribution
+) -> dict[str, Any]:
+    """Return the figures of answers; cases that nobody began are left out and counted.
+
+    Args:
+        labels: Opened labels of the exam.
+        given: Answers by case.
+        mix: Says which effects cannot be told apart, and which ones all joints have together.
+    """
+    scores = []
+    for label in labels:
+        case = label["case"]
+        if case not in given:
+            continue
+        one = given[case]
+        answer = None if one.answer is None else parse_answer(one.answer, f"case {case}")
+        scores.append(score_answer(label, answer, mix, one.examined))
+    not_begun = len(labels) - len(scores)
+    if not_begun:
+        log.warning("%d of %d cases were not begun and are left out", not_begun, len(labels))
+    return compute_metrics(scores, not_begun)
 
 
 REPORT_FILE = "exam.html"

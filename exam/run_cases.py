@@ -1,4 +1,7 @@
-"""Candidates, and their answers to all cases: one process a case, which sees a copy of that case only."""
+"""Candidates, and their answers to all cases: one process a case, which sees a copy of that case only.
+
+Answers are read from the folder of a run, or from a published file.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,6 +38,13 @@ INTERRUPTED = (-signal.SIGINT, 128 + signal.SIGINT)
 """Exit codes of a program that an interruption of the command ended too."""
 LAST_CHARACTERS = 2000
 """Last characters of a program's output that an error quotes. Chosen by hand; not searched."""
+
+
+PUBLISHED = ("schema", "verdict", "reason", "selected", "ranking", "gap")
+"""Parts of an answer that are published: those that a score reads. The others are nine in ten of its bytes; a
+published file names them as `left_out`."""
+RUN_FILE = "run.json"
+"""File beside answers: who gave them, at which commit, to which labels."""
 
 
 class Candidate(Protocol):
@@ -179,6 +190,79 @@ def read_facts(path: Path) -> dict[str, Any]:
         return json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
+
+
+@dataclass(frozen=True)
+class GivenAnswer:
+    """Answer of a candidate to a case; the fields of a line of a published file.
+
+    Attributes:
+        note: Seconds that it took, or the reason why there is no answer; empty where nothing was noted.
+        answer: Content of its `diagnosis.json`, `None` without one.
+        left_out: Parts of it that are not published; `None` where nothing was left out.
+        labels_sha256: Hash of the labels of the exam that was answered; `None` where nobody noted it.
+        examined: The examiner's figures; see `exam.examiner.examine_case`.
+    """
+
+    note: Mapping[str, Any]
+    answer: Mapping[str, Any] | None
+    left_out: Sequence[str] | None = None
+    labels_sha256: str | None = None
+    examined: Mapping[str, Any] | None = None
+
+
+def read_answers(path: Path) -> dict[str, GivenAnswer]:
+    """Return the answers in the folder of `exam.do=run`, or in a published file, by case.
+
+    Raises:
+        RecordingError: there is no answer.
+    """
+    found: dict[str, GivenAnswer] = {}
+    where = path
+    try:
+        if path.is_file():
+            for row in map(json.loads, path.read_text().splitlines()):
+                case = row.pop("case")
+                found[case] = GivenAnswer(**row)
+        elif path.is_dir():
+            answered = read_run(path).get("labels_sha256")
+            for place in filter(is_begun, path.iterdir()):
+                where = place / ANSWER_FILE
+                content = json.loads(where.read_text()) if where.is_file() else None
+                note = read_facts(place / NOTE_FILE)
+                found[place.name] = GivenAnswer(note, content, labels_sha256=answered)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RecordingError(
+            f"exam.answers: {where}: expected {ANSWER_FILE} in a folder a case, or a line a case of a published file "
+            f"({error!r}); delete what is damaged, and exam.do=run resume=<answers> answers it again"
+        ) from error
+    if all(one.answer is None for one in found.values()):
+        raise RecordingError(f"exam.answers: {path} holds no answer to any case")
+    return found
+
+
+def read_run(answers: Path) -> dict[str, Any]:
+    """Return what `exam.do=run` noted beside answers; empty where nothing is noted, as of a published file."""
+    return read_facts(answers / RUN_FILE)
+
+
+def publish_answers(given: Mapping[str, GivenAnswer], path: Path) -> None:
+    """Write all answers into one file, a line a case, with their notes and what is left out."""
+    lines = []
+    for case, one in sorted(given.items()):
+        note = dict(one.note)
+        if note.get("error"):
+            # The lines before name folders of the computer that answered.
+            note["error"] = note["error"].strip().splitlines()[-1]
+        kept = replace(one, note=note)
+        if one.answer is not None:
+            answer = {key: one.answer[key] for key in PUBLISHED if key in one.answer}
+            left_out = sorted({*(one.left_out or ()), *one.answer} - {*PUBLISHED})
+            kept = replace(kept, answer=answer, left_out=left_out)
+        # A missing answer is told as `null`; whatever else is missing is left away.
+        told = {key: value for key, value in vars(kept).items() if value is not None}
+        lines.append(json.dumps({"case": case, "note": note, "answer": None} | told) + "\n")
+    write_text(path, "".join(lines))
 
 
 @spec

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from diagnosis.answer import Answer, Selected
+from exam.case_distribution import CaseDistribution
 
 CI90_OVER_CI95 = 1.6449 / 1.9600
 """From half a 95 % interval to half a 90 % interval of a normal distribution."""
@@ -99,18 +100,17 @@ class CaseScore:
 def score_answer(
     label: Mapping[str, Any],
     answer: Answer | None,
-    classes: Sequence[Sequence[str]],
-    of_machine: Sequence[str],
-    examination: Mapping[str, Any] | None = None,
+    mix: CaseDistribution,
+    examined: Mapping[str, Any] | None = None,
 ) -> CaseScore:
     """Return the score of `answer`; `None` is a missing answer.
 
     Args:
         label: The truth, as `dataset.make_label` has it.
         answer: The answer.
-        classes: Effects that recordings of commands and positions cannot tell apart.
-        of_machine: Effects that all joints have together; nobody is asked for their joints.
-        examination: The examiner's own figures; see `examiner.examine_case`.
+        mix: Says which effects cannot be told apart, and which ones all joints have together: nobody is asked for
+            their joints.
+        examined: The examiner's own figures; see `examiner.examine_case`.
     """
     kind, outside = label["kind"], label["outside"]
     true = {one["effect"]: one for one in label["effects"]}
@@ -118,11 +118,12 @@ def score_answer(
     chosen: list[Selected] = []
     if answer is not None and verdict == "effects":
         chosen = sorted(answer.selected, key=lambda one: -one.probability)
-    stands_for = match_effects(list(true), chosen, classes)
+    stands_for = match_effects(list(true), chosen, mix.classes)
+    together = {name for name, trouble in mix.troubles.items() if trouble.joints == "all"}
     claims, joints_right, numbers = [], [], []
     for one, effect in zip(chosen, stands_for, strict=True):
         claims.append(Claim(one.probability, bool(effect)))
-        if effect and effect not in of_machine:
+        if effect and effect not in together:
             joints_right.append(set(one.joints) == set(true[effect]["joints"]))
         # Parameters of another effect of the class are other quantities.
         if effect == one.effect:
@@ -132,7 +133,6 @@ def score_answer(
     if answer is not None and verdict in right_kinds:
         ranked = [one.probability for one in answer.ranking if one.effect == verdict]
         claims.append(Claim(ranked[0] if ranked else 1.0, kind in right_kinds[verdict]))
-    examined = examination["closed"] if examination is not None else None
     return CaseScore(
         kind=kind,
         truth=tuple(true),
@@ -142,7 +142,7 @@ def score_answer(
         joints_right=tuple(joints_right),
         claims=tuple(claims),
         numbers=tuple(numbers),
-        examined=examined,
+        examined=examined["closed"] if examined is not None else None,
         outside=outside["ailment"] if outside else None,
         other_hand=label.get("other_hand", False),
     )

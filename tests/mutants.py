@@ -67,7 +67,7 @@ SCIENCE = {
     "diagnosis.simulator_diagnosis": ["test_simulator_diagnosis.py"],
     "diagnosis.simulator_runs": ["test_simulator_diagnosis.py"],
     "diagnosis.simulator_search": ["test_simulator_diagnosis.py"],
-    "exam.answer_scoring": ["test_exam_marks.py", "test_exam.py"],
+    "exam.metrics": ["test_exam_marks.py", "test_exam.py"],
     "exam.score": ["test_exam_marks.py"],
 }
 """Modules on which figures rest, and the tests of each."""

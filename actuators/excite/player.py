@@ -80,23 +80,19 @@ class PlanPlayer:
         machine: The machine.
         approach: How start poses are taken up.
         guards: Limits of all commands.
-        level: Level of the message that the way to a start pose was given up.
 
     Attributes:
         phase: `APPROACH`, `REST`, … of each run, `(N,)`.
         segment: Number of the segment of each run, `(N,)`.
     """
 
+    level = logging.WARNING
+    """Level of the message that the way to a start pose was given up."""
+
     def __init__(
-        self,
-        plan: ExcitationPlan,
-        machine: Machine,
-        approach: Approach,
-        guards: CommandGuards,
-        level: int = logging.WARNING,
+        self, plan: ExcitationPlan, machine: Machine, approach: Approach, guards: CommandGuards
     ) -> None:
         self._plan, self._machine, self._approach, self._guards = plan, machine, approach, guards
-        self._level = level
         if guards.max_tool_speed_m_s is not None and not machine.has_bodies:
             raise ConfigError(
                 f"collect.guards.max_tool_speed_m_s: the geometry of machine '{machine.name}' is not known; give null, or bodies "
@@ -174,7 +170,7 @@ class PlanPlayer:
             joints = ", ".join(f"{names[j]} ({q[n, j]:.3f})" for j in np.flatnonzero(far[n]))
             name = self._plan.runs[n][self.segment[n]].name
             text = "run %d: way to the start of %s given up, out of place: %s; going on from there"
-            log.log(self._level, text, n, name, joints)
+            log.log(self.level, text, n, name, joints)
         phase[arrived] += 1  # rest, or wait
         rest = round(self._approach.rest_s / self._machine.period_s)
         self._left[arrived] = rest

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
+from actuators.recordings.split import measure_commanded_s
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -108,7 +109,7 @@ def list_remarks(
     for j, name in enumerate(machine.joint_names):
         if text := _find_lock(inspections, machine, j, thresholds):
             locks[name] = text
-    remarks = [*_check_excitation(inspections, machine, thresholds)]
+    remarks = [*_check_excitation(inspections, machine, thresholds)] if inspections else []
     for one in inspections:
         remarks += _group_findings(one, machine, locks)
     return sorted(
@@ -154,14 +155,11 @@ def _group_findings(
 
 
 def _find_lock(
-    inspections: Sequence[Inspection],
-    machine: Machine,
-    joint: int,
-    thresholds: InspectionThresholds,
+    inspections: Sequence[Inspection], machine: Machine, joint: int, limits: InspectionThresholds
 ) -> str | None:
     """Return the condition that separates ignored commands of a joint from obeyed ones, as text, or `None`."""
     name = machine.joint_names[joint]
-    lead = round((machine.dead_time_s + thresholds.settle_s) / machine.period_s)
+    lead = round((machine.dead_time_s + limits.settle_s) / machine.period_s)
     ignored, obeyed, count = [], [], 0
     for inspection in inspections:
         recording = inspection.viewed
@@ -172,9 +170,9 @@ def _find_lock(
                 end = finding.row + finding.num_rows
                 is_ignored[finding.row : end] = True
                 near[max(0, finding.row - lead) : end + lead] = True
-        is_driven = np.abs(recording.u[:, joint]) > thresholds.driving
+        is_driven = np.abs(recording.u[:, joint]) > limits.driving
         speed = np.gradient(recording.q[:, joint].astype(float)) * recording.rate_hz
-        is_moving = np.abs(speed) > 2.0 * thresholds.still * machine.max_speed[joint]
+        is_moving = np.abs(speed) > 2.0 * limits.still * machine.max_speed[joint]
         ignored.append(is_ignored)
         obeyed.append(is_driven & is_moving & ~near)
     if count < MIN_STRETCHES:
@@ -185,7 +183,7 @@ def _find_lock(
     u = np.concatenate([one.viewed.u for one in inspections])
     q = np.concatenate([one.viewed.q for one in inspections])
     best = (0.0, 1.0, "")
-    for text, condition in _list_conditions(u, q, machine, joint, thresholds):
+    for text, condition in _list_conditions(u, q, machine, joint, limits):
         # a lock may stop the motion itself, or the command on its way
         for delay in (0, round(machine.dead_time_s / machine.period_s)):
             holds = np.roll(condition, delay)
@@ -222,12 +220,10 @@ def _check_excitation(
     inspections: Sequence[Inspection], machine: Machine, thresholds: InspectionThresholds
 ) -> Iterator[RecordingRemark]:
     """Yield the joints that are hardly commanded."""
-    total_s = sum(one.viewed.duration_s for one in inspections)
-    for j, name in enumerate(machine.joint_names if inspections else ()):
-        seconds = 0.0
-        for one in inspections:
-            is_commanded = np.abs(one.viewed.u[:, j]) > thresholds.commanded
-            seconds += float(is_commanded.sum()) / one.viewed.rate_hz
+    viewed = [one.viewed for one in inspections]
+    total_s = sum(one.duration_s for one in viewed)
+    commanded_s = measure_commanded_s(viewed, thresholds.commanded)
+    for name, seconds in zip(machine.joint_names, commanded_s.tolist(), strict=True):
         if seconds < MIN_COMMANDED_RUNS * choose_horizon_s(machine):
             text = f"commanded for {seconds:.1f} s of {total_s:.0f} s"
             yield RecordingRemark("joint at rest", name, "all recordings", 0.0, total_s, 1, text)

@@ -249,15 +249,12 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
         raise CheckpointError(
             f"{path} is missing; give the folder of a policy, or an ONNX file with its contract"
         ) from None
-    except KeyError as error:
-        raise CheckpointError(
-            f"{path}: this contract lacks {error}; docs/doctor.md lists its fields"
-        ) from error
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise CheckpointError(
-            f"{path}: this contract cannot be used ({type(error).__name__}: {error}); docs/doctor.md "
-            "lists its fields"
-        ) from error
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+        fault = f"cannot be used ({type(error).__name__}: {error})"
+        if isinstance(error, KeyError):
+            fault = f"lacks {error}"
+        text = f"{path}: this contract {fault}; docs/doctor.md lists its fields"
+        raise CheckpointError(text) from error
 
 
 def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> list[dict[str, Any]]:

@@ -111,12 +111,10 @@ def check_motion(
         seed: Of the draws.
     """
     horizon_s = HORIZON_SHARE * choose_horizon_s(machine)
-    lacking = ""
     if actuator is None:
-        lacking = "no simulator was given: actuator=<its actuator>"
-    elif not effects:
+        return MotionEvidence((), horizon_s, "no simulator was given: actuator=<its actuator>")
+    if not effects:
         lacking = "no effects of the training were given: effect=[library]"
-    if actuator is None or lacking:
         return MotionEvidence((), horizon_s, lacking)
     try:
         apart_s = max(machine.period_s, WINDOWS_APART * horizon_s)

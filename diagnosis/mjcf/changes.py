@@ -146,7 +146,10 @@ def _comment(
     root = ElementTree.fromstring(text)
     for parent in list(root.iter()):
         for child in list(parent):
-            named = [one for one in changes if _is_element(child, parent, one)]
+            key = (child.tag, child.get("name"))
+            if parent.tag == "actuator":
+                key = ("actuator", child.get("joint"))
+            named = [one for one in changes if (one.element, one.joint) == key]
             if not named:
                 continue
             words = "; ".join(describe_change(one) for one in named)
@@ -156,12 +159,6 @@ def _comment(
     root.insert(0, ElementTree.Comment(" " + " ".join(head).replace("--", "-") + " "))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def _is_element(child: ElementTree.Element, parent: ElementTree.Element, one: MjcfChange) -> bool:
-    if one.element == "joint":
-        return child.tag == "joint" and child.get("name") == one.joint
-    return parent.tag == "actuator" and child.get("joint") == one.joint
 
 
 def describe_change(one: MjcfChange) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import secrets
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -17,11 +18,14 @@ from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel, use_workers
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import Count, spec
-from exam import answer_scoring, dataset, metrics, run_cases
+from exam import dataset, metrics, run_cases
 from exam.case_distribution import CaseDesign, CaseDistribution
-from exam.generate import CASES_FOLDER, STREAMS, CaseRecorder, Half, HalfPlan
+from exam.examiner import examine_case
+from exam.generate import CASES_FOLDER, STREAMS, WITHHELD_FOLDER, CaseRecorder, Half, HalfPlan
 from exam.plants.family import DrawnPlants
 from exam.run_cases import Candidate
 
@@ -173,11 +177,11 @@ class Exam:
             "labels_sha256": facts["labels_sha256"],
             "candidate": repr(settings.candidate),
         }
-        before = {**run, **answer_scoring.read_run(out)}
+        before = {**run, **run_cases.read_run(out)}
         for name in ("candidate", "labels_sha256"):
             if before[name] != run[name]:
                 raise ConfigError(
-                    f"resume={out}: expected {name}={before[name]}, as in its {answer_scoring.RUN_FILE}, got {run[name]}: answers "
+                    f"resume={out}: expected {name}={before[name]}, as in its {run_cases.RUN_FILE}, got {run[name]}: answers "
                     "of two candidates or to two exams are not mixed; choose another session.out=<folder>"
                 )
         if before["commit"] != run["commit"]:
@@ -185,7 +189,7 @@ class Exam:
         if not any(one.get("run") == run for one in dataset.read_ledger(self._folder)):
             entry = {"labels_sha256": facts["labels_sha256"], "run": run}
             dataset.append_entry(self._folder, dataset.BEGUN, entry)
-        write_json(out / answer_scoring.RUN_FILE, run)
+        write_json(out / run_cases.RUN_FILE, run)
         candidate, workers = settings.candidate, settings.workers
         failed = run_cases.answer_cases(candidate, cases, out, self.machine, workers)
         if failed:
@@ -212,6 +216,27 @@ class Exam:
                 f"exam.folder={self._folder}: expected {FACTS_FILE}, which exam.do=make writes last ({error!r}); {MAKE_AGAIN}"
             ) from error
 
+    def _examine(
+        self, labels: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]
+    ) -> dict[str, dict[str, Any]]:
+        """Return the examiner's figures by case and candidate; none without withheld recordings."""
+        cases = []
+        for label in labels:
+            is_withheld = (self._folder / WITHHELD_FOLDER / label["case"]).is_dir()
+            if label["kind"] in ("one", "several") and is_withheld:
+                cases.append(label["case"])
+
+        def examine_begun(case: str) -> dict[str, Any]:
+            begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
+            answers = {name: folders[name] / case for name in begun}
+            about = (self._folder, self.exam.fit, self.machine, case)
+            return examine_case(*about, answers) if begun else {}
+
+        bar = ItemProgress("repairs examined", len(cases))
+        with bar as progress, use_workers(self.exam.workers):
+            tell = lambda _, share: progress.reach(share * len(cases))  # noqa: E731
+            return dict(zip(cases, map_parallel(examine_begun, cases, tell), strict=True))
+
     def _score(self) -> None:
         """Open the labels; write marks, answers, labels and report; print the table."""
         is_published = not (self._folder / dataset.LABELS_FILE).is_file()
@@ -220,7 +245,7 @@ class Exam:
         facts, text = dataset.open_labels(self._folder)
         labels = facts.pop("cases")
         answers = {name: Path(path) for name, path in self.exam.answers.items()}
-        given = {name: answer_scoring.read_answers(path) for name, path in answers.items()}
+        given = {name: run_cases.read_answers(path) for name, path in answers.items()}
         for name, path in answers.items():
             hashes = {one.labels_sha256 for one in given[name].values()}
             if hashes - {None, facts["labels_sha256"]}:
@@ -229,24 +254,21 @@ class Exam:
                 )
         facts["ledger"] = []
         for path in answers.values():
-            run = answer_scoring.read_run(path)
+            run = run_cases.read_run(path)
             facts["ledger"].append(dataset.describe_registration(self._folder, path, run))
         if not is_published:
             hashes = {"labels_sha256": facts["labels_sha256"]}
             dataset.append_entry(self._folder, dataset.OPENED, hashes)
         out = self.session.folder
-        examined = answer_scoring.examine_answers(
-            self._folder, labels, answers, self.exam.fit, self.machine, self.exam.workers
-        )
-        tables = {}
+        tables, examined = {}, self._examine(labels, answers)
         for name, one in given.items():
             for case, figures in examined.items():
                 if name in figures:
                     one[case] = replace(one[case], examined=figures[name])
-            tables[name] = answer_scoring.build_table(labels, one, self.exam.mix)
-            tables[name]["commit"] = answer_scoring.read_run(answers[name]).get("commit")
+            tables[name] = metrics.build_table(labels, one, self.exam.mix)
+            tables[name]["commit"] = run_cases.read_run(answers[name]).get("commit")
             # Answers and labels stand beside the score, so that anybody can score them again.
-            answer_scoring.publish_answers(one, out / f"answers_{name}.jsonl")
+            run_cases.publish_answers(one, out / f"answers_{name}.jsonl")
         write_text(out / dataset.OPENED_FILE, text)
         write_json(out / "marks.json", {"exam": facts, "candidates": tables})
         metrics.write_report(out, facts, tables)

@@ -115,6 +115,12 @@ class PlantLink:
 
     def send(self, command: Command) -> Command:
         """Move on by one control period with these commands, `(N, J)`."""
+        self._move(np.asarray(command.u, dtype=float), self._k * self._machine.period_s)
+        self._k += 1
+        return command
+
+    def _move(self, u: np.ndarray, t_s: float) -> None:
+        """Move on by a control period with commands `(N, J)` that are sent `t_s` after the begin."""
         raise NotImplementedError
 
     def extra(self) -> Mapping[str, np.ndarray]:

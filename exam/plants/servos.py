@@ -14,7 +14,6 @@ from scipy.signal import lfilter
 from brokk_rl.commands import find_rest
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Dimension, Machine
-from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from diagnosis.mjcf.plant import MjcfPlant
 from exam.plants import servo_faults
@@ -75,23 +74,17 @@ class ServoArm(PlantLink):
         """True positions of the joints, `(N, J)`."""
         return self._plant.read(self._state)[0]
 
-    def send(self, command: Command) -> Command:
-        """Move on by one control period with these commands, `(N, J)`."""
-        machine, k, causes = self._machine, self._k, self._causes
-        t_s = k * machine.period_s
-        u = causes.command(np.asarray(command.u, dtype=float))
-        luck = self._chance["luck"][k]
-        later_s = causes.delay_s(self._elapsed_s + t_s)
-        self._bus.send(u, t_s, luck[:, :1], luck[:, 1:], later_s)
-        for i in range(round(machine.period_s / STEP_S)):
+    def _move(self, u: np.ndarray, t_s: float) -> None:
+        luck = self._chance["luck"][self._k]
+        later_s = self._causes.delay_s(self._elapsed_s + t_s)
+        self._bus.send(self._causes.command(u), t_s, luck[:, :1], luck[:, 1:], later_s)
+        for i in range(round(self._machine.period_s / STEP_S)):
             self._step(t_s + i * STEP_S)
-        self._k += 1
-        return command
 
     def _step(self, t_s: float) -> None:
         n, causes, loop = self._n, self._causes, self._loop
         q, speed = self._plant.read(self._state)
-        reading = self._measure_at(q)
+        reading = self._measure()
         target = causes.target(self._targets.step(self._bus.at(t_s)), reading)
         cap = np.minimum(n["duty_cap"], causes.cap(self._duty))
         self._duty = loop.step(target, reading, speed, cap)
@@ -109,11 +102,8 @@ class ServoArm(PlantLink):
         self._state = self._plant.run(self._state, torque[:, None], self._changes or None)[:, 0]
 
     def _measure(self) -> np.ndarray:
-        return self._measure_at(self.q)
-
-    def _measure_at(self, q: np.ndarray) -> np.ndarray:
         step = self._n["step_rad"]
-        return np.round((q + self._sigma * self._chance["noise"][self._k]) / step) * step
+        return np.round((self.q + self._sigma * self._chance["noise"][self._k]) / step) * step
 
 
 def draw_chance(seed: int, machine: Machine, steps: int) -> dict[str, np.ndarray]:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.machine import Machine
-from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus, SteppedEncoders, draw_chance
@@ -29,27 +28,26 @@ LATEST_STAMP_S = 0.6
 """Time by which a stamp is late at most; chosen by hand, far above any fault of a clock."""
 
 
+BuildHydraulics = Callable[[PlantParameters, Machine, OutsideCauses], Any]
+"""Builds hydraulics, with the methods of `SensingValves`, from numbers `(N, J)`, machine and causes."""
+
+
 class ValveArm(PlantLink):
     """A `Link` to simulated machines with valves.
 
     Args:
         batch: The runs and their machines.
         step_s: Time step of the hydraulics.
-        hydraulics: Builds them from numbers `(N, J)`, machine and causes, with the methods of `SensingValves`.
+        hydraulics: Builds them.
     """
 
-    def __init__(
-        self,
-        batch: PlantBatch,
-        step_s: float,
-        hydraulics: Callable[[PlantParameters, Machine, OutsideCauses], Any],
-    ) -> None:
+    def __init__(self, batch: PlantBatch, step_s: float, hydraulics: BuildHydraulics) -> None:
         pairs = zip(batch.runs, batch.numbers, strict=True)
         chance = [draw_chance(run.chance, one, batch.steps) for run, one in pairs]
         super().__init__(batch, chance)
         n, machine = self._n, batch.machine
-        drawn = self._chance["phase"][0], self._chance["luck"]
-        self._causes = OutsideCauses(machine, batch.place_causes(CAUSES), *drawn, step_s)
+        severity = batch.place_causes(CAUSES)
+        self._causes = OutsideCauses(machine, severity, self._chance, step_s)
         # mean delay of the effect, whose delays are uniform
         bus = n | {"jitter_s": 0.5 * n["jitter_s"]}
         self._bus = CommandBus(bus)
@@ -71,18 +69,16 @@ class ValveArm(PlantLink):
         shown = self._encoders.read(self._stamped(), self._chance["noise"][self._k])
         return self._causes.show(self._k, shown)
 
-    def send(self, command: Command) -> Command:
-        """Move on by one control period with these commands, `(N, J)`."""
-        machine, causes, hydraulics = self._machine, self._causes, self._hydraulics
-        t_s, k, step_s = self._k * machine.period_s, self._k, self._step_s
-        run_s = self._elapsed_s + t_s
-        u = causes.drive(np.asarray(command.u, dtype=float), run_s)
+    def _move(self, u: np.ndarray, t_s: float) -> None:
+        causes, hydraulics = self._causes, self._hydraulics
+        k, step_s, run_s = self._k, self._step_s, self._elapsed_s + t_s
+        u = causes.drive(u, run_s)
         # below its loss a frame is lost: 0 or 1 says which
         luck = np.where(self._chance["lost"][k], -1.0, 1.0)
         self._bus.send(u, t_s, luck[:, None], self._chance["queue"][k][:, None], 0.0 * u)
         oil = self._n["flow"] * self._oil(run_s)
         hydraulics.take_pose(self._q, self._link)
-        for i in range(round(machine.period_s / step_s)):
+        for i in range(round(self._machine.period_s / step_s)):
             is_open = hydraulics.open(self._bus.at(t_s + i * step_s))
             self._motions += is_open & ~self._is_open
             self._is_open = is_open
@@ -93,8 +89,6 @@ class ValveArm(PlantLink):
             self._link = np.clip(self._link, self._q - self._half_play, self._q + self._half_play)
             self._trace.append(self._link)
         del self._trace[: -self._num_kept]
-        self._k += 1
-        return command
 
     def _settle(self) -> np.ndarray:
         """Return the factor on the flows by the compensators: each motion has its own rest."""

@@ -21,8 +21,6 @@ reversal_pause   after a reversal the valve stays closed for some tenths of a se
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from brokk_rl.machine import Machine
@@ -95,23 +93,18 @@ class OutsideCauses:
     Args:
         machine: Limits, period, full speeds.
         severity: Of each cause, `(N, J)`.
-        phase: Uniform random number of each run, `(N,)`: when its charger begins.
-        luck: Uniform random numbers, `(T, N)`, one a control period.
+        chance: Uniform random numbers: `phase` of each run, `(1, N)`, when its charger begins, and `luck`, `(T, N)`,
+            one a control period.
         step_s: Time step of the valves.
     """
 
     def __init__(
-        self,
-        machine: Machine,
-        severity: Mapping[str, np.ndarray],
-        phase: np.ndarray,
-        luck: np.ndarray,
-        step_s: float,
+        self, machine: Machine, severity: PlantParameters, chance: PlantParameters, step_s: float
     ) -> None:
-        self._step_s = step_s
-        self._period_s, self._luck, self._phase = machine.period_s, luck, phase
+        self._step_s, self._period_s = step_s, machine.period_s
+        self._luck, self._phase = chance["luck"], chance["phase"][0]
         self._of = severity
-        none = np.zeros((len(phase), machine.num_joints))
+        none = np.zeros((len(self._phase), machine.num_joints))
         travel = machine.upper - machine.lower
         cut = STOP_TRAVEL * travel * self._of["moved_stop"]
         # the stop that is farther from home: the machine must reach its home

@@ -14,11 +14,10 @@ from composed import option
 from brokk_rl.errors import RecordingError
 from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected
 from exam import metrics, score
-from exam.answer_scoring import GivenAnswer, build_table, publish_answers, read_answers
 from exam.dataset import open_labels
+from exam.metrics import build_table
+from exam.run_cases import GivenAnswer, publish_answers, read_answers
 from exam.score import CaseScore, Claim, score_answer
-
-CLASSES = (("dead_time", "clock_offset"), ("flow_gain", "encoder_scale"))
 
 
 def label(
@@ -59,7 +58,7 @@ def answered(
 
 
 def marked(truth: dict[str, Any], said: Answer | None) -> CaseScore:
-    return score_answer(truth, said, CLASSES, ("frame_loss",))
+    return score_answer(truth, said, option("exam_mix", "main"))
 
 
 def test_an_equivalent_is_right_beside_the_strict_figure_only() -> None:
