@@ -223,7 +223,7 @@ class ReferenceDiagnosis(Diagnosis):
             verdict=decision.verdict,
             proof=proof,
             prove_nothing=partial(prove, findings=()),
-            rivals=decision.rivals,
+            rivals=decision.table.list_found(),
             otherwise=_explain(decision, self.case.machine),
             evidence=_describe_evidence(decision),
         )

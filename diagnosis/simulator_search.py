@@ -13,13 +13,16 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.effect_library import EffectType, EffectValues, list_shared_effects
-from diagnosis.engine.decide import JOINT_NATS, SECOND_SHARE
+from diagnosis.engine.decide import JOINT_NATS
 from diagnosis.grown_effects import GrownEffect, list_candidates
 from diagnosis.simulator_runs import EffectSimulator, FreeRunLikelihood
 
 ROUNDS = 30
 """Steps of Levenberg and Marquardt at most, by which all numbers are fitted together: those of a mass
 and its friction trade against each other."""
+SHARE = 0.03
+"""Least share of an effect found before that a further one earns: with 0.3 a drive's friction is not named beside
+its mass."""
 LEAST_NATS = 22.0
 """An effect that earns less is not named. The engine asks for less; that was not tried around a simulator."""
 JOINT_SHARE = 0.1
@@ -84,7 +87,7 @@ class SimulatorSearch:
             proposed.sort(key=lambda one: -one.nats)
             if not found:
                 self.rivals = proposed
-            needed = max([LEAST_NATS, *(SECOND_SHARE * one.nats for one in found)])
+            needed = max([LEAST_NATS, *(SHARE * one.nats for one in found)])
             if not proposed or proposed[0].nats < needed:
                 break
             some = proposed[:NUM_FITTED]

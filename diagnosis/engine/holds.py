@@ -55,13 +55,15 @@ class HeldCourse:
     Attributes:
         course: Its model.
         delays: Additional delay of each sample of the field, in samples, `(T,)`.
-        gain: What it earns on the field less its prior, nats.
+        gains: What it earns on each joint of the field, nats.
+        prior: Log prior of the course, nats, 0 at most.
         weights: Share of each sample in what is seen of the delays, `(T,)`.
     """
 
     course: Course
     delays: np.ndarray
-    gain: float
+    gains: tuple[float, ...]
+    prior: float
     weights: np.ndarray
 
 
@@ -331,18 +333,18 @@ def _weigh_samples(side: Side) -> np.ndarray:
     return squares / max(float(squares.sum()), 1e-12)
 
 
-def _weigh_course(joints: Sequence[FieldJoint], delays: np.ndarray) -> float:
-    """Return what a course earns in the measure of all rows, nats."""
+def _weigh_course(joints: Sequence[FieldJoint], delays: np.ndarray) -> tuple[float, ...]:
+    """Return what a course earns on each joint in the measure of all rows, nats."""
     side = joints[0].side
     held = hold_commands(side, delays)
-    gain = 0.0
+    gains = []
     for joint in joints:
         path = held.simulate(joint.joint, joint.numbers)[0]
         left = joint.residual - (joint.measure(path).astype(float) - joint.increments)
         count = joint.count * (1.0 if side.model.integrates else joint.measure.interval)
         squares = joint.projection.measure_squares(left)
-        gain += float(compute_gain(squares, joint.squares, count)[0])
-    return gain
+        gains.append(float(compute_gain(squares, joint.squares, count)[0]))
+    return tuple(gains)
 
 
 def find_hold(joints: Sequence[FieldJoint], bases: Sequence[JointBaseline]) -> HeldCourse | None:
@@ -351,12 +353,13 @@ def find_hold(joints: Sequence[FieldJoint], bases: Sequence[JointBaseline]) -> H
     numbers = [joint.numbers for joint in joints]
     laws = _list_laws(side, bases, numbers)
     effect = max(laws, key=lambda law: law.evidence[-1]).course.effect
-    best = None
+    best, most = None, 0.0
     for law in laws:
         if law.course.effect != effect:
             continue
         delays, prior = _follow_law(side, bases, numbers, law)
-        gain = _weigh_course(joints, delays) + prior
-        if gain > (best.gain if best else 0.0):
-            best = HeldCourse(law.course, delays, gain, _weigh_samples(side))
+        gains = _weigh_course(joints, delays)
+        if sum(gains) + prior > most:
+            most = sum(gains) + prior
+            best = HeldCourse(law.course, delays, gains, prior, _weigh_samples(side))
     return best

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,8 @@ import pytest
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
-from diagnosis.answer import (
-    Answer,
-    Estimate,
-    Gap,
-    NextExperiment,
-    Ranked,
-    RegimeGap,
-    Selected,
-    Where,
-)
-from diagnosis.engine.decide import EffectFinding, find_owners, judge_first
+from diagnosis.engine import decide
+from diagnosis.engine.decide import EffectFinding, find_owners
 from diagnosis.engine.evidence import JointRow
 from diagnosis.engine.rows import Row
 from diagnosis.reference_diagnosis import propose_measurement, rank_effects
@@ -38,18 +30,18 @@ def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) ->
 PLACE = {"rmse_rad": 0.03, "floor_rad": 0.002, "after_rad": 0.004, "share": 1.0}
 
 
-def said() -> Answer:
+def said() -> answer.Answer:
     """An answer with everything in it."""
-    selected = Selected(
+    selected = answer.Selected(
         effect="backlash", joints=("q3",), probability=0.97,
-        parameters={"gap_rad": {"q3": Estimate(0.031, (0.028, 0.034))}}, gap_closed=Estimate(0.91, (0.86, 0.95)),
+        parameters={"gap_rad": {"q3": answer.Estimate(0.031, (0.028, 0.034))}}, gap_closed=answer.Estimate(0.91, (0.86, 0.95)),
         same_as=("lag",), decided_by="a dial gauge",
     )  # fmt: skip
-    return Answer(
-        verdict="effects", selected=(selected,), ranking=(Ranked("backlash", ("q3",), 0.97),),
-        gap=Gap(0.03, 0.004, 0.002, Estimate(0.93, (0.88, 0.96))),
-        where=Where({"q3": PLACE}, (RegimeGap("q3", "after a reversal", 0.8),), "actuation"),
-        next_experiment=NextExperiment("a dial gauge", ("backlash", "lag")),
+    return answer.Answer(
+        verdict="effects", selected=(selected,), ranking=(answer.Ranked("backlash", ("q3",), 0.97),),
+        gap=answer.Gap(0.03, 0.004, 0.002, answer.Estimate(0.93, (0.88, 0.96))),
+        where=answer.Where({"q3": PLACE}, (answer.RegimeGap("q3", "after a reversal", 0.8),), "actuation"),
+        next_experiment=answer.NextExperiment("a dial gauge", ("backlash", "lag")),
         reason="play", more={"sanity": [{"a": 1}]},
     )  # fmt: skip
 
@@ -96,19 +88,45 @@ def test_training_takes_the_found_effects_as_they_are(
     assert "q3: 0.031" in text and "other: 0.0" in text
 
 
+def weigh(*found: tuple[Any, ...]) -> decide.EvidenceTable:
+    """What effects earn: name, nats, a joint, and what other joints show of it."""
+    rows = [EffectFinding(one[0], one[2:3], one[1], elsewhere=one[3]) for one in found]
+    return decide.EvidenceTable(tuple(rows), 0.0, frozenset({"slip"}))
+
+
 def test_a_cause_is_named_or_unknown_by_what_it_earns() -> None:
+    lag = ("lag", 30.0, 1, np.inf)
     cases = [
-        ("lag", 16.0, 0.0, 0.0, "effects"), ("lag", 15.9, 0.0, 0.0, "none"),
-        ("frame_loss", 60.0, 0.0, 0.0, "effects"), ("frame_loss", 59.9, 0.0, 0.0, "none"),
-        # a row outside the library has to explain much, and much more
-        ("lag", 30.0, 46.0, 0.0, "effects"), ("lag", 30.0, 46.1, 0.0, "unknown"),
-        ("lag", -9.0, 45.0, 0.0, "none"), ("lag", -9.0, 45.1, 0.0, "unknown"),
-        # flexible columns explain a little more than any effect does
-        ("lag", 100.0, 0.0, 130.0, "effects"), ("lag", 100.0, 0.0, 130.1, "unknown"),
+        ([("lag", 18.0, 1, np.inf)], 0.0, "effects"), ([("lag", 17.9, 1, np.inf)], 0.0, "none"),
+        # a row outside the library explains much more, and flexible columns a little more
+        ([("slip", 75.0, 1, np.inf), lag], 0.0, "effects"), ([("slip", 75.1, 1, np.inf), lag], 0.0, "unknown"),
+        ([lag], 60.0, "effects"), ([lag], 60.1, "unknown"),
+        # a cause of the whole machine that one joint alone shows is none
+        ([("jitter", 99.0, 1, 18.0)], 50.1, "effects"), ([("jitter", 99.0, 1, 17.9)], 30.1, "unknown"),
+        ([("jitter", 99.0, 1, 17.9), ("slip", 99.0, 1, 17.9)], 0.0, "none"),
     ]  # fmt: skip
-    for effect, nats, outside, generic, expected in cases:
-        best = EffectFinding(effect, (1,), nats)
-        assert judge_first(best, nats, outside, generic) == expected
+    for found, generic, expected in cases:
+        table = weigh(*found)
+        assert decide.judge_first(table, generic, is_coarse=False) == expected
+        # the best effects of all joints together explain it, or the steps of a coarse sensor
+        owned = replace(table, owned=200.0)
+        assert decide.judge_first(owned, generic, is_coarse=False) != "unknown"
+        assert decide.judge_first(table, generic, is_coarse=True) != "unknown"
+    # a common cause counts without its strongest joint
+    assert decide.add_up_common([60.0, 5.0, -2.0], -10.0) == (53.0, -7.0)
+    assert decide.add_up_common([60.0], -10.0) == (50.0, 50.0)
+
+
+def test_a_further_effect_earns_enough_beside_the_first() -> None:
+    first = weigh(("lag", 100.0, 1, np.inf), ("creep", 90.0, 1, np.inf))
+    # on a joint of the first it earns a share of that; what shows on one joint alone does not hide it
+    for nats, joint, expected in ((18.0, 0, 2), (17.9, 0, 1), (30.0, 1, 2), (29.9, 1, 1)):
+        beside = weigh(("jitter", 80.0, 1, 3.0), ("creep", nats, joint, np.inf))
+        tables = iter([beside, weigh()])
+        found = decide.select(first, lambda _, tables=tables: next(tables))
+        assert [one.effect for one in found] == ["lag", "creep"][:expected]
+    # what shows by itself is not named again
+    assert decide.select(first, lambda _: weigh(), known=[first.found[0]]) == []
 
 
 def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:

@@ -244,7 +244,7 @@ def test_share_and_persistence_of_losses_are_read_from_their_course(machine: Mac
         delays.append(delays[-1] + 1 if is_lost else 0)
     course = Course("frame_loss", probability, persistence)
     weights = np.full(len(delays), 1.0 / len(delays))
-    held = holds.HeldCourse(course, np.array(delays), 1.0, weights)
+    held = holds.HeldCourse(course, np.array(delays), (1.0,), 0.0, weights)
     found = {name: value for name, (value, _) in sizes.describe_hold(held, machine).items()}
     # A course on a machine shows a part of the losses only.
     expected = {"probability": probability / sizes.SEEN_SHARE, "persistence": persistence}

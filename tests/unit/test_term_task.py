@@ -26,17 +26,7 @@ from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import find_site
 from brokk_rl.spec import spec
 from deploy.policy.bundle import PolicyBundle
-from tasks.term_task import (
-    FigureTerm,
-    HeldCriterion,
-    JointAction,
-    ObservedTerm,
-    RewardTerm,
-    StartsNearHome,
-    TerminationTerm,
-    TermTask,
-    UniformCommand,
-)
+from tasks import term_task
 from tasks.terms import StepState
 
 CPU = torch.device("cpu")
@@ -44,7 +34,7 @@ SHIPPED = Path(__file__).parents[2] / "tasks" / "policies" / "borehole_insertion
 
 
 @spec
-class Turn(TermTask):
+class Turn(term_task.TermTask):
     """Turn the first joint at a wanted speed."""
 
 
@@ -60,37 +50,37 @@ def penalty(state: StepState) -> torch.Tensor:
     return -error(state).abs()
 
 
-def term(function: str, **changes: Any) -> ObservedTerm:
+def term(function: str, **changes: Any) -> term_task.ObservedTerm:
     values: dict[str, Any] = {"samples": 1, "mean": 0.0, "std": 1.0, "noise": 0.0, "bias": 0.0}
-    return ObservedTerm(function=function, **values | changes)
+    return term_task.ObservedTerm(function=function, **values | changes)
 
 
-def figure(function: str, title: str) -> FigureTerm:
-    return FigureTerm(
+def figure(function: str, title: str) -> term_task.FigureTerm:
+    return term_task.FigureTerm(
         function=function, reduce="last", title=title, unit="share", factor=1.0, digits=2
     )
 
 
-TIME = TerminationTerm(function="tasks.terms:time_limit", outcome="time")
-SUCCESS = TerminationTerm(function="tasks.terms:success", outcome="success")
+TIME = term_task.TerminationTerm(function="tasks.terms:time_limit", outcome="time")
+SUCCESS = term_task.TerminationTerm(function="tasks.terms:success", outcome="success")
 
 
 def make(**changes: Any) -> Turn:
     fields: dict[str, Any] = {
         "episode_s": 0.5,
         "scene": None,
-        "start": StartsNearHome(spread=0.2, margin=0.05),
-        "command": {"speed": UniformCommand(lowest=(0.1,), highest=(0.2,))},
+        "start": term_task.StartsNearHome(spread=0.2, margin=0.05),
+        "command": {"speed": term_task.UniformCommand(lowest=(0.1,), highest=(0.2,))},
         "observation": {
             "joints": term("tasks.terms:joint_positions", samples=3, std=0.5),
             "error": term(f"{__name__}:error", mean=1.0, std=2.0),
             "off": None,
         },
         "privileged": {"force": term("tasks.terms:contact_force", std=1000.0)},
-        "action": JointAction(scale=0.5, mask=True),
-        "reward": {"penalty": RewardTerm(function=f"{__name__}:penalty", weight=2.0)},
+        "action": term_task.JointAction(scale=0.5, mask=True),
+        "reward": {"penalty": term_task.RewardTerm(function=f"{__name__}:penalty", weight=2.0)},
         "curriculum": None,
-        "success": HeldCriterion(
+        "success": term_task.HeldCriterion(
             function=f"{__name__}:is_turning", params={"tolerance": 0.01}, share=0.5, after_s=0.1
         ),
         "figures": {
@@ -205,10 +195,10 @@ def test_the_reward_is_the_weighted_sum(machine: Machine, asked: float) -> None:
 def test_exclusive_joints_move_alone_where_their_command_is_the_largest(machine: Machine) -> None:
     exclusive = torch.tensor(machine.is_exclusive)
     output = torch.tensor([[0.2, 0.4, 0.0, 0.0, 0.3], [0.2, 0.4, 0.0, 0.0, -3.0]])
-    found = JointAction(scale=0.5, mask=True).command(output, exclusive)
+    found = term_task.JointAction(scale=0.5, mask=True).command(output, exclusive)
     assert found[0].tolist() == pytest.approx([0.0, 0.2, 0.0, 0.0, 0.0])
     assert found[1].tolist() == pytest.approx([0.1, 0.0, 0.0, 0.0, -1.0])
-    free = JointAction(scale=0.5, mask=False).command(output, exclusive)
+    free = term_task.JointAction(scale=0.5, mask=False).command(output, exclusive)
     assert free[1].tolist() == pytest.approx([0.1, 0.2, 0.0, 0.0, -1.0])
 
 
@@ -231,7 +221,7 @@ def test_its_description_gives_the_same_terms_back() -> None:
     task = make()
     other = make(
         observation={"error": term("tasks.terms:commands")},
-        action=JointAction(scale=1.0, mask=False),
+        action=term_task.JointAction(scale=1.0, mask=False),
     )
     node = describe_task(task).apply_to(describe_spec(other))
     assert build_node(node, "task") == task
