@@ -104,10 +104,7 @@ def _try_nodes(
 def _list_parts(nodes: Mapping[str, Any]) -> Iterator[Any]:
     """Yield each node, of those that hold several parts by name the parts."""
     for node in nodes.values():
-        if isinstance(node, Mapping):
-            yield from _list_parts(node)
-        else:
-            yield node
+        yield from _list_parts(node) if isinstance(node, Mapping) else (node,)
 
 
 def build_node(node: Any, place: str = "") -> Any:
@@ -136,10 +133,8 @@ def build_node(node: Any, place: str = "") -> Any:
 def describe_spec(value: Any) -> Any:
     """Return a spec as a node of the configuration: plain data with the class of each part."""
     if is_dataclass(value) and not isinstance(value, type):
-        node = {TARGET: name_class(value)}
-        for field in fields(value):
-            node[field.name] = describe_spec(getattr(value, field.name))
-        return node
+        own = {field.name: describe_spec(getattr(value, field.name)) for field in fields(value)}
+        return {TARGET: name_class(value)} | own
     if isinstance(value, Mapping):
         return {key: describe_spec(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -150,11 +145,8 @@ def describe_spec(value: Any) -> Any:
 def drop_targets(node: Any, kept: Collection[str] = ()) -> Any:
     """Return plain data without the names of classes, but for those in `kept`."""
     if isinstance(node, Mapping):
-        left = {}
-        for key, value in node.items():
-            if key != TARGET or value in kept:
-                left[key] = drop_targets(value, kept)
-        return left
+        left = {key: value for key, value in node.items() if key != TARGET or value in kept}
+        return {key: drop_targets(value, kept) for key, value in left.items()}
     if isinstance(node, list):
         return [drop_targets(value, kept) for value in node]
     return node
@@ -278,10 +270,15 @@ class _LateImport(MetaPathFinder, Loader):
 
 @contextmanager
 def defer_slow_import() -> Iterator[None]:
-    """Make the use of torch raise `_SlowImport`, but not its import."""
+    """Make the use of torch raise `_SlowImport`, but not its import.
+
+    A package whose import was interrupted is forgotten whole. Otherwise its next import would find
+    its finished modules, and they would not become members of it.
+    """
     if SLOW in sys.modules:
         yield
         return
+    before = set(sys.modules)
     if not any(isinstance(finder, _LateImport) for finder in sys.meta_path):
         sys.meta_path.insert(0, _LateImport())
     _LateImport.is_refusing = True
@@ -290,3 +287,7 @@ def defer_slow_import() -> Iterator[None]:
     finally:
         _LateImport.is_refusing = False
         sys.modules.pop(SLOW, None)
+        for name in sorted(sys.modules.keys() - before):  # a package before its modules
+            package = name.rpartition(".")[0]
+            if package and package not in sys.modules:
+                del sys.modules[name]

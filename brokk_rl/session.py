@@ -9,7 +9,7 @@ import random
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from importlib import metadata
@@ -146,6 +146,8 @@ class Session:
             record["started"] = before.get("started", record["started"])
             record["resumed"] = [*before.get("resumed", []), _format_now()]
         new_folders = list_missing_folders(self.folder)
+        own = (self.folder / RESOLVED, self.folder / RECORD)
+        earlier = {path: path.read_bytes() if path.is_file() else None for path in own}
         write_text(self.folder / RESOLVED, resolved)
         write_json(self.folder / RECORD, record)
         outcome: str | None = "failed"
@@ -157,21 +159,28 @@ class Session:
             raise
         except BaseException as error:
             record["error"] = f"{type(error).__name__}: {error}"
-            if isinstance(error, BrokkError) and not before and self._remove_start(new_folders):
-                outcome = None  # Refused before any work: nothing stays.
+            if isinstance(error, BrokkError) and self._take_back(earlier, new_folders):
+                outcome = None  # Refused before any work.
             raise
         finally:
             if outcome:
                 record |= {"outcome": outcome, "ended": _format_now()}
                 write_json(self.folder / RECORD, record)
 
-    def _remove_start(self, new_folders: Sequence[Path]) -> bool:
-        """Remove what `start` made and return true, unless the run has written something."""
-        if {path.name for path in self.folder.iterdir()} - {RECORD, RESOLVED}:
+    def _take_back(self, earlier: Mapping[Path, bytes | None], new: Sequence[Path]) -> bool:
+        """Leave the folder as `start` found it and return true, unless the run has written something.
+
+        Without that a refused resume would give its options to the next one, by the record.
+        """
+        begun_ns = (self.folder / RECORD).stat().st_mtime_ns
+        others = set(self.folder.rglob("*")) - earlier.keys()
+        if any(path.stat().st_mtime_ns >= begun_ns for path in others):
             return False
-        for name in (RECORD, RESOLVED):
-            (self.folder / name).unlink()
-        remove_empty_folders(new_folders)
+        for path, content in earlier.items():
+            path.unlink()
+            if content is not None:
+                write_bytes(path, content)
+        remove_empty_folders(new)
         return True
 
 
@@ -267,11 +276,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def list_missing_folders(folder: Path) -> list[Path]:
     """Return `folder` and its parents that do not exist yet, the innermost first."""
-    missing = []
-    for path in (folder, *folder.parents):
-        if not path.exists():
-            missing.append(path)
-    return missing
+    return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def remove_empty_folders(folders: Sequence[Path]) -> None:

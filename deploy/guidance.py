@@ -72,13 +72,10 @@ class LeverMap:
         names = machine.joint_names
         by_joint = {lever.joint: lever for lever in machine.levers}
         if missing := [name for name in names if name not in by_joint]:
-            raise ConfigError(
-                f"guidance: no lever for {', '.join(missing)}; add it to the machine's file"
-            )
-        self._axis = np.array(
-            [AXES.index((by_joint[name].side, by_joint[name].axis)) for name in names]
-        )
-        self.full_rad = np.array([by_joint[name].max_angle_rad for name in names])
+            raise ConfigError(f"guidance: no lever for {', '.join(missing)} in the machine's file")
+        levers = [by_joint[name] for name in names]
+        self._axis = np.array([AXES.index((lever.side, lever.axis)) for lever in levers])
+        self.full_rad = np.array([lever.max_angle_rad for lever in levers])
         """Lever angle at full command, `(J,)`."""
         self.axis_full_rad = np.ones(len(AXES))
         """Lever angle at full deflection of each of the four `AXES`; 1 without a joint."""
@@ -91,7 +88,8 @@ class LeverMap:
 
     def levers(self, u: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the angles of the four `AXES` in rad, and the button, for commands `(J,)`."""
-        angles, button = np.zeros(len(AXES)), bool((u[self._exclusive] != 0).any())
+        angles = np.zeros(len(AXES))
+        button = bool((u[self._exclusive] != 0).any())
         for j in np.flatnonzero(self._exclusive == button):
             angles[self._axis[j]] = u[j] * self.full_rad[j]
         return angles, button
@@ -117,15 +115,15 @@ class LeverDisplay:
     def __init__(self, guidance: LeverGuidance, machine: Machine) -> None:
         self._guidance = guidance
         self.map = LeverMap(machine)
-        self._angles_rad, self._button = np.zeros(len(AXES)), False
+        self._angles_rad = np.zeros(len(AXES))
+        self._button = False
 
     def show(self, u: np.ndarray, period_s: float) -> LeverAngles:
         """Return the angles to display for commands `(J,)`, one period after the last ones."""
         wanted = np.where(np.abs(u) < self._guidance.dead_zone, 0.0, u)
         angles_rad, button = self.map.levers(wanted)
         moves = bool(wanted.any())
-        changes = moves and button != self._button
-        if changes and self._angles_rad.any():  # through neutral first
+        if moves and button != self._button and self._angles_rad.any():  # through neutral first
             angles_rad = np.zeros_like(angles_rad)
         elif moves:
             self._button = button
@@ -147,7 +145,8 @@ class HandLag:
 
     def __init__(self, advice: dict[str, Any], machine: Machine) -> None:
         lag = max(float(np.mean(advice["lag_s"])) / machine.period_s, 1e-6)  # 0 would divide
-        self._dead_zone, self._exclusive = float(np.mean(advice["dead_zone"])), machine.is_exclusive
+        self._dead_zone = float(np.mean(advice["dead_zone"]))
+        self._exclusive = machine.is_exclusive
         self._left = math.exp(-1.0 / lag)
         self._mean = lag * (1.0 - self._left)
         self._hand = np.zeros(machine.num_joints)
@@ -159,7 +158,8 @@ class HandLag:
         """
         asked = np.abs(u) + 1e-6 * np.abs(self._hand)
         alone = asked[self._exclusive].max(initial=0.0) > asked[~self._exclusive].max(initial=0.0)
-        held, away = self._exclusive == alone, (self._hand - u) * guiding
+        held = self._exclusive == alone
+        away = (self._hand - u) * guiding
         self._hand = np.where(held, u + away * self._left, 0.0)
         deflection = np.where(held, u + away * self._mean, 0.0)
         opened = (np.abs(deflection) - self._dead_zone).clip(min=0.0) / (1.0 - self._dead_zone)

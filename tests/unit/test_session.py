@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import random
 from pathlib import Path
 
@@ -87,6 +88,27 @@ def test_a_run_that_is_refused_after_it_wrote_something_keeps_it(tmp_path: Path)
     with pytest.raises(ConfigError):
         begin_and_fail()
     assert read_record(tmp_path / "a")["outcome"] == "failed"
+
+
+@pytest.mark.parametrize("writes", [False, True])
+def test_a_resume_that_is_refused_before_it_wrote_anything_leaves_the_record(
+    writes: bool, tmp_path: Path
+) -> None:
+    checkpoint = tmp_path / "model_0.pt"
+    with session(tmp_path).start("a: 1\n", {"overrides": ["a=1"]}):
+        checkpoint.touch()
+    os.utime(checkpoint, (0, 0))  # longer ago than a tick of the clock of files
+
+    def go_on_and_fail() -> None:
+        with session(tmp_path).start("a: 2\n", {"overrides": ["a=2"]}, resume=True):
+            if writes:
+                checkpoint.touch()
+            raise ConfigError("no")
+
+    with pytest.raises(ConfigError):
+        go_on_and_fail()
+    assert read_record(tmp_path)["overrides"] == ["a=2" if writes else "a=1"]
+    assert (tmp_path / "resolved.yaml").read_text() == ("a: 2\n" if writes else "a: 1\n")
 
 
 def test_the_folder_of_a_training_that_was_killed_is_refused_with_the_command_that_goes_on(
