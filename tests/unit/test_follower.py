@@ -108,9 +108,7 @@ BOTH_WAYS = [0.05, 0.5, -0.5, 1.0]
         ({"dead_zone": {"q1": 0.2, "other": 0.0}}, BOTH_WAYS, [0.0, 0.375, -0.375, 1.0]),
     ],
 )
-def test_a_lever_is_deflected_as_worked_by_hand(
-    numbers: dict[str, Any], shown: list[float], expected: list[float], machine: Machine
-) -> None:
+def test_a_lever_follows(numbers: Any, shown: Any, expected: Any, machine: Machine) -> None:
     assert q1(machine, shown, **numbers) == pytest.approx(expected)
 
 
@@ -138,9 +136,7 @@ def test_few_levers_are_moved_at_once_the_largest_first(machine: Machine) -> Non
         assert torch.equal(follow(machine, proposed, joints_at_once=count), expected)
 
 
-def test_a_lever_once_taken_is_kept_for_a_while_as_long_as_it_is_asked_for(
-    machine: Machine,
-) -> None:
+def test_a_lever_once_taken_is_kept_while_it_is_asked_for(machine: Machine) -> None:
     proposed = torch.zeros(8, 5)
     proposed[:, 0], proposed[1:, 2] = 0.4, 0.8
     moved = follow(machine, proposed, joints_at_once=1, grip_s=0.2) != 0
@@ -190,7 +186,7 @@ def test_before_the_valves_of_a_machine_stands_the_same_filter(machine: Machine)
     dead_zone=st.floats(0.0, 0.2), tremor=st.floats(0.0, 0.2), joints_at_once=st.integers(1, 5) | st.none(),
     grip_s=st.floats(0.0, 1.0), seed=st.integers(0, 99),
 )  # fmt: skip
-def test_whoever_it_is_no_joint_moves_beside_an_exclusive_one_and_no_more_than_meant(
+def test_no_joint_moves_beside_an_exclusive_one(
     machine: Machine, seed: int, **numbers: Any
 ) -> None:
     # Not even the proposals are exclusive.
@@ -201,9 +197,7 @@ def test_whoever_it_is_no_joint_moves_beside_an_exclusive_one_and_no_more_than_m
 
 
 @pytest.mark.parametrize("name", NEUTRAL)
-def test_each_part_is_off_at_its_neutral_value_whatever_the_others_are(
-    name: str, machine: Machine
-) -> None:
+def test_each_part_is_off_at_its_neutral_value(name: str, machine: Machine) -> None:
     shipped = option("follower", "person")
     check_follower(replace(shipped, **{name: NEUTRAL[name]}), machine)
     check_follower(person(**{name: getattr(shipped, name)}), machine)
@@ -230,9 +224,7 @@ def test_each_episode_has_another_person_within_the_ranges(machine: Machine) -> 
         ({"joints_at_once": (3, 2)}, "1 or more"),
     ],
 )
-def test_a_person_that_cannot_be_is_refused(
-    numbers: dict[str, Any], message: str, machine: Machine
-) -> None:
+def test_an_impossible_person_is_refused(numbers: Any, message: str, machine: Machine) -> None:
     with pytest.raises(ConfigError, match=message):
         person(**numbers).build(machine, 1, CPU)
 
@@ -274,9 +266,7 @@ def test_a_loop_behind_a_perfect_person_is_the_loop_without_one(machine: Machine
     assert all(torch.equal(value, behind[name]) for name, value in alone.items())
 
 
-def test_histories_and_recordings_hold_what_was_expectedand_not_what_was_proposed(
-    machine: Machine,
-) -> None:
+def test_histories_and_recordings_hold_what_was_given(machine: Machine) -> None:
     loop = loop_with(machine, person(delay_s=0.1, gain=0.5))
     proposed = []
     for _ in range(6):
@@ -295,9 +285,7 @@ def test_histories_and_recordings_hold_what_was_expectedand_not_what_was_propose
     torch.testing.assert_close(loop.task.episode["valve_travel"], travel)
 
 
-def test_the_controller_beside_a_policy_without_advice_keeps_its_own(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_the_controller_beside_an_unadvised_policy_keeps_its_advice(caplog: Any) -> None:
     task = describe_spec(option("task", "borehole_insertion"))
     advice = {"delay_s": 0.3, "lag_s": 0.1, "dead_zone": 0.0, "joints_at_once": 2}
     advice |= {"hold_s": 0.65, "settle_s": 0.5}
