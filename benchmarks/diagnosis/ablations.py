@@ -4,7 +4,8 @@
     python benchmarks/diagnosis/ablations.py <out.json> <exam> --without scatter ageing
 
 An exam is a folder that `brokk mode=exam` made, with its labels; names count strictly. What is switched
-off, and how, stands in `ingredients.yaml`. Called again, the answers in `<out.json>` are kept.
+off, and how, stands in `ingredients.yaml`, with other values of the constants of the decision. These are
+tried on one evidence, without the gates of the proof. Called again, the answers in `<out.json>` are kept.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import argparse
 import json
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from itertools import product
@@ -29,24 +30,72 @@ from rich.progress import track
 from brokk_rl import extensions
 from diagnosis.case import load_case
 from diagnosis.effect_library import load_effects
+from diagnosis.engine.decide import Decider, Decision, EffectFinding, EvidenceTable
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from exam.dataset import open_labels
 
 INGREDIENTS = yaml.safe_load(Path(__file__).with_name("ingredients.yaml").read_text())
+NO_PROOF = "gates of the proof, and the decision alone"
+"""The ingredient without which the other values of its constants are tried."""
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "no ageing": lambda model, numbers: np.zeros(len(model.fitted)),
     "no price": lambda table, _, name: np.full((1, (table.names == name).sum()), -np.inf),
+    "one joint is enough": lambda gains, rest: (sum(gains) + rest, np.inf),
     "one motion": lambda side, flow: np.zeros(side.num_samples, dtype=int),
 }
 
 
-def answer(case: str, machine_name: str, ingredient: str) -> list[Any]:
-    """Return the verdict about a case without an ingredient, the names, and the seconds that it took."""
+class ManyDecisions(Decider):
+    """A decider that is asked with each value of each constant of the decision."""
+
+    def decide(self) -> Decision:
+        """Raise `LookupError` with a decision for each."""
+        found = {NO_PROOF: super().decide()}
+        for name, values in INGREDIENTS[NO_PROOF].items():
+            for value in values:
+                with patch(f"diagnosis.{name}", value):
+                    found[f"{name.split('.')[-1]} {value:g}"] = super().decide()
+        raise LookupError(found)
+
+    def weigh(self, there: Sequence[EffectFinding]) -> EvidenceTable:
+        """Return what everything earns beside effects, which no constant changes."""
+        known = self.__dict__.setdefault("known", {})
+        key = tuple((one.effect, one.joints) for one in there)
+        known[key] = known.get(key) or super().weigh(there)
+        return known[key]
+
+
+def prepare(case: str, machine_name: str) -> ReferenceDiagnosis:
+    """Return the diagnosis of a case."""
     torch.set_num_threads(1)
-    machine, begun = extensions.load_option("machine", machine_name), time.process_time()
+    machine = extensions.load_option("machine", machine_name)
     thresholds = extensions.load_part("thresholds")
     given, kinds = load_case(Path(case), machine), load_effects(machine, None, None)
-    work = ReferenceDiagnosis(given, kinds, thresholds, np.random.default_rng(0))
+    return ReferenceDiagnosis(given, kinds, thresholds, np.random.default_rng(0))
+
+
+def decide_often(case: str, machine_name: str) -> dict[str, list[Any]]:
+    """Return the answers about a case without proof, with each value of each constant of the decision."""
+    work, begun = prepare(case, machine_name), time.process_time()
+    with patch("diagnosis.reference_diagnosis.Decider", ManyDecisions):
+        try:
+            work.search((), lambda name, done: None)
+        except LookupError as told:
+            answers = {}
+            for name, one in told.args[0].items():
+                names = [shown.kind.name for shown in work.detected]
+                names += [work.name(finding) for finding in one.named]
+                verdict = "effects" if names else one.verdict
+                answers[name] = [verdict, names, time.process_time() - begun]
+            return answers
+    raise AssertionError("a decider raises its decisions")
+
+
+def answer(case: str, machine_name: str, ingredient: str) -> dict[str, list[Any]]:
+    """Return the verdict about a case without an ingredient, the names, and the seconds that it took."""
+    if ingredient == NO_PROOF:
+        return decide_often(case, machine_name)
+    work, begun = prepare(case, machine_name), time.process_time()
     with ExitStack() as stack:
         for target, value in INGREDIENTS[ingredient].items():
             if target.endswith("()"):
@@ -55,9 +104,10 @@ def answer(case: str, machine_name: str, ingredient: str) -> list[Any]:
         try:
             found = work.run(lambda name, done: None).answer
         except Exception as error:  # without its ingredient the engine may break in any way
-            return [f"failed: {error!r}", [], time.process_time() - begun]
+            return {ingredient: [f"failed: {error!r}", [], time.process_time() - begun]}
     named = sorted(found.selected, key=lambda one: -one.probability)
-    return [found.verdict, [one.effect for one in named], time.process_time() - begun]
+    names = [one.effect for one in named]
+    return {ingredient: [found.verdict, names, time.process_time() - begun]}
 
 
 def count(labels: Mapping[str, dict[str, Any]], answers: Mapping[str, list[Any]]) -> dict[str, Any]:
@@ -97,14 +147,14 @@ def main() -> None:
         for label in open_labels(exam)[0]["cases"]:
             labels[str(exam / "cases" / label["case"])] = label
     answers = json.loads(given.out.read_text())["answers"] if given.out.is_file() else {}
-    jobs: dict[Future[list[Any]], tuple[str, str]] = {}
+    jobs: dict[Future[dict[str, list[Any]]], str] = {}
     with ProcessPoolExecutor(given.workers) as pool:
         for name, case in product(given.without, labels):
             if case not in answers.get(name, {}):
-                jobs[pool.submit(answer, case, given.machine, name)] = name, case
+                jobs[pool.submit(answer, case, given.machine, name)] = case
         for job in track(as_completed(jobs), total=len(jobs)):
-            name, case = jobs[job]
-            answers.setdefault(name, {})[case] = job.result()
+            for name, one in job.result().items():
+                answers.setdefault(name, {})[jobs[job]] = one
             rows = [{"without": one} | count(labels, answers[one]) for one in answers]
             given.out.write_text(json.dumps({"rows": rows, "answers": answers}, indent=1) + "\n")
 

@@ -8,11 +8,6 @@ Called again, it goes on where it stopped, with more scenes or more options too.
 `table.json`, the error model for `task.noise` into `noise.json`, and pictures of what went wrong,
 with the reasons, into `failures/`. A fixed seed: the same scenes everywhere.
 
-A camera that is set up wrongly; it finds no hole, or one that is off by as much:
-
-    python benchmarks/perception/table.py <out> 'plane_conic slip.focal=1.15'
-    'plane_conic slip.baseline=0.9' --count 6
-
 Rims as drills leave them, before and after:
 
     python benchmarks/perception/table.py <out> plane_conic
@@ -29,13 +24,12 @@ import multiprocessing
 import signal
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import hydra
-import numpy as np
 from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress
@@ -170,7 +164,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     lines = []
     for option in task.options:
         finder = build_finder(option)
-        tally, found = score_frame(finder, set_up_wrongly(option, frame), shot.truth)
+        tally, found = score_frame(finder, frame, shot.truth)
         place = {
             "condition": task.condition,
             "distance_m": task.distance_m,
@@ -182,24 +176,6 @@ def look(task: Task) -> list[dict[str, Any]]:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
             show_failure(task, name, frame, found, finder)
     return lines
-
-
-def set_up_wrongly(option: str, frame: Frame) -> Frame:
-    """Returns the frame of a camera whose focal length or baseline is told wrong by a factor."""
-    factors = {"slip.focal": 1.0, "slip.baseline": 1.0}
-    for one in option.split():
-        if one.startswith("slip."):
-            name, factor = one.split("=")
-            factors[name] = float(factor)
-    if set(factors.values()) == {1.0}:
-        return frame
-    assert frame.baseline_m is not None
-    matrix = frame.camera_matrix.copy()
-    matrix[[0, 1], [0, 1]] *= factors["slip.focal"]
-    # The finder matches the pair, by the wrong numbers.
-    nothing = np.full_like(frame.depth_m, np.nan)
-    baseline_m = factors["slip.baseline"] * frame.baseline_m
-    return replace(frame, depth_m=nothing, camera_matrix=matrix, baseline_m=baseline_m)
 
 
 def show_failure(
@@ -232,7 +208,7 @@ def renderer(condition: str, distance_m: float, render: tuple[str, ...]) -> Fram
 
 @functools.cache
 def build_finder(option: str) -> StagedFinder:
-    name, *overrides = [one for one in option.split() if not one.startswith("slip.")]
+    name, *overrides = option.split()
     return composed(
         "perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides
     ).build()

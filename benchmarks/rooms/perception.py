@@ -25,14 +25,6 @@ def read_holes(folder: Path) -> Table:
     return rows
 
 
-def read_times(folder: Path) -> Table:
-    """Return the milliseconds of each stage."""
-    rows: Table = []
-    for stage, ms in load_json(folder / "speed.json")["ms"].items():
-        rows.append({"stage": stage} | {name: round(value, 1) for name, value in ms.items()})
-    return rows
-
-
 MEASUREMENTS = (
     Measurement(
         name="holes",
@@ -44,14 +36,5 @@ MEASUREMENTS = (
         code=CODE,
         read=read_holes,
         where="two cores, 60 min",
-    ),
-    Measurement(
-        name="stage_times",
-        title="Time of a frame, stage by stage",
-        conditions="A frame of 1080p, without the network, in ms. `processor_time` is the sum on one core, the others are wall time.",
-        commands=("python benchmarks/perception/speed.py {out}/speed.json --count 1",),
-        code=CODE,
-        read=read_times,
-        where="one core, 5 min",
     ),
 )
