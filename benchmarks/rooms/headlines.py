@@ -132,8 +132,8 @@ HEADLINES = (
         Headline(
             f"nobody identified `{plant}`, {STRICT}",
             "unidentified_machine",
-            read_policy(STRICT, plant=plant, policy="trained", follower="filter"),
-            read_policy(STRICT, plant=plant, policy="classical", follower="none"),
+            read_policy(STRICT, plant=plant, policy="trained", follower="filter", episode_s=40),
+            read_policy(STRICT, plant=plant, policy="classical", follower="none", episode_s=40),
         )
         for plant in ("load_sensing", "post_compensated", "open_center")
     ),
