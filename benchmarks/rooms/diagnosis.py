@@ -51,12 +51,12 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "44 simulated machines, answered once. A person drives 23 fields.",
+        "44 simulated machines, answered once. A person drives 27 fields.",
         "exam_plants=valves exam_recording=operators", 44, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "24 simulated cranes, answered once. A person drives 11 fields.",
+        "24 simulated cranes, answered once. A person drives 13 fields.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 24, "diagnosis", "valve",
     ),
     describe_exam(

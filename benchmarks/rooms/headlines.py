@@ -130,9 +130,9 @@ HEADLINES = (
     ),
     *(
         Headline(
-            f"nobody identified `{plant}`, {STRICT}",
+            f"nobody identified `{plant}`, {STRICT} in 20 s",
             "unidentified_machine",
-            read_policy(STRICT, plant=plant, policy="trained", follower="filter", episode_s=40),
+            read_policy(STRICT, plant=plant, policy="trained", follower="filter", episode_s=20),
             read_policy(STRICT, plant=plant, policy="classical", follower="none", episode_s=40),
         )
         for plant in ("load_sensing", "post_compensated", "open_center")
