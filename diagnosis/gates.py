@@ -110,10 +110,9 @@ def _judge_limits(recordings: Sequence[Recording], machine: Machine) -> Gate:
 
 def judge_scatter(growth: float) -> Gate:
     """Return whether tool points follow the encoders by some law of geometry, as on the reference."""
-    text = f"tool points scatter {growth:.1f} times as much about any law of the encoders as on the reference"
     passed = growth <= MAX_SCATTER_GROWTH
-    if not passed:
-        text = f"{text}; look for an encoder that slips or shows coarse steps"
+    advice = "" if passed else "; look for an encoder that slips or shows coarse steps"
+    text = f"tool points scatter {growth:.1f} times as much about any law of the encoders as on the reference{advice}"
     return Gate("encoders_slip", passed, growth, MAX_SCATTER_GROWTH, text)
 
 

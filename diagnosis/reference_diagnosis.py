@@ -122,7 +122,7 @@ class Diagnosis(ABC):
         named = {j for one in proof.findings for j in one.joints}
         told = accept_named_joints(told, name_joints(sorted(named), machine))
         names = {one.kind.name for one in detected} | {self.name(one) for one in proof.findings}
-        if not names & SCATTERING:
+        if geometry.is_tracked(self.case.field, machine) and not names & SCATTERING:
             told.append(gates.judge_scatter(geometry.measure_scatter_growth(self.case, self.kinds)))
         if failed := gates.list_failures(told):
             proof, detected = found.prove_nothing(), []

@@ -201,7 +201,7 @@ class RepairProof(ABC):
         """Return whether the repaired simulator may err less than the one as it was."""
         before, after = self.measure_errors(self.before), self.measure_errors(self.after)
         most = float(np.quantile(before - after, SURE_QUANTILE))
-        text = f"the error is {after[0]:.3g} with the effects, {before[0]:.3g} without"
+        text = f"free runs err by {after[0]:.3g} with the effects, by {before[0]:.3g} without"
         return Gate("reduces_error", most > 0.0, float(after[0]), float(before[0]), text)
 
 

@@ -28,7 +28,7 @@ more, and those named without being there 0.6 at most."""
 STEADY_COMMAND = 0.01
 """Changes of a command over the last second, in all, below which it is steady; chosen by hand."""
 SCATTER_SIGMA = 0.08
-"""Standard deviation of the logarithm of the scatter from day to day; chosen by hand: larger ones miss
+"""Standard deviation of the scatter from day to day, over its size; chosen by hand: larger ones miss
 faint effects, smaller ones add false alarms."""
 MAX_GAIN = 60.0
 """Largest gain in log likelihood that counts; chosen by hand: the statistics are no exact
@@ -40,7 +40,10 @@ FLOAT_NOISE = 2e-6
 
 
 def measure_scatter(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:
-    """Return the logarithm of the scatter of each recording under steady commands, `(P, J)`; NaN where there are too few."""
+    """Return the square root of the scatter of each recording under steady commands, `(P, J)`; NaN where there are too few.
+
+    Coarse steps of a real sensor show now and then only: parts differ tenfold, and logarithms without bound.
+    """
     second = max(2, round(1.0 / machine.period_s))
     found = np.full((len(recordings), machine.num_joints), np.nan)
     for number, recording in enumerate(recordings):
@@ -51,7 +54,7 @@ def measure_scatter(recordings: Sequence[Recording], machine: Machine) -> np.nda
             own = bend[steady[:, j], j]
             if len(own) >= 3 * second:
                 cut = np.minimum(own, 4 * np.sqrt(np.mean(own**2)))
-                found[number, j] = np.log(np.sqrt(np.mean(cut**2)) + FLOAT_NOISE)
+                found[number, j] = np.sqrt(np.sqrt(np.mean(cut**2)) + FLOAT_NOISE)
     return found
 
 
@@ -66,9 +69,9 @@ def find_sensor_noise(
     plain = measure_scatter(reference, machine)
     base = _compute_mean(plain)
     # Where there are too few steady commands nothing is known to be added.
-    added = np.nan_to_num(np.maximum(np.exp(2.0 * seen) - np.exp(2.0 * base), 0.0))
+    added = np.nan_to_num(np.maximum(seen**4 - base**4, 0.0))
     sizes = np.sqrt(added / WHITE_NOISE_FACTOR)
-    noisy = 0.5 * np.log(np.exp(2.0 * plain) + added)
+    noisy = (plain**4 + added) ** 0.25
     variance = _compute_variance(noisy, plain)
     gain = _compute_likelihood(seen, noisy, variance)
     gain = gain - _compute_likelihood(seen, plain, _compute_variance(plain, plain))
@@ -84,8 +87,8 @@ def find_sensor_noise(
     parameters = {}
     for j in np.flatnonzero(mask).tolist():
         # The scatter grows by this share of a growth of the noise.
-        share = added[j] / (np.exp(2.0 * base[j]) + added[j])
-        own = np.sqrt(variance[j]) / share
+        share = added[j] / (base[j] ** 4 + added[j])
+        own = 2.0 * np.sqrt(variance[j]) / seen[j] / share
         factor = np.exp(SIGMAS * np.hypot(own, get_form_error(kind.name)))
         size = float(sizes[j])
         parameters[machine.joint_names[j]] = Estimate(size, (size / factor, size * factor))
@@ -120,7 +123,8 @@ def _compute_variance(drawn: np.ndarray, plain: np.ndarray) -> np.ndarray:
     for values in (drawn, plain):
         # NaN where fewer than two parts have steady commands
         found.append(np.ma.masked_invalid(values).var(0, ddof=1).filled(np.nan))
-    return np.fmax(*found) * (1.0 + 1.0 / len(drawn)) + SCATTER_SIGMA**2
+    usual = 0.5 * SCATTER_SIGMA * _compute_mean(drawn)
+    return np.fmax(*found) * (1.0 + 1.0 / len(drawn)) + usual**2
 
 
 def _compute_mean(values: np.ndarray) -> np.ndarray:

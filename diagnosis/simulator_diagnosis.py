@@ -156,7 +156,7 @@ class SimulatorDiagnosis(Diagnosis):
             proof=proof,
             prove_nothing=prove,
             rivals=[one.summarise() for one in search.rivals],
-            otherwise="no effect makes the errors of the simulator likelier than chance would",
+            otherwise="no effect makes the errors of the simulator likelier and surely reduces those of its free runs",
             evidence={},
         )
 

@@ -90,6 +90,23 @@ def warp_device() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def feed() -> Any:
+    """What a page shows, as the test says."""
+    from browser import Scripted
+
+    return Scripted()
+
+
+@pytest.fixture
+def port(feed: Any) -> Iterator[int]:
+    """The port of a page that shows it."""
+    from browser import served
+
+    with served(feed) as found:
+        yield found
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """A headless Chromium."""

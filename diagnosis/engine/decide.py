@@ -36,6 +36,8 @@ OUTSIDE_NATS = 45.0
 """The cause is unknown where a row outside the library earns so much more than the library."""
 GENERIC_NATS = 30.0
 """The same for flexible columns, which pay for their number."""
+COMMON = ("thermal_drift", "dead_time")
+"""Effects that have one size on all joints, or one on each."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class EffectFinding:
     @property
     def name(self) -> str:
         """Name in the registry."""
-        return "thermal_drift" if self.effect == "thermal_all" else self.effect
+        return self.effect.removesuffix("_all")
 
 
 @dataclass(frozen=True)
@@ -140,14 +142,11 @@ class Decider:
             known.append(EffectFinding("quantisation", tuple(coarse), SHOWN_NATS))
         table = self.weigh(known)
         generic = self._weigh_generic(known)
-        verdict = judge_first(table, generic[1], is_coarse=bool(coarse))
-        named = list(known)
-        if verdict == "effects":
-            named += select(table, lambda found: self.weigh([*known, *found]), known)
-        if verdict == "unknown":
-            named = []
-        elif named:
-            verdict = "effects"
+        verdict = "unknown"
+        named = []
+        if not is_unknown(table, generic[1], is_coarse=bool(coarse)):
+            named = [*known, *select(table, lambda found: self.weigh([*known, *found]), known)]
+            verdict = "effects" if named else "none"
         return Decision(verdict, tuple(named), table, generic)
 
     def weigh(self, there: Sequence[EffectFinding]) -> EvidenceTable:
@@ -161,8 +160,9 @@ class Decider:
             if effect not in self.outside and effect not in SHARED:
                 rows = {j: row for j, row in rows.items() if owners.get(j, ("",))[0] == effect}
             found.append(_add_up(effect, rows))
-        if "thermal_drift" in table:
-            found.append(_add_up("thermal_all", evidence.weigh_common("thermal_drift", joints)))
+        for effect in COMMON:
+            if effect in table:
+                found.append(_add_up(f"{effect}_all", evidence.weigh_common(effect, joints)))
         held = self._find_held(joints) if joints[0].side is evidence.field else None
         if held is not None:
             found.append(held)
@@ -226,10 +226,8 @@ def find_owners(
     return best
 
 
-def judge_first(
-    table: EvidenceTable, generic_nats: float, is_coarse: bool
-) -> Literal["effects", "none", "unknown"]:
-    """Return whether the best effect is named, nothing is there, or the cause is unknown.
+def is_unknown(table: EvidenceTable, generic_nats: float, is_coarse: bool) -> bool:
+    """Return whether something outside the library explains the field much better than the library.
 
     The library explains what its best effect earns, or the best ones of all joints together.
 
@@ -242,9 +240,7 @@ def judge_first(
     odd = max([one.nats for one in table.list_found(outside=True)], default=0.0)
     explained = max(best, table.owned, 0.0)
     is_odd = odd > explained + OUTSIDE_NATS or generic_nats > explained + GENERIC_NATS
-    if is_odd and not is_coarse:
-        return "unknown"
-    return "effects" if best >= LEAST_NATS else "none"
+    return is_odd and not is_coarse
 
 
 def select(
@@ -306,7 +302,7 @@ def add_up_common(gains: Sequence[float], rest: float) -> tuple[float, float]:
 
 def _add_up(effect: str, rows: Mapping[int, JointRow]) -> EffectFinding:
     """Return an effect with the joints that it pays on."""
-    if effect in SHARED or effect == "thermal_all":
+    if effect in SHARED or effect.endswith("_all"):
         gains = [row.gain - row.price for row in rows.values()]
         nats, elsewhere = add_up_common(gains, -JOINT_NATS)
         own = {j: row.row for j, row in rows.items()}

@@ -267,7 +267,8 @@ def _build_target_bank(
         error = _drop_slow(side.q[:, j] - held.simulate(j, row)[0], side)
         lost = side.u[:, j] - held.u[:, j] - _undo_pulse(error, pulse, ratio)
         left = _undo_pulse(known, pulse, ratio)
-        variance = float(np.mean(np.clip(left, *np.quantile(left, (0.01, 0.99))) ** 2))
+        clipped = np.clip(left, *np.quantile(left, (0.01, 0.99)))
+        variance = max(float(np.mean(clipped**2)), 1e-12)
         for d in range(1, num_delays):
             missing = side.u[:, j] - delay_commands(side.u[:, j], np.full(len(bank), d / parts))
             bank[:, d] += (lost * missing - 0.5 * missing**2) / variance

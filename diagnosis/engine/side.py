@@ -304,7 +304,8 @@ def describe_poses(q: np.ndarray, machine: Machine) -> tuple[np.ndarray, np.ndar
     """
     middle = 0.5 * (machine.upper + machine.lower)
     half = 0.5 * (machine.upper - machine.lower)
-    x = ((q - middle) / half).T
+    # A simulated joint may run away; no law of the pose holds beyond half a travel from its ends.
+    x = np.clip((q - middle) / half, -2.0, 2.0).T
     # Legendre's polynomials but for their factor: independent of each other over the travel.
     cubic = x**3 - 0.6 * x
     quartic = x**4 - 6.0 / 7.0 * x**2 + 3.0 / 35.0

@@ -15,7 +15,6 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
 from diagnosis.engine import decide
-from diagnosis.engine.decide import EffectFinding, find_owners
 from diagnosis.engine.evidence import JointRow
 from diagnosis.engine.rows import Row
 from diagnosis.reference_diagnosis import propose_measurement, rank_effects
@@ -69,7 +68,7 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
 def test_rivals_share_what_the_first_name_leaves(machine: Machine) -> None:
     # Of one name in two forms the better one counts.
     earned = (("backlash", 90.0), ("lag", 60.0), ("stiction", 45.0), ("lag", 44.0), ("creep", -1.0))
-    rivals = [EffectFinding(name, (2,), nats) for name, nats in earned]
+    rivals = [decide.EffectFinding(name, (2,), nats) for name, nats in earned]
     found = rank_effects(said().selected, rivals, "effects", machine)
     # Of 0.03, as e to 1, since 15 nats lie between them.
     shares = {"backlash": 0.97, "lag": 0.03 / (1 + np.exp(-1)), "stiction": 0.03 / (1 + np.e)}
@@ -90,7 +89,7 @@ def test_training_takes_the_found_effects_as_they_are(
 
 def weigh(*found: tuple[Any, ...]) -> decide.EvidenceTable:
     """What effects earn: name, nats, a joint, and what other joints show of it."""
-    rows = [EffectFinding(one[0], one[2:3], one[1], elsewhere=one[3]) for one in found]
+    rows = [decide.EffectFinding(one[0], one[2:3], one[1], elsewhere=one[3]) for one in found]
     return decide.EvidenceTable(tuple(rows), 0.0, frozenset({"slip"}))
 
 
@@ -107,11 +106,13 @@ def test_a_cause_is_named_or_unknown_by_what_it_earns() -> None:
     ]  # fmt: skip
     for found, generic, expected in cases:
         table = weigh(*found)
-        assert decide.judge_first(table, generic, is_coarse=False) == expected
+        assert decide.is_unknown(table, generic, is_coarse=False) == (expected == "unknown")
+        if expected != "unknown":
+            assert len(decide.select(table, lambda _: weigh())) == (expected == "effects")
         # the best effects of all joints together explain it, or the steps of a coarse sensor
         owned = replace(table, owned=200.0)
-        assert decide.judge_first(owned, generic, is_coarse=False) != "unknown"
-        assert decide.judge_first(table, generic, is_coarse=True) != "unknown"
+        assert not decide.is_unknown(owned, generic, is_coarse=False)
+        assert not decide.is_unknown(table, generic, is_coarse=True)
     # a common cause counts without its strongest joint
     assert decide.add_up_common([60.0, 5.0, -2.0], -10.0) == (53.0, -7.0)
     assert decide.add_up_common([60.0], -10.0) == (50.0, 50.0)
@@ -121,8 +122,7 @@ def test_a_further_effect_earns_enough_beside_the_first() -> None:
     first = weigh(("lag", 100.0, 1, np.inf), ("creep", 90.0, 1, np.inf))
     # on a joint of the first it earns a share of that; what shows on one joint alone does not hide it
     for nats, joint, expected in ((18.0, 0, 2), (17.9, 0, 1), (30.0, 1, 2), (29.9, 1, 1)):
-        beside = weigh(("jitter", 80.0, 1, 3.0), ("creep", nats, joint, np.inf))
-        tables = iter([beside, weigh()])
+        tables = iter([weigh(("jitter", 80.0, 1, 3.0), ("creep", nats, joint, np.inf)), weigh()])
         found = decide.select(first, lambda _, tables=tables: next(tables))
         assert [one.effect for one in found] == ["lag", "creep"][:expected]
     # what shows by itself is not named again
@@ -136,4 +136,4 @@ def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:
     table = {"lag": lag, "backlash": backlash, "hysteresis": {0: JointRow(row, 99.0, 0.0)}}
     # each pays 6 nats for a joint; backlash pays 6 more on the second one
     expected = {0: ("lag", 44.0), 1: ("backlash", 28.0)}
-    assert find_owners(table, frozenset({"hysteresis"})) == expected
+    assert decide.find_owners(table, frozenset({"hysteresis"})) == expected

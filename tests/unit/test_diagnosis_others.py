@@ -57,8 +57,7 @@ def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine
     kinds = {kind.name: kind for kind in effect_library.load_effects(machine)}
     rough = GapCase(machine, reference, [dataclasses.replace(field, q=q)])
     found = sensors.find_sensor_noise(rough, kinds["sensor_noise"], 8.0, 12.0)
-    assert found is not None
-    assert found.joints.tolist() == [False, True, False, False, False]
+    assert found and found.joints.tolist() == [False, True, False, False, False]
     assert found.parameters["sigma_rad"]["q2"].mean == pytest.approx(1.5e-3, rel=0.15)
     # What shakes a joint after its command has changed is no noise of its sensor.
     shaken, changes = field.q.copy(), np.flatnonzero(np.diff(field.u[:, 2]))
@@ -68,6 +67,14 @@ def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine
     assert sensors.find_sensor_noise(shaking, kinds["sensor_noise"], 8.0, 12.0) is None
     sound = GapCase(machine, reference, [field])
     assert sensors.find_sensor_noise(sound, kinds["sensor_noise"], 8.0, 12.0) is None
+    # Noise is told beside the steps of a sensor that is always coarse, though they show in some parts only.
+    usual = [swept(machine, 100.0, seed, 1e-6) for seed in range(7)]
+    for one in usual[2:]:
+        one.q[:, 1] = np.round(one.q[:, 1] / 0.004) * 0.004
+    coarse = GapCase(machine, usual[:-1], usual[-1:])
+    usual[-1].q[:, 1] += 0.03 * np.random.default_rng(4).standard_normal(len(usual[-1].q))
+    found = sensors.find_sensor_noise(coarse, kinds["sensor_noise"], 4.0, 12.0)
+    assert found and found.parameters["sigma_rad"]["q2"].mean == pytest.approx(0.03, rel=0.1)
 
 
 def tracked(

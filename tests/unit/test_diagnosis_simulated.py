@@ -284,17 +284,18 @@ def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "effect", "number", "size"),
+    ("changes", "effect", "joints", "number", "size"),
     [
-        ({"delay_s": (0.3, 0.45)}, "dead_time", "dead_time_s", 0.15),
-        ({"gain": (1.0, 0.8)}, "flow_gain", "gain", 0.8),
+        ({"delay_s": (0.3, 0.45)}, "dead_time", ("q4",), "dead_time_s", 0.15),
+        ({"delay_s": (0.45, 0.45)}, "dead_time", ("q3", "q4"), "dead_time_s", 0.15),
+        ({"gain": (1.0, 0.8)}, "flow_gain", ("q4",), "gain", 0.8),
     ],
 )
 def test_a_changed_joint_is_named_sized_and_proven(
-    two_joints: Machine, changes: dict[str, Any], effect: str, number: str, size: float
+    two_joints: Machine, changes: Any, effect: str, joints: Any, number: str, size: float
 ) -> None:
     answer = diagnose(make_case(two_joints, **changes))
-    assert [(one.effect, one.joints) for one in answer.selected] == [(effect, ("q4",))]
+    assert [(one.effect, one.joints) for one in answer.selected] == [(effect, joints)]
     estimate = answer.selected[0].parameters[number]["q4"]
     assert estimate.mean == pytest.approx(size, rel=0.1)
     assert estimate.ci95[0] <= size <= estimate.ci95[1]

@@ -37,17 +37,6 @@ FAILED = RecordingStatus(on=False, seconds=0.0, dropped=0, failed=True)
 
 
 @pytest.fixture
-def feed() -> Scripted:
-    return Scripted()
-
-
-@pytest.fixture
-def port(feed: Scripted) -> Iterator[int]:
-    with served(feed) as found:
-        yield found
-
-
-@pytest.fixture
 def opened(browser: Any) -> Iterator[Callable[..., Any]]:
     with opening(browser, "() => window.measured.allowed !== null") as found:
         yield found

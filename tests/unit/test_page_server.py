@@ -5,27 +5,14 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Iterator
 from typing import Any
 
-import pytest
 from browser import TOKEN, Scripted, served
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from deploy.page.connections import UNPROVEN, WATCHING
 from deploy.page.protocol import PageState
-
-
-@pytest.fixture
-def feed() -> Scripted:
-    return Scripted()
-
-
-@pytest.fixture
-def port(feed: Scripted) -> Iterator[int]:
-    with served(feed) as found:
-        yield found
 
 
 def talk(
