@@ -50,7 +50,7 @@ class EffectFinding:
         nats: Gain less all prices.
         rows: Its row on each of them; empty for held commands and direct findings.
         hold: The course of held commands.
-        elsewhere: What an effect of the whole machine earns without its strongest joint, nats.
+        elsewhere: What an effect of the whole machine earns on other joints than its strongest one, nats.
     """
 
     effect: str
@@ -142,12 +142,10 @@ class Decider:
             known.append(EffectFinding("quantisation", tuple(coarse), SHOWN_NATS))
         table = self.weigh(known)
         generic = self._weigh_generic(known)
-        verdict = "unknown"
-        named = []
-        if not is_unknown(table, generic[1], is_coarse=bool(coarse)):
-            named = [*known, *select(table, lambda found: self.weigh([*known, *found]), known)]
-            verdict = "effects" if named else "none"
-        return Decision(verdict, tuple(named), table, generic)
+        if is_unknown(table, generic[1], is_coarse=bool(coarse)):
+            return Decision("unknown", (), table, generic)
+        named = [*known, *select(table, lambda found: self.weigh([*known, *found]), known)]
+        return Decision("effects" if named else "none", tuple(named), table, generic)
 
     def weigh(self, there: Sequence[EffectFinding]) -> EvidenceTable:
         """Return what everything earns beside effects that are there already."""
@@ -287,17 +285,19 @@ def apply_findings(
 
 
 def add_up_common(gains: Sequence[float], rest: float) -> tuple[float, float]:
-    """Return what an effect of the whole machine earns, nats, and what is left of it without its strongest joint.
+    """Return what an effect of the whole machine earns, nats, and the part of it that other joints than the strongest show.
 
     A common cause fits whatever one joint leaves: of 143 practice cases 44 have one of 18 nats or more that shows
     on one joint alone, and on two of these it is there. A machine with one joint shows no more than that one.
 
     Args:
         gains: What it earns on each joint, nats.
-        rest: What belongs to none of them: prior and costs.
+        rest: What belongs to none of them, prior and costs; the joints bear it in proportion to their gains.
     """
-    total = sum(gains) + rest
-    return total, total - max(gains) if len(gains) > 1 else total
+    gained = sum(gains)
+    others = gained - max(gains) if len(gains) > 1 else gained
+    total = gained + rest
+    return total, total * others / gained if gained > 0.0 else total
 
 
 def _add_up(effect: str, rows: Mapping[int, JointRow]) -> EffectFinding:

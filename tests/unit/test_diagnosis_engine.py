@@ -113,8 +113,8 @@ def test_a_cause_is_named_or_unknown_by_what_it_earns() -> None:
         owned = replace(table, owned=200.0)
         assert not decide.is_unknown(owned, generic, is_coarse=False)
         assert not decide.is_unknown(table, generic, is_coarse=True)
-    # a common cause counts without its strongest joint
-    assert decide.add_up_common([60.0, 5.0, -2.0], -10.0) == (53.0, -7.0)
+    # a common cause counts by what other joints than the strongest show of it
+    assert decide.add_up_common([60.0, 25.0, 15.0], -20.0) == (80.0, 32.0)
     assert decide.add_up_common([60.0], -10.0) == (50.0, 50.0)
 
 
