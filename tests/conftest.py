@@ -92,7 +92,7 @@ def warp_device() -> Iterator[None]:
 
 @pytest.fixture
 def feed() -> Any:
-    """What a page shows, as the test says."""
+    """A feed of the page that the test fills."""
     from browser import Scripted
 
     return Scripted()
@@ -100,7 +100,7 @@ def feed() -> Any:
 
 @pytest.fixture
 def port(feed: Any) -> Iterator[int]:
-    """The port of a page that shows it."""
+    """The port of a page that shows this feed."""
     from browser import served
 
     with served(feed) as found:

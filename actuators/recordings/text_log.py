@@ -36,7 +36,7 @@ FIRST_ROWS = 3
 COMMAS = {
     ",": "; if the comma is both delimiter and decimal sign, export again with a decimal point, or with ; or tab between the cells"
 }
-"""What else may be wrong with a delimiter."""
+"""Further advice in the error about a delimiter, by that delimiter."""
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
 

@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "44 simulated machines, answered once. A person drives 27 fields.",
+        "44 simulated machines. A script opened the labels early; the code was fixed. A person drives 27 fields.",
         "exam_plants=valves exam_recording=operators", 44, "diagnosis", "valve",
     ),
     describe_exam(

@@ -87,7 +87,7 @@ MEASUREMENTS = (
         name="unidentified_machine",
         title="A policy for machines that nobody identified",
         conditions="It learned in [two parts](operator.md#the-simulated-person), 1,282 and 1,540 million steps, one seed. The first was chosen from seven trainings by the three circuits, to which nothing was fitted; the second, and the filter, on other plants. "
-        "It learned episodes of 40 s, and is too slow for some machines in 20 s. Baseline: the controller without the filter, from the same starts.",
+        "It learned episodes of 40 s. Baseline: the controller without the filter, from the same starts.",
         commands=tuple(
             command
             for follower, episode_s in TRIALS

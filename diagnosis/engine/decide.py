@@ -68,7 +68,7 @@ class EffectFinding:
 
 @dataclass(frozen=True)
 class EvidenceTable:
-    """What everything earns on the field beside the effects that are there already.
+    """Gains of all effects and rows on the field, beside the effects that are there already.
 
     Attributes:
         found: Effects and rows outside the library, the best first.

@@ -88,7 +88,7 @@ def test_training_takes_the_found_effects_as_they_are(
 
 
 def weigh(*found: tuple[Any, ...]) -> decide.EvidenceTable:
-    """What effects earn: name, nats, a joint, and what other joints show of it."""
+    """Return a table of effects: name, gain in nats, a joint, and the part of the gain on other joints."""
     rows = [decide.EffectFinding(one[0], one[2:3], one[1], elsewhere=one[3]) for one in found]
     return decide.EvidenceTable(tuple(rows), 0.0, frozenset({"slip"}))
 
