@@ -16,7 +16,6 @@ import torch
 from scipy.signal import savgol_filter
 
 from actuators.models.linear import Hold
-from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import examine_recordings
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
@@ -88,13 +87,11 @@ class Diagnosis(ABC):
     Attributes:
         case: The recordings.
         kinds: The library.
-        thresholds: When a stretch of a recording is worth telling.
         generator: Draws bootstraps.
     """
 
     case: GapCase
     kinds: Sequence[EffectType]
-    thresholds: InspectionThresholds
     generator: np.random.Generator
 
     @abstractmethod
@@ -113,8 +110,8 @@ class Diagnosis(ABC):
         """Return the outcome; `tell` receives the name and the progress of each step."""
         machine = self.case.machine
         tell("recordings", 0.02)
-        remarks = examine_recordings(self.case.field, machine, self.thresholds)
-        known = examine_recordings(self.case.reference, machine, self.thresholds)
+        remarks = examine_recordings(self.case.field, machine)
+        known = examine_recordings(self.case.reference, machine)
         told = gates.judge_recordings(remarks, known, self.case.field, self.case.reference, machine)
         found = self.search(told, tell)
         tell("sizes and proof", 0.9)

@@ -14,9 +14,7 @@ from composed import option
 from matplotlib.figure import Figure
 from quick_compose import compose_once
 
-from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl import cli, plot
-from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 
 compose_once()
@@ -59,12 +57,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def machine() -> Machine:
     """The default machine."""
     return option("machine", "brokk170")
-
-
-@pytest.fixture(scope="session")
-def thresholds() -> InspectionThresholds:
-    """Limits from which a stretch of a recording is worth telling."""
-    return load_part("thresholds")
 
 
 @pytest.fixture(scope="session")

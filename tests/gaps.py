@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from motion import make_recording
 
-from brokk_rl import extensions
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library
@@ -41,5 +40,5 @@ def diagnose(case: GapCase) -> Answer:
     """Returns the answer of the engine."""
     kinds = effect_library.load_effects(case.machine)
     generator = np.random.default_rng(0)
-    work = ReferenceDiagnosis(case, kinds, extensions.load_part("thresholds"), generator)
+    work = ReferenceDiagnosis(case, kinds, generator)
     return work.run(lambda *_: None).answer

@@ -1,9 +1,8 @@
-"""Report of a plan: `plan.json` and `plan.png`."""
+"""A plan as it would be played: its picture, and the segments that find no time."""
 
 from collections.abc import Iterable, Sequence
 from itertools import cycle, pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +15,8 @@ from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, draw_grid, make_figure, sa
 
 INCHES_A_ROW, STRIP_INCHES, WIDTH_INCHES = 1.65, 1.0, 17.0
 """Height of a joint and of the strip of segments, and width of the picture; chosen by hand."""
+CUT = 0.2
+"""Part of a program that may be missing at the end of a run without a warning."""
 LETTER = 0.0075
 """Width of a letter of a segment's name, as a part of the time axis."""
 
@@ -44,37 +45,16 @@ class PlanTrack:
             self.extra[name] = np.stack([sample.extra[name] for sample in kept], 1)
 
 
-def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> dict[str, Any]:
-    """Return `plan.json`: the segments of each run with predicted times."""
-    return {
-        "schema": 1,
-        "machine": machine.name,
-        "excitation": list(plan.names),
-        "run_s": plan.run_s,
-        "num_runs": len(plan.runs),
-        "predicted": "by a nominal machine: dead time, full speed times command",
-        "runs": [_summarise_run(plan, track, n, machine) for n in range(len(plan.runs))],
-    }
-
-
-def _summarise_run(plan: ExcitationPlan, track: PlanTrack, n: int, machine: Machine) -> list[Any]:
-    """Return the segments of one run; one that finds no time has no `start_s`."""
-    period_s, inside, found = machine.period_s, INSIDE[track.phase[:, n]], []
-    for i, segment in enumerate(plan.runs[n]):
-        rows = np.flatnonzero((track.segment[:, n] == i) & inside)
-        entry = {
-            "name": segment.name,
-            "program_s": _round_ms(len(segment.u) * period_s),
-            "start_s": _round_ms(track.t_s[rows[0]]) if len(rows) else None,
-            "end_s": _round_ms(track.t_s[rows[-1]] + period_s) if len(rows) else None,
-            "cut_s": _round_ms((len(segment.u) - len(rows)) * period_s),
-        }
-        found.append(entry)
-    return found
-
-
-def _round_ms(value_s: Any) -> float:
-    return round(float(value_s), 3)
+def list_cut_segments(plan: ExcitationPlan, track: PlanTrack) -> list[str]:
+    """Return the names of the segments of which more than `CUT` finds no time in some of the runs."""
+    found = set()
+    for n, segments in enumerate(plan.runs):
+        inside = INSIDE[track.phase[:, n]]
+        for i, segment in enumerate(segments):
+            num_played = np.count_nonzero((track.segment[:, n] == i) & inside)
+            if num_played < (1.0 - CUT) * len(segment.u):
+                found.add(segment.name)
+    return sorted(found)
 
 
 def draw_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine, path: Path) -> None:

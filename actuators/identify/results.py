@@ -23,7 +23,7 @@ from actuators import open_loop
 from actuators.contracts import ActuatorFit, FitTask
 from actuators.identify import dead_time
 from actuators.identify.scores import FreeRunScores, average_joints
-from actuators.recordings.split import list_sources, measure_commanded_s
+from actuators.recordings.split import list_sources
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -35,13 +35,6 @@ HOLD, LINEAR = "hold", "arx"
 """The baselines that stand beside every model."""
 HEADLINE_S = 5.0
 """The horizon by which models are compared, where the recordings are long enough."""
-THIN_S = 120.0
-"""A joint that is commanded for less than this in the recordings to fit to is too little
-excited."""
-THIN_TRAVEL = 0.4
-"""So is one that saw less than this part of its travel, …"""
-THIN_COMMAND = 0.5
-"""… or no command larger than this both ways."""
 FEW_RUNS = 6
 """Runs to judge by below which an interval from resampling them is coarse."""
 DELAY_TOLERANCE_S = 0.05
@@ -67,11 +60,10 @@ def write_verdict(result: Mapping[str, Any], machine: Machine) -> list[VerdictSe
     overall = result["overall"][result["model"]]
     given = [horizon for horizon, value in overall.items() if value is not None]
     horizon = f"{HEADLINE_S:g}" if f"{HEADLINE_S:g}" in given else given[-1]
-    warnings = [*_list_excitation_doubts(result), *_list_test_doubts(result)]
     return [
         _judge_comparison(result, horizon),
         *_judge_dead_time(result, machine),
-        *(VerdictSentence("warn", text) for text in warnings),
+        *(VerdictSentence("warn", text) for text in _list_test_doubts(result)),
     ]
 
 
@@ -131,28 +123,8 @@ def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[Verdic
     return found
 
 
-def _list_excitation_doubts(result: Mapping[str, Any]) -> Iterator[str]:
-    for joint, facts in result["data"]["excitation"].items():
-        lacks = []
-        if facts["commanded_s"] < THIN_S:
-            lacks.append(f"commanded for {facts['commanded_s']:.0f} s only")
-        if facts["travel"] < THIN_TRAVEL:
-            lacks.append(f"seen over {100 * facts['travel']:.0f} % of its travel")
-        low, high = facts["largest_command"]
-        if high < THIN_COMMAND:
-            lacks.append(f"no command beyond +{high:.2g}")
-        if -low < THIN_COMMAND:
-            lacks.append(f"no command beyond -{-low:.2g}")
-        if lacks:
-            yield f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model."
-
-
 def _list_test_doubts(result: Mapping[str, Any]) -> Iterator[str]:
-    data = result["data"]
-    idle = [joint for joint, facts in data["excitation"].items() if facts["judged_s"] <= 0]
-    if idle:
-        yield f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing."
-    runs = data["test"]["runs"]
+    runs = result["data"]["test"]["runs"]
     if runs < FEW_RUNS:
         yield f"Judged by {runs} runs: intervals from so few are coarse, most likely too narrow."
     for horizon, reason in result["missing"].items():
@@ -196,7 +168,6 @@ def build_results(
     kept = last.fitted[model]
     result: dict[str, Any] = {
         "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
-        "fold_seconds": [round(stage.fitted[model].seconds, 2) for stage in stages[:-1]],
     }  # fmt: skip
     result |= _tabulate_errors(scores, model, horizons_s)
     longest_s = open_loop.find_longest_horizon_s(judged, machine)
@@ -204,7 +175,7 @@ def build_results(
     reason = f"the longest recording judged by leaves {longest_s:.1f} s after the {before_s:.2f} s before a free run"
     result["missing"] = {f"{h:g}": reason for h in HORIZONS_S if h not in horizons_s}
     result["delay_s"] = {joint: delay and delay.plain() for joint, delay in delays.items()}
-    result["data"] = _describe_data(stages, fitted_to, judged, scores)
+    result["data"] = _describe_data(stages, judged, len(cut.q))
     result["verdict"] = [asdict(sentence) for sentence in write_verdict(result, machine)]
     return result, scores
 
@@ -233,36 +204,21 @@ def _tabulate_errors(
 
 
 def _describe_data(
-    stages: Sequence[FitStage],
-    fitted_to: Sequence[Recording],
-    judged: Sequence[Recording],
-    scores: FreeRunScores,
+    stages: Sequence[FitStage], judged: Sequence[Recording], num_windows: int
 ) -> dict[str, Any]:
-    """Return facts on the data: amount, runs of each part, excitation of each joint."""
+    """Return facts on the data: amount, and runs of each part."""
     last = stages[-1]
-    u = np.concatenate([recording.u for recording in fitted_to])
-    q = np.concatenate([recording.q for recording in fitted_to])
-    moved_s, judged_s = measure_commanded_s(fitted_to), measure_commanded_s(judged)
     tested, runs = set(), []
     for stage in stages:
         tested.update(stage.test)
         parts = {part: list(getattr(stage, part)) for part in ("train", "validation", "test")}
         runs.append({"stage": stage.name or "fit"} | parts)
-    excitation = {}
-    for j, joint in enumerate(scores.machine.joint_names):
-        excitation[joint] = {
-            "commanded_s": float(moved_s[j]),
-            "judged_s": float(judged_s[j]),
-            "travel": float(np.ptp(q[:, j]) / scores.travel[j]),
-            "largest_command": [float(min(0.0, u[:, j].min())), float(max(0.0, u[:, j].max()))],
-        }
     return {
         "train": _count_recordings(list_recordings(last.train), len(last.train)),
         "validation": _count_recordings(list_recordings(last.validation), len(last.validation)),
         "test": _count_recordings(judged, len(tested)),
-        "windows": len(scores.cut.q),
+        "windows": num_windows,
         "runs": runs,
-        "excitation": excitation,
     }
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 
 from actuators.excite import plan_report
@@ -18,14 +17,12 @@ from brokk_rl.contracts.link import Connection
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import RATE_TOLERANCE
-from brokk_rl.session import Session, write_json
+from brokk_rl.session import Session
 from brokk_rl.spec import Count, Positive, spec
 
 log = logging.getLogger(__name__)
 
 FOLDER = "recordings"
-CUT = 0.2
-"""Part of a program that may be missing at the end of a run without a warning."""
 
 
 @spec
@@ -38,7 +35,7 @@ class Collection:
         file_minutes: A run is cut into files of this length.
         flush_s: The file that grows is written again after this time, so that even a power failure
             costs no more.
-        only_plan: Stop after `plan.png` and `plan.json`, before anything moves.
+        only_plan: Stop after `plan.png`, before anything moves.
         approach: How start poses are taken up.
         guards: Bounds that no program can exceed.
     """
@@ -66,7 +63,7 @@ class Collect:
     collect: Collection
 
     def run(self) -> None:
-        """Write `plan.png`, `plan.json` and `recordings/<run>_<part>.parquet` into the run folder.
+        """Write `plan.png` and `recordings/<run>_<part>.parquet` into the run folder.
 
         Raises:
             ConfigError: the plan finds no room in a run.
@@ -104,19 +101,15 @@ class Collect:
         return PlanPlayer(plan, self.machine, self.collect.approach, self.collect.guards)
 
     def _show(self, plan: ExcitationPlan) -> None:
-        """Try the plan out on a nominal machine; writes picture and figures."""
+        """Try the plan out on a nominal machine and draw it."""
         machine, count = self.machine, self.collect.num_runs
         link = NominalLink(machine, count)
         track = PlanTrack(drive(link, self._runner(plan), machine, count, plan.run_s))
-        summary = plan_report.summarise_plan(plan, track, machine)
-        write_json(self.session.folder / "plan.json", summary)
         path = self.session.folder / "plan.png"
         plan_report.draw_plan(plan, track, machine, path)
-        entries = chain.from_iterable(summary["runs"])
-        unplayed = {one["name"] for one in entries if one["cut_s"] > CUT * one["program_s"]}
-        if unplayed:
+        if unplayed := plan_report.list_cut_segments(plan, track):
             text = "plan: no time for %s in some of the runs; raise collect.run_minutes"
-            log.warning(text, ", ".join(sorted(unplayed)))
+            log.warning(text, ", ".join(unplayed))
         text = "plan: %d segments in the first of %d runs; see %s"
         log.info(text, len(plan.runs[0]), count, path)
 

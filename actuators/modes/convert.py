@@ -7,7 +7,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
-from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.log_files import find_logs, name_log
 from actuators.recordings.recording_checks import examine_recordings, tabulate_remarks
 from brokk_rl import record
@@ -60,7 +59,6 @@ class Convert:
     session: Session
     machine: Machine
     reader: LogReader
-    thresholds: InspectionThresholds
     convert: Conversion
 
     def run(self) -> None:
@@ -85,7 +83,7 @@ class Convert:
         count = sum(map(len, pieces.values()))
         log.info("%d recordings of %d logs in %s", count, len(pieces), folder)
         recordings = list(chain.from_iterable(pieces.values()))
-        remarks = examine_recordings(recordings, self.machine, self.thresholds)
+        remarks = examine_recordings(recordings, self.machine)
         head, rows = tabulate_remarks(remarks)
         if rows:
             print_table(head, rows, "look at these first")

@@ -11,7 +11,7 @@ import pandas as pd
 
 from actuators.identify import dead_time
 from actuators.motion_panels import draw_joint_track
-from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
+from actuators.recordings.inspection import Inspection, inspect_recording
 from actuators.recordings.recording_checks import REMARKS, list_remarks, tabulate_remarks
 from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
@@ -77,18 +77,10 @@ class InspectedFile:
     def plain(self) -> dict[str, Any]:
         """Return it as plain JSON data."""
         seen = self.inspection
-        recording = seen.recording if seen else None
-        metadata = recording.metadata if recording else {}
-        oil_c = recording.extra.get("oil_c", np.empty(0)) if recording else np.empty(0)
-        oil_c = oil_c[np.isfinite(oil_c)]
         return {
             "path": str(self.path),
-            "run": recording.run if recording else None,
-            "num_samples": recording.num_samples if recording else None,
-            "source": metadata.get("source"),
-            "created": metadata.get("created"),
-            "resampled_from": metadata.get("resampled_from"),
-            "oil_c": [float(oil_c.min()), float(oil_c.max())] if len(oil_c) else None,
+            "run": seen.recording.run if seen else None,
+            "num_samples": seen.recording.num_samples if seen else None,
             "breaches": [asdict(breach) for breach in self.breaches],
             "timing": seen.timing if seen else None,
             "joints": seen.joints if seen else None,
@@ -103,7 +95,6 @@ class Inspect:
     session: Session
     machine: Machine
     inspect: InspectionRequest
-    thresholds: InspectionThresholds
 
     def run(self) -> None:
         """Write `inspection.json`, `inspection.html` and pictures, and print the tables.
@@ -119,7 +110,7 @@ class Inspect:
         sound = [
             one.inspection.recording for one in inspected if one.inspection and not one.breaches
         ]
-        remarks = list_remarks(known, self.machine, self.thresholds)
+        remarks = list_remarks(known, self.machine)
         result = {
             "schema": 1,
             "machine": self.machine.name,
@@ -158,7 +149,7 @@ class Inspect:
         recording, breaches = record.examine_recording(path, self.machine)
         found = None
         if recording is not None and recording.num_samples > 1:
-            found = inspect_recording(recording, self.machine, self.thresholds)
+            found = inspect_recording(recording, self.machine)
         return InspectedFile(path, breaches, found)
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:

@@ -253,11 +253,6 @@ class ColumnMap:
                 "run": signals.run.name,
                 "fingerprint": record.format_fingerprint(machine),
             }
-            clock_s = positions[0].t_s
-            period_s = np.diff(clock_s[(clock_s >= begin_s) & (clock_s <= end_s)])
-            if len(period_s):
-                periods = f"periods of {period_s.min():.3f} to {period_s.max():.3f} s"
-                metadata["resampled_from"] = f"{1.0 / np.median(period_s):.1f} Hz, {periods}"
             found.append(replace(made, extra=extra, metadata=metadata))
         return found
 

@@ -6,17 +6,15 @@ Axes: `T` time, `J` joints. Recordings may be broken: missing values are NaN and
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from annotated_types import Ge
 
 from actuators.recordings.signal_checks import LONGEST_LAG_S, find_jumps, find_spikes, find_wrap
+from actuators.recordings.split import COMMANDED
 from brokk_rl.commands import read_targets, view_recordings
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
-from brokk_rl.spec import Share, spec
 
 FAST_SHARE = 0.2
 """Speed, of full speed, from which motion without command is no sinking load but an input that is
@@ -52,38 +50,22 @@ MIN_SATURATED_ROWS = 10
 hand: half a second at 20 Hz."""
 
 
-@spec
-class InspectionThresholds:
-    """Thresholds from which on a stretch of a recording is reported.
-
-    Attributes:
-        commanded: A smaller command counts as none. A target counts as held where it stays the same.
-        driving: A larger command should move any joint: beyond the dead band.
-        still: A smaller speed counts as rest, as a part of the joint's full speed.
-        settle_s: Time beyond the dead time that a joint takes to start or to stop.
-        unanswered_s: Command without motion is told from this duration on.
-        drift: Motion without command is told from this part of the travel on, within one stretch
-            without command.
-        equal_rows: Equal samples in a row that a sensor with noise does not show.
-        steps: A change of so many steps of the sensor, or of its noise, cannot hide in it.
-        at_limit: A joint so close to its limit, as a part of its travel, may stand at its stop.
-    """
-
-    commanded: Share
-    driving: Share
-    still: float
-    settle_s: float
-    unanswered_s: float
-    drift: float
-    equal_rows: Annotated[int, Ge(2)]
-    steps: float
-    at_limit: float
-
-    def check(self) -> None:
-        if self.commanded > self.driving:
-            raise ConfigError(
-                f"commanded: expected driving={self.driving} or less, got {self.commanded}"
-            )
+DRIVING = 0.3
+"""Command that should move any joint: above the widest dead band expected, 0.22 of stroke."""
+STILL = 0.05
+"""Speed, of full speed, below which a joint rests; chosen by hand, well above the noise of the encoders."""
+SETTLE_S = 0.3
+"""Time beyond the dead time that a joint takes to start or to stop: spool, oil and structure."""
+UNANSWERED_S = 0.5
+"""Command without motion is told from this duration on; chosen by hand: shorter ones are mostly late starts."""
+DRIFT = 0.01
+"""Part of the travel from which motion within one stretch without command is told; chosen by hand."""
+EQUAL_ROWS = 10
+"""Equal samples in a row that a sensor with noise does not show, half a second at 20 Hz; chosen by hand."""
+STEPS = 4.0
+"""A change of so many steps of a sensor, or of its noise, cannot hide in it; chosen by hand, few false alarms."""
+AT_LIMIT = 0.01
+"""A joint so close to its limit, as a part of its travel, may stand at its stop; chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -128,13 +110,11 @@ class Inspection:
     findings: list[RecordingFinding]
 
 
-def inspect_recording(
-    recording: Recording, machine: Machine, thresholds: InspectionThresholds
-) -> Inspection:
+def inspect_recording(recording: Recording, machine: Machine) -> Inspection:
     """Return the contents of a recording of `machine`."""
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
-        scan = _RecordingScan(recording, machine, thresholds)
+        scan = _RecordingScan(recording, machine)
         findings = sorted(scan.find_all(), key=lambda finding: finding.row)
         return Inspection(recording, scan.viewed, scan.timing(), scan.joints(), findings)
 
@@ -142,10 +122,8 @@ def inspect_recording(
 class _RecordingScan:
     """Scan of one recording: the quantities that all findings use."""
 
-    def __init__(
-        self, recording: Recording, machine: Machine, thresholds: InspectionThresholds
-    ) -> None:
-        self._machine, self._limits = machine, thresholds
+    def __init__(self, recording: Recording, machine: Machine) -> None:
+        self._machine = machine
         (self.viewed,) = view_recordings([recording], machine)
         self._t_s, self._u = self.viewed.t_s, self.viewed.u.astype(np.float64)
         self._q = self.viewed.q.astype(np.float64)
@@ -158,14 +136,14 @@ class _RecordingScan:
         self._reach = max(1, round(0.15 / self._period_s))
         self._after, self._before = self._speed(self._reach, 0), self._speed(0, self._reach)
         self._v = np.nanmean([self._after, self._before], 0)
-        self._is_moving = np.abs(self._v) > thresholds.still * machine.max_speed
-        self._lead = round((machine.dead_time_s + thresholds.settle_s) / self._period_s)
-        least = HELD_TARGET if machine.interface == "position" else thresholds.commanded
+        self._is_moving = np.abs(self._v) > STILL * machine.max_speed
+        self._lead = round((machine.dead_time_s + SETTLE_S) / self._period_s)
+        least = HELD_TARGET if machine.interface == "position" else COMMANDED
         self._idle = np.stack([find_held(np.abs(u) < least, self._lead) for u in self._u.T], 1)
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
         self._step = np.array([estimate_step(q) for q in self._q.T])
         grain = np.fmax(np.nan_to_num(self._step), np.nan_to_num(self._noise))
-        self._visible = thresholds.steps * grain
+        self._visible = STEPS * grain
 
     def timing(self) -> dict[str, float | None]:
         """Return duration, rate and jitter."""
@@ -183,14 +161,14 @@ class _RecordingScan:
     def joints(self) -> dict[str, dict[str, float | None]]:
         """Return the figures of each joint."""
         size, found = np.abs(self._u), {}
-        margin = self._limits.at_limit * self._travel
+        margin = AT_LIMIT * self._travel
         low, high = self._machine.lower + margin, self._machine.upper - margin
         at_limit = (self._q < low) | (self._q > high)
         for j, name in enumerate(self._machine.joint_names):
             figures = {
                 "lowest": np.nanmin(self._q[:, j]),
                 "highest": np.nanmax(self._q[:, j]),
-                "commanded": np.mean(size[:, j] > self._limits.commanded),
+                "commanded": np.mean(size[:, j] > COMMANDED),
                 "full_command": np.mean(size[:, j] > 0.99),
                 "moving": np.mean(self._is_moving[:, j]),
                 "at_limit": np.mean(at_limit[:, j]),
@@ -222,7 +200,7 @@ class _RecordingScan:
         for row, count in find_stretches(same & is_seen):
             text = f"{count} rows repeat the one before"
             yield self._finding("lost frames", None, row, count, text)
-        commanded = np.abs(self._u) > self._limits.commanded
+        commanded = np.abs(self._u) > COMMANDED
         for j in np.flatnonzero(self._machine.is_exclusive):
             others = np.delete(commanded, j, axis=1).any(1)
             for row, count in find_stretches(commanded[:, j] & others):
@@ -231,9 +209,9 @@ class _RecordingScan:
 
     def _find_ignored_commands(self, j: int, name: str) -> Iterator[RecordingFinding]:
         """Yield commands that should move a joint away from a stop and do not."""
-        joint, margin = self._machine.joints[j], self._limits.at_limit * self._travel[j]
+        joint, margin = self._machine.joints[j], AT_LIMIT * self._travel[j]
         for sign in (1, -1):
-            driven = find_held(sign * self._u[:, j] > self._limits.driving, self._lead)
+            driven = find_held(sign * self._u[:, j] > DRIVING, self._lead)
             low, high = joint.lower.value + margin, joint.upper.value - margin
             stop = self._q[:, j] > high if sign > 0 else self._q[:, j] < low
             is_ignored = driven & ~self._is_moving[:, j] & ~stop & np.isfinite(self._v[:, j])
@@ -288,7 +266,7 @@ class _RecordingScan:
         for row, count in find_stretches(self._idle[:, j]):
             q, ends = self._q[row : row + count, j], min(5, count)
             moved = np.nanmedian(q[-ends:]) - np.nanmedian(q[:ends])
-            if abs(moved) > max(self._limits.drift * self._travel[j], self._visible[j]):
+            if abs(moved) > max(DRIFT * self._travel[j], self._visible[j]):
                 speed = np.nanquantile(np.abs(self._v[row : row + count, j]), 0.9)
                 is_fast = speed > FAST_SHARE * self._machine.max_speed[j]
                 mean = moved / (count * self._period_s)
@@ -306,18 +284,18 @@ class _RecordingScan:
             jump = abs(q[end] - q[end - 1]) if end < len(equal) else 0.0
             before = abs(self._before[row - 1, j])
             after = abs(self._after[min(end, len(equal) - 1), j])
-            was_moving = before > self._limits.still * self._machine.max_speed[j]
+            was_moving = before > STILL * self._machine.max_speed[j]
             least = max(self._visible[j], JUMP * np.fmax(before, after) * self._period_s)
             if was_moving and jump > least:
                 text = f"{count + 1} equal samples, then a jump of {jump:.2g} {unit}"
                 yield self._finding("frozen sensor", name, row - 1, count + 1, text)
-            elif is_noisy and count + 1 >= self._limits.equal_rows:
+            elif is_noisy and count + 1 >= EQUAL_ROWS:
                 text = f"{count + 1} equal samples of a sensor with noise"
                 yield self._finding("frozen sensor", name, row - 1, count + 1, text)
 
     def _find_saturation(self, j: int, name: str, unit: str) -> Iterator[RecordingFinding]:
         """Yield rows at the extreme of a sensor while the joint is driven further, away from its stops."""
-        q, margin = self._q[:, j], self._limits.at_limit * self._travel[j]
+        q, margin = self._q[:, j], AT_LIMIT * self._travel[j]
         acting = np.roll(self._u[:, j], round(self._machine.dead_time_s / self._period_s))
         if not np.ptp(q) > margin:
             return
@@ -325,7 +303,7 @@ class _RecordingScan:
             stop = self._machine.upper[j] if outward > 0 else self._machine.lower[j]
             if abs(stop - extreme) < margin:
                 continue
-            is_driven = outward * acting > self._limits.driving
+            is_driven = outward * acting > DRIVING
             for row, count in find_stretches((q == extreme) & is_driven):
                 if count >= MIN_SATURATED_ROWS:
                     text = f"{count} samples at {extreme:.4g} {unit} while driven further"
@@ -345,7 +323,7 @@ class _RecordingScan:
 
     def _find_long(self, condition: np.ndarray) -> list[tuple[int, int]]:
         """Return the stretches of a condition that last long enough to be told."""
-        least = max(LEAST_ROWS, self._limits.unanswered_s / self._period_s)
+        least = max(LEAST_ROWS, UNANSWERED_S / self._period_s)
         return [(row, count) for row, count in find_stretches(condition) if count >= least]
 
     def _finding(

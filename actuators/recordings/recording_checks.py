@@ -15,8 +15,8 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from actuators.recordings.inspection import Inspection, InspectionThresholds, inspect_recording
-from actuators.recordings.split import measure_commanded_s
+from actuators.recordings.inspection import DRIVING, SETTLE_S, STILL, Inspection, inspect_recording
+from actuators.recordings.split import COMMANDED, measure_commanded_s
 from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -93,23 +93,19 @@ MOST_ROWS = 40
 IGNORED = "command without motion"
 
 
-def examine_recordings(
-    recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
-) -> list[RecordingRemark]:
+def examine_recordings(recordings: Sequence[Recording], machine: Machine) -> list[RecordingRemark]:
     """Return all remarks about recordings of `machine`, the most severe first."""
-    inspections = [inspect_recording(one, machine, thresholds) for one in recordings]
-    return list_remarks(inspections, machine, thresholds)
+    inspections = [inspect_recording(one, machine) for one in recordings]
+    return list_remarks(inspections, machine)
 
 
-def list_remarks(
-    inspections: Sequence[Inspection], machine: Machine, thresholds: InspectionThresholds
-) -> list[RecordingRemark]:
+def list_remarks(inspections: Sequence[Inspection], machine: Machine) -> list[RecordingRemark]:
     """Return all remarks about inspected recordings of `machine`, the most severe first."""
     locks = {}
     for j, name in enumerate(machine.joint_names):
-        if text := _find_lock(inspections, machine, j, thresholds):
+        if text := _find_lock(inspections, machine, j):
             locks[name] = text
-    remarks = [*_check_excitation(inspections, machine, thresholds)] if inspections else []
+    remarks = [*_check_excitation(inspections, machine)] if inspections else []
     for one in inspections:
         remarks += _group_findings(one, machine, locks)
     return sorted(
@@ -154,12 +150,10 @@ def _group_findings(
         yield RecordingRemark(name, joint, where, *span_s, len(some), text, part)
 
 
-def _find_lock(
-    inspections: Sequence[Inspection], machine: Machine, joint: int, limits: InspectionThresholds
-) -> str | None:
+def _find_lock(inspections: Sequence[Inspection], machine: Machine, joint: int) -> str | None:
     """Return the condition that separates ignored commands of a joint from obeyed ones, as text, or `None`."""
     name = machine.joint_names[joint]
-    lead = round((machine.dead_time_s + limits.settle_s) / machine.period_s)
+    lead = round((machine.dead_time_s + SETTLE_S) / machine.period_s)
     ignored, obeyed, count = [], [], 0
     for inspection in inspections:
         recording = inspection.viewed
@@ -170,9 +164,9 @@ def _find_lock(
                 end = finding.row + finding.num_rows
                 is_ignored[finding.row : end] = True
                 near[max(0, finding.row - lead) : end + lead] = True
-        is_driven = np.abs(recording.u[:, joint]) > limits.driving
+        is_driven = np.abs(recording.u[:, joint]) > DRIVING
         speed = np.gradient(recording.q[:, joint].astype(float)) * recording.rate_hz
-        is_moving = np.abs(speed) > 2.0 * limits.still * machine.max_speed[joint]
+        is_moving = np.abs(speed) > 2.0 * STILL * machine.max_speed[joint]
         ignored.append(is_ignored)
         obeyed.append(is_driven & is_moving & ~near)
     if count < MIN_STRETCHES:
@@ -183,7 +177,7 @@ def _find_lock(
     u = np.concatenate([one.viewed.u for one in inspections])
     q = np.concatenate([one.viewed.q for one in inspections])
     best = (0.0, 1.0, "")
-    for text, condition in _list_conditions(u, q, machine, joint, limits):
+    for text, condition in _list_conditions(u, q, machine, joint):
         # a lock may stop the motion itself, or the command on its way
         for delay in (0, round(machine.dead_time_s / machine.period_s)):
             holds = np.roll(condition, delay)
@@ -198,10 +192,10 @@ def _find_lock(
 
 
 def _list_conditions(
-    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int, thresholds: InspectionThresholds
+    u: np.ndarray, q: np.ndarray, machine: Machine, joint: int
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Yield what may lock a joint, with the rows in which it holds, `(T,)`."""
-    commanded = np.abs(u) > thresholds.commanded
+    commanded = np.abs(u) > COMMANDED
     others = np.asarray(np.delete(commanded, joint, axis=1).any(1))
     yield "any other joint is commanded", others
     yield "no other joint is commanded", ~others
@@ -217,12 +211,12 @@ def _list_conditions(
 
 
 def _check_excitation(
-    inspections: Sequence[Inspection], machine: Machine, thresholds: InspectionThresholds
+    inspections: Sequence[Inspection], machine: Machine
 ) -> Iterator[RecordingRemark]:
     """Yield the joints that are hardly commanded."""
     viewed = [one.viewed for one in inspections]
     total_s = sum(one.duration_s for one in viewed)
-    commanded_s = measure_commanded_s(viewed, thresholds.commanded)
+    commanded_s = measure_commanded_s(viewed)
     for name, seconds in zip(machine.joint_names, commanded_s.tolist(), strict=True):
         if seconds < MIN_COMMANDED_RUNS * choose_horizon_s(machine):
             text = f"commanded for {seconds:.1f} s of {total_s:.0f} s"

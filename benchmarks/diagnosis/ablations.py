@@ -69,9 +69,8 @@ def prepare(case: str, machine_name: str) -> ReferenceDiagnosis:
     """Return the diagnosis of a case."""
     torch.set_num_threads(1)
     machine = extensions.load_option("machine", machine_name)
-    thresholds = extensions.load_part("thresholds")
     given, kinds = load_case(Path(case), machine), load_effects(machine, None, None)
-    return ReferenceDiagnosis(given, kinds, thresholds, np.random.default_rng(0))
+    return ReferenceDiagnosis(given, kinds, np.random.default_rng(0))
 
 
 def decide_often(case: str, machine_name: str) -> dict[str, list[Any]]:

@@ -11,7 +11,6 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from actuators.contracts import ActuatorFit, FitTask
-from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
@@ -44,7 +43,6 @@ class Diagnose:
         actuator: The simulator that `diagnosis.field` is held against.
         simulator: A simulator of your own in its place: `module:function`, or an MJCF file.
         own: The actuator that runs it.
-        thresholds: When a stretch of a recording is worth telling.
         diagnosis: Recordings to diagnose.
     """
 
@@ -54,7 +52,6 @@ class Diagnose:
     actuator: Actuator | None
     simulator: str | None
     own: OwnSimulator
-    thresholds: InspectionThresholds
     diagnosis: DiagnosisSubject
 
     def check(self) -> None:
@@ -112,12 +109,10 @@ class Diagnose:
             if doubts := given.doubts():
                 return self._add_changes(describe_doubts(given, "; ".join(doubts)), given)
             if given.reference and self.machine.interface in MODELS:
-                work = ReferenceDiagnosis(given, self._kinds, self.thresholds, generator)
+                work = ReferenceDiagnosis(given, self._kinds, generator)
             else:
                 base, seed = self._find_base(given), self.session.stream("base")
-                work = SimulatorDiagnosis(
-                    given, self._kinds, self.thresholds, generator, base, seed
-                )
+                work = SimulatorDiagnosis(given, self._kinds, generator, base, seed)
             return self._add_changes(work.run(tell), given)
 
     def _add_changes(self, found: Outcome, given: GapCase) -> Outcome:

@@ -69,22 +69,16 @@ def test_every_run_is_cut_into_files_that_know_each_other(
     assert first.t_s[0] == second.t_s[0] == 0.0
 
 
-def test_the_plan_says_beforehand_what_the_run_will_do(collected: Path, machine: Machine) -> None:
-    plan = json.loads((collected / "plan.json").read_text())
-    assert (collected / "plan.png").read_bytes().startswith(b"\x89PNG")
-    assert plan["num_runs"] == 2 and plan["run_s"] == 30.0
-    # the plant lags and has a dead band, the nominal machine does not
-    files = made(collected, machine)
-    commanded = np.concatenate([files[name].u for name in files if name.startswith("sine_00")])
-    for entry in plan["runs"][0]:
-        joint = machine.joint_names.index(entry["name"].removeprefix("sine_"))
-        moving = np.flatnonzero(commanded[:, joint])
-        assert machine.period_s * moving[0] == pytest.approx(entry["start_s"], abs=1.5)
-
-
-def test_only_the_plan(tmp_path: Path) -> None:
-    mode(tmp_path / "plan", *SMALL, "collect.only_plan=true").run()
-    assert {path.name for path in (tmp_path / "plan").iterdir()} == {"plan.json", "plan.png"}
+def test_only_the_plan_is_drawn_and_what_finds_no_time_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    excitation = ("excitation=levels", "collect.only_plan=true")
+    for name, minutes, told in (("long", 1.0, False), ("short", 0.2, True)):
+        caplog.clear()
+        mode(tmp_path / name, *SMALL, *excitation, f"collect.run_minutes={minutes}").run()
+        (picture,) = (tmp_path / name).iterdir()
+        assert picture.name == "plan.png" and picture.read_bytes().startswith(b"\x89PNG")
+        assert ("plan: no time for" in caplog.text) == told, caplog.text
 
 
 def test_the_same_seed_records_the_same_and_another_does_not(

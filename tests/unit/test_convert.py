@@ -74,7 +74,6 @@ def test_positions_are_interpolated_and_commands_held(
     # the command of row 50 is in force from 4.0 s on, not before
     np.testing.assert_array_equal(recording.u[:, 0], recording.t_s >= 4.0 - 1e-6)
     assert np.abs(recording.u[:, 1:]).max() == 0.0
-    assert recording.metadata["resampled_from"] == "12.5 Hz, periods of 0.080 to 0.080 s"
 
 
 def test_a_log_is_split_at_its_gaps_and_its_pieces_share_the_run(

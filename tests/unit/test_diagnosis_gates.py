@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from gaps import recording
 
-from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -84,7 +83,7 @@ def test_limits_that_the_recordings_leave_are_told(machine: Machine) -> None:
 
 
 def test_fast_motion_without_command_is_an_unlogged_input_and_slow_one_a_leak(
-    machine: Machine, thresholds: InspectionThresholds
+    machine: Machine,
 ) -> None:
     plain = recording(machine, seconds=245.0)
     t_s = plain.t_s
@@ -92,7 +91,7 @@ def test_fast_motion_without_command_is_an_unlogged_input_and_slow_one_a_leak(
         q = plain.q.copy()
         swing = np.abs((0.1 * t_s) % 2.0 - 1.0)  # slope of 0.1 a second
         q[:, 1] = machine.home[1] + share * machine.max_speed[1] / 0.1 * swing
-        found = examine_recordings([replace(plain, q=q)], machine, thresholds)
+        found = examine_recordings([replace(plain, q=q)], machine)
         names = {one.name: one for one in found if one.joint == "q2"}
         assert name in names and len({"unlogged input", "motion without command"} & {*names}) == 1
         assert names[name].share > 0.8

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from gaps import DELAY, recording
 
-from actuators.recordings.inspection import InspectionThresholds
 from actuators.recordings.recording_checks import REMARKS, RecordingRemark, examine_recordings
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -18,19 +17,17 @@ Examine = Callable[[Recording], dict[str, RecordingRemark]]
 
 
 @pytest.fixture
-def examine(machine: Machine, thresholds: InspectionThresholds) -> Examine:
+def examine(machine: Machine) -> Examine:
     """Returns the remarks on a recording by name."""
 
     def run(one: Recording) -> dict[str, RecordingRemark]:
-        return {found.name: found for found in examine_recordings([one], machine, thresholds)}
+        return {found.name: found for found in examine_recordings([one], machine)}
 
     return run
 
 
-def test_a_sound_recording_says_only_which_joint_rested(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    (remark,) = examine_recordings([recording(machine)], machine, thresholds)
+def test_a_sound_recording_says_only_which_joint_rested(machine: Machine) -> None:
+    (remark,) = examine_recordings([recording(machine)], machine)
     assert (remark.name, remark.joint, remark.kind.severity) == ("joint at rest", "q2", "note")
 
 
@@ -108,12 +105,10 @@ def test_lost_frames_and_broken_rules_are_one_remark_each(
     assert found["exclusive joint"].from_s == pytest.approx(20.0)
 
 
-def test_the_gravest_comes_first_and_all_of_it_is_plain(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
+def test_the_gravest_comes_first_and_all_of_it_is_plain(machine: Machine) -> None:
     sound = recording(machine)
     slow = replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)
-    remarks = examine_recordings([slow], machine, thresholds)
+    remarks = examine_recordings([slow], machine)
     places = [["bad", "warn", "note"].index(remark.kind.severity) for remark in remarks]
     assert places == sorted(places)
     for remark in remarks:

@@ -98,7 +98,7 @@ def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(
         assert (set(stage["train"]), set(stage["validation"])) == (train, validation)
         assert not train & validation and train | validation == every - set(stage["test"])
     assert stages[-1]["test"] == [] and len(stages) == 4
-    assert result["data"]["test"]["runs"] == 6 and len(result["fold_seconds"]) == 3
+    assert result["data"]["test"]["runs"] == 6
     # 15 s files: 1 s windows up to those of 10 s
     plant, hold = (result["joints"]["q1"][name]["10"]["percent"] for name in ("plant", "hold"))
     assert plant < 0.1 < hold
@@ -165,13 +165,9 @@ def test_a_model_that_stands_still_is_no_good_news(
     result = run(identify(machine, tmp_path / "out", recordings, Fit(Hold())))
     verdict = result["verdict"][0]
     assert verdict["tone"] == "bad" and "worse on q1, q2, q3, q4, q5" in verdict["text"]
-    q3 = {"commanded_s": 30.0, "largest_command": [-0.9, 0.2], "judged_s": 0.0}
-    result["data"]["excitation"]["q3"] |= q3
     result["delay_s"]["q4"] |= {"value": 0.8, "ci95": [0.78, 0.82]}
     texts = [finding.text for finding in write_verdict(result, machine)]
     for part in (
-        "q3 is too little excited: commanded for 30 s only; no command beyond +0.2",
-        "q3 never moves by command in the runs judged by",
         "dead time of q4 may exceed the history of 0.65 s",
         "num_history of machine 'brokk170' to 19 or more",
     ):

@@ -17,12 +17,7 @@ from motion import make_recording
 
 from actuators.identify.request import Identification
 from actuators.modes.inspect import InspectionRequest
-from actuators.recordings.inspection import (
-    InspectionThresholds,
-    RecordingFinding,
-    _RecordingScan,
-    inspect_recording,
-)
+from actuators.recordings.inspection import RecordingFinding, _RecordingScan, inspect_recording
 from brokk_rl import record
 from brokk_rl.commands import scale_targets
 from brokk_rl.errors import RecordingError
@@ -48,16 +43,12 @@ def sound(machine: Machine, seconds: float = 60.0) -> Recording:
     return make_recording(machine, u, q, metadata=told)
 
 
-def found(
-    recording: Recording, machine: Machine, thresholds: InspectionThresholds
-) -> list[RecordingFinding]:
-    return inspect_recording(recording, machine, thresholds).findings
+def found(recording: Recording, machine: Machine) -> list[RecordingFinding]:
+    return inspect_recording(recording, machine).findings
 
 
-def test_its_figures_are_those_it_was_made_with(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
-    seen = inspect_recording(sound(machine), machine, thresholds)
+def test_its_figures_are_those_it_was_made_with(machine: Machine) -> None:
+    seen = inspect_recording(sound(machine), machine)
     assert seen.timing["rate_hz"] == pytest.approx(20.0)
     assert seen.timing["jitter_s"] == pytest.approx(0.0, abs=1e-9)
     joint = seen.joints["q3"]
@@ -68,20 +59,16 @@ def test_its_figures_are_those_it_was_made_with(
     assert seen.joints["q1"]["commanded"] == 0.0
 
 
-def test_the_step_of_a_coarse_sensor_is_found_and_is_no_freeze(
-    machine: Machine, thresholds: InspectionThresholds
-) -> None:
+def test_the_step_of_a_coarse_sensor_is_found_and_is_no_freeze(machine: Machine) -> None:
     whole = sound(machine)
     rests = whole.q.copy()
     rests[:, 2] = 0.15 * np.clip(np.arange(len(rests)) * PERIOD_S - 20.5, 0.0, 2.0) ** 2
     for q, step in ((whole.q, 0.004), (rests, 0.006)):
         coarse = replace(whole, q=np.round(q / step) * step)
-        seen = inspect_recording(coarse, machine, thresholds)
+        seen = inspect_recording(coarse, machine)
         assert seen.joints["q3"]["step"] == pytest.approx(step, rel=0.01)
         assert "frozen sensor" not in [finding.kind for finding in seen.findings]
-    assert (
-        inspect_recording(replace(whole, q=rests), machine, thresholds).joints["q3"]["step"] is None
-    )
+    assert inspect_recording(replace(whole, q=rests), machine).joints["q3"]["step"] is None
 
 
 Arrays = tuple[np.ndarray, np.ndarray, Machine]
@@ -145,23 +132,19 @@ def command_together(arrays: Arrays) -> None:
     ],
 )  # fmt: skip
 def test_what_is_planted_is_found_where_it_was_put_and_nothing_else(
-    machine: Machine,
-    thresholds: InspectionThresholds,
-    change: Callable[[Arrays], None],
-    expected: list[tuple[Any, ...]],
-    text: str,
+    machine: Machine, change: Callable[[Arrays], None], expected: list[tuple[Any, ...]], text: str
 ) -> None:
     whole = sound(machine)
     u, q = whole.u.copy(), whole.q.copy()
     change((u, q, machine))
-    findings = found(replace(whole, u=u, q=q), machine, thresholds)
+    findings = found(replace(whole, u=u, q=q), machine)
     assert [(f.kind, f.joint, f.row, f.num_rows) for f in findings] == expected
     assert all(text in finding.text for finding in findings)
 
 
-def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_held_one_is(
-    thresholds: InspectionThresholds,
-) -> None:
+def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_held_one_is() -> (
+    None
+):
     arm = option("machine", "so101")
     t_s = arm.period_s * np.arange(1000)
     q = np.tile(arm.home, (len(t_s), 1))
@@ -170,9 +153,9 @@ def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_
     u = scale_targets(q, arm)
     q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
     follows = make_recording(arm, u, q)
-    assert found(follows, arm, thresholds) == []
+    assert found(follows, arm) == []
     q[700:, 2] -= 0.05 * np.minimum(np.arange(300) / 20, 1.0)  # the arm is pushed away
-    (finding,) = found(replace(follows, q=q.astype(np.float32)), arm, thresholds)
+    (finding,) = found(replace(follows, q=q.astype(np.float32)), arm)
     assert (finding.kind, finding.joint) == ("motion without command", "elbow")
 
 
@@ -180,7 +163,7 @@ def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_
     ("period_s", "kept", "is_found"), [(0.02, 1.0, False), (5.0, 1.0, False), (0.02, 0.0, True)]
 )
 def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
-    thresholds: InspectionThresholds, period_s: float, kept: float, is_found: bool
+    period_s: float, kept: float, is_found: bool
 ) -> None:
     arm = option("machine", "so101")
     t_s = period_s * np.arange(1500)
@@ -194,7 +177,7 @@ def test_a_servo_that_sags_or_is_slow_obeys_and_one_that_is_off_does_not(
     targets[:, 2], q[:, 2] = arm.home[2] + travel * wave, arm.home[2] + travel * (late - 0.15)
     q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
     log = make_recording(arm, scale_targets(targets, arm), q, rate_hz=1.0 / period_s, t_s=t_s)
-    named = [one for one in found(log, arm, thresholds) if one.kind == "does not obey"]
+    named = [one for one in found(log, arm) if one.kind == "does not obey"]
     assert bool(named) == is_found
     assert all(one.joint == "elbow" and one.row >= 495 for one in named)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from axis import PLANT, driven, make_axis
 
-from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Answer
@@ -32,7 +31,7 @@ def diagnose(machine: Machine) -> Diagnosis:
         kinds = load_effects(axis, names, base)
         case = GapCase(axis, [], seen)
         draw = np.random.default_rng(0)
-        work = SimulatorDiagnosis(case, kinds, load_part("thresholds"), draw, base, 0)
+        work = SimulatorDiagnosis(case, kinds, draw, base, 0)
         return work.run(lambda doing, done: None).answer
 
     return run
