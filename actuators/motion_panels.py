@@ -11,10 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from brokk_rl.machine import Machine
-from brokk_rl.plot import GREY, RED, add_legend, remove_frame
+from brokk_rl.plot import GREY, RED, add_legend, draw_grid, make_figure, remove_frame
 
 ROW_INCHES, WIDTH_INCHES = 2.75, 12.0
 """Height of a joint and width of the picture; chosen by hand."""
+TRACK_INCHES, TRACK_WIDTH_INCHES = 1.7, 15.0
+"""The same of the tracks over a whole recording; chosen by hand."""
+LETTER = 0.0045
+"""Width of a letter of a name, as a part of the time axis."""
 LEAST_SPAN = 0.02
 """Least height of an axis, of the joint's travel. Chosen by hand: less is noise of the encoder."""
 
@@ -86,22 +90,66 @@ def draw_motion_panels(
     return figure
 
 
-def draw_joint_track(
-    axis: Axes, times: np.ndarray, q: np.ndarray, u: np.ndarray, machine: Machine, joint: int
-) -> None:
-    """Draw command (full is half the height), position and stops of one joint, each `(T,)`."""
-    lower, upper, home = machine.lower[joint], machine.upper[joint], machine.home[joint]
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-    # An exclusive joint never moves with others.
-    color = RED if machine.is_exclusive[joint] else GREY
-    label = "command (full: to the stops; red: never with others)"
-    axis.fill_between(
-        times, middle, middle + half * u, step="post", color=color, alpha=0.6, label=label
-    )
-    axis.plot(times, q, color="black", linewidth=1.1, label="position")
-    axis.axhline(lower, color=RED, linewidth=0.9, linestyle="--", label="stop")
-    axis.axhline(upper, color=RED, linewidth=0.9, linestyle="--")
-    axis.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
-    labels = [f"{lower:.2f}", f"home {home:.2f}", f"{upper:.2f}"]
-    axis.set_yticks([lower, home, upper], labels, fontsize=8)
-    axis.set_ylabel(f"{machine.joint_names[joint]}\n{machine.joints[joint].unit}")
+@dataclass(frozen=True)
+class Shade:
+    """A stretch of time that is shaded.
+
+    Attributes:
+        joint: Number of the joint; `None` for all.
+        begin_s: Begin.
+        end_s: End.
+        color: Color of it.
+        name: Text above the first joint, where it finds room.
+    """
+
+    joint: int | None
+    begin_s: float
+    end_s: float
+    color: str
+    name: str = ""
+
+
+def draw_joint_tracks(
+    machine: Machine, t_s: np.ndarray, q: np.ndarray, u: np.ndarray, shades: Sequence[Shade]
+) -> tuple[Figure, list[Axes]]:
+    """Draw command (full is half the height), position and stops of each joint over time.
+
+    Args:
+        machine: Limits and homes.
+        t_s: Time, `(T,)`; NaN where it is not known.
+        q: Positions, `(T, J)`.
+        u: Commands, `(T, J)`.
+        shades: Shaded stretches.
+    """
+    figure = make_figure(TRACK_WIDTH_INCHES, 1.1 + TRACK_INCHES * machine.num_joints)
+    axes = [*figure.subplots(machine.num_joints, 1, sharex=True, squeeze=False)[:, 0]]
+    for j, axis in enumerate(axes):
+        lower, upper, home = machine.lower[j], machine.upper[j], machine.home[j]
+        middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+        # An exclusive joint never moves with others.
+        color = RED if machine.is_exclusive[j] else GREY
+        label = "command (full: to the stops; red: never with others)"
+        command = middle + half * u[:, j]
+        axis.fill_between(t_s, middle, command, step="post", color=color, alpha=0.6, label=label)
+        axis.plot(t_s, q[:, j], color="black", linewidth=1.1, label="position")
+        axis.axhline(lower, color=RED, linewidth=0.9, linestyle="--", label="stop")
+        axis.axhline(upper, color=RED, linewidth=0.9, linestyle="--")
+        axis.set_ylim(middle - 1.12 * half, middle + 1.12 * half)
+        labels = [f"{lower:.2f}", f"home {home:.2f}", f"{upper:.2f}"]
+        axis.set_yticks([lower, home, upper], labels, fontsize=8)
+        axis.set_ylabel(f"{machine.joint_names[j]}\n{machine.joints[j].unit}")
+        for one in shades:
+            if one.joint in (None, j):
+                axis.axvspan(one.begin_s, one.end_s, color=one.color, alpha=0.3, linewidth=0)
+        draw_grid(axis, "x")
+    begin_s, span_s = np.nanmin(t_s), max(np.nanmax(t_s) - np.nanmin(t_s), 1e-9)
+    for one in shades:
+        if one.end_s - one.begin_s > LETTER * span_s * len(one.name):
+            place = 0.5 * (one.begin_s + one.end_s), 1.02
+            form: Any = {"xycoords": ("data", "axes fraction"), "ha": "center", "fontsize": 8}
+            axes[0].annotate(one.name, place, **form)
+    axes[-1].set_xlabel("time, s")
+    axes[-1].set_xlim(begin_s, begin_s + span_s)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=3, frameon=False, fontsize=9)
+    return figure, axes

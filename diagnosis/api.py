@@ -257,7 +257,7 @@ def _load_simulator(simulator: str | Path | Actuator | Callable[..., Any] | None
             )
         simulator = f"{simulator.__module__}:{simulator.__qualname__}"
     if isinstance(simulator, str | Path) and own_simulator.is_named_in(str(simulator)):
-        return replace(_load_option("actuator", "own"), source=str(simulator))
+        return own_simulator.OwnSimulator(source=str(simulator))
     return _load_option("actuator", simulator)
 
 

@@ -50,13 +50,6 @@ def measure_tool_speed(machine: Machine, q: np.ndarray, speed: np.ndarray) -> np
     return np.linalg.norm((jacobian @ speed[..., None])[..., 0], axis=-1)
 
 
-def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
-    """Return the tool speed in m/s, `(T,)`, along a path `q`, `(T, J)`; `None` where the geometry is not known."""
-    if not machine.has_bodies:
-        return None
-    return measure_tool_speed(machine, q, np.gradient(q, machine.period_s, axis=0))
-
-
 log = logging.getLogger(__name__)
 
 SPEED_WINDOW = 4

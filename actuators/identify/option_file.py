@@ -36,7 +36,6 @@ def write_numbers(
     machine: Machine,
     numbers: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray],
-    **facts: Any,
 ) -> Any:
     """Write `<name>.yaml` with fitted numbers, and `<name>.json` with their standard errors, if there are any.
 
@@ -47,7 +46,6 @@ def write_numbers(
         machine: The machine.
         numbers: By name, `(J,)`, or rows of them `(J, M)`; written with five digits.
         errors: Standard errors of some of them, `(J,)`; NaN for a joint that lacks the number.
-        **facts: Further facts for the second file.
 
     Returns:
         The fitted actuator.
@@ -69,7 +67,7 @@ def write_numbers(
                 told[key][joint] = {"value": float(value), "standard_error": float(error)}
     fitted = dataclasses.replace(actuator, **values)
     if errors:
-        write_json(folder / f"{name}.json", {"schema": 1, "parameters": told, **facts})
+        write_json(folder / f"{name}.json", {"schema": 1, "parameters": told})
     write_option(folder, name, fitted, f"fitted to recordings of {machine.name}")
     return fitted
 

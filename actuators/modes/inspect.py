@@ -10,14 +10,14 @@ import numpy as np
 import pandas as pd
 
 from actuators.identify import dead_time
-from actuators.motion_panels import draw_joint_track
+from actuators.motion_panels import Shade, draw_joint_tracks
 from actuators.recordings.inspection import Inspection, inspect_recording
 from actuators.recordings.recording_checks import REMARKS, list_remarks, tabulate_remarks
 from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.plot import make_figure, save_figure
+from brokk_rl.plot import save_figure
 from brokk_rl.progress import track_items
 from brokk_rl.record import Breach, Recording
 from brokk_rl.report import embed_picture, render_page
@@ -223,24 +223,19 @@ def draw_recording(
 ) -> None:
     """Draw commands, positions, findings (shaded) and breaches (lines) as PNG."""
     recording = inspection.recording
-    count = machine.num_joints
-    figure = make_figure(14, 1.1 + 1.7 * count)
-    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    t_s = recording.t_s
-    begin_s, span_s = float(np.nanmin(t_s)), max(float(np.nanmax(t_s) - np.nanmin(t_s)), 1e-9)
-    for j, (joint, axis) in enumerate(zip(machine.joints, axes, strict=True)):
-        draw_joint_track(axis, t_s, recording.q[:, j], recording.u[:, j], machine, j)
-        for finding in inspection.findings:
-            if finding.joint in (joint.name, None):
-                end_s = finding.t_s + max(finding.duration_s, THINNEST * span_s)
-                axis.axvspan(finding.t_s, end_s, color=FINDING, alpha=0.35, linewidth=0)
+    t_s, shades = recording.t_s, []
+    span_s = float(np.nanmax(t_s) - np.nanmin(t_s))
+    for one in inspection.findings:
+        end_s = one.t_s + max(one.duration_s, THINNEST * span_s)
+        joint = None if one.joint is None else machine.joint_names.index(one.joint)
+        shades.append(Shade(joint, one.t_s, end_s, FINDING))
+    figure, axes = draw_joint_tracks(machine, t_s, recording.q, recording.u, shades)
+    for joint, axis in zip(machine.joints, axes, strict=True):
         own = {f"u_{joint.name}", f"q_{joint.name}_{joint.unit}", "t_s"}
         for breach in breaches:
             if breach.row is not None and breach.column in own and np.isfinite(t_s[breach.row]):
                 axis.axvline(t_s[breach.row], color=BREACH, linewidth=1.0)
-    axes[-1].set_xlabel("time [s]")
-    axes[-1].set_xlim(begin_s, begin_s + span_s)
     name = recording.path.name if recording.path else "recording"
-    title = "measured position (black), command (filled), findings (shaded), breaches (lines)"
-    figure.suptitle(f"{name}: {title}", fontsize=11)
+    title = f"{name}: findings are shaded, breaches of the format are vertical lines"
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12)
     save_figure(figure, path)

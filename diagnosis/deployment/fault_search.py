@@ -287,15 +287,11 @@ def _measure_loss(residual: np.ndarray) -> np.ndarray:
 
 
 def _find_segment(gained: np.ndarray) -> tuple[tuple[int, int], float]:
-    """Return the segment of rows, begin and end, with the largest sum, and the sum (Kadane)."""
-    best, best_at, total, begin = 0.0, (0, 0), 0.0, 0
-    for row, value in enumerate(gained.tolist()):
-        if total <= 0.0:
-            total, begin = 0.0, row
-        total += value
-        if total > best:
-            best, best_at = total, (begin, row + 1)
-    return best_at, best
+    """Return the segment of rows, begin and end, with the largest sum, and the sum."""
+    before = np.append(0.0, np.cumsum(gained))
+    end = int(np.argmax(before - np.minimum.accumulate(before)))
+    begin = end - int(np.argmin(before[end::-1]))
+    return (begin, end), float(before[end] - before[begin])
 
 
 def _select_evenly(places: np.ndarray, most: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -41,18 +41,16 @@ class ChangeSimulator:
         session: Folder, seed, device.
         machine: The machine.
         simulator: The simulator that was diagnosed: an MJCF file, or `module:function`.
-        own: The actuator that runs it.
         changes: Which findings, and what to write.
     """
 
     session: Session
     machine: Machine
     simulator: str
-    own: OwnSimulator
     changes: ChangeRequest
 
     def check(self) -> None:
-        replace(self.own, source=self.simulator)
+        OwnSimulator(source=self.simulator)
 
     def run(self) -> None:
         """Write the files.
@@ -70,7 +68,7 @@ class ChangeSimulator:
             raise ConfigError(
                 f"changes.diagnosis={self.changes.diagnosis}: its verdict is '{given.verdict}', so there is nothing to change"
             )
-        own = replace(self.own, source=self.simulator)
+        own = OwnSimulator(source=self.simulator)
         kinds = effect_library.load_effects(self.machine, None, own)
         folder.mkdir(parents=True, exist_ok=True)
         effects_file.write_ranges(given, kinds, folder / effects_file.RANGES_FILE)

@@ -42,7 +42,6 @@ class Diagnose:
         fit: Fit of the simulator to `reference/`, for joints commanded by torque.
         actuator: The simulator that `diagnosis.field` is held against.
         simulator: A simulator of your own in its place: `module:function`, or an MJCF file.
-        own: The actuator that runs it.
         diagnosis: Recordings to diagnose.
     """
 
@@ -51,7 +50,6 @@ class Diagnose:
     fit: ActuatorFit
     actuator: Actuator | None
     simulator: str | None
-    own: OwnSimulator
     diagnosis: DiagnosisSubject
 
     def check(self) -> None:
@@ -61,14 +59,14 @@ class Diagnose:
             raise ConfigError(
                 f"give either actuator=… or simulator={self.simulator}: one is held against the recordings"
             )
-        replace(self.own, source=self.simulator)
+        OwnSimulator(source=self.simulator)
 
     @property
     def base(self) -> Actuator | None:
         """The simulator that is held against the field; `None` where there is a reference."""
         if self.simulator is None:
             return self.actuator
-        return replace(self.own, source=self.simulator)
+        return OwnSimulator(source=self.simulator)
 
     def run(self) -> None:
         """Write `diagnosis.json`, `report.html` and `effects.yaml`.

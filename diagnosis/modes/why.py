@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,6 @@ class Why:
         policy: `folder`: the policy.
         simulator: Actuator of the simulator that trained it, as `actuator=` takes it; or a simulator of
             your own, `module:function` or an MJCF file.
-        own: Runs a simulator of your own.
         sent: The commands of the log are those that the policy's loop sent.
         target_in_base_m: Target where the log has none.
     """
@@ -59,13 +57,12 @@ class Why:
     log: str | tuple[str, ...]
     policy_path: str
     simulator: str
-    own: OwnSimulator
     sent: bool
     target_in_base_m: tuple[float, float, float] | None
 
     def check(self) -> None:
         if self._is_own:
-            self._build_own()
+            OwnSimulator(source=self.simulator)
         elif not self.simulator.startswith("@"):
             names = [one.name for one in registry.list_options() if one.group == "actuator"]
             if self.simulator not in names:
@@ -109,14 +106,11 @@ class Why:
     def _is_own(self) -> bool:
         return own_simulator.is_named_in(self.simulator)
 
-    def _build_own(self) -> OwnSimulator:
-        return replace(self.own, source=self.simulator)
-
     def _try_inputs(self) -> None:
         """Refuse logs, a policy or a simulator that no stage could use, before the first one."""
         load_policy(self.policy_path, self.machine)
         if self._is_own:
-            self._build_own().build(self.machine, 1, torch.device("cpu"))
+            OwnSimulator(source=self.simulator).build(self.machine, 1, torch.device("cpu"))
         record.read_recordings(self.log, self.machine)
 
     def _try_to_play(self, stages: Mapping[str, StoryStage]) -> None:

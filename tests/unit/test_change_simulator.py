@@ -65,7 +65,6 @@ def build_mode(folder: Path, answer: Answer) -> ChangeSimulator:
         session=Session(out=str(folder / "out"), seed=0, device="cpu"),
         machine=make_machine("shoulder", "elbow"),
         simulator=str(folder / "arm.xml"),
-        own=api._load_option("actuator", "own"),
         changes=ChangeRequest(diagnosis=str(folder)),
     )
 

@@ -142,9 +142,7 @@ def test_what_is_planted_is_found_where_it_was_put_and_nothing_else(
     assert all(text in finding.text for finding in findings)
 
 
-def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_held_one_is() -> (
-    None
-):
+def test_a_servo_that_follows_a_slow_target_is_no_finding_one_that_leaves_it_is() -> None:
     arm = option("machine", "so101")
     t_s = arm.period_s * np.arange(1000)
     q = np.tile(arm.home, (len(t_s), 1))

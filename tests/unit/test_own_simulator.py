@@ -190,7 +190,7 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
     asked = why.Why(
         session=Session(out=str(tmp_path), seed=0, device="cpu"), machine=make_machine("hinge"),
         evaluation=api.extensions.load_part("evaluation"), log="log.parquet", policy_path="policy", simulator=name,
-        own=api._load_option("actuator", "own"), sent=True, target_in_base_m=None,
+        sent=True, target_in_base_m=None,
     )  # fmt: skip
     parser = OverridesParser.create()
     for stage in (asked._examine(), asked._diagnose(), asked._evaluate("all", "[library]")):
