@@ -371,11 +371,7 @@ def _load_file(path: Path, changed_ns: int, machine: Machine) -> Any:
     return MjcfPlant(path, machine)
 
 
-@lru_cache(maxsize=8)
-def _load_function(
-    step: Callable[..., Any], start: Callable[..., Any] | None, machine: Machine, name: str
-) -> FunctionPlant:
-    return FunctionPlant(step, start, machine, name)
+_load_function = lru_cache(maxsize=8)(FunctionPlant)
 
 
 def _import_function(source: str) -> tuple[Callable[..., Any], Callable[..., Any] | None]:

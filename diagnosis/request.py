@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import NonNegative, spec
+from brokk_rl.spec import Count, NonNegative, spec
 
 FITS = {"speed": "valve", "position": "servo", "torque": "force"}
 """Fit of each command interface."""
@@ -29,11 +29,9 @@ class DiagnosisSubject:
     field: str | tuple[str, ...] | None
     effects: tuple[str, ...] | None
     repeatability: NonNegative
-    workers: int
+    workers: Count
 
     def check(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"diagnosis.workers: expected 1 or more, got {self.workers}")
         if (self.case is None) == (self.field is None):
             raise ConfigError(
                 "diagnosis: give either case=<folder with reference/ and field/>, or field=<glob> and actuator=<simulator>"

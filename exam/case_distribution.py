@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import MinLen
 from numpy.random import Generator
 
 from brokk_rl.errors import ConfigError
@@ -104,7 +105,7 @@ class CaseDistribution:
     tracked_share: float
     second_joint: float
     classes: tuple[tuple[str, ...], ...]
-    troubles: dict[str, EffectDistribution]
+    troubles: Annotated[dict[str, EffectDistribution], MinLen(1)]
 
     def check(self) -> None:
         total = sum(self.shares.values())
@@ -112,8 +113,6 @@ class CaseDistribution:
             raise ConfigError(
                 f"exam.mix.shares: expected {', '.join(KINDS)} with sum 1, got {self.shares}"
             )
-        if not self.troubles:
-            raise ConfigError("exam.mix.troubles: expected one or more effects, got none")
 
     def questions(
         self, machine: Machine, plants: DrawnPlants, generator: Generator

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import MinLen
 
 from actuators.excite.plan_report import PlanTrack
 from actuators.excite.player import CommandGuards, PlanPlayer, drive
-from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
+from actuators.excite.schedule import ExcitationPlan, plan_runs
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, list_choices
@@ -49,6 +50,10 @@ BLOCK_CASES = 12
 an interruption loses more."""
 
 
+Programs = Annotated[tuple[str, ...], MinLen(1)]
+"""Names of the excitations of a file."""
+
+
 @spec
 class HalfPlan:
     """Plan of the recordings of one half of a case, `reference` or `field`, or of the withheld part.
@@ -61,16 +66,12 @@ class HalfPlan:
         elapsed_s: Range of the time that the machine has run before a file begins.
     """
 
-    programs: tuple[tuple[str, ...], ...]
-    other_hand: tuple[tuple[str, ...], ...]
+    programs: Annotated[tuple[Programs, ...], MinLen(1)]
+    other_hand: tuple[Programs, ...]
     file_s: float
     elapsed_s: tuple[float, float]
 
     def check(self) -> None:
-        if not self.programs or not all(self.programs):
-            raise ConfigError(
-                "exam: each file needs one or more excitations, e.g. [[levels], [levels, holds]]"
-            )
         if self.other_hand and len(self.other_hand) != len(self.programs):
             raise ConfigError(
                 f"other_hand: expected as many files as programs, {len(self.programs)}, got {len(self.other_hand)}"
@@ -158,7 +159,6 @@ class CaseRecorder:
         plants: Its doubles.
         roughness: Which of the family's.
         excitations: By name.
-        approach: How start poses are taken up.
         halves: Plan of each half, and of the withheld part.
         folder: Of the exam.
     """
@@ -167,7 +167,6 @@ class CaseRecorder:
     plants: DrawnPlants
     roughness: str
     excitations: Mapping[str, Excitation]
-    approach: Approach
     halves: Mapping[Half, HalfPlan]
     folder: Path
 
@@ -229,7 +228,7 @@ class CaseRecorder:
                     f"exam: programs: no excitation '{name}'; {list_choices(name, self.excitations)}"
                 )
         chosen = {name: self.excitations[name] for name in job.programs}
-        about = (chosen, self.machine, self.approach, 1, job.plan.file_s, job.stream("plan"))
+        about = (chosen, self.machine, 1, job.plan.file_s, job.stream("plan"))
         for _ in range(NUM_PLANS - 1):
             with suppress(ConfigError):
                 return plan_runs(*about)
@@ -249,7 +248,7 @@ class CaseRecorder:
         runs = tuple(plan.runs[0] for _, plan in files)
         plan = ExcitationPlan(runs=runs, run_s=file_s, names=tuple(self.excitations))
         guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
-        player = PlanPlayer(plan, machine, self.approach, guards)
+        player = PlanPlayer(plan, machine, guards)
         player.level = logging.DEBUG  # a faulty machine may be slow on its ways to start poses
         with link as opened:
             track = PlanTrack(drive(opened, player, machine, len(jobs), file_s))

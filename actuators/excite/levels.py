@@ -4,7 +4,6 @@ import numpy as np
 
 from actuators.excite.poses import PoseProgram
 from actuators.excite.schedule import check_order
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import Positive, Share, spec
 
@@ -28,7 +27,7 @@ class Levels(PoseProgram):
             travel, is driven the other way.
     """
 
-    share: float
+    share: Positive
     pose_s: float
     turn_s: Positive
     exclusive_share: float
@@ -42,10 +41,6 @@ class Levels(PoseProgram):
     def check(self) -> None:
         check_order(self, "shortest_s", "longest_s")
         check_order(self, "turn_s", "pose_s")
-        if self.zero_share + self.small_share > 1:
-            raise ConfigError(
-                f"zero_share: expected 1 or less with small_share, got {self.zero_share + self.small_share}"
-            )
 
     def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands of so many control periods, `(T, J)`."""

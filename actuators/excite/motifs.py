@@ -69,7 +69,7 @@ class Ramps(Motif):
         stop_margin: As in `levels`.
     """
 
-    share: float
+    share: Positive
     slopes_per_s: Annotated[tuple[Positive, ...], MinLen(1)]
     highest: float
     reach: float
@@ -103,7 +103,7 @@ class Holds(Motif):
         stop_margin: As in `levels`.
     """
 
-    share: float
+    share: Positive
     hold_s: float
     stop_margin: float
 
@@ -126,7 +126,7 @@ class Reversals(Motif):
         stop_margin: As in `levels`.
     """
 
-    share: float
+    share: Positive
     levels: tuple[float, ...]
     holds_s: tuple[float, ...]
     num_cycles: int

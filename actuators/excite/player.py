@@ -18,7 +18,15 @@ from typing import Annotated, Any, Self
 import numpy as np
 from annotated_types import Interval
 
-from actuators.excite.schedule import Approach, ExcitationPlan
+from actuators.excite.schedule import (
+    APPROACH_LEAST,
+    APPROACH_LEVEL,
+    APPROACH_SETTLE_S,
+    ARRIVED,
+    REST_S,
+    ExcitationPlan,
+    estimate_approach_s,
+)
 from brokk_rl.commands import SpeedProgram, find_rest, read_targets
 from brokk_rl.contracts.link import Link
 from brokk_rl.errors import ConfigError, LinkError
@@ -57,6 +65,8 @@ SPEED_WINDOW = 4
 noise."""
 
 
+PATIENCE = 3.0
+"""An approach is given up after this many times its nominal duration; chosen by hand."""
 APPROACH, REST, PLAY, RETURN, WAIT, DONE = range(6)
 """What a run is doing."""
 MOVES = np.array([True, False, False, True, False, False])
@@ -71,7 +81,6 @@ class PlanPlayer:
     Args:
         plan: Segments of each run.
         machine: The machine.
-        approach: How start poses are taken up.
         guards: Limits of all commands.
 
     Attributes:
@@ -82,10 +91,8 @@ class PlanPlayer:
     level = logging.WARNING
     """Level of the message that the way to a start pose was given up."""
 
-    def __init__(
-        self, plan: ExcitationPlan, machine: Machine, approach: Approach, guards: CommandGuards
-    ) -> None:
-        self._plan, self._machine, self._approach, self._guards = plan, machine, approach, guards
+    def __init__(self, plan: ExcitationPlan, machine: Machine, guards: CommandGuards) -> None:
+        self._plan, self._machine, self._guards = plan, machine, guards
         if guards.max_tool_speed_m_s is not None and not machine.has_bodies:
             raise ConfigError(
                 f"collect.guards.max_tool_speed_m_s: the geometry of machine '{machine.name}' is not known; give null, or bodies "
@@ -112,7 +119,7 @@ class PlanPlayer:
         slow, fast = self._rest_positions(q)
         target = self._start[self._rows, self.segment]
         error = target - slow
-        far = np.abs(error) > self._approach.tolerance * self._travel
+        far = np.abs(error) > ARRIVED * self._travel
         program = self._program[self._rows, self._index]
         before = self._program[self._rows, np.maximum(self._index - 1, 0)]
         self._advance(q, far, ((program * before <= 0) & (before != 0)).any(1))
@@ -165,7 +172,7 @@ class PlanPlayer:
             text = "run %d: way to the start of %s given up, out of place: %s; going on from there"
             log.log(self.level, text, n, name, joints)
         phase[arrived] += 1  # rest, or wait
-        rest = round(self._approach.rest_s / self._machine.period_s)
+        rest = round(REST_S / self._machine.period_s)
         self._left[arrived] = rest
         rested = ~arrived & late
         phase[rested & (phase == REST)] = PLAY
@@ -186,9 +193,9 @@ class PlanPlayer:
 
     def _toward(self, error: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Return commands toward the targets: ordinary joints first, then exclusive ones."""
-        approach, exclusive = self._approach, self._machine.is_exclusive
-        size = np.abs(error) / (self._speed * approach.settle_s)
-        size = size.clip(approach.smallest, approach.level)
+        exclusive = self._machine.is_exclusive
+        size = np.abs(error) / (self._speed * APPROACH_SETTLE_S)
+        size = size.clip(APPROACH_LEAST, APPROACH_LEVEL)
         first = far[:, ~exclusive].any(1)
         return np.sign(error) * size * far * mask_exclusive_joints(exclusive, ~first)
 
@@ -208,14 +215,12 @@ class PlanPlayer:
     def _patience(self, q: np.ndarray) -> np.ndarray:
         """Return the periods after which the approach from `q` is given up, `(N,)`."""
         start = self._start[self._rows, self.segment]
-        needed_s = self._approach.duration_s(self._machine, q, start)
-        return np.ceil(self._approach.patience * needed_s / self._machine.period_s).astype(int)
+        needed_s = estimate_approach_s(self._machine, q, start)
+        return np.ceil(PATIENCE * needed_s / self._machine.period_s).astype(int)
 
     def _pack(self) -> None:
         """Pack segments into arrays: programs end to end, `(N, L, J)`, the rest `(N, S, …)`."""
         runs, machine = self._plan.runs, self._machine
-        if not all(runs):
-            raise ConfigError("plan: a run has no segments")
         shape = len(runs), max(len(run) for run in runs)
         programs = [np.concatenate([segment.u for segment in run]) for run in runs]
         self._program = np.zeros((len(runs), max(map(len, programs)), machine.num_joints))

@@ -2,15 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Interval
 
 from brokk_rl.contracts.actuator import Excitation, Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import Positive, spec
 
 NUM_TRIES = 6
 """How often the length of the programs is fitted to the room that the ways between them leave; the
@@ -24,41 +21,28 @@ def check_order(options: object, smaller: str, larger: str) -> None:
         raise ConfigError(f"{smaller}: expected {larger}={most} or less, got {least}")
 
 
-@spec
-class Approach:
-    """Approach to the start pose of a segment.
+APPROACH_LEVEL = 0.6
+"""Largest command on the way to the start pose of a segment; chosen by hand."""
+APPROACH_LEAST = 0.2
+"""Smallest command on that way: above any dead band."""
+APPROACH_SETTLE_S = 1.0
+"""The command falls with the way that is left as if it were to take this time; longer than the dead time."""
+ARRIVED = 0.015
+"""A joint this close to its start, as a part of its travel, has arrived."""
+REST_S = 1.5
+"""Rest before a program begins; longer than the dead time, so that each program begins at rest."""
 
-    Attributes:
-        level: Largest command on the way.
-        smallest: Smallest command, above any dead band.
-        settle_s: The command falls with the way that is left as if it were to take this time;
-            longer than the dead time.
-        tolerance: A joint this close, as a part of its travel, has arrived.
-        rest_s: Rest before the program begins; longer than the dead time, so that each program
-            begins at rest.
-        patience: An approach is given up after this many times its nominal duration.
-    """
 
-    level: Annotated[float, Interval(gt=0, le=1)]
-    smallest: Positive
-    settle_s: Positive
-    tolerance: Positive
-    rest_s: float
-    patience: Annotated[float, Ge(1)]
-
-    def check(self) -> None:
-        check_order(self, "smallest", "level")
-
-    def duration_s(self, machine: Machine, start: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Return the nominal time from `start` to `target`, each `(…, J)`, with the rest."""
-        way = np.abs(target - start)
-        far = way > self.tolerance * (machine.upper - machine.lower)
-        going_s = way / (self.level * machine.max_speed)
-        slowing_s = self.settle_s * np.log(1.0 + going_s / self.settle_s)
-        each_s = np.where(far, going_s + slowing_s + machine.dead_time_s, 0.0)
-        first_s = each_s[..., ~machine.is_exclusive].max(-1, initial=0.0)
-        then_s = each_s[..., machine.is_exclusive].max(-1, initial=0.0)
-        return first_s + then_s + self.rest_s
+def estimate_approach_s(machine: Machine, start: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the nominal time from `start` to `target`, each `(…, J)`, with the rest, s."""
+    way = np.abs(target - start)
+    far = way > ARRIVED * (machine.upper - machine.lower)
+    going_s = way / (APPROACH_LEVEL * machine.max_speed)
+    slowing_s = APPROACH_SETTLE_S * np.log(1.0 + going_s / APPROACH_SETTLE_S)
+    each_s = np.where(far, going_s + slowing_s + machine.dead_time_s, 0.0)
+    first_s = each_s[..., ~machine.is_exclusive].max(-1, initial=0.0)
+    then_s = each_s[..., machine.is_exclusive].max(-1, initial=0.0)
+    return first_s + then_s + REST_S
 
 
 @dataclass(frozen=True)
@@ -79,7 +63,6 @@ class ExcitationPlan:
 def plan_runs(
     excitations: Mapping[str, Excitation],
     machine: Machine,
-    approach: Approach,
     num_runs: int,
     run_s: float,
     generator: np.random.Generator,
@@ -94,11 +77,6 @@ def plan_runs(
             "excitation: none chosen; for example excitation=sine or excitation=[levels,ramps,holds]"
         )
     shares = {name: excitation.share for name, excitation in excitations.items()}
-    for name, share in shares.items():
-        if share <= 0:
-            raise ConfigError(
-                f"excitation.{name}: its share is {share:g}; expected more than 0, or leave it out"
-            )
     parts = {name: share / sum(shares.values()) for name, share in shares.items()}
     runs = []
     for seed in generator.integers(2**63, size=num_runs):
@@ -110,7 +88,7 @@ def plan_runs(
                 segments += excitation.segments(machine, parts[name] * programs_s, draws)
             # motion within a segment is left out
             starts = np.stack([segment.start for segment in segments])
-            ways_s = approach.duration_s(machine, np.stack([machine.home, *starts[:-1]]), starts)
+            ways_s = estimate_approach_s(machine, np.stack([machine.home, *starts[:-1]]), starts)
             steps = sum(len(segment.u) for segment in segments)
             needed_s = float(ways_s.sum()) + steps * machine.period_s
             fill_s = needed_s if needed_s <= run_s else run_s - needed_s

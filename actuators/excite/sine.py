@@ -28,7 +28,7 @@ class Sine:
             travel, is brought home.
     """
 
-    share: float
+    share: Positive
     lowest_hz: Positive
     highest_hz: float
     smallest: Positive

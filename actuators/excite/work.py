@@ -31,7 +31,7 @@ class Work(PoseProgram):
         stop_margin: As in `levels`.
     """
 
-    share: float
+    share: Positive
     pose_s: Positive
     joints_at_once: Count
     stroke_s: PositiveRange

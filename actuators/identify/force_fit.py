@@ -82,15 +82,11 @@ class ForceFit:
             StorageError: a file could not be written.
         """
         machine = task.machine
-        if machine.interface != "torque":
-            raise ConfigError(
-                f"fit={self.name}: machine '{machine.name}' is commanded by {machine.interface}, not by torque"
-            )
+        self.actuator.build(machine, 1, torch.device("cpu"))  # refuses numbers that make no sense
         if self.motion_hz >= 0.45 / machine.period_s:
             raise ConfigError(
                 f"fit.motion_hz: {self.motion_hz:g} Hz cannot be filtered at a period of {machine.period_s:g} s; lower it"
             )
-        self.actuator.build(machine, 1, torch.device("cpu"))  # refuses numbers that make no sense
         given = self.actuator.dead_time_s
         delays_s = expand_per_joint(
             machine.dead_time_s if given is None else given, machine, "fit.actuator.dead_time_s"

@@ -5,7 +5,6 @@ for the dead time (`actuators.identify.dead_time`) gives the start; nonlinear le
 """
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from actuators.models.servo import Servo
 from actuators.open_loop import WARM_UP_S
 from brokk_rl.commands import read_targets
 from brokk_rl.errors import RecordingError
-from brokk_rl.spec import Range, spec
+from brokk_rl.spec import spec
 
 STEPS = np.array([5e-3, 2e-3, 5e-2, 2e-3, 1e-3, 1e-2])
 """Size of each number, in its own unit, by which steps of the search count; a tenth is a difference.
@@ -35,19 +34,16 @@ OUTLIER = 3.0
 """Root mean square errors of the start beyond which an error counts with its size, not its square."""
 
 
-@spec
-class ServoBounds:
-    """Lower and upper bound of each number of `actuator=servo` that is fitted, by its name."""
-
-    dead_time_s: Range
-    response_s: Range
-    damping: Range
-    play_rad: Range
-    sag_rad: Range
-    sag_slope: Range
-
-
-NUMBERS = tuple(field.name for field in fields(ServoBounds))
+BOUNDS = {
+    "dead_time_s": (0.0, 1.0),
+    "response_s": (0.0, 0.5),
+    "damping": (0.05, 5.0),
+    "play_rad": (0.0, 0.2),
+    "sag_rad": (-0.2, 0.2),
+    "sag_slope": (-0.3, 0.3),
+}
+"""Lower and upper bound of each number of `actuator=servo` that is fitted. A response of 0.5 s is a loop of 0.3 Hz;
+no drive keeps a resonance of a lower damping, and a loop of a higher one is a first-order lag."""
 
 
 @spec
@@ -58,12 +54,10 @@ class ServoFit:
         name: Name of the model in tables and of its files: `<name>.yaml`, an option for
             `actuator=@…`, and `<name>.json` with standard errors.
         actuator: The model; top speed and limit keep the values they have here.
-        free: Lower and upper bound of each number that is fitted.
     """
 
     name: str
     actuator: Servo
-    free: ServoBounds
 
     def fit(self, task: FitTask) -> Servo:
         """Fit to all recordings; validation chooses nothing.
@@ -81,7 +75,7 @@ class ServoFit:
                 f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s"
             )
         targets = [read_targets(one.u.astype(float), machine) for one in recordings]
-        low, high = np.array([getattr(self.free, name) for name in NUMBERS]).T
+        low, high = np.array(list(BOUNDS.values())).T
         # a joint answers no earlier than its history reaches back
         high[0] = min(high[0], (machine.num_history - 1) * machine.period_s)
         found, errors = [], []
@@ -97,8 +91,8 @@ class ServoFit:
             x, error = _JointRuns(pairs, machine.period_s, middle).fit(low, high)
             found.append(x)
             errors.append(error)
-        numbers = dict(zip(NUMBERS, np.array(found).T, strict=True))
-        told = dict(zip(NUMBERS, np.array(errors).T, strict=True))
+        numbers = dict(zip(BOUNDS, np.array(found).T, strict=True))
+        told = dict(zip(BOUNDS, np.array(errors).T, strict=True))
         return write_numbers(task.folder, self.name, self.actuator, machine, numbers, told)
 
 
@@ -119,7 +113,7 @@ class _JointRuns:
         self._skip = round(WARM_UP_S / period_s)
 
     def fit(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return `NUMBERS` within their bounds, and their standard errors."""
+        """Return the numbers of `BOUNDS` and their standard errors."""
         grid_s = np.arange(0.0, high[0] + 1e-9, RESOLUTION_S)
         best = None
         scale = 0.0

@@ -10,7 +10,7 @@ from pathlib import Path
 from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
 from actuators.excite.player import CommandGuards, NominalLink, PlanPlayer, Sample, drive
-from actuators.excite.schedule import Approach, ExcitationPlan, check_order, plan_runs
+from actuators.excite.schedule import ExcitationPlan, check_order, plan_runs
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.contracts.link import Connection
@@ -36,7 +36,6 @@ class Collection:
         flush_s: The file that grows is written again after this time, so that even a power failure
             costs no more.
         only_plan: Stop after `plan.png`, before anything moves.
-        approach: How start poses are taken up.
         guards: Bounds that no program can exceed.
     """
 
@@ -45,7 +44,6 @@ class Collection:
     file_minutes: Positive
     flush_s: Positive
     only_plan: bool
-    approach: Approach
     guards: CommandGuards
 
     def check(self) -> None:
@@ -75,7 +73,7 @@ class Collect:
         # The link refuses what it cannot do before a plan is written.
         link = self.link.build(self.machine, settings.num_runs, self.session)
         count, generator = settings.num_runs, self.session.generator("collect")
-        plan = plan_runs(self.excitation, self.machine, settings.approach, count, run_s, generator)
+        plan = plan_runs(self.excitation, self.machine, count, run_s, generator)
         self._show(plan)
         if settings.only_plan:
             return
@@ -98,7 +96,7 @@ class Collect:
         return self.session.folder / FOLDER
 
     def _runner(self, plan: ExcitationPlan) -> PlanPlayer:
-        return PlanPlayer(plan, self.machine, self.collect.approach, self.collect.guards)
+        return PlanPlayer(plan, self.machine, self.collect.guards)
 
     def _show(self, plan: ExcitationPlan) -> None:
         """Try the plan out on a nominal machine and draw it."""

@@ -142,7 +142,6 @@ class Identify:
         if options.test is not None:
             test = group_by_run(record.read_recordings(options.test, self.machine))
             self._check_unseen(runs, test)
-            check_commanded(runs, self.machine, 2, "one to fit to and one to stop the fit by")
             return [self._stage("", folder, runs, test)]
         purpose = (
             "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)"

@@ -5,6 +5,9 @@ from __future__ import annotations
 import logging
 import re
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import StringConstraints
 
 from actuators.recordings import log_draft
 from actuators.recordings.guess import GivenColumns, Guess
@@ -25,6 +28,10 @@ HEAD = ["subject", "guess", "how sure", "evidence"]
 TEMPLATE = Path(__file__).with_name("import.html.jinja")
 
 
+MachineName = Annotated[str, StringConstraints(pattern=r"^[a-z]\w*$")]
+"""A letter, then letters, digits and _."""
+
+
 @spec
 class LogSelection(GivenColumns):
     """Logs to import, and what a person says about them.
@@ -35,7 +42,7 @@ class LogSelection(GivenColumns):
     """
 
     input: str | tuple[str, ...]
-    name: str | None
+    name: MachineName | None
 
     def check(self) -> None:
         given = self.position_unit
@@ -45,10 +52,6 @@ class LogSelection(GivenColumns):
                     f"log.position_unit: unknown unit '{unit}'; {list_choices(unit, UNITS)}, or a number of one of them, "
                     "such as '0.00153 rad' for a count of an encoder"
                 )
-        if self.name is not None and not re.fullmatch(r"[a-z]\w*", self.name):
-            raise ConfigError(
-                f"log.name: expected a letter, then letters, digits and _, got '{self.name}'"
-            )
 
 
 @spec

@@ -99,15 +99,9 @@ class TargetColumn:
 
     column: str
     scale: float
-    full_speed: float | None
+    full_speed: Positive | None
     offset: float = 0.0  # maps from before this field have none
     wraps: float | None = None
-
-    def check(self) -> None:
-        if (self.full_speed is not None and self.full_speed <= 0) or self.scale == 0:
-            raise ConfigError(
-                f"column '{self.column}': expected full_speed > 0 and a scale other than 0"
-            )
 
     def command(self, values: np.ndarray, t_s: np.ndarray) -> np.ndarray:
         """Return the speed in force from each sample to the next, 0 at the last; same shape."""
@@ -162,11 +156,6 @@ class ColumnMap:
     damaged: Damaged = "refuse"  # maps from before these fields have none
     dbc: str | None = None
     channel: int | str | None = None
-
-    def check(self) -> None:
-        for time in self.time.values() if isinstance(self.time, dict) else (self.time,):
-            if not isinstance(time, RowTime) and time.scale <= 0:
-                raise ConfigError(f"column map: time.scale {time.scale:g} must be positive")
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
         """Return the pieces of the log at `path` as recordings of `machine`.

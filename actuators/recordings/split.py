@@ -42,9 +42,9 @@ def list_sources(recordings: Sequence[Recording]) -> list[str]:
     return sorted({recording.metadata.get("source", "unknown") for recording in recordings})
 
 
-def measure_commanded_s(recordings: Sequence[Recording], least: float = COMMANDED) -> np.ndarray:
-    """Return for how long each joint has a command above `least` in all recordings together, s, `(J,)`."""
-    each = [(np.abs(one.u) > least).sum(0) / one.rate_hz for one in recordings]
+def measure_commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
+    """Return for how long each joint has a command in all recordings together, s, `(J,)`."""
+    each = [(np.abs(one.u) > COMMANDED).sum(0) / one.rate_hz for one in recordings]
     return np.sum(each, 0)
 
 

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 
 from actuators.contracts import ActuatorFit
-from actuators.excite.schedule import Approach
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
@@ -57,7 +56,6 @@ class ExamSettings:
         reference: How the machine as it is believed to be is recorded.
         field: How the machine as it is is recorded.
         withheld: How it is recorded for the examiner, who simulates the repair there.
-        approach: How start poses are taken up.
         sealed: The cases depend on a secret salt among the labels, too: nobody can make them again
             from `session.seed`.
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
@@ -75,7 +73,6 @@ class ExamSettings:
     reference: HalfPlan
     field: HalfPlan
     withheld: HalfPlan
-    approach: Approach
     sealed: bool
     salt: str | None
 
@@ -145,7 +142,7 @@ class Exam:
         }
         found = dataset.seal_labels(folder, {**facts, "cases": labels}, salt)
         halves: dict[Half, HalfPlan] = {half: getattr(settings, half) for half in STREAMS}
-        drawn = (settings.plants, settings.roughness, self.excitation, settings.approach)
+        drawn = (settings.plants, settings.roughness, self.excitation)
         recorder = CaseRecorder(self.machine, *drawn, halves, folder)
         recorder.write_all(questions, settings.workers)
         write_json(folder / FACTS_FILE, {**facts, "labels_sha256": found})

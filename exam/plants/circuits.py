@@ -6,6 +6,7 @@ machine has numbers of its own, and an effect or a cause changes these numbers w
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import NonNegative, spec
 from exam.plants.changes import PlantParameters
-from exam.plants.family import DrawnPlants, PlantBatch, change_spec, share
+from exam.plants.family import DrawnPlants, PlantBatch, share
 from exam.plants.hydraulics import SPOOL_STEP
 from exam.plants.linkage import Arm
 from exam.plants.valve_arm import ValveArm
@@ -98,8 +99,8 @@ class CircuitValves:
         }
         self._sinking = numbers["supply_ratio"] / machine.max_speed * numbers["sink_rad_s"]
         self._ajar = numbers["supply_ratio"] / AJAR_LOAD
-        stepped = change_spec(machine, period_s=STEP_S, dead_time_s=0.0, num_history=2)
-        at_once = change_spec(circuit, transport_s=0.0, outrigger_nm_rad=0.0)
+        stepped = replace(machine, period_s=STEP_S, dead_time_s=0.0, num_history=2)
+        at_once = replace(circuit, transport_s=0.0, outrigger_nm_rad=0.0)
         self._model = SteppedCircuit(at_once, stepped, shape[0], torch.device("cpu"))
         for name in self._model.parameters:
             self._set(name, changed[name])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
@@ -80,11 +79,6 @@ class PlantBatch:
 def share(values: Mapping[str, float], machine: Machine) -> PlantParameters:
     """Return numbers that all joints share."""
     return {name: np.full(machine.num_joints, value) for name, value in values.items()}
-
-
-def change_spec(spec: Any, **numbers: Any) -> Any:
-    """Return a spec with other values of some fields, such as a machine in shorter steps."""
-    return dataclasses.replace(spec, **numbers)
 
 
 class PlantLink:
@@ -172,18 +166,11 @@ class DrawnPlants:
     table: ClassVar[Mapping[str, Change]]
     causes: ClassVar[tuple[str, ...]]
 
-    def check(self) -> None:
-        for name in self.outside_not_on:
-            if name not in self.causes:
-                raise ConfigError(
-                    f"exam.plants.outside_not_on: no cause '{name}'; {list_choices(name, self.causes)}"
-                )
-
     def draw(self, machine: Machine, run: PlantRun) -> tuple[str, PlantParameters]:
         """Return make and numbers of a run's machine, aged and with its faults.
 
         Raises:
-            ConfigError: an effect or a roughness is unknown, or the family cannot be drawn here.
+            ConfigError: the roughness is unknown, or the family cannot be drawn here.
         """
         if run.roughness not in self.roughness:
             raise ConfigError(
@@ -204,12 +191,8 @@ class DrawnPlants:
             aged = roughness * spread * of_day.standard_normal(count)
             numbers[name] = numbers[name] * np.exp(aged)
         for effect, size in run.faults.items():
-            if effect in self.causes:
-                continue
-            if effect not in self.table:
-                known = list_choices(effect, self.table)
-                raise ConfigError(f"exam: a machine of make '{make}' lacks '{effect}'; {known}")
-            self.table[effect](numbers, size)
+            if effect not in self.causes:
+                self.table[effect](numbers, size)
         return make, numbers
 
     def complete(

@@ -6,6 +6,7 @@ quantised reading drives motors with back EMF against friction, and weight comes
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from diagnosis.mjcf.plant import MjcfPlant
 from exam.plants import servo_faults
 from exam.plants.changes import PlantParameters
 from exam.plants.electronics import CommandBus
-from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, change_spec, share
+from exam.plants.family import DrawnPlants, PlantBatch, PlantLink, share
 from exam.plants.servo_drive import FRICTIONS, STEP_S, PositionLoop, TargetFilter
 from exam.plants.servo_faults import CAUSES, ServoCauses
 
@@ -33,8 +34,8 @@ COGS = 40.0
 def restrict_to_torques(machine: Machine) -> Machine:
     """Return the machine with joints that take 1 Nm a command, once a time step."""
     unit = Dimension(value=1.0, source="unit of the torque", confidence="high")
-    joints = [change_spec(joint, command="torque", max_force=unit) for joint in machine.joints]
-    return change_spec(machine, period_s=STEP_S, dead_time_s=0.0, joints=tuple(joints))
+    joints = [replace(joint, command="torque", max_force=unit) for joint in machine.joints]
+    return replace(machine, period_s=STEP_S, dead_time_s=0.0, joints=tuple(joints))
 
 
 class ServoArm(PlantLink):

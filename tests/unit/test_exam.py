@@ -293,7 +293,7 @@ def test_another_hand_drives_the_field_of_half_of_the_cases_and_never_the_refere
     mode = load_mode(*SMALL, *words, "exam.mix.num_cases=20", f"session.out={tmp_path}")
     exam, questions = mode.exam, mode.questions("")
     halves: dict[generate.Half, Any] = {"reference": exam.reference, "field": exam.field}
-    about = (mode.machine, exam.plants, "mild", mode.excitation, exam.approach)
+    about = (mode.machine, exam.plants, "mild", mode.excitation)
     recorder = CaseRecorder(*about, halves, tmp_path)
 
     def name_first(number: int, half: generate.Half) -> str:

@@ -19,10 +19,9 @@ from actuators.excite.player import (
     drive,
     measure_tool_speed,
 )
-from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
+from actuators.excite.schedule import ExcitationPlan, plan_runs
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import LinkError
-from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command, JointState
@@ -32,11 +31,6 @@ OPEN = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
 
 def measure_speed(machine: Machine, q: np.ndarray) -> np.ndarray:
     return measure_tool_speed(machine, q, np.gradient(q, machine.period_s, axis=0))
-
-
-@pytest.fixture(scope="module")
-def approach() -> Approach:
-    return load_mode("mode=collect", "session.out=unused").collect.approach
 
 
 def constant(joints: dict[int, float], seconds: float, start: np.ndarray, **fields: Any) -> Segment:
@@ -53,13 +47,12 @@ RUN_S = 120.0
 def played(
     runs: Sequence[Sequence[Segment]],
     machine: Machine,
-    approach: Approach,
     guards: CommandGuards = OPEN,
     link: Any = None,
 ) -> PlanTrack:
     plan = ExcitationPlan(runs=tuple(map(tuple, runs)), run_s=RUN_S, names=("a",))
     link = link or NominalLink(machine, len(runs))
-    player = PlanPlayer(plan, machine, approach, guards)
+    player = PlanPlayer(plan, machine, guards)
     return PlanTrack(drive(link, player, machine, len(runs), RUN_S))
 
 
@@ -81,14 +74,12 @@ def with_speed(machine: Machine, scale: float) -> Machine:
     return replace(machine, joints=tuple(joints))
 
 
-def test_a_program_is_played_unchanged_from_its_start_pose(
-    machine: Machine, approach: Approach
-) -> None:
+def test_a_program_is_played_unchanged_from_its_start_pose(machine: Machine) -> None:
     generator = np.random.default_rng(0)
     start = np.stack([anywhere(machine, seed) for seed in range(4)])
     programs = 0.05 * generator.uniform(-1, 1, (4, 100, 5)) * (np.arange(5) != 1)
     runs = [[constant({}, 1.0, s, u=u)] for s, u in zip(start, programs, strict=True)]
-    track = played(runs, machine, approach)
+    track = played(runs, machine)
     for n, (segment,) in enumerate(runs):
         inside = track.phase[:, n] == PLAY
         assert (track.u[inside, n] == segment.u).all()
@@ -97,13 +88,13 @@ def test_a_program_is_played_unchanged_from_its_start_pose(
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 1.5])
 def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
-    scale: float, machine: Machine, approach: Approach, caplog: pytest.LogCaptureFixture
+    scale: float, machine: Machine, caplog: pytest.LogCaptureFixture
 ) -> None:
     runs = []
     for n in range(5):
         starts = [anywhere(machine, 10 * n + i) for i in range(3)]
         runs.append([constant({}, 1.0, start, name=f"a_{i}") for i, start in enumerate(starts)])
-    track = played(runs, machine, approach, link=NominalLink(with_speed(machine, scale), 5))
+    track = played(runs, machine, link=NominalLink(with_speed(machine, scale), 5))
     assert not caplog.records
     assert (track.phase[-1] == PLAY).any()
     assert track.segment[-1].tolist() == [2] * 5
@@ -115,36 +106,32 @@ def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
 
 
 def test_exclusive_joints_never_move_together_with_others_on_the_way_either(
-    machine: Machine, approach: Approach
+    machine: Machine,
 ) -> None:
     # No excitation may ask for this; the runner drops q2.
     together = constant({1: 0.5, 3: 0.5}, 2.0, anywhere(machine, 0))
     runs = [[constant({}, 1.0, anywhere(machine, n)), together] for n in range(6)]
-    track = played(runs, machine, approach)
+    track = played(runs, machine)
     alone, others = track.u[:, :, 1] != 0, (np.delete(track.u, 1, axis=2) != 0).any(2)
     assert alone.any() and others.any() and not (alone & others).any()
 
 
-def test_the_stops_are_kept_although_the_command_acts_late(
-    machine: Machine, approach: Approach
-) -> None:
+def test_the_stops_are_kept_although_the_command_acts_late(machine: Machine) -> None:
     for scale in (1.0, 1.4):
         for sign in (-1.0, 1.0):
             segments = [constant({0: sign, 2: sign, 3: sign, 4: sign}, 30.0, machine.home)]
             link = NominalLink(with_speed(machine, scale), 1)
-            track = played([segments], machine, approach, link=link)
+            track = played([segments], machine, link=link)
             left = np.minimum(track.q - machine.lower, machine.upper - track.q).min((0, 1))
             assert left.min() > 0.0, f"speed x {scale}: {left}"
             assert np.delete(find_shares(machine, left), 1).max() < 0.06, "and they are reached"
 
 
-def test_inward_turns_a_joint_back_until_its_program_passes_zero(
-    machine: Machine, approach: Approach
-) -> None:
+def test_inward_turns_a_joint_back_until_its_program_passes_zero(machine: Machine) -> None:
     u = np.zeros((500, 5))
     u[:, 4] = 0.8
     u[400:, 4] = -0.8
-    track = played([[constant({}, 0.0, machine.home, u=u)]], machine, approach)
+    track = played([[constant({}, 0.0, machine.home, u=u)]], machine)
     inside = track.phase[:, 0] == PLAY
     sent = track.u[inside, 0, 4]
     assert set(np.abs(sent)) == {0.8}
@@ -152,13 +139,11 @@ def test_inward_turns_a_joint_back_until_its_program_passes_zero(
     assert (sent[400:420] == -0.8).all()
 
 
-def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(
-    machine: Machine, approach: Approach
-) -> None:
+def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(machine: Machine) -> None:
     u = np.zeros((2000, 5))
     # Drives into the stop, then slowly back.
     u[:, 2] = np.where(np.arange(2000) // 500 % 2 == 0, 0.9, -0.2)
-    track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine, approach)
+    track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine)
     phase = track.phase[:, 0]
     begin = np.flatnonzero(phase >= PLAY)[0]
     away = np.flatnonzero(phase > PLAY) - begin
@@ -169,19 +154,17 @@ def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(
     assert (phase >= PLAY).sum() == 2000, "a segment lasts as long as its program"
 
 
-def test_commands_keep_to_the_largest(machine: Machine, approach: Approach) -> None:
+def test_commands_keep_to_the_largest(machine: Machine) -> None:
     guards = CommandGuards(max_command=0.3, max_tool_speed_m_s=None)
     segment = constant({0: 1.0, 3: -1.0}, 3.0, anywhere(machine, 1))
-    track = played([[segment]], machine, approach, guards)
+    track = played([[segment]], machine, guards)
     assert np.abs(track.u).max() == 0.3
 
 
-def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(
-    machine: Machine, approach: Approach
-) -> None:
+def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(machine: Machine) -> None:
     segment = constant({0: 1.0, 3: 0.5}, 4.0, machine.home)
     guards = replace(OPEN, max_tool_speed_m_s=0.4)
-    free, slow = (played([[segment]], machine, approach, one) for one in (OPEN, guards))
+    free, slow = (played([[segment]], machine, one) for one in (OPEN, guards))
     fast, guarded = (measure_speed(machine, track.q[:, 0]) for track in (free, slow))
     assert fast is not None and guarded is not None
     assert fast.max() > 0.8 and 0.35 < guarded.max() < 0.42
@@ -207,10 +190,10 @@ class Stuck(NominalLink):
 
 
 def test_an_approach_that_does_not_arrive_is_given_up_and_said(
-    machine: Machine, approach: Approach, caplog: pytest.LogCaptureFixture
+    machine: Machine, caplog: pytest.LogCaptureFixture
 ) -> None:
     start = machine.home + 0.8 * (np.arange(machine.num_joints) == 3)
-    track = played([[constant({0: 0.3}, 1.0, start)]], machine, approach, link=Stuck(machine, 1))
+    track = played([[constant({0: 0.3}, 1.0, start)]], machine, link=Stuck(machine, 1))
     assert (track.u[track.phase[:, 0] == PLAY, 0, 0] == 0.3).all()
     assert "start of a_00 given up, out of place: q4" in caplog.text
 
@@ -234,23 +217,20 @@ class Broken(NominalLink):
     ("link", "message"), [(Silent, "no state after"), (Broken, "finite positions")]
 )
 def test_a_link_that_fails_is_an_error(
-    link: type[NominalLink], message: str, machine: Machine, approach: Approach, monkeypatch: Any
+    link: type[NominalLink], message: str, machine: Machine, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr("actuators.excite.player.SILENCE_S", 0.05)
     with pytest.raises(LinkError, match=message):
-        played([[constant({0: 0.3}, 5.0, machine.home)]], machine, approach, link=link(machine, 1))
+        played([[constant({0: 0.3}, 5.0, machine.home)]], machine, link=link(machine, 1))
 
 
-def test_a_plan_fills_its_time_and_repeats_with_its_seed(
-    machine: Machine, approach: Approach
-) -> None:
+def test_a_plan_fills_its_time_and_repeats_with_its_seed(machine: Machine) -> None:
     chosen = {name: option("excitation", name) for name in ("levels", "ramps", "holds")}
     plan, again, other = (
-        plan_runs(chosen, machine, approach, 2, 600.0, np.random.default_rng(seed))
-        for seed in (1, 1, 2)
+        plan_runs(chosen, machine, 2, 600.0, np.random.default_rng(seed)) for seed in (1, 1, 2)
     )
     link = NominalLink(machine, 2)
-    runner = PlanPlayer(plan, machine, approach, OPEN)
+    runner = PlanPlayer(plan, machine, OPEN)
     track = PlanTrack(drive(link, runner, machine, 2, 600.0))
     assert runner.done and len(track.t_s) > 0.75 * 600 * 20, "neither cut nor left empty"
     for run, same in zip(plan.runs, again.runs, strict=True):
