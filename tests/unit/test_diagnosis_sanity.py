@@ -17,6 +17,11 @@ Examine = Callable[[Recording], dict[str, RecordingRemark]]
 
 
 @pytest.fixture
+def sound(machine: Machine) -> Recording:
+    return recording(machine)
+
+
+@pytest.fixture
 def examine(machine: Machine) -> Examine:
     """Returns the remarks on a recording by name."""
 
@@ -26,15 +31,14 @@ def examine(machine: Machine) -> Examine:
     return run
 
 
-def test_a_sound_recording_says_only_which_joint_rested(machine: Machine) -> None:
-    (remark,) = examine_recordings([recording(machine)], machine)
+def test_a_sound_recording_says_only_which_joint_rested(sound: Recording, machine: Machine) -> None:
+    (remark,) = examine_recordings([sound], machine)
     assert (remark.name, remark.joint, remark.kind.severity) == ("joint at rest", "q2", "note")
 
 
 def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
-    machine: Machine, examine: Examine
+    sound: Recording, machine: Machine, examine: Examine
 ) -> None:
-    sound = recording(machine)
     found = examine(recording(machine, np.abs(sound.u[:, 3]) > 0))["interlock"]
     assert found.joint == "q3"
     assert found.kind.severity == "bad"
@@ -44,9 +48,8 @@ def test_a_joint_locked_while_another_moves_is_an_interlock_and_says_which(
 
 
 def test_a_joint_locked_in_a_pose_is_an_interlock_and_says_where(
-    machine: Machine, examine: Examine
+    sound: Recording, machine: Machine, examine: Examine
 ) -> None:
-    sound = recording(machine)
     limit = float(np.quantile(sound.q[:, 0], 0.5))
     found = examine(recording(machine, np.roll(sound.q[:, 0] > limit, -DELAY)))["interlock"]
     assert found.joint == "q3" and "q3 ignores its command when q1 is above" in found.amount
@@ -71,17 +74,15 @@ def test_a_lock_without_a_common_condition_stays_unexplained(
     ],
 )
 def test_only_rows_that_are_not_equally_spaced_are_a_fault_of_the_clock(
-    machine: Machine, examine: Examine, change, name: str | None
+    sound: Recording, examine: Examine, change, name: str | None
 ) -> None:
-    sound = recording(machine)
     found = examine(replace(sound, t_s=change(sound.t_s)))
     assert {key for key in found if "clock" in key} == ({name} if name else set())
 
 
 def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_not(
-    machine: Machine, examine: Examine
+    sound: Recording, machine: Machine, examine: Examine
 ) -> None:
-    sound = recording(machine)
     middle = float(sound.q[:, 2].min() + 0.7 * np.ptp(sound.q[:, 2]))
     q = sound.q.copy()
     q[:, 2] = np.minimum(q[:, 2], middle)
@@ -93,9 +94,8 @@ def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_no
 
 
 def test_lost_frames_and_broken_rules_are_one_remark_each(
-    machine: Machine, examine: Examine
+    sound: Recording, examine: Examine
 ) -> None:
-    sound = recording(machine)
     q, u = sound.q.copy(), sound.u.copy()
     for row in range(100, 4000, 97):
         q[row] = q[row - 1]
@@ -105,8 +105,7 @@ def test_lost_frames_and_broken_rules_are_one_remark_each(
     assert found["exclusive joint"].from_s == pytest.approx(20.0)
 
 
-def test_the_gravest_comes_first_and_all_of_it_is_plain(machine: Machine) -> None:
-    sound = recording(machine)
+def test_the_gravest_comes_first_and_all_of_it_is_plain(sound: Recording, machine: Machine) -> None:
     slow = replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)
     remarks = examine_recordings([slow], machine)
     places = [["bad", "warn", "note"].index(remark.kind.severity) for remark in remarks]

@@ -53,6 +53,13 @@ def check_joints(recordings: list[dict[str, Any]], num: int = 600, atol: float =
     np.testing.assert_allclose(found["q_knee_rad"], expected[:rows, 4], atol=atol)
 
 
+def check_import(option: str) -> None:
+    done, recordings = import_log(option)
+    assert done.code == 0, done.err
+    assert "No guess is unsure" in done.out
+    check_joints(recordings)
+
+
 def follow_advice(text: str) -> str:
     """Returns the setting that a message advises, as it is typed."""
     found = re.search(r"'(log\.\w+=[^']+)'|(log\.\w+=[^\s,;]+)", text)
@@ -124,10 +131,7 @@ def write_dates(form: str) -> list[str]:
 def test_every_layout_of_text_gives_both_joints(name: str, lines: list[str], encoding: str) -> None:
     end = "\r" if name == "returns.csv" else "\r\n"
     Path(name).write_bytes((end.join(lines) + end).encode(encoding))
-    done, recordings = import_log(f"log.input={name}")
-    assert done.code == 0, done.err
-    assert "No guess is unsure" in done.out
-    check_joints(recordings)
+    check_import(f"log.input={name}")
 
 
 @pytest.mark.parametrize(
@@ -173,9 +177,7 @@ def test_columns_of_parquet_of_every_kind_are_read(kind: str) -> None:
     if kind == "decimals":
         frame["hip_pos_rad"] = frame["hip_pos_rad"].map(lambda value: Decimal(f"{value:.6f}"))
     frame.to_parquet("a.parquet")
-    done, recordings = import_log("log.input=a.parquet")
-    assert "No guess is unsure" in done.out
-    check_joints(recordings)
+    check_import("log.input=a.parquet")
 
 
 def test_a_list_that_is_empty_at_first_is_read_and_a_position_without_command_is_told() -> None:
@@ -240,10 +242,7 @@ def test_stamps_of_several_kinds_are_read(kind: str) -> None:
         clock = 1.7e12 + rows[:, :1] * 1000.0
         names = ("timestamp", *NAMES[1:])
     write_text("a.csv", np.column_stack([clock, rows[:, 1:]]), names)
-    done, recordings = import_log("log.input=a.csv")
-    assert done.code == 0, done.err
-    assert "No guess is unsure" in done.out
-    check_joints(recordings)
+    check_import("log.input=a.csv")
 
 
 def test_rows_that_are_lost_by_chance_do_not_cut_a_log_into_pieces() -> None:
