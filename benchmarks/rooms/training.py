@@ -77,7 +77,7 @@ MEASUREMENTS = (
     Measurement(
         name="other_circuits",
         title="The policy that ships, on circuits to which nothing was fitted",
-        conditions="Nothing was fitted to these plants. The baseline is the classical controller, from the same 256 starts.",
+        conditions="Baseline: the classical controller, from the same 256 starts.",
         commands=evaluate_each("actuator", CIRCUITS, "evaluation.episodes=256"),
         code=SHIPPED_CODE,
         read=lambda folder: read_evaluations(folder, "plant"),
@@ -86,8 +86,8 @@ MEASUREMENTS = (
     Measurement(
         name="unidentified_machine",
         title="A policy for machines that nobody identified",
-        conditions="It learned in [two parts](operator.md#the-simulated-person), 1,282 and 1,540 million steps, one seed. The first was chosen from seven trainings by the three circuits, to which nothing was fitted; the second, and the filter, on other plants. "
-        "It learned episodes of 40 s. Baseline: the controller without the filter, from the same starts.",
+        conditions="It learned in [two parts](operator.md#the-simulated-person), 1,282 and 1,540 million steps, one seed, episodes of 40 s. The first was chosen from seven trainings by the three circuits, to which nothing was fitted; the second, and the filter, on other plants. "
+        "Two later trainings that priced time were quicker there, but worse in 40 s. Baseline: the controller without filter, same starts.",
         commands=tuple(
             command
             for follower, episode_s in TRIALS
