@@ -53,9 +53,9 @@ class GrownEffect:
         return count
 
     def summarise(self) -> EffectFinding:
-        """Return its name and its joints, and what it earned."""
-        joints = tuple(np.flatnonzero(self.joints).tolist())
-        return EffectFinding(self.kind.name, joints, self.nats)
+        """Return its name, and what it earned in equal parts on its joints."""
+        joints = np.flatnonzero(self.joints).tolist()
+        return EffectFinding(self.kind.name, dict.fromkeys(joints, self.nats / max(len(joints), 1)))
 
     def keep(self, joints: np.ndarray) -> GrownEffect:
         """Return the effect on some of its joints only."""

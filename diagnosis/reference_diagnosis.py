@@ -26,7 +26,7 @@ from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, 
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.effect_library import DetectedEffect, EffectType
-from diagnosis.engine.decide import Decider, Decision, EffectFinding
+from diagnosis.engine.decide import LEAST_NATS, Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import SIGMAS, describe_numbers
 from diagnosis.repair_proof import EngineProof, RepairProof
@@ -36,11 +36,6 @@ SizesByName = Mapping[str, Mapping[str, Estimate]]
 """Sizes by number and joint, or `machine`."""
 ProgressCallback = Callable[[str, float], None]
 """Receives the name of a step and the share of the whole that is done."""
-DIRECT_NATS = 4.0
-NAME_NATS = 20.0
-"""Cost of a joint and of a name where tool points or the scatter of samples show an effect. With 12
-four of 139 practice cases with tool points named geometry falsely beside a true name, by 6 nats at most; the
-true ones are named either way."""
 CLOCK_SHIFT_S = 0.012
 """Least shift between encoders and tool tracker that is named: 73 practice cases without one show 0.0022 s at
 most, two whose encoder repeats its readings 0.011 s."""
@@ -52,9 +47,8 @@ SCATTERING = frozenset({"clock_offset", "quantisation", "sensor_noise"})
 """Effects by which tool points scatter about any law of the encoders."""
 UNNAMED_PROBABILITY = 0.8
 """Probability of a verdict that names no effect; chosen by hand."""
-NATS_OF_HALF = 20.0
 NATS_OF_SURE = 15.0
-"""An effect of so many nats is there in half of the cases, and how fast that grows."""
+"""How fast the probability grows with what an effect earns; chosen by hand."""
 MAX_RIVALS = 4
 """Most rivals of a ranking."""
 
@@ -167,11 +161,11 @@ class Diagnosis(ABC):
     @cached_property
     def detected(self) -> list[DetectedEffect]:
         """Effects that tool points and the scatter of samples show."""
-        found = geometry.find_geometry_errors(self.case, self.kinds, DIRECT_NATS, NAME_NATS)
+        found = geometry.find_geometry_errors(self.case, self.kinds)
         for kind in self.kinds:
             # Steps of a coarse sensor are found by the engine itself.
             if kind.name == "sensor_noise":
-                noise = sensors.find_sensor_noise(self.case, kind, DIRECT_NATS, NAME_NATS)
+                noise = sensors.find_sensor_noise(self.case, kind)
                 found += [] if noise is None else [noise]
         return found
 
@@ -320,8 +314,8 @@ def accept_named_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate
 
 
 def estimate_probability(nats: float) -> float:
-    """Return the probability that a named effect is there."""
-    odds = np.exp((min(nats, 300.0) - NATS_OF_HALF) / NATS_OF_SURE)
+    """Return the probability that a named effect is there: half for one that just earns enough."""
+    odds = np.exp((min(nats, 300.0) - LEAST_NATS) / NATS_OF_SURE)
     return float(np.clip(odds / (1.0 + odds), 0.5, 0.99))
 
 
@@ -429,7 +423,7 @@ def _explain(decision: Decision, machine: Machine) -> str:
         return "no effect earns more on the field recordings than it would by chance"
     group, nats = decision.generic
     shown = f"the field follows a law of: {group} ({nats:.0f} nats)"
-    outside = decision.outside
+    outside = next(iter(decision.table.list_found(is_outside=True)), None)
     if outside is not None and outside.nats > nats:
         cause = outside.effect.replace("_", " ")
         joints = ", ".join(name_joints(outside.joints, machine))
@@ -439,7 +433,7 @@ def _explain(decision: Decision, machine: Machine) -> str:
 
 def _describe_evidence(decision: Decision) -> dict[str, Any]:
     """Return what each effect earns beside the first, and each cause outside the library, plain JSON data."""
-    outside = decision.outside
+    outside = next(iter(decision.table.list_found(is_outside=True)), None)
     return {
         "outside": None if outside is None else {"cause": outside.effect, "score": outside.nats},
         "generic": {"group": decision.generic[0], "score": decision.generic[1]},

@@ -17,6 +17,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType
+from diagnosis.engine.decide import JOINT_NATS, LEAST_NATS
 from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.side import stack_side
 from diagnosis.engine.sizes import SIGMAS, get_form_error
@@ -58,9 +59,7 @@ def measure_scatter(recordings: Sequence[Recording], machine: Machine) -> np.nda
     return found
 
 
-def find_sensor_noise(
-    case: GapCase, kind: EffectType, price: float, name_price: float
-) -> DetectedEffect | None:
+def find_sensor_noise(case: GapCase, kind: EffectType) -> DetectedEffect | None:
     """Return the noise that the scatter of the field's samples shows; `None` without any."""
     reference, machine = split_recordings(case.reference, case.machine), case.machine
     if len(reference) < 2:
@@ -76,12 +75,12 @@ def find_sensor_noise(
     gain = _compute_likelihood(seen, noisy, variance)
     gain = gain - _compute_likelihood(seen, plain, _compute_variance(plain, plain))
     gain = np.minimum(gain, MAX_GAIN)
-    mask = (gain > price) & (sizes >= MIN_ADDED_SCATTER * estimate_sensor_noise(reference))
+    mask = (gain > JOINT_NATS) & (sizes >= MIN_ADDED_SCATTER * estimate_sensor_noise(reference))
     sides = stack_side(case.field, machine), stack_side(case.reference, machine)
     for j in np.flatnonzero(mask).tolist():
         # The steps of a coarse sensor scatter as well.
         mask[j] = find_lattice(*sides, j) == 0.0
-    worth = float((gain[mask] - price).sum()) - name_price
+    worth = float((gain[mask] - JOINT_NATS).sum()) - LEAST_NATS
     if worth <= 0.0:
         return None
     parameters = {}

@@ -40,7 +40,7 @@ NO_PROOF = "gates of the proof, and the decision alone"
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "no ageing": lambda model, numbers: np.zeros(len(model.fitted)),
     "no price": lambda table, _, name: np.full((1, (table.names == name).sum()), -np.inf),
-    "one joint is enough": lambda gains, rest: (sum(gains) + rest, np.inf),
+    "plain covariance": lambda base, slopes, columns: base.covariance,
     "one motion": lambda side, flow: np.zeros(side.num_samples, dtype=int),
 }
 

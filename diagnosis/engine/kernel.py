@@ -195,9 +195,7 @@ def simulate_path(
     moving = wp.int32(0)
     begin = wp.int32(-1)
     for k in range(load.shape[0]):
-        is_first = wp.int32(0)
         if begins[k] != begin:
-            is_first = wp.int32(1)
             begin = begins[k]
             slow = zero
             ring = zero
@@ -294,7 +292,7 @@ def simulate_path(
             speed = slow
             if opened <= zero:
                 speed += numbers[c, Place.CREEP] + numbers[c, Place.CREEP_BY_LOAD] * load[k]
-            if sag != zero and is_first == 0:
+            if sag != zero and k > begin:
                 speed += sag * (load[k] - load[k - 1]) / period_s
             off = ring - speed
             ring = speed + (cosine + damped * sine) * off + sine * ring_rate

@@ -228,6 +228,8 @@ def estimate_nuisance(side: Side, joint: int, base: JointBaseline) -> JointNuisa
             if evidence > best:
                 best = evidence
                 sizes = tried
+    scatter = scale_columns(columns, sizes)[len(mix) :]
+    mix = np.linalg.cholesky(base.add_scatter(slopes, scatter) + np.diag(ageing**2)).T
     return JointNuisance(mix, sizes, [part.project(sizes) for part in parts])
 
 

@@ -90,11 +90,7 @@ def test_numbers_of_the_configuration_are_explained() -> None:
     ("rule", "module", "text"),
     [
         (rules.floors, "brokk_rl.machine", "from brokk_rl.sim import model"),
-        (
-            rules.floors,
-            "brokk_rl.rl.runner",
-            "def f():\n    from brokk_rl.modes.train import Train",
-        ),
+        (rules.floors, "brokk_rl.rl.runner", "def f():\n    import brokk_rl.modes.train"),
         (rules.floors, "actuators.models.lag", "import diagnosis.answer"),
         (rules.doors, "diagnosis.answer", "import mujoco"),
         (rules.doors, "brokk_rl.modes.list", "from omegaconf import OmegaConf"),

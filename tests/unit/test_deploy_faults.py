@@ -98,11 +98,8 @@ def test_what_speaks_against_the_positions_takes_the_advice_away_and_nothing_is_
     stage.get_going()
     stage.fault(fault, message)
     stage.go(limit_s + 0.061)  # the policy's period
-    elsewhere = message in ("LeverState", "MachineStatus") and fault in (
-        "drop",
-        "wrong_id",
-        "delay",
-    )
+    is_missing = fault in ("drop", "wrong_id", "delay")
+    elsewhere = is_missing and message in ("LeverState", "MachineStatus")
     assert stage.advised == (fault in OPERATORS or elsewhere)
     assert not stage.air.sent
 

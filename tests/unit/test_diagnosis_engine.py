@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
 from diagnosis.engine import decide
+from diagnosis.engine.baseline import JointBaseline
 from diagnosis.engine.evidence import JointRow
 from diagnosis.engine.rows import Row
 from diagnosis.reference_diagnosis import propose_measurement, rank_effects
@@ -68,7 +69,7 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
 def test_rivals_share_what_the_first_name_leaves(machine: Machine) -> None:
     # Of one name in two forms the better one counts.
     earned = (("backlash", 90.0), ("lag", 60.0), ("stiction", 45.0), ("lag", 44.0), ("creep", -1.0))
-    rivals = [decide.EffectFinding(name, (2,), nats) for name, nats in earned]
+    rivals = [decide.EffectFinding(name, {2: nats}) for name, nats in earned]
     found = rank_effects(said().selected, rivals, "effects", machine)
     # Of 0.03, as e to 1, since 15 nats lie between them.
     shares = {"backlash": 0.97, "lag": 0.03 / (1 + np.exp(-1)), "stiction": 0.03 / (1 + np.e)}
@@ -87,44 +88,50 @@ def test_training_takes_the_found_effects_as_they_are(
     assert "q3: 0.031" in text and "other: 0.0" in text
 
 
-def weigh(*found: tuple[Any, ...]) -> decide.EvidenceTable:
-    """Return a table of effects: name, gain in nats, a joint, and the part of the gain on other joints."""
-    rows = [decide.EffectFinding(one[0], one[2:3], one[1], elsewhere=one[3]) for one in found]
-    return decide.EvidenceTable(tuple(rows), 0.0, frozenset({"slip"}))
+def weigh(**nets: dict[int, float]) -> decide.EvidenceTable:
+    """Return a table of effects with gains by joint, nats; jitter is of the whole machine, slip outside the library."""
+    kinds: Any = {"jitter": {"is_common": True}, "slip": {"is_outside": True}}
+    found = [decide.EffectFinding(name, one, **kinds.get(name, {})) for name, one in nets.items()]
+    return decide.EvidenceTable(tuple(found))
 
 
 def test_a_cause_is_named_or_unknown_by_what_it_earns() -> None:
-    lag = ("lag", 30.0, 1, np.inf)
+    lag = {1: 30.0}
     cases = [
-        ([("lag", 18.0, 1, np.inf)], 0.0, "effects"), ([("lag", 17.9, 1, np.inf)], 0.0, "none"),
-        # a row outside the library explains much more, and flexible columns a little more
-        ([("slip", 75.0, 1, np.inf), lag], 0.0, "effects"), ([("slip", 75.1, 1, np.inf), lag], 0.0, "unknown"),
-        ([lag], 60.0, "effects"), ([lag], 60.1, "unknown"),
+        (weigh(lag={1: 24.0}), 0.0, "effects"), (weigh(lag={1: 23.9}), 0.0, "none"),
+        # a row outside the library, or flexible columns, explain so much more
+        (weigh(slip={1: 54.0}, lag=lag), 0.0, "effects"), (weigh(slip={1: 54.1}, lag=lag), 0.0, "unknown"),
+        (weigh(lag=lag), 54.0, "effects"), (weigh(lag=lag), 54.1, "unknown"),
         # a cause of the whole machine that one joint alone shows is none
-        ([("jitter", 99.0, 1, 18.0)], 50.1, "effects"), ([("jitter", 99.0, 1, 17.9)], 30.1, "unknown"),
-        ([("jitter", 99.0, 1, 17.9), ("slip", 99.0, 1, 17.9)], 0.0, "none"),
+        (weigh(jitter={0: 75.0, 1: 24.0}), 50.1, "effects"), (weigh(jitter={0: 75.1, 1: 23.9}), 24.1, "unknown"),
+        (weigh(jitter={0: 23.0, 1: 23.9}), 0.0, "none"), (weigh(jitter={0: 24.0}), 0.0, "effects"),
     ]  # fmt: skip
-    for found, generic, expected in cases:
-        table = weigh(*found)
+    for table, generic, expected in cases:
         assert decide.is_unknown(table, generic, is_coarse=False) == (expected == "unknown")
         if expected != "unknown":
             assert len(decide.select(table, lambda _: weigh())) == (expected == "effects")
         # the best effects of all joints together explain it, or the steps of a coarse sensor
-        owned = replace(table, owned=200.0)
-        assert not decide.is_unknown(owned, generic, is_coarse=False)
+        owned = (*table.found, *weigh(creep={2: 99.0}, sag={3: 99.0}).found)
+        assert not decide.is_unknown(decide.EvidenceTable(owned), generic, is_coarse=False)
         assert not decide.is_unknown(table, generic, is_coarse=True)
-    # a common cause counts by what other joints than the strongest show of it
-    assert decide.add_up_common([60.0, 25.0, 15.0], -20.0) == (80.0, 32.0)
-    assert decide.add_up_common([60.0], -10.0) == (50.0, 50.0)
+    # joints bear a common cost in proportion
+    assert decide.share_cost([60.0, 25.0, 15.0], 20.0) == [48.0, 20.0, 12.0]
+    assert decide.share_cost([60.0, -5.0], 56.0) == [0.0, 0.0]
 
 
-def test_a_further_effect_earns_enough_beside_the_first() -> None:
-    first = weigh(("lag", 100.0, 1, np.inf), ("creep", 90.0, 1, np.inf))
-    # on a joint of the first it earns a share of that; what shows on one joint alone does not hide it
-    for nats, joint, expected in ((18.0, 0, 2), (17.9, 0, 1), (30.0, 1, 2), (29.9, 1, 1)):
-        tables = iter([weigh(("jitter", 80.0, 1, 3.0), ("creep", nats, joint, np.inf)), weigh()])
+def test_a_further_effect_earns_enough_beside_those_before_it() -> None:
+    first = weigh(lag={1: 100.0, 2: 50.0}, creep={1: 90.0})
+    cases = [
+        # on other joints it earns what any effect has to earn
+        ({0: 24.0}, [{0: 24.0}]), ({0: 23.9}, []),
+        # where one before it earns more, a share of that; other joints keep what they earn
+        ({1: 30.0}, [{1: 30.0}]), ({1: 29.9}, []), ({0: 24.0, 1: 29.9}, [{0: 24.0}]), ({1: 10.0, 2: 24.0}, [{2: 24.0}]),
+    ]  # fmt: skip
+    for nets, expected in cases:
+        # jitter earns more, and shows on joints of the first alone
+        tables = iter([weigh(jitter={1: 29.0, 2: 14.0, 0: 9.0}, creep=nets), weigh()])
         found = decide.select(first, lambda _, tables=tables: next(tables))
-        assert [one.effect for one in found] == ["lag", "creep"][:expected]
+        assert [dict(one.nets) for one in found[1:]] == expected
     # what shows by itself is not named again
     assert decide.select(first, lambda _: weigh(), known=[first.found[0]]) == []
 
@@ -135,5 +142,17 @@ def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:
     backlash = {0: JointRow(row, 49.0, 0.0), 1: JointRow(row, 40.0, 6.0)}
     table = {"lag": lag, "backlash": backlash, "hysteresis": {0: JointRow(row, 99.0, 0.0)}}
     # each pays 6 nats for a joint; backlash pays 6 more on the second one
-    expected = {0: ("lag", 44.0), 1: ("backlash", 28.0)}
+    expected = {0: "lag", 1: "backlash"}
     assert decide.find_owners(table, frozenset({"hysteresis"})) == expected
+
+
+def test_numbers_are_as_unsure_as_fits_to_machines_that_scatter() -> None:
+    generator, spread = np.random.default_rng(3), 0.5
+    slopes, columns = generator.normal(size=(2, 3, 60))
+    scatter = generator.normal(size=(20_000, 3)) @ columns
+    errors = np.sqrt(spread) * generator.normal(size=scatter.shape) + scatter
+    normal = slopes @ slopes.T
+    fitted = np.linalg.solve(normal, slopes @ errors.T)
+    base: Any = SimpleNamespace(covariance=spread * np.linalg.inv(normal), spread=spread)
+    told = JointBaseline.add_scatter(base, slopes, columns)
+    assert told == pytest.approx(np.cov(fitted), rel=0.03, abs=0.01 * np.trace(told))

@@ -56,7 +56,7 @@ def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine
     q[:, 3] = np.round(q[:, 3] / 0.0037) * 0.0037
     kinds = {kind.name: kind for kind in effect_library.load_effects(machine)}
     rough = GapCase(machine, reference, [dataclasses.replace(field, q=q)])
-    found = sensors.find_sensor_noise(rough, kinds["sensor_noise"], 8.0, 12.0)
+    found = sensors.find_sensor_noise(rough, kinds["sensor_noise"])
     assert found and found.joints.tolist() == [False, True, False, False, False]
     assert found.parameters["sigma_rad"]["q2"].mean == pytest.approx(1.5e-3, rel=0.15)
     # What shakes a joint after its command has changed is no noise of its sensor.
@@ -64,16 +64,16 @@ def test_a_noisy_sensor_is_told_from_a_coarse_one_with_its_size(machine: Machine
     late = np.minimum(changes[:, None] + np.arange(15), len(shaken) - 1)
     shaken[late, 2] += 2e-3 * np.random.default_rng(5).standard_normal(late.shape)
     shaking = GapCase(machine, reference, [dataclasses.replace(field, q=shaken)])
-    assert sensors.find_sensor_noise(shaking, kinds["sensor_noise"], 8.0, 12.0) is None
+    assert sensors.find_sensor_noise(shaking, kinds["sensor_noise"]) is None
     sound = GapCase(machine, reference, [field])
-    assert sensors.find_sensor_noise(sound, kinds["sensor_noise"], 8.0, 12.0) is None
+    assert sensors.find_sensor_noise(sound, kinds["sensor_noise"]) is None
     # Noise is told beside the steps of a sensor that is always coarse, though they show in some parts only.
     usual = [swept(machine, 100.0, seed, 1e-6) for seed in range(7)]
     for one in usual[2:]:
         one.q[:, 1] = np.round(one.q[:, 1] / 0.004) * 0.004
     coarse = GapCase(machine, usual[:-1], usual[-1:])
     usual[-1].q[:, 1] += 0.03 * np.random.default_rng(4).standard_normal(len(usual[-1].q))
-    found = sensors.find_sensor_noise(coarse, kinds["sensor_noise"], 4.0, 12.0)
+    found = sensors.find_sensor_noise(coarse, kinds["sensor_noise"])
     assert found and found.parameters["sigma_rad"]["q2"].mean == pytest.approx(0.03, rel=0.1)
 
 
@@ -92,7 +92,7 @@ def tracked(
 def find(machine: Machine, reference: Recording, field: Recording) -> list[DetectedEffect]:
     """Returns the errors of geometry that a field shows."""
     kinds = effect_library.load_effects(machine)
-    return geometry.find_geometry_errors(GapCase(machine, [reference], [field]), kinds, 8.0, 12.0)
+    return geometry.find_geometry_errors(GapCase(machine, [reference], [field]), kinds)
 
 
 def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Machine) -> None:

@@ -327,13 +327,6 @@ def test_a_coarse_sensor_is_named_with_its_step(two_joints: Machine, step_rad: f
         assert one.mean == pytest.approx(step_rad, rel=0.01)
 
 
-def test_a_lattice_that_the_reference_has_too_is_no_coarse_sensor(two_joints: Machine) -> None:
-    case = make_case(two_joints)
-    for one in (*case.reference, *case.field):
-        one.q[:] = np.round(one.q / 0.004) * 0.004
-    assert diagnose(case).verdict == "none"
-
-
 @pytest.mark.parametrize("late_s", [0.0, 0.03])
 def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
     machine: Machine, late_s: float
@@ -359,7 +352,7 @@ def test_encoders_that_lag_behind_a_tool_tracker_show_their_clock(
 def test_a_late_clock_is_told_once_and_beside_other_effects(two_joints: Machine) -> None:
     case = make_case(two_joints, (0.4, 0.4), (1.0, 0.8))
     sides = (stack_side(side, two_joints) for side in (case.reference, case.field))
-    decider = Decider(*sides, clock_late_s=0.1)
+    decider = Decider(*sides, np.zeros(2), clock_late_s=0.1)
     named = [(one.name, one.joints) for one in decider.decide().named]
     # The engine calls a late clock a dead time of all joints.
     assert named == [("dead_time", (0, 1)), ("flow_gain", (1,))]
@@ -369,7 +362,7 @@ def test_a_simulator_worse_than_standing_still_fails_its_gate(two_joints: Machin
     # The second joint goes the other way: a simulator without this errs by twice its motion.
     case = make_case(two_joints, gain=(1.0, -1.0))
     sides = (stack_side(side, two_joints) for side in (case.reference, case.field))
-    proof = EngineProof(case, Decider(*sides), [], np.random.default_rng(0))
+    proof = EngineProof(case, Decider(*sides, np.zeros(2)), [], np.random.default_rng(0))
     assert [one.passed for one in proof.judge()] == [True, False]
     assert diagnose(case).verdict == "unknown"
 

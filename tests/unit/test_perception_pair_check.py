@@ -16,9 +16,6 @@ from brokk_rl.signals import Frame
 from perception import pair_check
 from perception.render.stereo_camera import MisalignedPinhole, PairMisalignment
 
-PERFECT = PairMisalignment(
-    turn_rad=(0.0, 0.0, 0.0), focal=0.0, offset_px=(0.0, 0.0), distortion_px=0.0, seed=None
-)
 BASELINE_M, DEPTH_M = 0.12, 2.0
 
 
