@@ -5,7 +5,8 @@
 
 An exam is a folder that `brokk mode=exam` made, with its labels; names count strictly. What is switched
 off, and how, stands in `ingredients.yaml`, with other values of the constants of the decision. These are
-tried on one evidence, without the gates of the proof. Called again, the answers in `<out.json>` are kept.
+tried on one evidence, without the gates of the proof. What decides alike is one row. Called again,
+the answers in `<out.json>` are kept.
 """
 
 from __future__ import annotations
@@ -127,9 +128,8 @@ def count(labels: Mapping[str, dict[str, Any]], answers: Mapping[str, list[Any]]
             right["one: it alone"].append(names == truth)
         else:
             right["several: exact"].append(sorted(names) == sorted(truth))
-    row = {name: f"{sum(some)} of {len(some)}" for name, some in sorted(right.items())}
-    failed = sum(one[0].startswith("failed") for one in answers.values())
-    return row | {"failed": failed, "CPU s": round(np.mean([one[2] for one in answers.values()]))}
+    row = {name: f"{sum(some)}/{len(some)}" for name, some in sorted(right.items())}
+    return row | {"CPU s": round(np.mean([one[2] for one in answers.values()]))}
 
 
 def main() -> None:
@@ -154,7 +154,10 @@ def main() -> None:
         for job in track(as_completed(jobs), total=len(jobs)):
             for name, one in job.result().items():
                 answers.setdefault(name, {})[jobs[job]] = one
-            rows = [{"without": one} | count(labels, answers[one]) for one in answers]
+            alike = defaultdict(list)
+            for name, some in answers.items():
+                alike[json.dumps(count(labels, some))].append(name)
+            rows = [{"without": ", ".join(names)} | json.loads(row) for row, names in alike.items()]
             given.out.write_text(json.dumps({"rows": rows, "answers": answers}, indent=1) + "\n")
 
 
