@@ -24,7 +24,7 @@ from diagnosis.engine.side import Side
 LEAST_NATS = 24.0
 """Whatever is said earns so much beyond what is explained without it: an effect, a further one, a cause outside the
 library. On 142 practice cases of four makes 14 to 22 decide one or two more rightly, 24 to 28 accuse two unchanged
-machines of 20 fewer; three bounds (18, 30 for flexible columns, 45 for rows outside) decide one less rightly.
+machines of 21 fewer; three bounds (18, 30 for flexible columns, 45 for rows outside) decide one less rightly.
 """
 JOINT_NATS = 6.0
 """Cost of each joint of an effect; for its size and its form."""
