@@ -20,7 +20,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform
 
-from annotated_types import Ge, Gt, Interval
+from annotated_types import Ge, Gt, Interval, Lt
 from pydantic import AllowInfNan, BeforeValidator, ConfigDict, Strict, TypeAdapter, ValidationError
 from pydantic import dataclasses as pydantic_dataclasses
 from pydantic_core import ArgsKwargs, CoreSchema, PydanticCustomError, core_schema
@@ -59,6 +59,7 @@ class Ordered:
 Finite = Annotated[float, AllowInfNan(False)]
 Positive = Annotated[float, Gt(0), AllowInfNan(False)]
 NonNegative = Annotated[float, Ge(0), AllowInfNan(False)]
+NonZero = Positive | Annotated[float, Lt(0), AllowInfNan(False)]
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A part of a whole, 0 to 1."""
 Count = Annotated[int, Ge(1)]

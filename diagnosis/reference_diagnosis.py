@@ -48,7 +48,7 @@ SCATTERING = frozenset({"clock_offset", "quantisation", "sensor_noise"})
 UNNAMED_PROBABILITY = 0.8
 """Probability of a verdict that names no effect; chosen by hand."""
 NATS_OF_SURE = 15.0
-"""How fast the probability grows with what an effect earns; chosen by hand."""
+"""Gain that makes the odds of an effect e times as large; chosen by hand."""
 MAX_RIVALS = 4
 """Most rivals of a ranking."""
 

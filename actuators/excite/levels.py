@@ -4,6 +4,7 @@ import numpy as np
 
 from actuators.excite.poses import PoseProgram
 from actuators.excite.schedule import check_order
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.spec import Positive, Share, spec
 
@@ -39,22 +40,21 @@ class Levels(PoseProgram):
     stop_margin: float
 
     def check(self) -> None:
+        if self.zero_share + self.small_share > 1.0:
+            raise ConfigError("zero_share, small_share: expected 1 or less together, got more")
         check_order(self, "shortest_s", "longest_s")
         check_order(self, "turn_s", "pose_s")
 
     def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands of so many control periods, `(T, J)`."""
-        period_s, joints = machine.period_s, range(machine.num_joints)
-        u = np.stack([self._joint(steps, period_s, generator) for _ in joints], 1)
-        exclusive = machine.is_exclusive
-        if not exclusive.any() or exclusive.all():
+        u = np.stack([self._joint(steps, machine.period_s, generator) for _ in machine.joints], 1)
+        if not machine.is_exclusive.any() or machine.is_exclusive.all():
             return u
         turn = max(1, round(self.turn_s / machine.period_s))
-        num_turns = -(-steps // turn)
         # spread evenly from a random beginning, so that a short program has its part too
-        turns = self.exclusive_share * np.arange(num_turns + 1) + generator.random()
+        turns = self.exclusive_share * np.arange(-(-steps // turn) + 1) + generator.random()
         alone = np.diff(np.floor(turns)) > 0
-        return u * mask_exclusive_joints(exclusive, np.repeat(alone, turn)[:steps])
+        return u * mask_exclusive_joints(machine.is_exclusive, np.repeat(alone, turn)[:steps])
 
     def _joint(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
         """Return the levels of one joint, `(T,)`."""

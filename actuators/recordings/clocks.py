@@ -19,7 +19,7 @@ from actuators.recordings.guess import Evidence, GivenColumns, Guess, advise
 from actuators.recordings.log_tables import LogRun, Table, index_columns
 from actuators.recordings.name_evidence import TIME_UNITS, WORDS, read_words, split_unit
 from brokk_rl.errors import list_choices
-from brokk_rl.spec import Positive, spec
+from brokk_rl.spec import NonZero, Positive, spec
 
 CLOCK_POINTS = 200
 """Points of the line that ties one clock to another; its cost grows with their square, and 200
@@ -45,7 +45,7 @@ class Column:
     """
 
     column: str
-    scale: float
+    scale: NonZero
     offset: float
     wraps: float | None = None  # maps from before this field have none
 

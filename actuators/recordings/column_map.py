@@ -37,7 +37,7 @@ from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.spec import NonNegative, Positive, spec
+from brokk_rl.spec import NonNegative, NonZero, Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ class TargetColumn:
     """
 
     column: str
-    scale: float
+    scale: NonZero
     full_speed: Positive | None
     offset: float = 0.0  # maps from before this field have none
     wraps: float | None = None

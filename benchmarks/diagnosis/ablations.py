@@ -104,7 +104,7 @@ def answer(case: str, machine_name: str, ingredient: str) -> dict[str, list[Any]
         try:
             found = work.run(lambda name, done: None).answer
         except Exception as error:  # without its ingredient the engine may break in any way
-            return {ingredient: [f"failed: {error!r}", [], time.process_time() - begun]}
+            return {ingredient: ["failed", [repr(error)], time.process_time() - begun]}
     named = sorted(found.selected, key=lambda one: -one.probability)
     names = [one.effect for one in named]
     return {ingredient: [found.verdict, names, time.process_time() - begun]}

@@ -22,9 +22,10 @@ from diagnosis.engine.rows import SHARED, Row
 from diagnosis.engine.side import Side
 
 LEAST_NATS = 24.0
-"""Whatever is said earns so much beyond what is explained without it: an effect, a further one, a cause outside the
-library. On 142 practice cases of four makes 14 to 22 decide one or two more rightly, 24 to 28 accuse two unchanged
-machines of 21 fewer; three bounds (18, 30 for flexible columns, 45 for rows outside) decide one less rightly.
+"""Least gain of an effect, a further one or a cause outside the library, beyond what is explained without it.
+
+On 142 practice cases of four makes 14 to 22 decide one or two more rightly, 24 to 28 accuse two unchanged machines of
+21 fewer; three bounds (18, 30 for flexible columns, 45 for rows outside) decide one less rightly.
 """
 JOINT_NATS = 6.0
 """Cost of each joint of an effect; for its size and its form."""
@@ -71,12 +72,12 @@ class EffectFinding:
 
     @property
     def nats(self) -> float:
-        """What it earns on all of them, nats."""
+        """Gain on all of its joints less all costs, nats."""
         return sum(self.nets.values())
 
     @property
     def shows_on_several(self) -> bool:
-        """Whether other joints than the strongest show a common effect, by as much as any effect has to earn.
+        """True if other joints than the strongest show a common effect, by as much as any effect has to earn.
 
         A common cause fits whatever one joint leaves: of 155 practice cases 44 have one of 18 nats or more of which
         the other joints show less, and on one of these it is there. A machine with one joint shows no more than it.
@@ -111,7 +112,7 @@ class EvidenceTable:
 
     @property
     def owned(self) -> float:
-        """What the best effects of all joints earn together, nats."""
+        """Gain of the best effects of all joints together, nats."""
         return sum(one.nats for one in self.found if not (one.is_common or one.is_outside))
 
     def list_found(self, is_outside: bool = False) -> list[EffectFinding]:
