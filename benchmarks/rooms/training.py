@@ -87,7 +87,7 @@ MEASUREMENTS = (
         name="unidentified_machine",
         title="A policy for machines that nobody identified",
         conditions="It learned in [two parts](operator.md#the-simulated-person), 1,282 and 1,540 million steps, one seed, episodes of 40 s. The first was chosen from seven trainings by the three circuits, to which nothing was fitted; the second, and the filter, on other plants. "
-        "Two later trainings that priced time were quicker there, but worse in 40 s. Baseline: the controller without filter, same starts.",
+        "It moves two levers at a time, which costs seconds; a later training with all was better on four plants, worse on `open_center`. Baseline: the controller without filter, same starts.",
         commands=tuple(
             command
             for follower, episode_s in TRIALS
