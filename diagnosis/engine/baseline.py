@@ -6,7 +6,6 @@ Axes: `T` samples, `N` increments, `P` numbers, `F` fitted numbers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +27,10 @@ LEAST_SPREAD = 1e-3
 """Least mean square of the error of increments, so that a simulated reference has a covariance."""
 NUM_PARTS = 4
 """Parts of the reference that are left out in turn."""
+FIT_ROUNDS = (4, 4, 10)
+"""Most rounds of the three fits."""
+STEP_SHARES = np.array([1.0, 0.5, 0.25, 0.0])
+"""Shares of a step towards the numbers without a part that are tried."""
 FIRST_DELAYS_S = np.arange(0.0, 0.9, 0.05)
 LATE_FACTORS = np.array([0.0, 1.0, 1.4, 2.0, 2.8, 4.0])
 """Multiples of the mean from which numbers that are known late begin; 1 alone told a false lack of flow on two of
@@ -79,13 +82,13 @@ class JointBaseline:
 
 
 def build_simulation(
-    side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
+    side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure, places: np.ndarray
 ) -> Simulate:
-    """Return the increments of a joint with numbers `(P,)` as a function of its fitted ones."""
+    """Return the increments of a joint with numbers `(P,)` as a function of those at `places`, `(F,)`."""
 
     def simulate(trials: np.ndarray) -> np.ndarray:
         varied = np.repeat(numbers[None], len(trials), 0)
-        varied[:, side.model.fitted] = trials
+        varied[:, places] = trials
         return measure(side.simulate(joint, varied))
 
     return simulate
@@ -95,8 +98,9 @@ def linearise(
     side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the increments of the simulated joint `(N,)` and their slopes over the fitted numbers `(F, N)`."""
-    simulate = build_simulation(side, joint, numbers, measure)
-    return find_slopes(simulate, numbers[side.model.fitted], side.model.prior)
+    fitted = side.model.fitted
+    simulate = build_simulation(side, joint, numbers, measure, fitted)
+    return find_slopes(simulate, numbers[fitted], side.model.prior)
 
 
 def multiply_plain(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -105,26 +109,27 @@ def multiply_plain(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def fit_numbers(
-    side: Side,
-    joint: int,
-    numbers: np.ndarray,
-    measure: IncrementMeasure,
-    rounds: int,
-    fixed: Sequence[str] = (),
+    side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure, stage: int
 ) -> np.ndarray:
-    """Return the numbers of a joint, those that are not `fixed` fitted to the recordings, `(P,)`."""
+    """Return the numbers of a joint, those that are free in a fit fitted to the recordings, `(P,)`.
+
+    Args:
+        side: The reference.
+        joint: Place of the joint.
+        numbers: Where to begin, `(P,)`.
+        measure: Map from paths to increments.
+        stage: Which of the fits, 0 to 2.
+    """
     model = side.model
-    simulate = build_simulation(side, joint, numbers, measure)
+    is_free = model.list_fitted("joins") <= stage
+    places = model.fitted[is_free]
+    simulate = build_simulation(side, joint, numbers, measure, places)
     target = measure(side.q[:, joint]).astype(float)
-    prior = model.prior
-    names = np.array(model.names)[model.fitted]
-    own = np.isin(names, list(fixed))
-    held = numbers[model.fitted]
-    prior = replace(
-        prior, lower=np.where(own, held, prior.lower), upper=np.where(own, held, prior.upper)
-    )
+    prior = model.prior.select(is_free)
     found = numbers.copy()
-    found[model.fitted] = descend(simulate, target, multiply_plain, held, prior, rounds)
+    found[places] = descend(
+        simulate, target, multiply_plain, numbers[places], prior, FIT_ROUNDS[stage]
+    )
     return found
 
 
@@ -181,12 +186,11 @@ def fit_reference(side: Side) -> list[JointBaseline]:
     """Return the baseline of every joint; the demand of `side` is set on the way."""
     joints = range(side.num_joints)
     plain = IncrementMeasure(side, PLAIN)
-    model = side.model
     every = [guess_numbers(side, j) for j in joints]
-    every = [fit_numbers(side, j, every[j], plain, 4, tuple(model.late)) for j in joints]
+    every = [fit_numbers(side, j, every[j], plain, 0) for j in joints]
     side.ask_others(every)
     every = [guess_late(side, j, every[j]) for j in joints]
-    every = [fit_numbers(side, j, every[j], plain, 6) for j in joints]
+    every = [fit_numbers(side, j, every[j], plain, 1) for j in joints]
     side.ask_others(every)
     first = [_leave_out(side, j, every[j], PLAIN, None) for j in joints]
     side.ask_others(every)
@@ -195,7 +199,7 @@ def fit_reference(side: Side) -> list[JointBaseline]:
     for j in joints:
         motion = measure_motion(side, side.simulate(j, every[j])[0])
         measure = IncrementMeasure(side, scales[j], motion)
-        numbers = fit_numbers(side, j, every[j], measure, 5)
+        numbers = fit_numbers(side, j, every[j], measure, 2)
         found.append(_leave_out(side, j, numbers, scales[j], motion))
     side.ask_others([one.numbers for one in found])
     return found
@@ -204,7 +208,10 @@ def fit_reference(side: Side) -> list[JointBaseline]:
 def _leave_out(
     side: Side, joint: int, numbers: np.ndarray, scale: Scale, motion: Motion | None
 ) -> JointBaseline:
-    """Fit the numbers without each part by one step of Gauss and Newton, and keep what each part then errs by."""
+    """Fit the numbers without each part by one step of Gauss and Newton, and keep what each part then errs by.
+
+    Of the whole step and shares of it, the one is taken that fits the other parts best.
+    """
     measure = IncrementMeasure(side, scale, motion)
     base, slopes = linearise(side, joint, numbers, measure)
     target = measure(side.q[:, joint]).astype(float)
@@ -217,19 +224,24 @@ def _leave_out(
     normal = slopes @ slopes.T + np.diag(prior.precision)
     downhill = slopes @ residual + prior.pull(numbers[fitted])
     rows = prior.find_free(numbers[fitted], downhill)
-    trials = np.repeat(numbers[None], NUM_PARTS, 0)
-    for k, trial in enumerate(trials):
+    lower, upper = model.list_values("lower"), model.list_values("upper")
+    errors = np.empty((NUM_PARTS, side.num_samples))
+    left_out = np.empty_like(residual)
+    for k in range(NUM_PARTS):
         own = part == k
         without = normal - slopes[:, own] @ slopes[:, own].T
         towards = downhill - slopes[:, own] @ residual[own]
         step = np.linalg.solve(without[np.ix_(rows, rows)], towards[rows])
-        trial[fitted[rows]] += np.clip(step, -most[rows], most[rows])
-    paths = side.simulate(
-        joint, np.clip(trials, model.list_values("lower"), model.list_values("upper"))
-    )
-    errors = side.q[:, joint] - paths
+        trials = np.repeat(numbers[None], len(STEP_SHARES), 0)
+        trials[:, fitted[rows]] += np.outer(STEP_SHARES, np.clip(step, -most[rows], most[rows]))
+        trials = np.clip(trials, lower, upper)
+        paths = side.simulate(joint, trials)
+        left = target - measure(paths)
+        off = (trials[:, fitted] - prior.mean) / prior.deviation
+        best = np.argmin(np.square(left[:, ~own]).sum(1) + np.square(off).sum(1))
+        errors[k] = side.q[:, joint] - paths[best]
+        left_out[own] = left[best, own]
     places = np.arange(len(residual))
-    left_out = (target - measure(paths))[part, places]
     frames = (errors[:, 1:] - errors[:, :-1])[part, places]
     spread = float(np.square(np.clip(left_out, -3.0, 3.0)).sum() / measure.count)
     if motion is None:

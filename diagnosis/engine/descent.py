@@ -6,12 +6,15 @@ Axes: `C` trials, `F` values, `N` increments.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 NUM_DAMPINGS = 4
 """Dampings that are tried at once: a step costs one call of the kernel."""
+DAMPING_RATIO = 8.0
+MAX_DAMPING = 1e9
+"""Where no step of any damping up to it gains anything, a descent ends."""
 ENOUGH = 2e-4
 """Relative gain of a round below which a descent ends."""
 
@@ -38,6 +41,10 @@ class Prior:
     step: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+
+    def select(self, places: np.ndarray) -> Prior:
+        """Return the expectation of the values at some places."""
+        return Prior(**{one.name: getattr(self, one.name)[places] for one in fields(self)})
 
     @property
     def precision(self) -> np.ndarray:
@@ -88,14 +95,16 @@ def descend(
         rounds: Most rounds.
     """
     damping = 1e-3
+    has_moved = True
     for _ in range(rounds):
-        base, slopes = find_slopes(simulate, values, prior)
+        if has_moved:
+            base, slopes = find_slopes(simulate, values, prior)
         downhill = multiply(slopes, (target - base)[None])[:, 0] + prior.pull(values)
         free = prior.find_free(values, downhill)
         normal = multiply(slopes[free], slopes[free]) + np.diag(prior.precision[free])
         trials = np.repeat(values[None], NUM_DAMPINGS, 0)
         for k, trial in enumerate(trials):
-            damped = normal + damping * 8.0**k * np.diag(np.diag(normal))
+            damped = normal + damping * DAMPING_RATIO**k * np.diag(np.diag(normal))
             trial[free] += np.linalg.solve(damped, downhill[free])
         trials = np.clip(trials, prior.lower, prior.upper)
         errors = target - np.concatenate([base[None], simulate(trials)])
@@ -103,10 +112,14 @@ def descend(
         costs = np.diagonal(multiply(errors, errors)) + np.square(off).sum(1)
         best = int(np.argmin(costs[1:]))
         gain = costs[0] - costs[1 + best]
-        if gain <= 0.0:
-            break
+        has_moved = gain > 0.0
+        if not has_moved:
+            damping *= DAMPING_RATIO**NUM_DAMPINGS
+            if damping > MAX_DAMPING:
+                break
+            continue
         values = trials[best]
-        damping *= 8.0**best / 6.0
+        damping *= DAMPING_RATIO**best / 6.0
         if gain < ENOUGH * costs[0]:
             break
     return values

@@ -32,6 +32,7 @@ class JointNumber:
         lower: Smallest value.
         upper: Largest value.
         is_relative: Its ageing is in proportion to its value.
+        joins: From which fit to the reference on it is free, 0 to 2; before, it keeps the value that it began with.
     """
 
     name: str
@@ -42,6 +43,7 @@ class JointNumber:
     lower: float = -np.inf
     upper: float = np.inf
     is_relative: bool = False
+    joins: int = 0
 
 
 def repeat_number(count: int, number: JointNumber) -> list[JointNumber]:

@@ -25,9 +25,9 @@ NUMBERS = (
     JointNumber("damping_ratio", 1.0, 0.4, 0.03, 0.02, 0.15, 5.0),
     JointNumber("sag", 0.0, 0.04, 0.001, 0.0015, -1.0, 1.0),
     *repeat_number(4, JointNumber("sag_pose", 0.0, 0.03, 0.001, 0.001, -0.6, 0.6)),
-    JointNumber("dry", 0.004, 0.006, 0.0005, 0.0006, 0.0, 0.5),
-    JointNumber("static_ratio", 0.3, 0.3, 0.05, 0.05, 0.0, 3.0),
-    JointNumber("load_dry", 0.03, 0.05, 0.01, 0.01, 0.0, 0.8),
+    JointNumber("dry", 0.004, 0.006, 0.0005, 0.0006, 0.0, 0.5, joins=1),
+    JointNumber("static_ratio", 0.3, 0.3, 0.05, 0.05, 0.0, 3.0, joins=1),
+    JointNumber("load_dry", 0.03, 0.05, 0.01, 0.01, 0.0, 0.8, joins=1),
     JointNumber("shortage", 0.4, 0.4, 0.03, 0.03, 0.0, 30.0),
     JointNumber("firmware_damping", 0.6, 0.2, 0.05, 0.03, 0.0, 1.0),
     # Numbers that only effects set.
