@@ -29,11 +29,6 @@ On 142 practice cases of four makes 14 to 22 decide one or two more rightly, 24 
 """
 JOINT_NATS = 6.0
 """Cost of each joint of an effect; for its size and its form."""
-SHARE = 0.3
-"""A further effect counts on a joint where it earns this share of what an effect before it earns there, which is never
-quite of the right form. Of 60 practice cases with several effects 25 have the exact set with 0.25 and with 0.3, and 24
-with 0.4; other cases name fewer false ones with more, 0.5 at best.
-"""
 SHOWN_NATS = 1e3
 """A coarse sensor or a late clock shows by itself and comes before all that is simulated."""
 COMMON = ("thermal_drift", "dead_time")
@@ -88,11 +83,15 @@ class EffectFinding:
         return self.nats - max(nets) >= LEAST_NATS
 
     def limit(self, before: Sequence[EffectFinding]) -> EffectFinding:
-        """Return it with the joints where it counts beside those `before` it; a common one keeps all, at nothing."""
+        """Return it with the joints where it counts beside those `before` it; a common one keeps all, at nothing.
+
+        A row is never quite of the right form, and what it leaves looks like other effects. So a joint counts for
+        what earns most on it.
+        """
         nets = {}
         for j, net in self.nets.items():
             strongest = max([one.nets.get(j, 0.0) for one in before], default=0.0)
-            if net >= SHARE * strongest:
+            if net >= strongest:
                 nets[j] = net
             elif self.is_common:
                 nets[j] = 0.0

@@ -15,7 +15,8 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
 from diagnosis.engine import decide
-from diagnosis.engine.baseline import JointBaseline
+from diagnosis.engine.baseline import JointBaseline, multiply_plain
+from diagnosis.engine.descent import Prior, descend
 from diagnosis.engine.evidence import JointRow
 from diagnosis.engine.rows import Row
 from diagnosis.reference_diagnosis import propose_measurement, rank_effects
@@ -124,12 +125,12 @@ def test_a_further_effect_earns_enough_beside_those_before_it() -> None:
     cases = [
         # on other joints it earns what any effect has to earn
         ({0: 24.0}, [{0: 24.0}]), ({0: 23.9}, []),
-        # where one before it earns more, a share of that; other joints keep what they earn
-        ({1: 30.0}, [{1: 30.0}]), ({1: 29.9}, []), ({0: 24.0, 1: 29.9}, [{0: 24.0}]), ({1: 10.0, 2: 24.0}, [{2: 24.0}]),
+        # where one before it earns more it does not count; other joints keep what they earn
+        ({1: 100.0}, [{1: 100.0}]), ({1: 99.9}, []), ({0: 24.0, 1: 99.9}, [{0: 24.0}]), ({1: 40.0, 2: 50.0}, [{2: 50.0}]),
     ]  # fmt: skip
     for nets, expected in cases:
         # jitter earns more, and shows on joints of the first alone
-        tables = iter([weigh(jitter={1: 29.0, 2: 14.0, 0: 9.0}, creep=nets), weigh()])
+        tables = iter([weigh(jitter={1: 99.0, 2: 49.0, 0: 9.0}, creep=nets), weigh()])
         found = decide.select(first, lambda _, tables=tables: next(tables))
         assert [dict(one.nets) for one in found[1:]] == expected
     # what shows by itself is not named again
@@ -144,6 +145,14 @@ def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:
     # each pays 6 nats for a joint; backlash pays 6 more on the second one
     expected = {0: "lag", 1: "backlash"}
     assert decide.find_owners(table, frozenset({"hysteresis"})) == expected
+
+
+def test_a_descent_goes_on_where_long_steps_gain_nothing() -> None:
+    """From 3 a step of Gauss and Newton down an arc tangent ends beyond -5, and so does one half as long."""
+    wide = np.array([1e6])
+    prior = Prior(0.0 * wide, wide, np.array([1e-6]), -wide, wide)
+    found = descend(np.arctan, np.zeros(1), multiply_plain, np.array([3.0]), prior, 30)
+    assert found == pytest.approx([0.0], abs=1e-6)
 
 
 def test_numbers_are_as_unsure_as_fits_to_machines_that_scatter() -> None:

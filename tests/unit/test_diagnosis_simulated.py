@@ -24,8 +24,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.case import GapCase
-from diagnosis.engine import holds, sizes
-from diagnosis.engine.baseline import fit_reference
+from diagnosis.engine import baseline, holds, sizes
+from diagnosis.engine.baseline import fit_reference, linearise
 from diagnosis.engine.decide import Decider
 from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Motion, fit_variance
@@ -182,6 +182,22 @@ def test_a_pump_that_was_always_small_and_slow_to_start_is_found(two_joints: Mac
     side.q = np.stack([side.simulate(j, numbers)[0] for j in (0, 1)], 1).astype(float)
     for one in fit_reference(side):
         assert one.numbers[places] == pytest.approx([0.8, 0.4, 2.0], rel=0.1)
+
+
+def test_numbers_without_a_part_are_no_step_too_far(
+    two_joints: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Slopes far too small, as where friction lets go, make steps far too long."""
+    side = stack_side(make_case(two_joints).reference, two_joints)
+    told = [one.spread for one in fit_reference(side)]
+
+    def flatten(*given: Any) -> tuple[np.ndarray, np.ndarray]:
+        increments, slopes = linearise(*given)
+        return increments, 0.02 * slopes
+
+    monkeypatch.setattr(baseline, "linearise", flatten)
+    for one, spread in zip(fit_reference(side), told, strict=True):
+        assert one.spread == pytest.approx(spread, rel=0.25)
 
 
 def test_motions_that_start_late_or_run_unlike_each_other_are_known(two_joints: Machine) -> None:
