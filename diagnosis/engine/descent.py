@@ -13,8 +13,6 @@ import numpy as np
 NUM_DAMPINGS = 4
 """Dampings that are tried at once: a step costs one call of the kernel."""
 DAMPING_RATIO = 8.0
-MAX_DAMPING = 1e9
-"""Where no step of any damping up to it gains anything, a descent ends."""
 ENOUGH = 2e-4
 """Relative gain of a round below which a descent ends."""
 
@@ -115,8 +113,6 @@ def descend(
         has_moved = gain > 0.0
         if not has_moved:
             damping *= DAMPING_RATIO**NUM_DAMPINGS
-            if damping > MAX_DAMPING:
-                break
             continue
         values = trials[best]
         damping *= DAMPING_RATIO**best / 6.0

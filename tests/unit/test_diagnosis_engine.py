@@ -14,6 +14,7 @@ import pytest
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
+from diagnosis.closure import Gate, RivalError
 from diagnosis.engine import decide
 from diagnosis.engine.baseline import JointBaseline, multiply_plain
 from diagnosis.engine.descent import Prior, descend
@@ -43,7 +44,8 @@ def said() -> answer.Answer:
         gap=answer.Gap(0.03, 0.004, 0.002, answer.Estimate(0.93, (0.88, 0.96))),
         where=answer.Where({"q3": PLACE}, (answer.RegimeGap("q3", "after a reversal", 0.8),), "actuation"),
         next_experiment=answer.NextExperiment("a dial gauge", ("backlash", "lag")),
-        reason="play", more={"sanity": [{"a": 1}]},
+        rivals={"hold": RivalError(0.09, {"q1": 0.1}), "arx": RivalError(None, {})},
+        gates=(Gate("near_floor", False, 2.5, 1.75, "too far"),), reason="play", more={"sanity": [{"a": 1}]},
     )  # fmt: skip
 
 
@@ -57,8 +59,9 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
     assert found["gap"]["before"] == {"rmse_rad": 0.03}
     regimes = [{"joint": "q3", "regime": "after a reversal", "share": 0.8}]
     assert found["where"] == {"joints": {"q3": PLACE}, "regimes": regimes, "stage": "actuation"}
-    experiment = {"excitation": "a dial gauge", "separates": ["backlash", "lag"]}
-    assert found["next_experiment"] == experiment
+    assert found["next_experiment"]["separates"] == ["backlash", "lag"]
+    assert found["rivals"]["arx"]["rmse_rad"] is None
+    assert found["gates"][0].items() >= {"name": "near_floor", "passed": False}.items()
     assert propose_measurement(said().selected) == said().next_experiment
     assert found["ranking"] == [{"effect": "backlash", "joints": ["q3"], "probability": 0.97}]
     assert answer.read_answer(path) == said()

