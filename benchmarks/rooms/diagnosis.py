@@ -51,18 +51,18 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "44 simulated machines, answered once. A person drives 16 fields. The exam before had 13 of 15.",
-        "exam_plants=valves exam_recording=operators", 44, "diagnosis", "valve",
+        "32 simulated machines, answered once. A person drives 15 fields. The exam before, of 44, had 10 of 15.",
+        "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "24 simulated cranes, answered once. A person drives 14 fields.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 24, "diagnosis", "valve",
+        "18 simulated cranes, answered once. A person drives 9 fields. The exam before, of 24, had 6 of 8.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 18, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "26 simulated arms, answered once.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 26, "servo_diagnosis", "servo",
+        "14 simulated arms, answered once. The exam before, of 26, had 9 of 9.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 14, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
