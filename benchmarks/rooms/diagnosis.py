@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "32 simulated machines, answered once. A person drives 15 fields. The exam before, of 44, had 10 of 15.",
+        "32 simulated machines, answered once. A person drives 15 fields. The exam before, of 44, had 10 of 15 and 3 of 9.",
         "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(
