@@ -11,7 +11,12 @@ import pandas as pd
 
 from actuators.identify import dead_time
 from actuators.motion_panels import Shade, draw_joint_tracks
-from actuators.recordings.inspection import Inspection, inspect_recording
+from actuators.recordings.inspection import (
+    Inspection,
+    RecordingFinding,
+    inspect_recording,
+    to_json_number,
+)
 from actuators.recordings.recording_checks import REMARKS, list_remarks, tabulate_remarks
 from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text
@@ -19,7 +24,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.plot import save_figure
 from brokk_rl.progress import track_items
-from brokk_rl.record import Breach, Recording
+from brokk_rl.record import Breach
 from brokk_rl.report import embed_picture, render_page
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import Index, spec
@@ -70,22 +75,39 @@ class InspectedFile:
         return (self.inspection.timing["duration_s"] or 0.0) / 60.0 if self.inspection else 0.0
 
     @property
+    def findings(self) -> list[RecordingFinding]:
+        """Findings, none of a file that cannot be read."""
+        return self.inspection.findings if self.inspection else []
+
+    @property
     def num_remarks(self) -> int:
         """Number of breaches and findings."""
-        return len(self.breaches) + (len(self.inspection.findings) if self.inspection else 0)
+        return len(self.breaches) + len(self.findings)
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain JSON data."""
         seen = self.inspection
         return {
             "path": str(self.path),
-            "run": seen.recording.run if seen else None,
-            "num_samples": seen.recording.num_samples if seen else None,
+            "run": seen and seen.recording.run,
+            "num_samples": seen and seen.recording.num_samples,
             "breaches": [asdict(breach) for breach in self.breaches],
-            "timing": seen.timing if seen else None,
-            "joints": seen.joints if seen else None,
-            "findings": [asdict(finding) for finding in seen.findings] if seen else [],
+            "timing": seen and seen.timing,
+            "joints": seen and seen.joints,
+            "findings": [asdict(finding) for finding in self.findings],
         }
+
+    def format_row(self) -> list[str]:
+        """Return the cells of the table of recordings."""
+        timing = self.inspection.timing if self.inspection else {}
+        return [
+            self.path.name,
+            f"{self.minutes:.1f}",
+            _format(timing.get("rate_hz"), "{:.2f} Hz"),
+            _format(timing.get("jitter_s"), "{:.4f} s"),
+            str(len(self.breaches) or "–"),
+            str(len(self.findings) or "–"),
+        ]
 
 
 @spec
@@ -107,21 +129,18 @@ class Inspect:
         inspected = [self._look(path) for path in track_items(paths, "inspecting")]
         folder = self.session.folder
         known = [one.inspection for one in inspected if one.inspection]
-        sound = [
-            one.inspection.recording for one in inspected if one.inspection and not one.breaches
-        ]
         remarks = list_remarks(known, self.machine)
         result = {
             "schema": 1,
             "machine": self.machine.name,
-            "delay_s": self._delays(sound),
+            "delay_s": self._delays(inspected),
             "joints": self._overall(known),
             "recordings": [one.plain() for one in inspected],
         }
         write_json(folder / "inspection.json", result)
         tables = {
-            "recordings": (FILES, [_format_file_row(one) for one in inspected]),
-            "joints, all recordings": self._figures(result),
+            "recordings": (FILES, [one.format_row() for one in inspected]),
+            "joints, all recordings": (JOINTS, self._figures(result)),
             "findings": tabulate_remarks(remarks),
         }
         pictures: dict[str, str] = {}
@@ -152,70 +171,47 @@ class Inspect:
             found = inspect_recording(recording, self.machine)
         return InspectedFile(path, breaches, found)
 
-    def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
+    def _delays(self, inspected: Sequence[InspectedFile]) -> dict[str, Any]:
         """Return each joint's dead time from all sound recordings, `None` where unknown."""
         generator = self.session.generator("delay")
+        files = [one for one in inspected if not one.breaches]
+        sound = [one.inspection.recording for one in files if one.inspection]
         try:
-            found = dead_time.estimate_dead_times(recordings, self.machine, generator)
+            found = dead_time.estimate_dead_times(sound, self.machine, generator)
         except RecordingError:
             return dict.fromkeys(self.machine.joint_names)
         return {name: one and one.plain() for name, one in found.items()}
 
     def _overall(self, known: Sequence[Inspection]) -> dict[str, dict[str, float | None]]:
         """Return figures of each joint over all recordings: extremes, medians and weighted means."""
-        seconds = np.array([max(one.timing["duration_s"] or 0.0, 1e-9) for one in known])
+        seconds = [max(one.timing["duration_s"] or 0.0, 1e-9) for one in known]
         table = {}
         for joint in self.machine.joints:
             limits = {"lower_limit": joint.lower.value, "upper_limit": joint.upper.value}
             rows = pd.DataFrame([one.joints[joint.name] for one in known], dtype=float)
-            table[joint.name] = limits | {key: _combine(key, rows[key], seconds) for key in rows}
+            weights: Any = rows.notna().mul(seconds, axis=0)
+            figures = (rows * weights).sum() / weights.sum()
+            for key in OVERALL.keys() & rows:
+                figures[key] = rows[key].agg(OVERALL[key])
+            table[joint.name] = limits | {key: to_json_number(figures[key]) for key in rows}
         return table
 
-    def _figures(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-        """Return heading and cells of the table of joints."""
+    def _figures(self, result: dict[str, Any]) -> list[list[str]]:
+        """Return the cells of the table of joints."""
         rows = []
         for joint in self.machine.joints:
             entry, delay = result["joints"][joint.name], result["delay_s"][joint.name]
-            low, high = (_format_number(entry.get(key)) for key in ("lowest", "highest"))
-            lower, upper = (_format_number(entry[key]) for key in ("lower_limit", "upper_limit"))
-            rows.append([
-                joint.name, f"{low} … {high} {joint.unit}", f"{lower} … {upper}",
-                _format_percent(entry.get("commanded")), _format_percent(entry.get("at_limit")),
-                _format_number(entry.get("noise")), _format_number(entry.get("step")),
-                "–" if delay is None else f"{delay['value']:.2f} s",
-            ])  # fmt: skip
-        return JOINTS, rows
+            ends = ("lowest", "highest", "lower_limit", "upper_limit")
+            low, high, lower, upper = (_format(entry.get(key), "{:.2g}") for key in ends)
+            row = [joint.name, f"{low} … {high} {joint.unit}", f"{lower} … {upper}"]
+            row += [_format(entry.get(key), "{:.1%}") for key in ("commanded", "at_limit")]
+            row += [_format(entry.get(key), "{:.2g}") for key in ("noise", "step")]
+            rows.append([*row, _format(delay and delay["value"], "{:.2f} s")])
+        return rows
 
 
-def _combine(key: str, values: Any, seconds: np.ndarray) -> float | None:
-    """Return a figure over recordings from that of each of them, `None` where all lack it."""
-    there = values.notna()
-    if not there.any():
-        return None
-    if key in OVERALL:
-        return float(values.agg(OVERALL[key]))  # leaves NaN out
-    return float(np.average(values[there], weights=seconds[there]))
-
-
-def _format_file_row(one: InspectedFile) -> list[str]:
-    timing = one.inspection.timing if one.inspection else {}
-    rate_hz, jitter_s = timing.get("rate_hz"), timing.get("jitter_s")
-    return [
-        one.path.name,
-        f"{one.minutes:.1f}",
-        "–" if rate_hz is None else f"{rate_hz:.2f} Hz",
-        "–" if jitter_s is None else f"{1000.0 * jitter_s:.1f} ms",
-        str(len(one.breaches) or "–"),
-        str(len(one.inspection.findings) or "–") if one.inspection else "–",
-    ]
-
-
-def _format_number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2g}"
-
-
-def _format_percent(value: float | None) -> str:
-    return "–" if value is None else f"{100.0 * value:.1f} %"
+def _format(value: float | None, form: str) -> str:
+    return "–" if value is None else form.format(value)
 
 
 def draw_recording(

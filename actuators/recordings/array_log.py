@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 from scipy import io as matlab
 
-from actuators.recordings.cells import convert_column, tell_column
-from actuators.recordings.log_tables import HEAD_ROWS, LogFile, LogRun, Table, Wanted
+from actuators.recordings.cells import Labels, convert_frame
+from actuators.recordings.log_tables import LogFile, LogRun, Table
 from brokk_rl.errors import RecordingError
 
 EPISODE = "episode_index"
@@ -36,8 +36,6 @@ TABLE_ERRORS = (OSError, pa.ArrowException, ValueError)
 """Errors of pyarrow on a damaged file; a name that is no text is a `ValueError`."""
 NPZ_ERRORS = (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of NumPy on a damaged archive."""
-Labels = Mapping[str, list[str]]
-"""Names of the items of columns of lists."""
 
 
 class TableLog(LogFile):
@@ -52,29 +50,23 @@ class TableLog(LogFile):
         super().__init__(path)
         self._labels = labels or {}
 
-    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the columns of numbers, times, flags and lists; NaN stands for an empty cell."""
         kind = FORMATS[self.path.suffix.lower()]
-        found = {}
         try:
             source = ds.dataset(self.path, format=kind)
             table = source.to_table() if max_rows is None else source.head(max_rows)
             while any(pa.types.is_struct(one) for one in table.schema.types):
                 table = table.flatten()  # fields within others become `pose.x`
             frame = table.to_pandas(ignore_metadata=True)
-            for name, cells in frame.items():
-                is_text = cells.dtype.kind == "O"
-                filled = cells.dropna()[:HEAD_ROWS] if is_text else ()
-                if is_text and len(filled) == 0:
-                    continue
-                is_index = name.startswith(INDEX) and cells.dtype.kind == "M"
-                column, labels = "timestamp" if is_index else name, self._labels.get(name, ())
-                found |= convert_column(column, cells, tell_column(filled, "."), labels=labels)
+            dates = frame.select_dtypes(["datetime", "datetimetz"]).columns
+            index = {name: "timestamp" for name in dates if name.startswith(INDEX)}
+            columns = convert_frame(frame.rename(columns=index), ".", self._labels)
         except FileNotFoundError as error:
             self.refuse("no such log", error)
         except TABLE_ERRORS as error:
             self.refuse(f"cannot be read as {kind} ({error})", error)
-        return {"": Table(found)}
+        return {"": Table(columns)}
 
 
 class LeRobotLog(LogFile):
@@ -102,10 +94,10 @@ class LeRobotLog(LogFile):
         if not self._files:
             self.refuse("no data/**/*.parquet; a LeRobotDataset keeps its rows there")
 
-    def read_runs(self, wanted: Wanted | None, max_rows: int | None) -> Iterator[LogRun]:
+    def read_runs(self, max_rows: int | None) -> Iterator[LogRun]:
         """Yield each episode as a run."""
         for file in self._files if max_rows is None else self._files[:1]:
-            columns = file.read_tables(None, max_rows)[""].columns
+            columns = file.read_tables(max_rows)[""].columns
             numbers = columns.get(EPISODE, np.empty(0))
             if not len(numbers):
                 file.refuse(f"column '{EPISODE}' is missing or has no rows")
@@ -139,7 +131,7 @@ class ArrayLog(LogFile):
                         columns[f"{name}[{item}]"] = column
             self._tables[table] = columns
 
-    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the real vectors of the most frequent length, and columns of such matrices."""
         tables = {}
         for table, columns in self._tables.items():

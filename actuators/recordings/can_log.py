@@ -8,11 +8,10 @@ message are missing in the rows of the others.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from functools import partial
 from io import StringIO
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,8 @@ import can
 import cantools
 
 from actuators.recordings.guess import advise
-from actuators.recordings.message_log import HEAD_UNLISTED, LoggedMessage, MessageLog
+from actuators.recordings.log_tables import Table
+from actuators.recordings.message_log import LoggedMessage, MessageLog
 from brokk_rl import registry
 from brokk_rl.errors import ConfigError
 
@@ -55,12 +55,12 @@ class CanLog(MessageLog):
             kind = EXTENDED if message.is_extended_frame else 0
             self._messages[message.frame_id | kind] = message
 
-    def list_tables(self) -> dict[str, list[str]]:
-        """Return the signals of the messages of the DBC that the beginning of the log has."""
-        tables = super().list_tables()
+    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
+        """Return the signals of the messages of the DBC; refuse a log that has none."""
+        tables = super().read_tables(max_rows)
         if not tables:
             with self._open() as reader:
-                found = sorted({read_identifier(frame) for frame in islice(reader, HEAD_UNLISTED)})
+                found = sorted({read_identifier(frame) for frame in reader})
             ids = [f"0x{one & ~EXTENDED:X}{'x' if one & EXTENDED else ''}" for one in found[:8]]
             listed = ", ".join(ids) or "none"
             self.refuse(f"no message of the DBC is in this log; its identifiers are {listed}")
@@ -70,39 +70,32 @@ class CanLog(MessageLog):
         (message,) = [one for one in self._messages.values() if one.name == table]
         return {signal.name: signal.unit for signal in message.signals if signal.unit}
 
-    def _list_numbers(self, content: Any) -> dict[str, float]:
-        return content  # cantools names them already; a long log has millions of frames
-
     def _open(self) -> Any:
         if self.path.suffix.lower() in (".log", ".txt"):
             return can.CanutilsLogReader(StringIO(read_candump(self.path)))
         return can.LogReader(self.path)
 
-    def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
-        decoders = {}
-        for frame_id, message in self._messages.items():
-            if tables is None or message.name in tables:
-                decoders[frame_id] = partial(message.decode, decode_choices=False)
+    def _iterate(self) -> Iterator[LoggedMessage]:
         channels: dict[int, str] = {}
         with self._open() as reader:
             # python-can reads a file that is shorter than its header says without a word
             stated, there = getattr(reader, "file_size", 0), self.path.stat().st_size
             if there < stated:
                 self.report_damage(f"cut off at byte {there} of {stated}", None)
-            for number, frame in enumerate(reader):
+            for frame in reader:
                 frame_id, channel = read_identifier(frame), str(frame.channel)
                 is_empty = frame.is_error_frame or frame.is_remote_frame
                 is_other = self._channel not in (None, channel)
-                if frame_id not in decoders or is_empty or is_other:
+                if frame_id not in self._messages or is_empty or is_other:
                     continue
-                table = self._messages[frame_id].name
+                message = self._messages[frame_id]
+                table = message.name
                 if channels.setdefault(frame_id, channel) != channel:
                     both = sorted((channel, channels[frame_id]))
                     text = f"message '{table}' comes on the channels {', '.join(both)}, which are two sources"
                     self.refuse(f"{text}; {advise('channel', channel=both[0])}")
-                time_ns = round(frame.timestamp * 1e9)
-                decode = decoders[frame_id]
-                yield LoggedMessage(table, time_ns, bytes(frame.data), decode, f", frame {number}")
+                decode = partial(message.decode, bytes(frame.data), decode_choices=False)
+                yield LoggedMessage(table, round(frame.timestamp * 1e9), decode)
 
 
 def read_identifier(frame: can.Message) -> int:

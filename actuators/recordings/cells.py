@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -30,6 +30,10 @@ CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?|\d\d?:\d\d[.,]\d+|\d+([.,]\d
 NUMBER_SIGNS = str.maketrans({"D": "E", "d": "e"} | dict.fromkeys("'’\u00a0=\""))
 """Exponents of Fortran, signs between thousands, and those of a formula of Excel, `="0.5"`."""
 CellKind = Literal["number", "time", "list", "flag", "text"]
+HEAD_ROWS = 50
+"""Rows by which columns are told."""
+Labels = Mapping[str, list[str]]
+"""Names of the items of columns of lists."""
 
 
 def tell_kind(cell: Any, decimal: str) -> CellKind:
@@ -55,27 +59,32 @@ def tell_column(cells: Iterable[Any], decimal: str) -> CellKind:
     return counts.most_common(1)[0][0] if counts else "number"
 
 
-def convert_column(
-    name: str, cells: Any, kind: CellKind, decimal: str = ".", labels: Sequence[str] = ()
-) -> dict[str, np.ndarray]:
-    """Return the numbers of a column by name, each `(T,)`, those of lists item by item; none for text.
+def convert_frame(frame: Any, decimal: str, labels: Labels) -> dict[str, np.ndarray]:
+    """Return the numbers of a frame of pandas by column, each `(T,)`, those of lists item by item.
+
+    A column is of the kind of most of its first cells; NaN stands for a cell of another kind, and for a list
+    of another length. Columns of text are left out.
 
     Args:
-        name: Name of the column.
-        cells: A series of pandas.
-        kind: Kind of its cells; NaN stands for a cell of another one, and for a list of another length.
+        frame: The frame.
         decimal: Decimal sign of numbers in text.
-        labels: Names of the items of its lists; they are numbered where these do not fit.
+        labels: Names of the items of columns of lists; items without, or of another number, are numbered.
     """
-    if kind == "list":
-        items = _convert_lists(cells)
-        width = items.shape[1]
-        names = labels if len({*labels}) == width else range(width)
-        columns = zip(names, items.T, strict=True)
-        return {f"{name}[{label}]": values for label, values in columns}
-    if kind == "text":
-        return {}
-    return {name: _convert_cells(cells, kind, decimal)}
+    found: dict[str, np.ndarray] = {}
+    for name, cells in frame.items():
+        kind = "number"
+        if cells.dtype.kind == "O":
+            filled = cells.dropna()
+            kind = tell_column(filled[:HEAD_ROWS], decimal) if len(filled) else "text"
+        if kind == "list":
+            items = _convert_lists(cells)
+            given = labels.get(name, ())
+            names = given if len({*given}) == items.shape[1] else range(items.shape[1])
+            for label, values in zip(names, items.T, strict=True):
+                found[f"{name}[{label}]"] = values
+        elif kind != "text":
+            found[name] = _convert_cells(cells, kind, decimal)
+    return found
 
 
 def _convert_cells(cells: Any, kind: CellKind, decimal: str) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Clocks of the tables of a log: how they are read, what is done where they do not increase, and which column is one.
 
-A clock that wraps, is set back, repeats rows or is coarser than the rows is named by its kind, with the
-key that reads it. Each column that increases is a hypothesis of a clock, which its name and its rate weigh.
+A clock that wraps, is set back, repeats rows or is coarser than the rows is named, with the key that reads
+it. Each column that increases is a hypothesis of a clock, which its name and its rate weigh.
 """
 
 from __future__ import annotations
@@ -16,18 +16,17 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from actuators.recordings.guess import Evidence, GivenColumns, Guess, advise
-from actuators.recordings.log_tables import LogRun, Table, index_columns
+from actuators.recordings.log_tables import LogRun, Table
 from actuators.recordings.name_evidence import TIME_UNITS, WORDS, read_words, split_unit
+from actuators.recordings.signal_checks import find_wrap
 from brokk_rl.errors import list_choices
 from brokk_rl.spec import NonZero, Positive, spec
 
 CLOCK_POINTS = 200
 """Points of the line that ties one clock to another; its cost grows with their square, and 200
 points of the fastest messages fix a drift of 1 ppm within minutes."""
-COARSE_SHARE = 0.1
-"""Share of rows at the time of the row before from which a clock is coarse; lost rows repeat less often."""
 MOST_UNORDERED = 0.1
-"""Share of rows out of their order from which a clock is broken: its other times may be wrong too."""
+"""Share of rows out of their order from which a clock is useless: its other times may be wrong too."""
 SETBACK_PERIODS = 10
 """A longer step back is a clock that was set; shorter ones are rows out of their order."""
 
@@ -99,21 +98,18 @@ class ClockFault:
     """Rows of a clock that do not come later than all before.
 
     Attributes:
-        kind: A `coarse` or a `broken` clock, one that was set `back`, or rows that repeat or are out of `order`.
         rows: Rows concerned.
         text: Description.
         advice: How the log is read all the same.
+        is_damage: The other rows can be used.
+        is_set_back: The clock was set back before each of the rows.
     """
 
-    kind: str
     rows: np.ndarray
     text: str
     advice: str
-
-    @property
-    def is_damage(self) -> bool:
-        """True where the other rows can be used."""
-        return self.kind not in ("coarse", "broken")
+    is_damage: bool = True
+    is_set_back: bool = False
 
 
 def unwrap(values: np.ndarray, modulus: float | None) -> np.ndarray:
@@ -153,7 +149,7 @@ def find_fault(t_s: np.ndarray, table: Table, clock: str) -> ClockFault | None:
 
     Args:
         t_s: Its times, `(T,)` s.
-        table: The table with the columns that are needed.
+        table: Its table.
         clock: Column of the clock, which the others are held against.
     """
     later = is_later(t_s)
@@ -161,35 +157,34 @@ def find_fault(t_s: np.ndarray, table: Table, clock: str) -> ClockFault | None:
         return None
     bad = np.flatnonzero(~later)
     steps = np.diff(t_s, prepend=-np.inf)
-    is_equal = steps[bad] == 0
-    same = np.ones(len(bad), dtype=bool)
+    repeats = steps[bad] == 0
     for name, values in table.columns.items():
         if name != clock:
             now, before = values[bad], values[bad - 1]
-            same &= (now == before) | (np.isnan(now) & np.isnan(before))
-    count = f"{len(bad)} of {len(t_s)} rows"
-    if (is_equal & ~same).sum() > COARSE_SHARE * len(t_s):
-        text = f"the clock is coarser than the rows: {count} repeat the time of the row before, with other values"
-        return ClockFault("coarse", bad, text, _advise_rate(t_s))
+            repeats &= (now == before) | (np.isnan(now) & np.isnan(before))
+    most = MOST_UNORDERED * len(t_s)
+    is_coarse = ((steps[bad] == 0) & ~repeats).sum() > most
     period_s = float(np.median(steps[later][1:])) if later.sum() > 1 else 0.0
     back = np.flatnonzero(steps < -SETBACK_PERIODS * period_s)
-    if 0 < len(back) <= max(3, 0.01 * len(t_s)):
+    if 0 < len(back) <= max(3, 0.01 * len(t_s)) and not is_coarse:
         text = f"the clock is set back {len(back)} times, by {-steps[back[0]]:.4g} s at first; what follows is a piece of its own"
-        return ClockFault("back", back, text, advise("damaged"))
-    text = f"the time does not increase in {count}"
-    if (is_equal & same).sum() > 0.5 * len(bad):
-        return ClockFault("order", bad, f"{text}, which repeat the row before", advise("damaged"))
-    if len(bad) > MOST_UNORDERED * len(t_s):
-        rate = _advise_rate(np.floor(t_s))
-        return ClockFault("broken", bad, f"{text}: its digits may be wrong", rate)
-    return ClockFault("order", bad, text, advise("damaged"))
+        return ClockFault(back, text, advise("damaged"), is_set_back=True)
+    text = f"the time does not increase in {len(bad)} of {len(t_s)} rows"
+    if (~repeats).sum() > most:
+        text = (
+            f"{text}, which have other values: it is coarser than the rows, or its digits are wrong"
+        )
+        return ClockFault(bad, text, _advise_rate(t_s), is_damage=False)
+    if repeats.sum() > 0.5 * len(bad):
+        text = f"{text}, which repeat the row before"
+    return ClockFault(bad, text, advise("damaged"))
 
 
 def _advise_rate(t_s: np.ndarray) -> str:
     """Return the advice to take rows as equally spaced, at their mean rate."""
-    stamps_s, counts = np.unique(t_s[np.isfinite(t_s)], return_counts=True)
-    # the first and the last stamp may have only a part of their rows
-    span_s = stamps_s[-1] - stamps_s[1] if len(stamps_s) > 2 else 1.0
+    seconds, counts = np.unique(np.floor(t_s[np.isfinite(t_s)]), return_counts=True)
+    # the first and the last second may have only a part of their rows
+    span_s = seconds[-1] - seconds[1] if len(seconds) > 2 else 1.0
     rate_hz = float(counts[1:-1].sum() / span_s) or len(t_s)
     return advise("rate", rate_hz=float(f"{rate_hz:.3g}"))
 
@@ -205,7 +200,7 @@ DOUBLED_SHARE = 0.2
 """Share of repeated stamps from which two programs send to one topic."""
 MOST_DRIFT = 0.01
 """Drift of a sensor's clock from which on it does not count seconds; crystals drift by 1e-4 at most."""
-TIME_MODULI = (2.0**16, 2.0**24, 2.0**32, 1e3, 1e4, 1e5, 1e6, 1e9, 3600.0, 86400.0)
+TIME_MODULI = (1e3, 3600.0, 1e4, 2.0**16, 86400.0, 1e5, 1e6, 2.0**24, 1e9, 2.0**32)
 """Values at which counters of time begin again, in their own unit."""
 
 
@@ -223,12 +218,11 @@ def guess_times(run: LogRun, given: GivenColumns) -> dict[str, Guess]:
             times[name] = replace(found, choice=_shift_clock(found.choice, offset_s))
         else:
             faults += found
-    columns = index_columns({name: [*table.columns] for name, table in run.tables.items()})
-    if not columns:
+    if not run.places:
         run.refuse("no column of numbers can be read in it")
     if not times:
         rate = f"{advise('rate', rate_hz=50.0)} where they are at 50 Hz"
-        broken = "; ".join(faults) or f"columns: {', '.join(columns)}; {rate}"
+        broken = "; ".join(faults) or f"columns: {', '.join(run.places)}; {rate}"
         rates = f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz"
         run.refuse(f"no column is the time: none increases at a rate of {rates}; {broken}")
     for name in given.clock_offset_s or {}:
@@ -333,7 +327,9 @@ def _judge_clock(
     named = [split_unit(text)[1] or "", *reversed(read_words(text))]
     units = [TIME_UNITS[one] for one in named if one in TIME_UNITS and is_named]
     unit = 1.0 if is_pair else next(iter(units), None)  # a pair is chosen by its two units
-    wraps = _find_time_wrap(values) if is_named else None
+    wrap = find_wrap(values, TIME_MODULI) if is_named else None
+    is_counter = wrap is not None and 0 <= np.nanmin(values) <= np.nanmax(values) < wrap.modulus
+    wraps = wrap.modulus if wrap is not None and is_counter else None
     values = unwrap(values, wraps)
     fault = find_fault((unit or 1.0) * values, table, text)
     later = is_later(values)
@@ -389,17 +385,3 @@ def _weigh_time_unit(
     if len(scales) == 1 or (not is_whole and usual == [scale]):
         return scale, (f"1 = {scale:g} s (the only unit that gives a usual rate)", 1.0)
     return scale, (f"1 = {scale:g} s (a unit 1000 times longer or shorter would do too)", 0.0)
-
-
-def _find_time_wrap(values: np.ndarray) -> float | None:
-    """Return the value at which a counter of time begins again, `None` for one that does not."""
-    steps = np.diff(values[np.isfinite(values)])
-    forward, back = steps[steps > 0], steps[steps < 0]
-    if not len(back) or len(forward) < 10 or len(back) > 0.2 * len(steps) or np.nanmin(values) < 0:
-        return None
-    period = float(np.median(forward))
-    for modulus in TIME_MODULI:
-        # from the last value before the wrap to the first after it one period passes
-        if np.abs(back + modulus - period).max() <= max(1.5 * period, 0.001 * modulus):
-            return modulus
-    return None

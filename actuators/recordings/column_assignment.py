@@ -1,7 +1,7 @@
 """Columns of a log as hypotheses, which names propose and numbers weigh.
 
 Each pair of a command and a position is a hypothesis. Its names give evidence (the same joint), its numbers as
-well (how the motion follows the command). One assignment takes the pairs with the most evidence in all.
+well (how the motion follows the command).
 
 Axes: `C` commands, `P` positions.
 """
@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from actuators.recordings.clocks import guess_times, list_time_columns
 from actuators.recordings.guess import GivenColumns, advise
@@ -27,13 +26,13 @@ from actuators.recordings.joint_evidence import (
     weigh_correlation,
 )
 from actuators.recordings.log_signals import RunSignals
-from actuators.recordings.log_tables import LogRun, index_columns
+from actuators.recordings.log_tables import LogRun
 from actuators.recordings.name_evidence import WORDS, name_joint, read_column_name, read_words
 from actuators.recordings.signal_checks import Wrap, find_wrap
 from brokk_rl.errors import RecordingError
 
-SAME_NAME, OTHER_NAME = 3.0, -6.0
-"""Log odds of a pair with one name of a joint, and of one in which a column shares it with another one."""
+SAME_NAME = 3.0
+"""Log odds of a pair with one name of a joint."""
 
 
 class ColumnTable:
@@ -54,12 +53,10 @@ class ColumnTable:
     """
 
     def __init__(self, run: LogRun, given: GivenColumns) -> None:
-        self._run, self._given = run, given
+        self._given = given
         self.times = times = guess_times(run, given)
-        self._places = index_columns({name: [*run.tables[name].columns] for name in times})
-        self.signals = RunSignals(
-            run, self._places, lambda name: times[name].choice, True, 1.0, quiet=True
-        )
+        self._run = run = replace(run, tables={name: run.tables[name] for name in times})
+        self.signals = RunSignals(run, lambda name: times[name].choice, True, 1.0, quiet=True)
         self.remarks: list[str] = []
         self.joints = self._find() if given.joints is None else self._take(given.joints)
         u, q = [one.u for one in self.joints], [one.q for one in self.joints]
@@ -118,7 +115,7 @@ class ColumnTable:
     def _read_entries(self) -> list[ColumnEntry]:
         """Return the columns that are neither clock nor count nor switch."""
         entries = []
-        for full_name, (table, column) in self._places.items():
+        for full_name, (table, column) in self._run.places.items():
             clocks = list_time_columns(self.times[table].choice)
             is_time = any(column == one or column in re.findall(r"\w+", one) for one in clocks)
             is_time |= column.endswith("stamp") or column == self._run.tables[table].clock
@@ -131,7 +128,7 @@ class ColumnTable:
 
     def _read_entry(self, full_name: str) -> ColumnEntry:
         signal = self.signals.read(full_name)
-        _, column = self._places.get(full_name, (signal.table, full_name))
+        _, column = self._run.places.get(full_name, (signal.table, full_name))
         unit = self._run.tables[signal.table].units.get(column)
         return ColumnEntry(read_column_name(signal.table, column, unit), signal)
 
@@ -153,25 +150,22 @@ class ColumnTable:
         return targets, plain
 
     def _assign(self, commands: Entries, positions: Entries) -> list[JointGuess]:
-        """Return the pairs of the assignment with the most evidence."""
-        u, q = (np.array([one.name.key for one in several]) for several in (commands, positions))
-        is_same = u[:, None] == q[None]
-        has_other = is_same.any(1)[:, None] | is_same.any(0)[None]
-        names = np.where(is_same, SAME_NAME, np.where(has_other, OTHER_NAME, 0.0))
+        """Return a pair for each name that both sides have, and the others that their numbers pair clearly."""
         size = Correlations(self._run, commands, positions).size
-        numbers = np.vectorize(weigh_correlation)(size) + size
-        numbers[[not one.is_changing for one in commands]] = -1.0  # another log may move it
-        score = names + numbers + _prefer(commands, positions)
-        pairs = list(zip(*linear_sum_assignment(-score), strict=True))
+        score = np.vectorize(weigh_correlation)(size) + size
+        score[[not one.is_changing for one in commands]] = -1.0  # another log may move it
+        score += _prefer(commands, positions)
+        u, q = (np.array([one.name.key for one in several]) for several in (commands, positions))
+        same = np.argwhere(u[:, None] == q[None]).tolist()
         chosen: dict[str, tuple[int, int]] = {}
-        for pair in sorted(pairs, key=lambda pair: -score[pair]):
-            if is_same[pair]:
-                chosen.setdefault(commands[pair[0]].name.key, pair)
+        for row, column in sorted(same, key=lambda pair: -score[*pair]):
+            chosen.setdefault(u[row], (row, column))
         found = [(*pair, "same name", SAME_NAME) for pair in chosen.values()]
         rows, columns = _list_rest(commands, chosen), _list_rest(positions, chosen)
         rest = np.zeros_like(size)
         rest[np.ix_(rows, columns)] = size[np.ix_(rows, columns)]
-        clear = [pair for pair in pairs if _is_clear(rest, *pair)]
+        best = [(row, int(np.argmax(rest[row]))) for row in rows]
+        clear = [pair for pair in best if _is_clear(rest, *pair)]
         if len(rows) == len(columns) == 1:
             found.append((rows[0], columns[0], "the only command and the only position", 2.0))
         elif len(clear) == min(len(rows), len(columns)):
@@ -193,25 +187,22 @@ class ColumnTable:
             return []
         size = Correlations(self._run, moving, moving).size
         np.fill_diagonal(size, 0.0)
-        size = np.where((size >= size.T) & (size >= CLEAR_CORRELATION), size, 0.0)
-        pairs, used = [], set[int]()
-        for flat in np.argsort(-size, axis=None)[: np.count_nonzero(size)]:
-            row, column = (int(at) for at in np.unravel_index(flat, size.shape))
-            if used.isdisjoint((row, column)):
-                used |= {row, column}
-                pairs.append((moving[row], moving[column]))
-        return pairs
+        size = np.where((size > size.T) | np.triu(size == size.T), size, 0.0)
+        pairs = [(u, moving[np.argmax(row)]) for u, row in zip(moving, size, strict=True)]
+        return [
+            pair for pair, row in zip(pairs, size, strict=True) if max(row) >= CLEAR_CORRELATION
+        ]
 
     def _refuse(self, text: str, pairs: Sequence[Entries]) -> None:
         """Raise a `RecordingError` with the columns of each joint as they are given by hand."""
         proposed = [f'joint_{at}: ["{u.text}", "{q.text}"]' for at, (u, q) in enumerate(pairs, 1)]
         joints = ", ".join(proposed) or 'boom: ["<command>", "<position>"]'
-        columns = ", ".join(self._places)
+        columns = ", ".join(self._run.places)
         self._run.refuse(f"{text}{advise('joints', joints=joints)}; its columns are {columns}")
 
     def _check_drive(self, joint: JointGuess) -> None:
         """Add the evidence of a drive that is off by a column that says so, and remark it."""
-        for full_name, (_, column) in self._places.items():
+        for full_name, (_, column) in self._run.places.items():
             words = read_words(column)
             known = WORDS["enable"] | {"torque", "drive", "motor"}
             left = "".join(one for one in words if one not in known)

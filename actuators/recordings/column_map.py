@@ -26,13 +26,7 @@ import numpy as np
 from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn, put_near
 from actuators.recordings.guess import Damaged
 from actuators.recordings.log_files import open_log
-from actuators.recordings.log_signals import (
-    TICK_TOLERANCE,
-    RunSignals,
-    Signal,
-    locate,
-    open_signals,
-)
+from actuators.recordings.log_signals import TICK_TOLERANCE, RunSignals, Signal, locate
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -169,9 +163,7 @@ class ColumnMap:
                 f"import: the map names the joints {', '.join(self.joints)}, machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
-        texts = [column.column for column in self.optional.values()]
         for name, joint in self.joints.items():
-            texts += [joint.command.column, joint.position.column]
             if not isinstance(joint.command, TargetColumn):
                 continue
             is_position = joint.command.full_speed is None
@@ -185,7 +177,8 @@ class ColumnMap:
         opened = open_log(path, signs, self.dbc, self.damaged, self.channel)
         find_time = partial(self.find_time, where=path)
         found = []
-        for signals in open_signals(opened, texts, find_time, self.longest_gap_s):
+        for run in opened.read_runs(None):
+            signals = RunSignals(run, find_time, opened.keep_whole, self.longest_gap_s)
             found += self._read_run(signals, machine)
         if not found:
             raise RecordingError(

@@ -156,7 +156,7 @@ class _RecordingScan:
             "jitter_s": np.nanpercentile(np.abs(periods_s - median_s), 95),
             "longest_s": np.nanmax(periods_s),
         }
-        return {name: _to_json_number(value) for name, value in figures.items()}
+        return {name: to_json_number(value) for name, value in figures.items()}
 
     def joints(self) -> dict[str, dict[str, float | None]]:
         """Return the figures of each joint."""
@@ -176,7 +176,7 @@ class _RecordingScan:
                 "noise": self._noise[j],
                 "step": self._step[j],
             }
-            found[name] = {key: _to_json_number(value) for key, value in figures.items()}
+            found[name] = {key: to_json_number(value) for key, value in figures.items()}
         return found
 
     def find_all(self) -> Iterator[RecordingFinding]:
@@ -379,6 +379,6 @@ def estimate_step(q: np.ndarray) -> float:
     return step if np.quantile(off, LATTICE_SHARE) < LATTICE_ERROR else np.nan
 
 
-def _to_json_number(value: Any) -> float | None:
+def to_json_number(value: Any) -> float | None:
     """Return a number, `None` for NaN, which JSON cannot hold."""
     return float(value) if np.isfinite(value) else None

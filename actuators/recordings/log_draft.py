@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ from actuators.recordings.column_assignment import ColumnTable
 from actuators.recordings.guess import GivenColumns, Guess
 from actuators.recordings.joint_evidence import JointGuess
 from actuators.recordings.log_files import open_log
-from actuators.recordings.log_signals import Signal, open_signals
+from actuators.recordings.log_signals import RunSignals, Signal
 from actuators.recordings.log_tables import LogFile
 from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import RecordingError
@@ -162,7 +161,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         opened = open_log(path, None, given.dbc, given.damaged, given.channel)
         if isinstance(opened, TextLog):
             signs = opened.signs
-        run = next(opened.read_runs(None, SAMPLED_ROWS), None)
+        run = next(opened.read_runs(SAMPLED_ROWS), None)
         if run is None:
             raise RecordingError(f"{path}: no row")
         sample = ColumnTable(run, given)
@@ -195,30 +194,28 @@ def _scale_command(joint: JointGuess) -> None:
     """Choose neutral and full commands of a joint whose command sets its speed, or a force."""
     survey = joint.survey
     low, high, neutral = survey.lowest_command, survey.highest_command, 0.0
-    is_at_rest = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
-    largest_of_logs = "full commands are the largest of the logs"
     largest = max(abs(low), abs(high))
-    value = None
+    is_at_rest = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
+    full = "full commands are the largest of the logs"
     if joint.kind == "torque":  # a joint at rest may be held by a force, so 0 is neutral
-        low, high, value = -largest, largest, f"{-largest:.6g} to {largest:.6g}"
+        low, high = -largest, largest
         evidence = [("the largest command of the logs, both ways", 2.0)]
     elif -1.001 <= low < -0.5 and 0.5 < high <= 1.001:
-        low, high, value = -1.0, 1.0, "-1 to 1"
+        low, high = -1.0, 1.0
+        largest = 1.0
         evidence = [(f"commands lie within -1 and 1, at rest {survey.rest:g}", 4.0)]
     elif is_at_rest:
         neutral = survey.rest
-        text = f"neutral {neutral:.6g} is the command of {survey.rest_share:.0%} of the rows, all at rest"
-        evidence = [(f"{text}; {largest_of_logs}", 2.0)]
+        share = f"{survey.rest_share:.0%} of the rows, all at rest"
+        evidence = [(f"neutral {neutral:.6g} is the command of {share}; {full}", 2.0)]
     elif low <= 0.0 <= high:
-        text = f"neutral 0: no command is frequent at rest; {largest_of_logs}"
-        evidence = [(text, 2.0)]
+        evidence = [(f"neutral 0: no command is frequent at rest; {full}", 2.0)]
     else:
         evidence = [("no command is frequent at rest, and none is 0", -1.0)]
-    if value is None and neutral == 0.0 and joint.u.name.speed_unit is not None:
-        # a speed counts alike both ways
+    if neutral == 0.0 and joint.u.name.speed_unit is not None:  # a speed counts alike both ways
         low = -largest if low < 0.0 else low
         high = largest if high > 0.0 else high
-    value = value or f"{low:.6g} to {high:.6g}, neutral {neutral:.6g}"
+    value = f"{low:.6g} to {high:.6g}, neutral {neutral:.6g}"
     least = 1e-9 * max(1.0, abs(neutral))
     above = high if high > neutral + least else None
     below = low if low < neutral - least else None
@@ -275,6 +272,8 @@ GAP_PERIODS = 4
 """Least number of periods without a sample that split a log; loggers without real time skip up to two."""
 LOST_PERIODS = 20
 """A longer time without a sample is no row that was lost by chance."""
+USUAL_SHARE = 0.999
+"""Share of the periods within half a gap: 20 % of the rows, lost by chance, leave gaps of 5 to 8 periods."""
 
 
 @dataclass
@@ -312,15 +311,15 @@ class LogSurvey:
         Raises:
             RecordingError: It is damaged, or lacks a column that the first one has.
         """
-        texts = chain.from_iterable((joint.q.text, joint.u.text) for joint in joints)
-        for signals in open_signals(opened, [*texts], lambda table: times[table].choice, 1.0):
+        for run in opened.read_runs(None):
+            signals = RunSignals(run, lambda table: times[table].choice, opened.keep_whole, 1.0)
             read = []
             for joint in joints:
                 position = signals.read(joint.q.text, wraps=joint.q.modulus)
                 command = signals.read(joint.u.text, wraps=joint.target_wraps)
                 joint.survey.add(command, position, joint)
                 read += [position, command]
-            self._add_clocks(signals.run.where, read)
+            self._add_clocks(run.where, read)
 
     def _add_clocks(self, where: str, signals: Sequence[Signal]) -> None:
         """Add the clocks of a run, that of a position first."""
@@ -330,7 +329,9 @@ class LogSurvey:
         self.periods_s.append(period_s)
         slowest_s = max(float(np.median(np.diff(signal.t_s))) for signal in signals)
         self.slowest_period_s = max(self.slowest_period_s, slowest_s)
-        self.gap_periods = max(self.gap_periods, count_gap_periods(periods_s / period_s))
+        by_chance_s = periods_s[periods_s < LOST_PERIODS * period_s]
+        usual_s = float(np.quantile(by_chance_s, USUAL_SHARE))
+        self.gap_periods = max(self.gap_periods, math.ceil(2.0 * usual_s / period_s - 1e-3))
         gaps = np.flatnonzero(periods_s > self.gap_periods * slowest_s)
         if len(gaps):
             longest = gaps[np.argmax(periods_s[gaps])]
@@ -342,19 +343,3 @@ class LogSurvey:
         edges_s = np.concatenate([t_s[:1], t_s[gaps], t_s[-1:]])
         self.longest_s = max(self.longest_s, float(np.diff(edges_s).max()))
         self.num_runs += 1
-
-
-def count_gap_periods(periods: np.ndarray) -> int:
-    """Return for how many periods rows that are lost one by one, by chance, leave no sample.
-
-    Of `N` rows, each lost with probability `p`, the longest series of lost ones has about
-    `log N / log(1 / p)` (Erdős and Rényi); one row more is a gap.
-
-    Args:
-        periods: Times between rows over their median, `(N,)`.
-    """
-    steps = np.maximum(np.round(periods[periods < LOST_PERIODS]), 1.0)
-    lost = 1.0 - len(steps) / max(float(steps.sum()), 1.0)
-    if lost <= 0.0:
-        return GAP_PERIODS
-    return max(GAP_PERIODS, 2 + math.ceil(math.log(len(steps)) / math.log(1.0 / lost)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ def open_log(
         ConfigError: A log of a CAN bus without a DBC file, or a library is not installed.
         RecordingError: It is no log of a known kind, or its beginning cannot be read.
     """
-    name = _find_folder_reader(path) if path.is_dir() else _find_reader(path)
+    name = _find_reader(path)
     more: dict[str, tuple[Any, ...]] = {"TextLog": (signs,), "CanLog": (dbc, channel)}
     if name == "can_log.CanLog" and dbc is None:
         raise ConfigError(
@@ -76,20 +77,16 @@ def open_log(
     return opened
 
 
-def _find_folder_reader(path: Path) -> str:
-    reader = tell_folder(path)
-    if reader is None and len(_list_csv_files(path)) > 1:
-        reader = "text_log.CsvFolderLog"
-    if reader is None:
-        raise RecordingError(
-            f"{path}: expected a folder with the CSV files of one run, a LeRobotDataset (meta/info.json) or a bag of "
-            "ROS 2 (metadata.yaml)"
-        )
-    return reader
-
-
 def _find_reader(path: Path) -> str:
-    """Return the reader of a file; refuse an empty one, and one whose first bytes are those of another kind."""
+    """Return the reader of a log; refuse an empty file, and one whose first bytes are those of another kind."""
+    if path.is_dir():
+        reader = tell_folder(path)
+        if reader is None and len(_list_csv_files(path)) < 2:
+            raise RecordingError(
+                f"{path}: expected a folder with the CSV files of one run, a LeRobotDataset (meta/info.json) or a bag of "
+                "ROS 2 (metadata.yaml)"
+            )
+        return reader or "text_log.CsvFolderLog"
     if not path.exists():
         raise RecordingError(f"{path}: no such log")
     ending = path.suffix.lower()
@@ -165,12 +162,9 @@ def _list_csv_files(folder: Path) -> list[str]:
 
 def _list_csv_runs(folder: Path) -> list[Path]:
     """Return the folders below that hold several CSV files by the same names: each is a run."""
-    by_names: dict[tuple[str, ...], list[Path]] = {}
+    files = {}
     for entry in folder.iterdir():
         if entry.is_dir() and not entry.name.startswith(".") and tell_folder(entry) is None:
-            by_names.setdefault(tuple(_list_csv_files(entry)), []).append(entry)
-    runs = []
-    for names, entries in by_names.items():
-        if len(names) > 1 and len(entries) > 1:
-            runs += entries
-    return runs
+            files[entry] = tuple(_list_csv_files(entry))
+    counts = Counter(files.values())
+    return [entry for entry, names in files.items() if len(names) > 1 and counts[names] > 1]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
@@ -12,14 +12,7 @@ import numpy as np
 from actuators.recordings import clocks
 from actuators.recordings.clocks import TimeColumn, unwrap
 from actuators.recordings.guess import advise
-from actuators.recordings.log_tables import (
-    LogFile,
-    LogRun,
-    Table,
-    index_columns,
-    parse_expression,
-    warn_once,
-)
+from actuators.recordings.log_tables import LogRun, Table, parse_expression, warn_once
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 
 log = logging.getLogger(__name__)
@@ -70,44 +63,27 @@ class Signal:
         return np.interp(ticks_s, self.t_s, self.values)
 
 
-Places = Mapping[str, tuple[str, str]]
-"""Table and column of each full name."""
-
-
 @dataclass
 class RunSignals:
     """The signals of a run, each on the clock of its table.
 
     Attributes:
         run: The run.
-        places: Table and column of each full name.
         find_time: Returns the clock of a table by its name.
         skip: Leave rows out that lack a number or whose time does not increase.
         gap_s: Time at which a log is split; parts between which a clock was set back lie further apart.
         quiet: Leave out without a warning.
-        times_s: Times of the tables that were read.
     """
 
     run: LogRun
-    places: Places
     find_time: Callable[[str], TimeColumn]
     skip: bool
     gap_s: float
     quiet: bool = False
-    times_s: dict[str, np.ndarray] = field(default_factory=dict)
 
-    def read_times(self, name: str) -> np.ndarray:
-        """Return the times of a table, `(T,)` s; NaN for rows that are left out.
-
-        Raises:
-            RecordingError: The times cannot be used.
-        """
-        if name not in self.times_s:
-            self.times_s[name] = self._read_times(name, self.find_time(name))
-        return self.times_s[name]
-
-    def _read_times(self, name: str, time: TimeColumn) -> np.ndarray:
-        table = self.run.tables[name]
+    def _read_times(self, name: str, table: Table) -> np.ndarray:
+        """Return the times of a table, `(T,)` s; NaN for rows that are left out."""
+        time = self.find_time(name)
         num_rows = len(next(iter(table.columns.values())))
         if num_rows < 2:
             self.run.refuse(f"table '{name}' has {num_rows} rows; a log has at least 2")
@@ -129,7 +105,7 @@ class RunSignals:
                 times = f"{t_s[max(row - 1, 0)]:g} s, then {t_s[row]:g} s"
                 text = f"{place}: time does not increase ({times}): {fault.text}; {fault.advice}"
                 self.run.refuse(text)
-            for at in fault.rows if fault.kind == "back" else ():
+            for at in fault.rows if fault.is_set_back else ():
                 t_s[at:] += t_s[at - 1] - t_s[at] + 2.0 * self.gap_s
             later = clocks.is_later(t_s)
             if not self.quiet:
@@ -146,13 +122,13 @@ class RunSignals:
     def read(self, text: str, empty: bool = False, wraps: float | None = None) -> Signal:
         """Return a column or arithmetic over columns.
 
-        Rows of a sparse table that lack the column are none of it. Elsewhere an empty cell is damage, which
+        Rows of a sparse table that lack the column are none of it, and of its clock. Elsewhere an empty cell is damage, which
         is refused unless `empty` or the request to skip allows it.
 
         Raises:
             RecordingError: It holds what is no number; names row and column.
         """
-        names = list_names(text, self.places, self.run.where)
+        names = self._list_names(text)
         parts = {name: self._read_column(name, empty) for name in names}
         first = parts[names[0]]
         if names == (text,):
@@ -171,11 +147,14 @@ class RunSignals:
         return Signal(first.table, first.t_s, unwrap(values, wraps), first.rows, text)
 
     def _read_column(self, name: str, empty: bool) -> Signal:
-        table, column = self.places[name]
-        content, t_s = self.run.tables[table], self.read_times(table)
+        table, column = self.run.places[name]
+        content = self.run.tables[table]
+        if content.is_sparse:
+            content = content.select(np.isfinite(content.columns[column]))
+        t_s = self._read_times(table, content)
         values = np.asarray(content.columns[column], dtype=float)
         lacking = ~np.isfinite(values)
-        is_sparse = content.is_sparse or lacking.mean() >= SPARSE_SHARE
+        is_sparse = lacking.mean() >= SPARSE_SHARE
         if lacking.any() and not (empty or self.skip or is_sparse):
             self._refuse_cell(content, ~lacking, column, name)
         is_left_out = lacking & np.isfinite(t_s)
@@ -190,71 +169,35 @@ class RunSignals:
             self.run.refuse(f"column '{name}' has {count}; a log has at least 2")
         return Signal(table, t_s[rows], values[rows], rows, name)
 
+    def _list_names(self, text: str) -> tuple[str, ...]:
+        """Return the columns that a text names: itself, or those of its arithmetic."""
+        if text in self.run.places:
+            return (text,)
+        try:
+            names = parse_expression(text).names
+        except ConfigError:
+            self._refuse_missing(text)
+            raise
+        for name in names:
+            self._refuse_missing(name)
+        return names
+
+    def _refuse_missing(self, name: str) -> None:
+        """Refuse a column that is missing."""
+        if f"{name}#1" in self.run.places:
+            self.run.refuse(
+                f"several columns are named '{name}'; rename them, or name one: {name}#1, {name}#2"
+            )
+        if name not in self.run.places:
+            choices = list_choices(name, self.run.places)
+            self.run.refuse(f"column '{name}' is missing or holds no numbers; {choices}")
+
     def _refuse_cell(self, table: Table, known: np.ndarray, column: str, name: str) -> NoReturn:
         """Refuse the first row of a column that is not `known`, `(T,)`; `name`: its full name."""
         row = int(np.argmin(known))
         cell = table.show_cell(row, column) if column in table.columns else "the value"
         place = f"{table.locate(row)}, column '{name}'"
         self.run.refuse(f"{place}: {cell} is not a number; {advise('damaged')}")
-
-
-def open_signals(
-    opened: LogFile, texts: Sequence[str], find_time: Callable[[str], TimeColumn], gap_s: float
-) -> Iterator[RunSignals]:
-    """Yield the signals of each run of a log, of which only some columns and their clocks are read.
-
-    Args:
-        opened: The log.
-        texts: The columns, or arithmetic over them.
-        find_time: Returns the clock of a table by its name.
-        gap_s: Time at which a log is split.
-
-    Raises:
-        RecordingError: A column is missing, or the log is damaged.
-    """
-    places = index_columns(opened.list_tables())
-    wanted: dict[str, dict[str, None]] = {}
-    for text in texts:
-        for name in list_names(text, places, opened.path):
-            table, column = places[name]
-            wanted.setdefault(table, {})[column] = None
-    for table, columns in wanted.items():
-        inside = {column: (table, column) for one, column in places.values() if one == table}
-        for text in clocks.list_time_columns(find_time(table)):
-            columns |= dict.fromkeys(list_names(text, inside, opened.path))
-    for run in opened.read_runs(wanted, None):
-        yield RunSignals(run, places, find_time, opened.keep_whole, gap_s)
-
-
-def list_names(text: str, places: Places, where: object) -> tuple[str, ...]:
-    """Return the columns that a text names: itself, or those of its arithmetic.
-
-    Raises:
-        RecordingError: A column is missing.
-        ConfigError: It is neither.
-    """
-    if text in places:
-        return (text,)
-    try:
-        names = parse_expression(text).names
-    except ConfigError:
-        _refuse_missing(text, places, where)
-        raise
-    for name in names:
-        _refuse_missing(name, places, where)
-    return names
-
-
-def _refuse_missing(name: str, places: Places, where: object) -> None:
-    """Raise a `RecordingError` where a column is missing."""
-    if f"{name}#1" in places:
-        raise RecordingError(
-            f"{where}: several columns are named '{name}'; rename them, or name one: {name}#1, {name}#2"
-        )
-    if name not in places:
-        raise RecordingError(
-            f"{where}: column '{name}' is missing or holds no numbers; {list_choices(name, places)}"
-        )
 
 
 def _compute_column(columns: Mapping[str, np.ndarray], text: str) -> np.ndarray:

@@ -13,8 +13,8 @@ from __future__ import annotations
 import functools
 import logging
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import CodeType
 from typing import NoReturn
@@ -46,6 +46,11 @@ class Table:
     is_sparse: bool = False
     find_line: Callable[[int], tuple[int, Mapping[str, str]]] | None = None
 
+    def select(self, rows: np.ndarray) -> Table:
+        """Return the table with some of its rows, `(T,)` of truth values."""
+        columns = {name: values[rows] for name, values in self.columns.items()}
+        return replace(self, columns=columns)
+
     def locate(self, row: int) -> str:
         """Return the place of a row in its file, for a message."""
         if self.find_line is None:
@@ -75,15 +80,18 @@ class LogRun:
     where: str
     tables: Mapping[str, Table]
 
+    @functools.cached_property
+    def places(self) -> dict[str, tuple[str, str]]:
+        """Table and column of each full name; a column of the only table, which has no name, is named alone."""
+        found = {}
+        for table, content in self.tables.items():
+            for column in content.columns:
+                found[f"{table}:{column}" if table else column] = (table, column)
+        return found
+
     def refuse(self, text: str) -> NoReturn:
         """Raise a `RecordingError` that names the run."""
         raise RecordingError(f"{self.where}: {text}")
-
-
-Wanted = Mapping[str, Collection[str]]
-"""Columns by table."""
-HEAD_ROWS = 50
-"""Rows from which the columns of a log are listed."""
 
 
 @functools.cache
@@ -93,7 +101,7 @@ def warn_once(text: str) -> None:
 
 
 class LogFile:
-    """A log of which only the needed columns are read."""
+    """A log, which is read whole."""
 
     keep_whole = False
     """True leaves damaged parts out with a warning; False refuses a log with damage."""
@@ -116,40 +124,21 @@ class LogFile:
             self.refuse(f"{text}; {advise('damaged')}", error)
         warn_once(f"{self.path}: {text}: left out")
 
-    def list_tables(self) -> dict[str, list[str]]:
-        """Return the columns of numbers of each table, from the beginning of the log.
-
-        Raises:
-            RecordingError: The log cannot be read.
-        """
-        run = next(self.read_runs(None, HEAD_ROWS))
-        return {name: [*table.columns] for name, table in run.tables.items()}
-
-    def read_runs(self, wanted: Wanted | None, max_rows: int | None) -> Iterator[LogRun]:
+    def read_runs(self, max_rows: int | None) -> Iterator[LogRun]:
         """Yield each run; a log is one run unless its reader says otherwise.
 
         Args:
-            wanted: Columns that are needed, by table; `None` for all. A reader may leave out the others.
             max_rows: Rows of each table after which reading may stop; `None` for all.
 
         Raises:
             RecordingError: The log is damaged; names the place.
         """
         name = self.path.resolve().name if self.path.is_dir() else self.path.stem
-        yield LogRun(name, str(self.path), self.read_tables(wanted, max_rows))
+        yield LogRun(name, str(self.path), self.read_tables(max_rows))
 
-    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the tables of a log that is one run; see `read_runs`."""
         raise NotImplementedError
-
-
-def index_columns(tables: Mapping[str, Collection[str]]) -> dict[str, tuple[str, str]]:
-    """Return table and column of each full name; a column of the only table, which has no name, is named alone."""
-    places = {}
-    for table, columns in tables.items():
-        for column in columns:
-            places[f"{table}:{column}" if table else column] = (table, column)
-    return places
 
 
 LONGEST = 1000

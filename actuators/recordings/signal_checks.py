@@ -6,6 +6,7 @@ Axes: `T` samples.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,11 +53,11 @@ class Wrap:
         return f"it steps by {size:.6g} in {len(self.rows)} rows and goes on at the same speed"
 
 
-def find_wrap(values: np.ndarray) -> Wrap | None:
+def find_wrap(values: np.ndarray, moduli: Sequence[float] = MODULI) -> Wrap | None:
     """Return the wraps of a signal, `(T,)`, or `None`.
 
     All large steps must be by one modulus, the speed must be the same before and after, and the signal must
-    reach from one end of the modulus to the other.
+    reach from one end of the modulus to the other. Steps by a sign bit are looked for beside `MODULI` only.
     """
     values = values[np.isfinite(values)]
     if len(values) < 20 or np.ptp(values) == 0:
@@ -64,7 +65,7 @@ def find_wrap(values: np.ndarray) -> Wrap | None:
     steps, span = np.diff(values), float(np.ptp(values))
     typical = float(np.quantile(np.abs(steps), 0.9))
     is_count = values.min() >= 0 and bool((values == np.round(values)).all())
-    for modulus in MODULI:
+    for modulus in moduli:
         if is_count and values.max() >= modulus:
             continue  # a counter never reaches its modulus, a sign bit is above it
         if not 0.85 * modulus <= span <= 1.02 * modulus or typical > 0.2 * modulus:
@@ -80,7 +81,7 @@ def find_wrap(values: np.ndarray) -> Wrap | None:
         is_near = left <= max(FIT_SHARE * modulus, 3.0 * typical)
         if np.mean(is_near) >= 0.9 and np.mean(is_running) >= 0.5:
             return Wrap(modulus, rows)
-    return _find_sign_bit(values, steps)
+    return _find_sign_bit(values, steps) if moduli is MODULI else None
 
 
 def _find_sign_bit(values: np.ndarray, steps: np.ndarray) -> Wrap | None:

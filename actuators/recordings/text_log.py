@@ -19,14 +19,14 @@ from typing import Any, NoReturn
 
 import pandas as pd
 
-from actuators.recordings.cells import MISSING, CellKind, convert_column, tell_column, tell_kind
-from actuators.recordings.log_tables import LogFile, Table, Wanted
+from actuators.recordings.cells import MISSING, convert_frame, tell_kind
+from actuators.recordings.log_tables import LogFile, Table
 from actuators.recordings.name_evidence import is_unit
 
 log = logging.getLogger(__name__)
 
 SNIFFED_BYTES = 1 << 16
-"""Bytes at both ends of a file by which its layout is told."""
+"""Bytes at the beginning of a file by which its layout is told."""
 DELIMITERS = (",", ";", "\t", " ", "|")
 COMMENT_MARKS = "#%;/!*"
 """Signs that begin a line of comment."""
@@ -43,17 +43,14 @@ csv.field_size_limit(1 << 24)  # a cell may hold a long list
 class CsvFolderLog(LogFile):
     """A folder with the CSV files of one run, each on its clock."""
 
-    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
-        """Return the rows of each file that is needed."""
-        tables = {}
-        for path in sorted(self.path.glob("*.csv")):
-            if wanted is None or path.stem in wanted:
-                tables[path.stem] = TextLog(path).read_tables(None, max_rows)[""]
-        return tables
+    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
+        """Return the rows of each file."""
+        files = sorted(self.path.glob("*.csv"))
+        return {path.stem: TextLog(path).read_tables(max_rows)[""] for path in files}
 
 
 class TextLog(LogFile):
-    """A text file as a log with one table; its layout is told from both of its ends.
+    """A text file as a log with one table; its layout is told from its beginning.
 
     Args:
         path: The file.
@@ -68,7 +65,7 @@ class TextLog(LogFile):
 
     def __init__(self, path: Path, signs: tuple[str, str] | None = None) -> None:
         super().__init__(path)
-        head, tail, self._encoding = self._read_ends()
+        head, self._encoding = self._read_head()
         # Excel writes the delimiter into a line of its own; quotes hold 0,5 between commas
         stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
         pairs = itertools.product((stated[1],) if stated else DELIMITERS, ".,")
@@ -81,8 +78,6 @@ class TextLog(LogFile):
             width = Counter(len(rows[at]) for at in good).most_common(1)[0][0]
             fitting = {at: rows[at] for at in good if len(rows[at]) == width}
             samples = [*fitting.values()]
-            ends = [split_line(line, delimiter) for line in tail]
-            samples += [row for row in ends if len(row) == width and _is_data(row, decimal)]
             cells = itertools.chain.from_iterable(samples)
             score = sum(
                 cell not in MISSING and tell_kind(cell, decimal) != "text" for cell in cells
@@ -95,32 +90,26 @@ class TextLog(LogFile):
         _, self.signs, self._first_line, samples = max(candidates, key=lambda one: one[0])
         names = self._find_names(head[: self._first_line], samples)
         self._names = _tell_apart(names)
-        self._kinds: list[CellKind] = [
-            tell_column(cells, self.signs[1]) for cells in zip(*samples, strict=True)
-        ]
 
-    def _read_ends(self) -> tuple[list[str], list[str], str]:
-        """Return whole lines at the beginning and at the end of the file, and its encoding."""
+    def _read_head(self) -> tuple[list[str], str]:
+        """Return whole lines at the beginning of the file, and its encoding."""
         try:
             with self.path.open("rb") as file:
                 head = file.read(SNIFFED_BYTES)
-                size = file.seek(0, 2)
-                file.seek(max(len(head), size - SNIFFED_BYTES) // 2 * 2)
-                tail = file.read()
+                is_all = not file.read(1)
         except OSError as error:
             self.refuse(f"cannot be read as text ({error})", error)
         encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
         try:
-            first = head.decode(encoding, errors="strict" if size <= SNIFFED_BYTES else "ignore")
+            text = head.decode(encoding, errors="strict" if is_all else "ignore")
         except UnicodeDecodeError:
             encoding = "cp1252"
-            first = head.decode(encoding, errors="replace")
-        if "\0" in first:
+            text = head.decode(encoding, errors="replace")
+        if "\0" in text:
             known = "neither text nor a kind of log that is known by its ending"
             self.refuse(f"{known} (it holds bytes of 0)")
-        last = tail.decode(encoding.removesuffix("-sig"), errors="ignore")
-        lines = first.splitlines()
-        return lines if size <= SNIFFED_BYTES else lines[:-1], last.splitlines()[1:-1], encoding
+        lines = text.splitlines()
+        return lines if is_all else lines[:-1], encoding
 
     def _refuse_head(self, head: list[str]) -> NoReturn:
         """Refuse a file without rows of numbers; `head`: its first lines."""
@@ -166,7 +155,7 @@ class TextLog(LogFile):
             return [f"{name} [{unit}]" if unit not in MISSING else name for name, unit in pairs]
         return [f"column_{at + 1}" for at in range(width)]
 
-    def read_tables(self, wanted: Wanted | None, max_rows: int | None) -> dict[str, Table]:
+    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the rows of the file with all columns of numbers, times, flags and lists.
 
         NaN stands for a cell that is none of them. A last line that a crash cut off is left out with a warning.
@@ -174,9 +163,7 @@ class TextLog(LogFile):
         Raises:
             RecordingError: The file is damaged; names the line.
         """
-        columns = {}
-        for at, cells in self._read_cells(max_rows).items():
-            columns |= convert_column(self._names[at], cells, self._kinds[at], self.signs[1])
+        columns = convert_frame(self._read_frame(max_rows), self.signs[1], {})
         return {"": Table(columns, find_line=self.find_line)}
 
     def find_line(self, row: int) -> tuple[int, dict[str, str]]:
@@ -192,10 +179,9 @@ class TextLog(LogFile):
                     cells = split_line(line, self.signs[0])
                     yield number, cells, line.endswith("\n")
 
-    def _read_cells(self, max_rows: int | None) -> dict[int, Any]:
-        """Return the cells of all columns but text; numbers are numbers already where all of them are."""
+    def _read_frame(self, max_rows: int | None) -> Any:
+        """Return the cells of all columns that have a name; numbers are numbers already where all of them are."""
         (delimiter, decimal), width = self.signs, len(self._names)
-        places = [at for at, name in enumerate(self._names) if name and self._kinds[at] != "text"]
         read = functools.partial(
             pd.read_csv,
             self.path,
@@ -203,8 +189,6 @@ class TextLog(LogFile):
             decimal=decimal,
             header=None,
             names=range(width),
-            usecols=sorted({*places, width - 1}),
-            dtype={at: str for at in places if self._kinds[at] != "number"},
             na_values=MISSING,
             keep_default_na=False,
             encoding=self._encoding,
@@ -228,7 +212,8 @@ class TextLog(LogFile):
             self.refuse(f"{len(frame)} rows of data below the header; a log has at least 2")
         if frame[width - 1].isna().any() and self._names[-1]:
             self._report_bad_line(width, None)
-        return {at: frame[at] for at in places}
+        named = {at: name for at, name in enumerate(self._names) if name}
+        return frame[[*named]].rename(columns=named)
 
     def _report_bad_line(self, width: int, error: Exception | None) -> None:
         """Report the first line that has another number of cells than the others."""

@@ -542,10 +542,10 @@ def test_arm_and_wheels_on_one_topic_keep_their_own_rates() -> None:
     done, recordings = import_log("log.input=a.mcap")
     assert done.code == 0, done.err
     assert "2 joints at 50 Hz" in done.out
-    columns = open_log(Path("a.mcap")).list_tables()
+    columns = next(open_log(Path("a.mcap")).read_runs(None)).tables
     joints = ["position[hip]", "position[knee]", "position[7]"]
-    assert [*columns["/joint_states"]] == ["log_time", *joints]
-    assert "layout" not in "".join(columns["/command"])
+    assert [*columns["/joint_states"].columns] == ["log_time", *joints]
+    assert "layout" not in "".join(columns["/command"].columns)
     check_joints(recordings)
 
 
