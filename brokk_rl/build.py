@@ -193,9 +193,8 @@ def _call(kind: Any, values: dict[str, Any], place: str) -> Any:
     try:
         return kind(**values)
     except SpecError as error:
-        lines = []
-        for key, text in error.problems:
-            lines.append(_complete(".".join(filter(None, (place, key))), text, place))
+        named = [(".".join(filter(None, (place, key))), text) for key, text in error.problems]
+        lines = [_complete(name, text, place) for name, text in named]
         raise ConfigError("\n".join(lines)) from error
     except ConfigError as error:
         found = re.fullmatch(r"([\w.]+(?:\[\w+\])?): (.+)", str(error), re.DOTALL)

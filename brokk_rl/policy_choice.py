@@ -213,17 +213,19 @@ def _insert_behaviour(
     before: Any = OmegaConf.to_container(cfg.task, resolve=True)
     after = own.apply_to(before)
     changes = dict(list_differences(drop_targets(before), drop_targets(after), "task"))
-    refused = []
-    for key, (here, there) in changes.items():
-        if _is_given(key, given):
-            here, there = format_value(here), format_value(there)
-            refused.append(f"{key}={here} was asked for, the policy has {there}")
-    if refused:
+    said = {
+        key: f"{key}={format_value(here)} was asked for, the policy has {format_value(there)}"
+        for key, (here, there) in changes.items()
+    }
+    if refused := [text for key, text in said.items() if _is_given(key, given)]:
         raise ConfigError(
             f"the policy in {stored.name} acts by the task that it was trained in: "
             f"{'; '.join(refused)}. Leave these out, and the policy's own values are taken; or "
             "give a policy that was trained with them"
         )
+    named = _list_named()
+    if yielding := [text for key, text in said.items() if _is_given(key, named)]:
+        log.warning("the experiment yields to its policy: %s", "; ".join(yielding))
     if changes:
         cfg.task = after
         own_values = {key: before[key] for key in RIVALS_OWN if key in before}
@@ -262,10 +264,16 @@ def _list_given() -> set[str]:
     return given
 
 
+def _list_named() -> set[str]:
+    """Return the keys of the values in the file of the chosen experiment; none where none is chosen."""
+    chosen = HydraConfig.get().runtime.choices.get("experiment") or ""
+    files = {one.name: one.path for one in registry.list_options("experiment")}
+    path = Path(chosen[1:]).expanduser() if chosen.startswith("@") else files.get(chosen)
+    node = OmegaConf.to_container(OmegaConf.load(path)) if path else None
+    return {".".join(place) for place, _ in registry.iterate_leaves(node)}
+
+
 def _is_given(key: str, given: set[str]) -> bool:
     """Return whether `key`, a table above it but for the whole task, or a value below was typed."""
-    for name in given:
-        is_above = key.startswith(f"{name}.") and name != "task"
-        if name == key or is_above or name.startswith(f"{key}."):
-            return True
-    return False
+    above = {name for name in given if key.startswith(f"{name}.") and name != "task"}
+    return bool(above) or any(name == key or name.startswith(f"{key}.") for name in given)

@@ -115,10 +115,8 @@ def list_targets() -> frozenset[str]:
 
 @functools.cache
 def _read_targets(options: tuple[Option, ...]) -> frozenset[str]:
-    found: set[str] = set()
-    for option in options:
-        found.update(re.findall(r"_target_['\"]?:\s*['\"]?([\w.]+)", option.path.read_text()))
-    return frozenset(found)
+    text = "\n".join(option.path.read_text() for option in options)
+    return frozenset(re.findall(r"_target_['\"]?:\s*['\"]?([\w.]+)", text))
 
 
 def resolve_package_path(name: str) -> Path:

@@ -210,10 +210,9 @@ def find_differences(runs: Sequence[EvaluatedRun]) -> list[str]:
     named = set().union(*(run.named for run in made))
     inside = tuple(f"{key}." for key in named if "." in key)
     texts: Any = pd.DataFrame([run.settings for run in made]).map(repr)
-    columns = []
-    for name in sorted(texts, key=lambda name: ("." in name, name)):
-        if (name in named or name.startswith(inside)) and texts[name].nunique() > 1:
-            columns.append(name)
+    ordered = sorted(texts, key=lambda name: ("." in name, name))
+    ours = [name for name in ordered if name in named or name.startswith(inside)]
+    columns = [name for name in ours if texts[name].nunique() > 1]
     return [*columns, EVALUATED_ON] if any(run.training for run in runs) else columns
 
 

@@ -203,9 +203,8 @@ class PlayPage:
         colors = list(itertools.islice(itertools.cycle(COLORS), self._session.machine.num_joints))
         names = self._session.machine.joint_names
         with panel.add_tab("Traces"):
-            colored = []
-            for name, color in zip(names, colors, strict=True):
-                colored.append(f'<b style="color: {color}">{name}</b>')
+            pairs = zip(names, colors, strict=True)
+            colored = [f'<b style="color: {color}">{name}</b>' for name, color in pairs]
             gui.add_html(f"<div style='padding: 0 1em'>Joints: {', '.join(colored)}</div>")
             given = [uplot.Series(stroke=color, width=1.6) for color in colors]
             proposed = [uplot.Series(stroke=color, dash=(4, 4)) for color in colors]

@@ -195,12 +195,12 @@ FEW = ("evaluation.num_recorded=1", "evaluation.video=false", "actuator=lag", "s
 
 
 def test_values_of_an_experiment_yield_to_the_policy(
-    brokk: Callable[..., Done], tmp_path: Path
+    brokk: Callable[..., Done], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     other = "# @package _global_\ntask: {episode_s: 1.0, switch: {rule: text}}\n"
     (tmp_path / "other.yaml").write_text(other)
     done = brokk(*EVALUATE, *FEW, "experiment=@other.yaml")
-    assert done.code == 0, done.err
+    assert done.code == 0 and "task.switch.rule=text was asked for" in caplog.text, done.err
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert found["task"] == json.loads((SHIPPED / "policy.json").read_text())["task"]
 
