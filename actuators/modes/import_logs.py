@@ -81,14 +81,14 @@ class ImportLogs:
         log.info("picture: %s", folder / PICTURE_FILE)
         write_text(folder / MAP_FILE, draft.format(log_draft.MAP_TEMPLATE))
         write_text(folder / MACHINE_FILE, draft.format(log_draft.MACHINE_TEMPLATE))
-        unsure = [guess for guess in guesses if guess.sureness == "unsure"]
+        num_unsure = sum(guess.sureness == "unsure" for guess in guesses)
         result = {
             "schema": 1,
             "machine": draft.name,
             "logs": [str(path) for path in paths],
             "minutes": draft.survey.minutes,
             "guesses": [guess.plain() for guess in guesses],
-            "num_unsure": len(unsure),
+            "num_unsure": num_unsure,
             "remarks": list(draft.remarks),
         }
         write_json(folder / GUESS_FILE, result)
@@ -98,11 +98,10 @@ class ImportLogs:
             f"brokk mode=convert machine=@{folder / MACHINE_FILE} import=@{folder / MAP_FILE} "
             f"'convert.input={given}' session.out={folder.with_name(f'{folder.name}_recordings')}"
         )
-        summary = summarise(draft, guesses)
         values = {
             "title": f"Logs of {draft.name}",
-            "tone": "bad" if unsure else "",
-            "summary": summary,
+            "tone": "bad" if num_unsure else "",
+            "summary": summarise(draft, guesses),
             "motion": embed_picture(folder / PICTURE_FILE),
             "head": HEAD,
             "guesses": guesses,
@@ -110,9 +109,9 @@ class ImportLogs:
             "command": command,
         }
         write_text(folder / PAGE_FILE, render_page(TEMPLATE, values))
-        rows = [(guess.subject, guess.value, guess.sureness, guess.reason) for guess in guesses]
-        print_table(HEAD, rows)
-        for text in (*draft.remarks, summary, f"look at {folder / PAGE_FILE}, then:", command):
+        print_table(HEAD, [(one.subject, one.value, one.sureness, one.reason) for one in guesses])
+        texts = (values["summary"], f"look at {folder / PAGE_FILE}, then:", command)
+        for text in (*draft.remarks, *texts):
             print_text(text)
 
 
@@ -126,12 +125,12 @@ def _name_machine(path: Path) -> str:
 def summarise(draft: Draft, guesses: list[Guess]) -> str:
     """Return what was found in one sentence, and what is left to fill in."""
     unsure = sum(guess.sureness == "unsure" for guess in guesses)
+    many = "1 guess is" if unsure == 1 else f"{unsure} guesses are"
     end = "No guess is unsure."
-    if unsure:
-        many = "1 guess is" if unsure == 1 else f"{unsure} guesses are"
+    if any(guess.is_open for guess in guesses):
         end = f"{many} unsure: fill in {log_draft.MISSING} in {MAP_FILE}."
-        if not any(guess.is_open for guess in guesses):
-            end = f"{many} unsure: the numbers speak against what was given."
+    elif unsure:
+        end = f"{many} unsure: the numbers speak against what was given."
     if any(joint.guesses["unit"].is_open for joint in draft.joints):
         end += f" Without a unit {MACHINE_FILE} lacks limits and speeds: better run this again with log.position_unit=…"
     if any(joint.kind == "torque" for joint in draft.joints):

@@ -30,8 +30,8 @@ CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?|\d\d?:\d\d[.,]\d+|\d+([.,]\d
 NUMBER_SIGNS = str.maketrans({"D": "E", "d": "e"} | dict.fromkeys("'’\u00a0=\""))
 """Exponents of Fortran, signs between thousands, and those of a formula of Excel, `="0.5"`."""
 CellKind = Literal["number", "time", "list", "flag", "text"]
-HEAD_ROWS = 50
-"""Rows by which columns are told."""
+SAMPLED_CELLS = 50
+"""Cells, spread over a column, by which its kind is told."""
 Labels = Mapping[str, list[str]]
 """Names of the items of columns of lists."""
 
@@ -62,7 +62,7 @@ def tell_column(cells: Iterable[Any], decimal: str) -> CellKind:
 def convert_frame(frame: Any, decimal: str, labels: Labels) -> dict[str, np.ndarray]:
     """Return the numbers of a frame of pandas by column, each `(T,)`, those of lists item by item.
 
-    A column is of the kind of most of its first cells; NaN stands for a cell of another kind, and for a list
+    A column is of the kind of most of its cells; NaN stands for a cell of another kind, and for a list
     of another length. Columns of text are left out.
 
     Args:
@@ -75,7 +75,8 @@ def convert_frame(frame: Any, decimal: str, labels: Labels) -> dict[str, np.ndar
         kind = "number"
         if cells.dtype.kind == "O":
             filled = cells.dropna()
-            kind = tell_column(filled[:HEAD_ROWS], decimal) if len(filled) else "text"
+            sample = filled[:: max(1, len(filled) // SAMPLED_CELLS)]
+            kind = tell_column(sample, decimal) if len(filled) else "text"
         if kind == "list":
             items = _convert_lists(cells)
             given = labels.get(name, ())

@@ -265,22 +265,18 @@ class ColumnMap:
         if not is_beyond.any():
             return replace(signal, values=np.clip(u, -1.0, 1.0))
         row = int(np.argmax(is_beyond))
-        where = locate(signals.run, signal, row, column.column)
+        text = f"command {u[row]:g} is beyond full by more than {self.overrun:g}"
+        mend = "mend full_plus, full_minus, neutral or full_speed of the column map, or the log"
         if np.isnan(u[row]):
-            raise RecordingError(
-                f"{where}: {signal.values[row]:g} lies on the side of neutral for which the column map has no full "
-                "command; give both full_plus and full_minus, or mend neutral"
-            )
-        if target is not None:
-            raise RecordingError(
-                f"{where}: the target is {target[row]:.5g} {joint.unit}, beyond the limits {machine.lower[j]:g} "
-                f"to {machine.upper[j]:g} of '{joint.name}'; mend lower and upper in the machine file, "
-                "scale or offset in the column map, or the log"
-            )
-        raise RecordingError(
-            f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
-            "neutral or full_speed of the column map, or the log"
-        )
+            side = "the side of neutral for which the column map has no full command"
+            text = f"{signal.values[row]:g} lies on {side}"
+            mend = "give both full_plus and full_minus, or mend neutral"
+        elif target is not None:
+            limits = f"{machine.lower[j]:g} to {machine.upper[j]:g} of '{joint.name}'"
+            text = f"the target is {target[row]:.5g} {joint.unit}, beyond the limits {limits}"
+            mend = "mend lower and upper in the machine file, scale or offset in the column map, or the log"
+        where = locate(signals.run, signal, row, column.column)
+        raise RecordingError(f"{where}: {text}; {mend}")
 
 
 def read_column(

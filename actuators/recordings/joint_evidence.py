@@ -37,8 +37,6 @@ FOLLOWED = {"position": "position", "velocity": "speed", "torque": "acceleration
 """Quantity of the motion that follows each kind of command."""
 TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
-SAME_SHARE = 0.1
-"""Part by which slope and offset of the line may differ from 1 : 1 for a target in the unit of the position."""
 MOST_TURNS = 2.0
 """Turns beyond which a joint with a target is in doubt: joints of arms and legs stop before, winches do not."""
 LAST_LAG = 0.95
@@ -214,7 +212,7 @@ class JointGuess:
         """
         slope, rest = matrix.fit_target(at)
         r = {kind: float(several[at, at]) for kind, several in matrix.r.items()}
-        self._judge_kind(r, slope, rest, given.command)
+        self._judge_kind(r, slope, given.command)
         if self.u.is_changing:
             self._judge_motion(matrix, at)
             self._check_steps(slope, rest)
@@ -243,20 +241,13 @@ class JointGuess:
         guess = Guess(f"{self.name}: {what}", value, evidence, (), is_given)
         self.guesses[what] = guess.advise(advise(what)) if what in GIVEN_BY_KEY else guess
 
-    def _judge_kind(
-        self, r: Mapping[str, float], slope: float, rest: float, given: CommandKind | None
-    ) -> None:
+    def _judge_kind(self, r: Mapping[str, float], slope: float, given: CommandKind | None) -> None:
         """Choose which quantity the command sets."""
         named, size = self.u.name.quantity, {kind: abs(value) for kind, value in r.items()}
         weights = {}
         for kind in KIND_TEXTS:
             weights[kind] = 2.5 * (kind == named) - math.log(max(1.0 - size[kind], 0.005))
-        # a line of 1 : 1 from targets to positions is no coincidence
-        is_through = abs(rest) <= SAME_SHARE * float(np.ptp(self.q.values))
-        if abs(slope - 1.0) <= SAME_SHARE and is_through:
-            weights["position"] += 3.0
-        else:
-            weights["position"] += 0.5 if TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] else -0.5
+        weights["position"] += 0.5 if TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] else -0.5
         if named != "torque":  # an acceleration that follows a target is that of a servo
             weights["torque"] = -math.inf
         self.kind = chosen = given or max(weights, key=lambda kind: weights[kind])
@@ -478,11 +469,13 @@ def weigh_correlation(size: float) -> float:
 
 def _refuse_clocks(run: LogRun, signals: Sequence[Signal]) -> NoReturn:
     """Raise a `RecordingError` with the clocks, which have no time in common."""
-    spans = {one.table: (float(one.t_s[0]), float(one.t_s[-1])) for one in signals}
-    texts = [f"{table}: {begin:.12g} to {end:.12g} s" for table, (begin, end) in spans.items()]
-    listed = ", ".join(texts)
-    first = min(spans, key=lambda table: spans[table])
-    last = max(spans, key=lambda table: spans[table])
-    apart_s = spans[first][0] - spans[last][0]
-    mend = advise("offset", table=last, offset_s=apart_s)
-    run.refuse(f"the clocks of its tables have no time in common ({listed}); {mend}")
+    ordered = sorted(signals, key=lambda one: one.t_s[0])
+    first, last = ordered[0], ordered[-1]
+    texts = {
+        one.table: f"{one.table}: {one.t_s[0]:.12g} to {one.t_s[-1]:.12g} s" for one in ordered
+    }
+    apart_s = float(first.t_s[0] - last.t_s[0])
+    mend = advise("offset", table=last.table, offset_s=apart_s)
+    run.refuse(
+        f"the clocks of its tables have no time in common ({', '.join(texts.values())}); {mend}"
+    )
