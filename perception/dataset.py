@@ -99,17 +99,13 @@ def list_stems(folder: Path) -> list[Path]:
     Raises:
         FrameError: there is no such folder, or no frame in it.
     """
-    found = sorted(
-        path.with_name(path.name.removesuffix(COLOR))
-        for path in folder.glob(f"*{COLOR}")
-        if path.name[0] != "."
-    )
+    if not folder.is_dir():
+        raise FrameError(f"{folder}: no such folder")
+    found = []
+    for path in sorted(folder.glob(f"[!.]*{COLOR}")):
+        found.append(path.with_name(path.name.removesuffix(COLOR)))
     if not found:
-        raise FrameError(
-            f"{folder}: no frames; expected files <stem>{COLOR}"
-            if folder.is_dir()
-            else f"{folder}: no such folder"
-        )
+        raise FrameError(f"{folder}: no frames; expected files <stem>{COLOR}")
     return found
 
 
@@ -137,10 +133,7 @@ def read_label(stem: Path) -> FrameLabel:
     path = _build_path(stem, MASK)
     bits = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if bits is None or bits.ndim != 2:
-        raise FrameError(
-            f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames "
-            "have one"
-        )
+        raise FrameError(f"{path}: no mask; rendered and labelled frames have one")
     bits = np.asarray(bits, np.uint8)
     return FrameLabel((bits & BLOCK) > 0, (bits & HOLE_MASK) > 0, (bits & ARM) > 0)
 

@@ -14,17 +14,16 @@ import numpy as np
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
-from perception import pair_check, rim_scale, search
+from perception import pair_check, search
 from perception.camera import express_in_camera
 from perception.contracts import SegmenterSpec
 from perception.ellipse.detector import ContourArcs
-from perception.pair_check import PairCheck
-from perception.pair_depth import PairDepth
+from perception.pair_check import PairCheck, RimScale
 from perception.pose import consistency
+from perception.pose.appearance import IN_DUST
 from perception.pose.plane_conic import PlaneConic, convert_to_gray
 from perception.pose.rim import build_chart
-from perception.pose.wall_light import IN_DUST
-from perception.rim_scale import RimScale
+from perception.stereo import PairDepth
 
 SAME_ELLIPSE = 0.15
 """Distance and difference in size, as parts of an ellipse's size, below which two ellipses are the
@@ -40,57 +39,23 @@ MOST_CANDIDATES = 16
 
 EXPLANATIONS = {
     **pair_check.EXPLANATIONS,
-    **rim_scale.EXPLANATIONS,
     **consistency.EXPLANATIONS,
-    "part of the picture that is block": (
-        "too little of the picture is block. Is the block in sight, the segmenter the right one?"
-    ),
-    "ellipses of a possible size on the block": (
-        "nothing on the block looks like a rim of the right size."
-    ),
-    "pixels of the face with depth": (
-        "the face around it has hardly any depth. Too dark, too near, or no texture to match."
-    ),
-    "depth noise on the face, 1/m": (
-        "the face around it is no plane. Is it on the block's edge, or is the depth that noisy?"
-    ),
-    "tilt of the face, rad": (
-        "the camera sees the face at too flat an angle. Try another place for the camera."
-    ),
+    "part of the picture that is block": "too little is block. Is the block in sight?",
+    "ellipses of a possible size on the block": "nothing on it looks like a rim of the right size.",
+    "pixels of the face with depth": "its face has hardly any depth: dark, near, or no texture?",
+    "depth noise on the face, 1/m": "its face is no plane. The block's edge, or noisy depth?",
+    "tilt of the face, rad": "the face is seen at too flat an angle. Move the camera.",
     "axis ratio on the face": "on the face it is no circle. A shadow, a stain, or an edge.",
-    "part of a circle on the face with a rim": (
-        "too little of a rim is seen. Something hides it: try another place for the camera."
-    ),
-    "radius, m": (
-        "on the face it does not have the size of a hole. Check perception.pose.radius_m if "
-        "the holes have another size."
-    ),
-    "brightness inside over outside": (
-        "it is not dark inside. A ring, a filled hole, or a lamp in it."
-    ),
-    "contrast to the grain of the face": (
-        "it is hardly darker than the grain of the face. A stain or a shadow."
-    ),
-    IN_DUST: (
-        "dust or haze lies over it, and no light on a wall tells it from a flat dark disc. "
-        "Wait for the dust to settle, or look from a place farther aside."
-    ),
-    "mouth probability inside": (
-        "the network does not take it for the mouth of a hole. A flat dark disc looks like this."
-    ),
-    "evidence of depth inside": (
-        "it is evenly dark, and as deep as the face. A flat dark disc looks like this."
-    ),
-    "major semi-axis where it lies, px": (
-        "a hole in the face around it does not look as large or as small. Check "
-        "perception.radius_m if the holes have another size."
-    ),
-    "candidates of a frame before it": (
-        "there are too many better candidates in the frame. Grain or clutter that looks like rims."
-    ),
-    "distance to a larger rim, m": (
-        "it lies within a larger rim. The far rim or the floor of a hole."
-    ),
+    "part of a circle on the face with a rim": "too little is seen of it. Move the camera.",
+    "radius, m": "on the face it does not have the size of a hole. Check perception.pose.radius_m.",
+    "brightness inside over outside": "it is not dark inside: a ring, a filled hole, or a lamp.",
+    "contrast to the grain of the face": "it is hardly darker than grain. A stain or a shadow.",
+    IN_DUST: "in this dust a hole looks like a flat disc. Wait, or look from farther aside.",
+    "mouth probability inside": "the network takes it for no mouth. A flat dark disc?",
+    "evidence of depth inside": "it is evenly dark, and as deep as the face. A flat dark disc?",
+    "major semi-axis where it lies, px": "no hole looks so large or so small there (radius_m).",
+    "candidates of a frame before it": "too many are better. Grain or clutter that looks like rims.",
+    "distance to a larger rim, m": "it lies within a larger rim. The far rim or the floor.",
 }
 """Explanation and remedy for each `Rejection.reason`."""
 
@@ -215,7 +180,7 @@ class StagedFinder:
             scale = s.rims.measure_scale(frame, s.ellipse, s.radius_m)
         if scale is None or any(pose.score > scale[1] for _, pose in found):
             return []
-        reason = rim_scale.OF_DEPTH if frame.right is None else rim_scale.OF_PAIR
+        reason = pair_check.OF_DEPTH if frame.right is None else pair_check.OF_PAIR
         return [Rejection("ellipse", reason, scale[0], 1.0)]
 
     def _look_again(
@@ -339,33 +304,17 @@ def rectify(frame: Frame) -> Frame:
     # Most cameras deliver rectified pictures: nothing is copied then.
     if frame.distortion is None or not np.any(frame.distortion):
         return frame
-    height, width = frame.depth_m.shape
+    matrix, size = frame.camera_matrix, frame.depth_m.shape[::-1]
     maps = cv2.initUndistortRectifyMap(
-        frame.camera_matrix,
-        frame.distortion,
-        np.eye(3),
-        frame.camera_matrix,
-        (width, height),
-        cv2.CV_32FC1,
+        matrix, frame.distortion, np.eye(3), matrix, size, cv2.CV_32FC1
     )
     # Cubic for colour: edges keep their place to a fraction of a pixel.
     color = cv2.remap(frame.color, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     # Nearest for depth: a mean of two surfaces is a place where nothing is.
-    depth = cv2.remap(
-        frame.depth_m,
-        *maps,
-        cv2.INTER_NEAREST,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=float("nan"),
-    )
+    depth = cv2.remap(frame.depth_m, *maps, cv2.INTER_NEAREST, borderValue=float("nan"))
     # The right picture is not rectified with the left one, so it no longer belongs to it.
-    return replace(
-        frame,
-        color=np.asarray(color, np.uint8),
-        depth_m=np.asarray(depth, np.float32),
-        distortion=None,
-        right=None,
-    )
+    pictures = {"color": np.asarray(color, np.uint8), "depth_m": np.asarray(depth, np.float32)}
+    return replace(frame, **pictures, distortion=None, right=None)
 
 
 def _remove_duplicates(ellipses: Sequence[Ellipse]) -> list[Ellipse]:

@@ -1,20 +1,28 @@
-"""Check of a camera pair by matched features: order, turn, rectification, and the scale of depth.
+"""Check of a camera by what it shows: order, turn and rectification of a pair, and the scale of depth.
 
 The rows of a rectified pair correspond, and what it shows lies farther right in its left picture.
 Features are matched without any depth, because the depth of a bad pair is the first to fail. A
 shift across alone shows nothing here: a board at known distances measures it.
+
+A wrong baseline, unit of depth or focal length makes every rim too large or too small by one
+factor. The finder then finds nothing, since it searches rims of the right size alone: `RimScale`
+compares dark rims of any size with the holes.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
-from brokk_rl.contracts.vision import Rejection
+from brokk_rl.contracts.vision import Ellipse, Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, Positive, Share, spec
+from perception.ellipse import conic
+from perception.ellipse.detector import ContourArcs
 from perception.robust_fit import compute_biweight, estimate_spread, fit_linear
 
 FEW = "matched features of the pair"
@@ -26,35 +34,18 @@ CANNOT_TELL = (FEW, UNSURE)
 """Reasons that say nothing of the pair."""
 RANGE = "median depth of the pair's features, m"
 SCALE = "depth by disparity over the depth told"
+OF_PAIR = "size of dark rims over that of the holes, by the pair"
+OF_DEPTH = "size of dark rims over that of the holes, by depth"
 EXPLANATIONS = {
-    ROWS: (
-        "the rows of left and right picture do not correspond, so its depth is wrong. Rectify "
-        "the pictures, or calibrate the camera pair."
-    ),
-    ORDER: (
-        "left and right picture are swapped: what they show lies farther left in the left one. "
-        "Swap them: .color.png is the left one, .right.png the right one."
-    ),
-    TURN: (
-        "the pictures are turned: their features are apart from top to bottom. Turn them so "
-        "that the cameras stand side by side, and K and dist with them."
-    ),
-    FEW: (
-        "left and right picture share too few features to tell whether they are rectified. Is "
-        "it the same moment, is there light, is a lens covered?"
-    ),
-    UNSURE: (
-        "the shared features are too uncertain to tell whether the pair is rectified. Is there "
-        "light, are the pictures sharp?"
-    ),
-    RANGE: (
-        "what both pictures show lies at an impossible depth. K or baseline_m is wrong by a "
-        "large factor: is baseline_m in m?"
-    ),
-    SCALE: (
-        "depth and pair disagree by this factor. A factor of 1000, 100 or 10 is the unit of "
-        "depth; else K, baseline_m, or both belong to another resolution or camera."
-    ),
+    ROWS: "the rows of the pictures do not correspond. Rectify them, or calibrate the camera pair.",
+    ORDER: "the pictures are swapped: .color.png is the left one, .right.png the right one.",
+    TURN: "the pictures are turned. Turn them, K and dist: the cameras stand side by side.",
+    FEW: "the pictures share too few features. The same moment, light, no lens covered?",
+    UNSURE: "shared features are too uncertain to judge rectification. Light? Sharp pictures?",
+    RANGE: "the pair sees an impossible depth. K or baseline_m is far off: is baseline_m in m?",
+    SCALE: "depth and pair disagree: by 10, 100 or 1000 its unit; else K or baseline_m is wrong.",
+    OF_PAIR: "dark rims have the size of a hole by this factor: baseline_m, or perception.radius_m?",
+    OF_DEPTH: "dark rims have that size by this factor: unit of depth, K, or perception.radius_m?",
 }
 """Explanation and remedy for each reason."""
 
@@ -326,3 +317,65 @@ def measure_depth_scale(matches: PairMatches, frame: Frame, least: int) -> float
     if estimate_spread(logarithm - middle) > 0.1:
         return None
     return float(np.exp(middle))
+
+
+RING = 1.25, 1.8
+"""Radii of the ring around a rim in which its depth is read."""
+
+
+@spec
+class RimScale:
+    """Compare the size of round, dark, whole rims with that of the holes.
+
+    Attributes:
+        width_px: Width of the picture in which rims of any size are searched.
+        coverage: Least visible part of such a rim.
+        darkness: Largest brightness inside over that of the ring around it.
+        least: Factor on the size from which the scale is in doubt.
+    """
+
+    width_px: Count
+    coverage: Share
+    darkness: Share
+    least: Annotated[float, Ge(1)]
+
+    def measure_scale(
+        self, frame: Frame, detector: ContourArcs, radius_m: float
+    ) -> tuple[float, float] | None:
+        """Return the size of the surest rim over that of the holes, and its score.
+
+        Returns:
+            `None` where nothing is in doubt.
+        """
+        shrink = max(1, round(frame.color.shape[1] / self.width_px))
+        small = frame.color[::shrink, ::shrink]
+        if shrink > 1:
+            size = frame.color.shape[1] // shrink, frame.color.shape[0] // shrink
+            small = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)
+        gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        depth_m = frame.depth_m[shrink // 2 :: shrink, shrink // 2 :: shrink]
+        focal_px = float(frame.camera_matrix[0, 0]) / shrink
+        for one in detector.detect(gray, None, None):
+            ring_m = self._measure_depth(one, gray, depth_m)
+            if one.coverage >= self.coverage and ring_m is not None:
+                scale = one.a * ring_m / (focal_px * radius_m)
+                return (scale, one.score) if abs(np.log(scale)) > np.log(self.least) else None
+        return None
+
+    def _measure_depth(self, one: Ellipse, gray: np.ndarray, depth_m: np.ndarray) -> float | None:
+        """Return the depth around a rim, m; `None` for one that is not dark, or without depth."""
+        shape = min(len(gray), len(depth_m)), min(len(gray[0]), len(depth_m[0]))
+        row = conic.as_row(one)
+        part = conic.bound_ellipse(row, RING[1] * one.a, shape)
+        rows, columns = np.ogrid[part]
+        radii = conic.measure_radii(row, columns, rows)
+        ring = (radii > RING[0]) & (radii < RING[1])
+        inside = radii < 0.8
+        if not ring.any() or not inside.any():
+            return None
+        bright = float(np.median(gray[part][ring]))
+        if float(np.median(gray[part][inside])) > self.darkness * bright:
+            return None
+        around_m = depth_m[part][ring]
+        known_m = around_m[np.isfinite(around_m)]
+        return float(np.median(known_m)) if len(known_m) > 0.5 * len(around_m) else None

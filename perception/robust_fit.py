@@ -66,11 +66,9 @@ def fit_linear(
 def number_cells(cell: np.ndarray) -> np.ndarray:
     """Return consecutive numbers of cells, `(P,)`; of too few cells, bands of rows in their place."""
     cell = np.unique(cell, return_inverse=True)[1]
-    return (
-        cell
-        if cell.max(initial=0) >= FEWEST
-        else np.arange(len(cell)) * FEWEST // max(len(cell), 1)
-    )
+    if cell.max(initial=0) >= FEWEST:
+        return cell
+    return np.arange(len(cell)) * FEWEST // max(len(cell), 1)
 
 
 def compute_psi_slope(off: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
 from perception.contracts import SizePrior
 from perception.ellipse.detector import ContourArcs
+from perception.robust_fit import estimate_spread
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py), unless a comment says
 # otherwise.
@@ -94,11 +95,9 @@ class SearchLevel:
             return []
         part = gray[top : top + height * self.shrink, left : left + width * self.shrink]
         # Area interpolation averages, so that grain does not alias into edges.
-        small = (
-            cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
-            if self.shrink > 1
-            else part
-        )
+        small = part
+        if self.shrink > 1:
+            small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
         # Rounded up, so that every cell has pixels; the surplus is cut off below.
         finer = (-(-wide * STEP // self.shrink), -(-high * STEP // self.shrink))
         roi = cv2.resize(
@@ -125,10 +124,8 @@ class SearchLevel:
         prior = self.prior and SizePrior(
             self.prior.lowest_px / self.shrink, self.prior.highest_px / self.shrink
         )
-        return [
-            _enlarge(one, self.shrink, left, top)
-            for one in detector.detect(small, np.ascontiguousarray(roi).astype(bool), prior)
-        ]
+        found = detector.detect(small, np.ascontiguousarray(roi).astype(bool), prior)
+        return [_enlarge(one, self.shrink, left, top) for one in found]
 
 
 def plan_search_levels(
@@ -176,9 +173,9 @@ def plan_search_levels(
     found, rest = [], known.copy()
     shown_px = np.where(behind, size_px / HALF_HIDDEN, size_px)
     # Each octave suits a range of sizes; a cell may suit two of them.
-    suited = [
-        _select_sizes(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)
-    ]
+    suited = []
+    for octave in range(OCTAVES):
+        suited.append(_select_sizes(shown_px, comfortable_px * 2**octave, octave))
     for _ in range(OCTAVES):
         # Next is the resolution that suits most of the rest; of two the coarser one.
         counts = [np.count_nonzero(rest & one) for one in suited]
@@ -231,9 +228,7 @@ def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
     reach = _make_square(round(float(np.percentile(seen_px[face], SIZE_PERCENTILES[1])) / STEP))
     # The median removes single cells; an occluder is wider than two of them.
     rough_px, seen_px = seen_px, cv2.medianBlur(seen_px, 5)
-    # 1.4826 turns the median of absolute values into the standard deviation of a normal
-    # distribution.
-    noise = 1.4826 * float(np.median(np.abs(rough_px[face] / np.maximum(seen_px[face], 1.0) - 1.0)))
+    noise = estimate_spread(rough_px[face] / np.maximum(seen_px[face], 1.0) - 1.0)
     # A closing over the size of a hole: depth inside a hole is not that of the face. Only on the
     # face: beyond it nothing but the inside of a half-hidden hole may be in reach.
     around = cv2.dilate(np.where(face, seen_px, np.float32(0.0)), reach)

@@ -26,11 +26,12 @@ from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception.calibrate import transforms
 from perception.calibrate.extrinsics import CameraExtrinsics
-from perception.mount.mounts import AxesMount, CameraMount
-from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewPlanner
+from perception.mount.mounts import AxesMount, ExpectedCovariance, HoleBelief, ViewPlanner
 from perception.segment.window import Window
 from perception.sources.simulator import SimulatedCamera
 
+Stream = tuple[int, ...]
+"""Seed of a stream of random numbers."""
 LEAST_HINT_M = 1e-3
 """Least error of a pointed place as the choice of a view takes it: nobody points better."""
 
@@ -80,7 +81,7 @@ class _Exposure:
     part: Window
     believed_pose: np.ndarray
     t_s: float
-    seed: tuple[int, ...]
+    seed: Stream
 
 
 class WatchedHole:
@@ -94,15 +95,13 @@ class WatchedHole:
     """
 
     def __init__(
-        self,
-        settings: PerceivedTarget,
-        mount: CameraMount,
-        planner: ViewPlanner,
-        task_scene: np.ndarray,
-        generator: np.random.Generator,
+        self, settings: PerceivedTarget, machine: Machine, task_scene: np.ndarray, seed: Stream
     ) -> None:
-        self._settings, self._mount, self._generator = settings, mount, generator
-        self.planner = planner
+        generator = np.random.default_rng(seed)
+        mount, camera = settings.mount.build(machine), settings.camera
+        self._settings, self._machine, self._mount = settings, machine, mount
+        self._generator = generator
+        self.planner = ViewPlanner(settings.next_view, machine, mount, camera.rig, camera.arm)
         self.task_scene = tuple(float(value) for value in task_scene)
         self.true_m = np.array(self.task_scene[:3])
         self._hint_m = self.true_m + settings.hint_m * generator.standard_normal(3)
@@ -129,12 +128,7 @@ class WatchedHole:
             self._view = self._mount.error.draw(self._generator, "view")
 
     def expose(
-        self,
-        q: np.ndarray,
-        measured_q: np.ndarray,
-        chain_m: np.ndarray,
-        t_s: float,
-        seed: tuple[int, ...],
+        self, q: np.ndarray, measured_q: np.ndarray, t_s: float, seed: Stream
     ) -> _Exposure | None:
         """Return the picture to take, `None` where the hole is out of the picture."""
         rig, window = self._settings.camera.rig, self._settings.window_px
@@ -150,6 +144,7 @@ class WatchedHole:
             return None
         corner = np.clip(np.round(pixel - np.array(window) / 2), 0, size - window).astype(int)
         part = Window(int(corner[0]), int(corner[1]), *window)
+        chain_m = self._settings.camera.arm.trace(self._machine, q)
         return _Exposure(self.task_scene, chain_m, true, part, believed, t_s, seed)
 
     def wait_for(self, holes: Sequence[HolePose] | None, t_s: float) -> None:
@@ -197,11 +192,7 @@ class PerceivedTargets:
         """Begin new episodes; see `TargetSensor.reset`."""
         for number in np.flatnonzero(mask):
             stream = (self._seed, int(number), int(self._episodes[number]))
-            generator = np.random.default_rng(stream)
-            s, scene = self._settings, start["scene"][number]
-            place = (self._machine, self._mount, s.camera.rig, s.camera.arm)
-            planner = ViewPlanner(s.next_view, *place)
-            one = WatchedHole(s, self._mount, planner, scene, generator)
+            one = WatchedHole(self._settings, self._machine, start["scene"][number], stream)
             if len(self.watched) <= number:
                 self.watched.append(one)
             else:
@@ -260,11 +251,10 @@ class PerceivedTargets:
         for number in due:
             one, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             seed = (self._seed, int(number), int(self._steps[number]))
-            chain_m = self._settings.camera.arm.trace(self._machine, q[number])
             if t_s < one.planner.arrives_s - 1e-9 or not self._is_steady(one, int(number), q):
                 one.wait_for(None, t_s)
                 continue
-            exposure = one.expose(q[number], measured_q[number], chain_m, t_s, seed)
+            exposure = one.expose(q[number], measured_q[number], t_s, seed)
             if exposure is None:
                 one.wait_for((), t_s)
             else:

@@ -55,23 +55,18 @@ def posed(
         wobble_m: By how much, and by as many rad, the link is elsewhere.
     """
     chance = np.random.default_rng(seed)
-    facing = transforms.make_transform(
-        Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), np.array([-0.35, -0.2, 2.1])
-    )
-    board = (
-        transforms.invert(arm.compute_link_poses(machine, MIDDLE[None]).base_from_link[0])
-        @ CAMERA
-        @ facing
-    )
+    turn = Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix()
+    facing = transforms.make_transform(turn, np.array([-0.35, -0.2, 2.1]))
+    middle = arm.compute_link_poses(machine, MIDDLE[None]).base_from_link[0]
+    board = np.linalg.inv(middle) @ CAMERA @ facing
     zeros = zero_rad * chance.standard_normal(5) * [0, 1, 1, 1, 0]
     kept, seen = [], []
     while len(kept) < count:
         q = MIDDLE + chance.uniform(-1, 1, 5) * [0.35, 0.2, 0.35, 0.4, 0.45]
-        link = arm.compute_link_poses(
-            machine, (q + zeros + own_rad * chance.standard_normal(5))[None]
-        ).base_from_link[0]
+        true = q + zeros + own_rad * chance.standard_normal(5)
+        link = arm.compute_link_poses(machine, true[None]).base_from_link[0]
         link = transforms.apply_motion(link, wobble_m * chance.standard_normal(6))
-        there = transforms.invert(CAMERA) @ link @ board
+        there = np.linalg.inv(CAMERA) @ link @ board
         corners = corners_m() @ there[:3, :3].T + there[:3, 3]
         pixel = corners @ MATRIX.T / np.maximum(corners[:, 2:], 1e-3)
         inside = (pixel[:, :2] > 5).all() and (pixel[:, :2] < np.array(SIZE_PX) - 5).all()
@@ -99,22 +94,16 @@ def views(
     """Returns sights with noise of covariance `cov`, `(6, 6)`, and which of them, a share `wrong`, are of something else."""
     chance = np.random.default_rng(seed + 1000)
     count, links = len(poses.q), arm.compute_link_poses(machine, poses.q)
-    seen = np.array(
-        [
-            transforms.apply_motion(one, chance.multivariate_normal(np.zeros(6), cov))
-            for one in poses.camera_from_board
-        ]
-    )
+    off = chance.multivariate_normal(np.zeros(6), cov, len(poses.camera_from_board))
+    seen = np.array(list(map(transforms.apply_motion, poses.camera_from_board, off)))
     bad = np.zeros(count, bool)
     bad[chance.permutation(count)[: int(wrong * count)]] = True
     for k in np.flatnonzero(bad):
-        seen[k] = transforms.apply_motion(
-            seen[k], np.concatenate([chance.normal(0, 0.3, 3), chance.normal(0, 0.6, 3)])
-        )
+        gross = np.concatenate([chance.normal(0, 0.3, 3), chance.normal(0, 0.6, 3)])
+        seen[k] = transforms.apply_motion(seen[k], gross)
     shared, std = links.joints[:, 1:4], np.full(3, 0.0087)
-    slack = np.concatenate(
-        [0.0017 * links.joints, arm.build_wobble_motions(links.base_from_link, 0.001, 0.001)], 1
-    )
+    wobble = arm.build_wobble_motions(links.base_from_link, 0.001, 0.001)
+    slack = np.concatenate([0.0017 * links.joints, wobble], 1)
     found = HandEyeViews(
         links.base_from_link, seen[:, None], np.broadcast_to(cov, (count, 1, 6, 6)), slack, shared, std,
         tuple(str(k) for k in range(count)), machine.joint_names[1:4],
@@ -139,9 +128,7 @@ def picture(
     width, height = printed.shape[::-1]
     there = corners_m() @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
     pixel = (there @ MATRIX.T / there[:, 2:])[:, :2] + [shift_px, 0.0]
-    paper = np.array(
-        [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]]
-    )
+    paper = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
     over = 2  # drawn larger and shrunk, or edges would be ragged
     scaled = (pixel * over + (over - 1) / 2).astype(np.float32)
     warp = cv2.getPerspectiveTransform(paper.astype(np.float32), scaled)

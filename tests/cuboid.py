@@ -81,24 +81,17 @@ def seen(
         what, depth = np.where(ball < depth, 4, what), np.minimum(ball, depth)
     grain = np.random.default_rng(1).uniform(0.75, 1.0, (64, 64, 64))
     cell = (points * 25).astype(int) % 64
-    shade = np.select(
-        [what == 3, what == 4, what == 1, front, what == 2], [0.06, 0.9, 0.3, 0.75, 0.55], 0.95
-    )
-    color = (
-        shade[..., None]
-        * grain[cell[..., 0], cell[..., 1], cell[..., 2]][..., None]
-        * np.array([1.0, 0.97, 0.9])
-    )
+    kinds = [what == 3, what == 4, what == 1, front, what == 2]
+    shade = np.select(kinds, [0.06, 0.9, 0.3, 0.75, 0.55], 0.95)
+    bright = shade * grain[cell[..., 0], cell[..., 1], cell[..., 2]]
+    color = bright[..., None] * np.array([1.0, 0.97, 0.9])
     noise = np.random.default_rng(seed).normal(0.0, 1.0, depth.shape) * noise_per_m
     with np.errstate(divide="ignore"):
         depth = 1.0 / (1.0 / depth + noise)
-    depth = np.where(np.isfinite(depth) & (depth > 0.1) & (depth < 40), depth, np.nan).astype(
-        np.float32
-    )
+    known = np.isfinite(depth) & (depth > 0.1) & (depth < 40)
+    depth = np.where(known, depth, np.nan).astype(np.float32)
     color = (255 * color).clip(0, 255).astype(np.uint8)
-    frame = Frame(
-        color=color, depth_m=depth, camera_matrix=camera_matrix, base_from_camera=pose, t_s=0.0
-    )
+    frame = Frame(color, depth, camera_matrix, pose, 0.0)
     return View(frame, pose, np.isin(what, (2, 3)), what == 3, what == 4)
 
 

@@ -71,9 +71,8 @@ def wire(kind: str) -> CanBus:
     """Returns a bus that nobody else uses: multicast datagrams, or the kernel's own `vcan`."""
     if kind == "vcan":
         return CanBus(interface="socketcan", channel=VCAN, bitrate=None, port=None, hops=None)
-    return CanBus(
-        interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port(), hops=0
-    )
+    place = {"interface": "udp_multicast", "channel": "239.74.163.77", "port": free_port()}
+    return CanBus(**place, bitrate=None, hops=0)
 
 
 def build_twin(bus: CanBus, **changes: Any) -> Twin:
@@ -123,9 +122,8 @@ class Desk:
         session = Session(out=str(folder), seed=0, device="cpu")
         self._twin_arguments = (twin, machine, NominalMachine(), session, None)
         page = replace(option("page", "local"), port=0)
-        self._page = PageProcessConfig(
-            page, machine, option("guidance", "machine"), session, limits, 600.0
-        )
+        guidance = option("guidance", "machine")
+        self._page = PageProcessConfig(page, machine, guidance, session, limits, 600.0)
         self._link, self._browser = session.folder / LINK, contextlib.ExitStack()
         self.children: dict[str, ChildProcess] = {}
         self.bus = self.wire.open()
@@ -143,9 +141,8 @@ class Desk:
 
     def fault(self, fault: str, message: str = "", seconds: float = 1e9) -> float:
         """Switches a fault on; returns when (monotonic)."""
-        answer = request_fault(
-            self.port, {"fault": fault, "message": message, "seconds": seconds}, timeout_s=5.0
-        )
+        asked = {"fault": fault, "message": message, "seconds": seconds}
+        answer = request_fault(self.port, asked, timeout_s=5.0)
         assert answer.startswith("ok "), answer
         return float(answer.removeprefix("ok "))
 

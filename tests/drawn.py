@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -11,10 +14,8 @@ from perception.ellipse import conic
 
 K = np.array([[528.0, 0.0, 319.5], [0.0, 528.0, 239.5], [0.0, 0.0, 1.0]])
 CENTER, AXIS = np.array([0.05, 0.02, 1.2]), np.array([0.0, -0.57, -0.82]) / np.hypot(0.57, 0.82)
-RAYS = (
-    np.stack([*np.meshgrid(np.arange(640), np.arange(480)), np.ones((480, 640))], -1)
-    @ np.linalg.inv(K).T
-)
+PIXELS = np.stack([*np.meshgrid(np.arange(640), np.arange(480)), np.ones((480, 640))], -1)
+RAYS = PIXELS @ np.linalg.inv(K).T
 
 
 def drawn(
@@ -42,16 +43,12 @@ def drawn(
     color = np.repeat(np.clip(gray, 0, 255).astype(np.uint8)[..., None], 3, 2)
     frame = Frame(color, depth.astype(np.float32), K, np.eye(4), 0.0)
     angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)[:, None]
-    points = CENTER + radius_m * (
-        np.cos(angle) * np.array([1.0, 0, 0]) + np.sin(angle) * np.cross(AXIS, [1.0, 0, 0])
-    )
+    first, second = np.array([1.0, 0, 0]), np.cross(AXIS, [1.0, 0, 0])
+    points = CENTER + radius_m * (np.cos(angle) * first + np.sin(angle) * second)
     seen = points @ K.T
     row = conic.fit_ellipses((seen[:, :2] / seen[:, 2:])[None], np.ones((1, 90)))[0]
-    return (
-        frame,
-        Masks(np.ones(inverse.shape, np.float32), None),
-        Ellipse(*map(float, row), rms_px=0.05, coverage=1.0, score=0.9),
-    )
+    ellipse = Ellipse(*map(float, row), rms_px=0.05, coverage=1.0, score=0.9)
+    return frame, Masks(np.ones(inverse.shape, np.float32), None), ellipse
 
 
 def both_views(
@@ -64,6 +61,16 @@ def both_views(
     # for u
     x = u - pull_px * (m[0] * (u - K[0, 2]) / K[0, 0] + m[1] * (v - K[1, 2]) / K[1, 1] + m[2])
     back = (u - x[:, :1]) / (1 - pull_px * m[0] / K[0, 0])
-    return grain[:, 200:840], cv2.remap(
-        grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC
-    )
+    place = (back + 200).astype(np.float32), v.astype(np.float32)
+    return grain[:, 200:840], cv2.remap(grain, *place, cv2.INTER_CUBIC)
+
+
+def as_color(gray: np.ndarray) -> np.ndarray:
+    """Returns a grey picture, `(h, w)`, as one of colour."""
+    return np.repeat(np.rint(np.clip(gray, 0, 255)).astype(np.uint8)[..., None], 3, 2)
+
+
+def blank(height: int, width: int, **changes: Any) -> Frame:
+    """Returns a black frame whose depth is 1 m everywhere."""
+    color, depth_m = as_color(np.zeros((height, width))), np.ones((height, width), np.float32)
+    return replace(Frame(color, depth_m, np.eye(3), None, 0.0), **changes)

@@ -21,6 +21,7 @@ from perception.calibrate.disparity_error import (
     estimate_disparity_error,
     measure_board_disparity,
 )
+from perception.calibrate.evaluation import judge_fit
 from perception.calibrate.extrinsics import build_calibration
 from perception.calibrate.hand_eye import (
     MIN_VIEWS,
@@ -29,7 +30,6 @@ from perception.calibrate.hand_eye import (
     predict_board_poses,
     solve_hand_eye,
 )
-from perception.calibrate.verdict import judge_fit
 from perception.label.camera_pose import BoardPose, Charuco, estimate_board_pose
 from perception.sources.look import look_at_frames
 

@@ -98,10 +98,9 @@ def estimate_clock_offset(
     found = ClockEstimate(float(top), scores[best], scores[best] >= least_correlation)
     if not found.is_trusted:
         log.warning(
-            "clocks: speeds of board and arm correlate by %.2f, %g is needed to estimate an "
-            "offset; it is taken as 0. Move the arm while recording, with starts and stops.",
-            found.correlation,
-            least_correlation,
+            "clocks: speeds of board and arm correlate by %.2f, not by %g; the offset is taken as 0. "
+            "Move the arm while recording, with starts and stops.",
+            *(found.correlation, least_correlation),
         )
     return found
 

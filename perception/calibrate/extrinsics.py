@@ -12,7 +12,7 @@ import numpy as np
 from brokk_rl import record
 from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
-from perception.calibrate import verdict
+from perception.calibrate import evaluation
 from perception.sources import validation
 
 SCHEMA = 1
@@ -76,14 +76,13 @@ def read_calibration(path: Path, where: str) -> dict[str, Any]:
     expected = "calibration.yaml of `brokk mode=calibrate`"
     content = validation.read_mapping(path, f"{expected} by {where}")
     is_known = content.get("schema") == SCHEMA and "T_base_cam" in content
-    if not is_known or not all(
-        isinstance(content.get(part), dict | None) for part in ("verdict", "disparity")
-    ):
+    for part in ("verdict", "disparity"):
+        is_known = is_known and isinstance(content.get(part), dict | None)
+    if not is_known:
         raise FrameError(
-            f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` "
-            "writes one"
+            f"{where}: {path} is no calibration of schema {SCHEMA}; run mode=calibrate"
         )
-    verdict.check_verdict(content, f"{where}={path}")
+    evaluation.check_verdict(content, f"{where}={path}")
     return content
 
 

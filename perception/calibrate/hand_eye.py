@@ -1,6 +1,6 @@
 """Robot-world and hand-eye calibration, `A_i Y = X B_i`, in the presence of wrong detections.
 
-Two closed forms of OpenCV are refined over all views by damped Gauss-Newton steps. A residual
+Two closed forms of OpenCV are refined over all views by least squares. A residual
 compares where the camera sees the board with where it should. Its covariance holds the reprojection
 error of the corners and the uncertainty of the arm, so that a poor arm does not distort the optics.
 Weights are Student's t (Lange, Little and Taylor, 1989): wrong detections lose their weight and are
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -28,11 +29,9 @@ MEDIAN_DISTANCE = float(chi2.ppf(0.5, 6))
 MAX_DISTANCE = float(chi2.ppf(0.999, 6))
 """Squared distance beyond which a view is called wrong; one right view in a thousand is."""
 MAX_STEPS = 40
-"""Gauss-Newton steps; a bound, chosen by hand."""
+"""Steps of least squares; a bound, chosen by hand."""
 MAX_ROUNDS = 4
 """Rounds in which arm factor or used views are chosen anew; a bound, chosen by hand."""
-MIN_GAIN = 1e-7
-"""Relative gain of the cost below which the steps end."""
 MIN_VIEWS = 4
 """Views that can be told from each other; three decide, a fourth contradicts."""
 
@@ -113,7 +112,7 @@ def predict_board_poses(views: HandEyeViews, guess: HandEyeGuess) -> np.ndarray:
     link = views.base_from_link.copy()
     link[:, :3, 3] += motion[:, :3] + np.cross(motion[:, 3:], link[:, :3, 3])
     link[:, :3, :3] = Rotation.from_rotvec(motion[:, 3:]).as_matrix() @ link[:, :3, :3]
-    return transforms.invert(guess.base_from_camera) @ link @ guess.link_from_board
+    return np.linalg.inv(guess.base_from_camera) @ link @ guess.link_from_board
 
 
 def express_in_board(guess: HandEyeGuess, board: np.ndarray, motions: np.ndarray) -> np.ndarray:
@@ -162,7 +161,7 @@ def generate_starts(
 def _invert_estimate(rotation: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
     """Return the inverse of a transform whose rotation is orthonormal but for rounding."""
     nearest = Rotation.from_matrix(rotation).as_matrix()
-    return transforms.invert(transforms.make_transform(nearest, np.ravel(shift_m)))
+    return np.linalg.inv(transforms.make_transform(nearest, np.ravel(shift_m)))
 
 
 def solve_hand_eye(views: HandEyeViews) -> HandEyeSolution | None:
@@ -172,7 +171,7 @@ def solve_hand_eye(views: HandEyeViews) -> HandEyeSolution | None:
     shared = np.zeros(len(views.shared_std))
     best_deviance, guess = np.inf, HandEyeGuess(np.eye(4), np.eye(4), shared)
     for camera, board in generate_starts(views.base_from_link, views.camera_from_board[:, 0]):
-        refined = _minimise(views, HandEyeGuess(camera, board, shared), 1.0, None)
+        refined, _ = _minimise(views, HandEyeGuess(camera, board, shared), 1.0, None)
         deviance = compute_deviance(views, refined)
         if deviance < best_deviance:
             best_deviance, guess = deviance, refined
@@ -181,28 +180,27 @@ def solve_hand_eye(views: HandEyeViews) -> HandEyeSolution | None:
         before, factor = factor, _estimate_arm_factor(views, guess)
         if factor == before:
             break
-        guess = _minimise(views, guess, factor, None)
+        guess, _ = _minimise(views, guess, factor, None)
     return _select_views(views, guess, factor)
 
 
 def _select_views(views: HandEyeViews, guess: HandEyeGuess, factor: float) -> HandEyeSolution:
     """Return the solution of the views that are not wrong, each with its full weight."""
     used = _compare(views, guess, factor).distance <= MAX_DISTANCE
+    slopes = np.zeros((0, 12 + len(views.shared_std)))
     for _ in range(MAX_ROUNDS):
-        if used.sum() < MIN_VIEWS:
-            used = np.ones(len(views), bool)
-            break
-        guess = _minimise(views, guess, factor, used.astype(float))
+        is_enough = used.sum() >= MIN_VIEWS
+        used = used if is_enough else np.ones(len(views), bool)
+        guess, slopes = _minimise(views, guess, factor, used)
         now = _compare(views, guess, factor).distance <= MAX_DISTANCE
-        if (now == used).all():
+        if not is_enough or (now == used).all():
             break
         used = now
     residuals = _compare(views, guess, factor)
-    normal, _ = _build_normal_equations(views, residuals, used.astype(float))
     # views that disagree by more than they should inflate the covariance
-    freedom = max(6.0 * used.sum() - len(normal), 1.0)
+    freedom = max(6.0 * used.sum() - slopes.shape[1], 1.0)
     excess = max(1.0, float(residuals.distance[used].sum()) / freedom)
-    cov = excess * np.linalg.pinv(normal, hermitian=True)
+    cov = excess * np.linalg.pinv(slopes.T @ slopes, hermitian=True)
     return HandEyeSolution(guess, cov, factor, residuals.away, residuals.distance, used)
 
 
@@ -212,19 +210,15 @@ class _Residuals:
 
     Attributes:
         away: Small motion from the board as seen to the board as predicted, `(N, 6)`.
+        whitened: The same in standard deviations, `(N, 6)`.
         distance: Squared Mahalanobis distance, `(N,)`.
-        information: Inverse of the covariance, `(N, 6, 6)`.
         log_det: Logarithm of the covariance's determinant, `(N,)`.
-        slopes: Derivative by all unknowns, `(N, 6, 12 + S)`.
-        shared: Systematic errors, `(S,)`.
     """
 
     away: np.ndarray
+    whitened: np.ndarray
     distance: np.ndarray
-    information: np.ndarray
     log_det: np.ndarray
-    slopes: np.ndarray
-    shared: np.ndarray
 
 
 def _compare(views: HandEyeViews, guess: HandEyeGuess, factor: float) -> _Residuals:
@@ -234,95 +228,56 @@ def _compare(views: HandEyeViews, guess: HandEyeGuess, factor: float) -> _Residu
     # or the view is wrong anyway
     cov = views.seen_cov + factor**2 * (slack @ np.swapaxes(slack, 1, 2))[:, None]
     away = transforms.compute_motion(views.camera_from_board, board[:, None])
-    information = np.linalg.inv(cov)
-    distance = np.einsum("nci,ncij,ncj->nc", away, information, away)
+    root = np.linalg.cholesky(cov)
+    whitened = np.linalg.solve(root, away[..., None])[..., 0]
+    distance = (whitened**2).sum(-1)
     best, row = distance.argmin(1), np.arange(len(views))
-    away, information = away[row, best], information[row, best]
-    seen = views.camera_from_board[row, best]
-    back = np.swapaxes(seen[:, :3, :3], 1, 2)
-    turn = back @ board[:, :3, :3]
-    slopes = np.zeros((len(views), 6, 12 + len(guess.shared)))
-    slopes[:, :3, 0:3] = -back
-    slopes[:, :3, 3:6] = back @ transforms.build_cross_matrices(board[:, :3, 3])
-    slopes[:, 3:, 3:6] = -np.swapaxes(board[:, :3, :3], 1, 2)
-    slopes[:, :3, 6:9], slopes[:, 3:, 9:12] = turn, np.eye(3)
-    slopes[:, :, 12:] = express_in_board(guess, board, views.shared)
-    slopes[:, :3, 12:] = turn @ slopes[:, :3, 12:]
-    # the residual's turn grows with a turn of the board by the inverse Jacobian, not one to one;
-    # for 0.1 rad that is 5 %, and it changes the steps, not the answer
-    log_det = -np.linalg.slogdet(information)[1]
-    return _Residuals(away, distance[row, best], information, log_det, slopes, guess.shared)
-
-
-def _build_normal_equations(
-    views: HandEyeViews, residuals: _Residuals, weight: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return normal matrix and gradient of the weighted cost."""
-    weighted = np.swapaxes(residuals.slopes, 1, 2) @ (weight[:, None, None] * residuals.information)
-    normal = (weighted @ residuals.slopes).sum(0)
-    gradient = (weighted @ residuals.away[..., None]).sum(0)[:, 0]
-    prior = 1.0 / views.shared_std**2
-    normal[np.arange(12, len(normal)), np.arange(12, len(normal))] += prior
-    gradient[12:] += prior * residuals.shared
-    return normal, gradient
+    log_det = 2.0 * np.log(np.diagonal(root[row, best], axis1=1, axis2=2)).sum(1)
+    return _Residuals(away[row, best], whitened[row, best], distance[row, best], log_det)
 
 
 def _minimise(
-    views: HandEyeViews, guess: HandEyeGuess, factor: float, fixed: np.ndarray | None
-) -> HandEyeGuess:
-    """Return the nearest minimum, by damped steps that never go uphill.
+    views: HandEyeViews, start: HandEyeGuess, factor: float, used: np.ndarray | None
+) -> tuple[HandEyeGuess, np.ndarray]:
+    """Return the nearest minimum, and the slopes of the whitened residuals there, `(…, 12 + S)`.
 
     Args:
         views: The views.
-        guess: Where to begin.
+        start: Where to begin.
         factor: On the arm's uncertainty.
-        fixed: Weights of the views, `(N,)`; `None` for those of Student's t.
+        used: Views that count, `(N,)` bool; `None` for all of them by Student's t.
     """
 
-    def compute_cost(residuals: _Residuals) -> float:
-        far = residuals.distance
-        if fixed is not None:
-            size = (fixed * far).sum()
-        else:
-            size = ((STUDENT_T_FREEDOM + 6) * np.log1p(far / STUDENT_T_FREEDOM)).sum()
-        return float(size + (residuals.shared**2 / views.shared_std**2).sum())
+    def move(motion: np.ndarray) -> HandEyeGuess:
+        camera = transforms.apply_motion(start.base_from_camera, motion[:6])
+        board = transforms.apply_motion(start.link_from_board, motion[6:12])
+        return HandEyeGuess(camera, board, start.shared + motion[12:])
 
-    residuals = _compare(views, guess, factor)
-    cost, damping = compute_cost(residuals), 1e-4
-    for _ in range(MAX_STEPS):
-        if fixed is None:
-            weight = (STUDENT_T_FREEDOM + 6) / (STUDENT_T_FREEDOM + residuals.distance)
-        else:
-            weight = fixed
-        normal, gradient = _build_normal_equations(views, residuals, weight)
-        while damping < 1e8:
-            scale = np.diag(normal) + 1e-12 * np.trace(normal)
-            step = -np.linalg.solve(normal + damping * np.diag(scale), gradient)
-            trial = HandEyeGuess(
-                transforms.apply_motion(guess.base_from_camera, step[:6]),
-                transforms.apply_motion(guess.link_from_board, step[6:12]),
-                guess.shared + step[12:],
-            )
-            trial_residuals = _compare(views, trial, factor)
-            trial_cost = compute_cost(trial_residuals)
-            if trial_cost < cost:
-                break
-            damping *= 10.0
-        else:
-            return guess
-        gain, cost = cost - trial_cost, trial_cost
-        guess, residuals = trial, trial_residuals
-        damping = max(damping / 10.0, 1e-9)
-        if gain < MIN_GAIN * (1.0 + cost):
-            return guess
-    return guess
+    def compute_residuals(motion: np.ndarray) -> np.ndarray:
+        guess = move(motion)
+        found = _compare(views, guess, factor)
+        weight = used
+        if weight is None:
+            # the sum of squares is then the deviance of the t
+            weight = compute_student_deviance(found) / np.maximum(found.distance, 1e-12)
+        weighted = np.sqrt(weight)[:, None] * found.whitened
+        return np.concatenate([weighted.ravel(), guess.shared / views.shared_std])
+
+    size = 12 + len(start.shared)
+    found = least_squares(compute_residuals, np.zeros(size), x_scale="jac", max_nfev=MAX_STEPS)
+    return move(found.x), found.jac
+
+
+def compute_student_deviance(residuals: _Residuals) -> np.ndarray:
+    """Return minus twice the logarithm of Student's t, `(N,)`, but for the determinant."""
+    far = residuals.distance
+    return (STUDENT_T_FREEDOM + 6) * np.log1p(far / STUDENT_T_FREEDOM)
 
 
 def compute_deviance(views: HandEyeViews, guess: HandEyeGuess) -> float:
     """Return minus twice the logarithm of the likelihood of all views, but for a constant."""
     residuals = _compare(views, guess, 1.0)
-    deviance = (STUDENT_T_FREEDOM + 6) * np.log1p(residuals.distance / STUDENT_T_FREEDOM)
-    return float((deviance + residuals.log_det).sum())
+    return float((compute_student_deviance(residuals) + residuals.log_det).sum())
 
 
 def _estimate_arm_factor(views: HandEyeViews, guess: HandEyeGuess) -> float:

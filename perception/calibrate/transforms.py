@@ -17,12 +17,6 @@ def make_transform(rotation: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
     return transform
 
 
-def invert(transform: np.ndarray) -> np.ndarray:
-    """Return the inverse transforms."""
-    back = np.swapaxes(transform[..., :3, :3], -1, -2)
-    return make_transform(back, -(back @ transform[..., :3, 3:])[..., 0])
-
-
 def apply_motion(transform: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """Return a transform, `(4, 4)`, after a small motion, `(6,)`, in its own frame."""
     rotation = transform[:3, :3]
@@ -34,13 +28,8 @@ def compute_motion(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the small motions, `(…, 6)`, that take the transforms `start` to `end`."""
     back = np.swapaxes(start[..., :3, :3], -1, -2)
     shift = (back @ (end[..., :3, 3:] - start[..., :3, 3:]))[..., 0]
-    return np.concatenate([shift, compute_rotation_vectors(back @ end[..., :3, :3])], -1)
-
-
-def compute_rotation_vectors(rotation: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors, `(…, 3)` rad, of rotations."""
-    vectors = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
-    return vectors.reshape(*rotation.shape[:-2], 3)
+    turn = Rotation.from_matrix((back @ end[..., :3, :3]).reshape(-1, 3, 3)).as_rotvec()
+    return np.concatenate([shift, turn.reshape(shift.shape)], -1)
 
 
 def span_plane(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,8 +38,3 @@ def span_plane(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     return first, np.cross(normal, first)
-
-
-def build_cross_matrices(vector: np.ndarray) -> np.ndarray:
-    """Return the matrices, `(…, 3, 3)`, of the cross product with vectors: `M(a) @ b = a x b`."""
-    return -np.cross(vector[..., None, :], np.eye(3))

@@ -50,7 +50,7 @@ def fit_ellipses(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     best = np.real(values).argmax(1)
     a, b, c = a1 = np.real(vectors)[np.arange(len(m)), :, best].T
     d, e, f = (t @ a1.T[:, :, None])[:, :, 0].T
-    fitted = _convert_coefficients(a, b / 2, c, d / 2, e / 2, f)
+    fitted = _convert_coefficients(a, b / 2, d / 2, c, e / 2, f)
     fitted[4 * a * c - b * b <= 0] = np.nan
     fitted[:, :4] *= scale[known][:, None]
     fitted[:, :2] += center[known]
@@ -76,18 +76,12 @@ def build_quadratic_forms(ellipses: np.ndarray) -> np.ndarray:
 
 def convert_forms_to_ellipses(forms: np.ndarray) -> np.ndarray:
     """Return the ellipses `(C, 5)` of forms `(C, 3, 3)`, a row of NaN where a form is none."""
-    return _convert_coefficients(
-        forms[:, 0, 0],
-        forms[:, 0, 1],
-        forms[:, 1, 1],
-        forms[:, 0, 2],
-        forms[:, 1, 2],
-        forms[:, 2, 2],
-    )
+    rows, columns = np.triu_indices(3)
+    return _convert_coefficients(*forms[:, rows, columns].T)
 
 
 def _convert_coefficients(
-    a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, e: np.ndarray, last: np.ndarray
+    a: np.ndarray, b: np.ndarray, d: np.ndarray, c: np.ndarray, e: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
     """Return the ellipses `(C, 5)` of `a x² + 2 b xy + c y² + 2 d x + 2 e y + last`, NaN for none."""
     result = np.empty((len(a), 5))

@@ -16,7 +16,6 @@ from perception.ellipse import conic
 from perception.ellipse import edges as ellipse_edges
 from perception.ellipse import support as ellipse_support
 from perception.ellipse.edges import Edges
-from perception.ellipse.picture_noise import estimate_noise
 from perception.ellipse.support import (
     ANGLES,
     NUM_SAMPLES,
@@ -27,9 +26,6 @@ from perception.ellipse.support import (
 )
 
 # A change of these by 20 % changed no count of drawn patterns, photographs and hidden ellipses.
-PERCENTILE, NOISE, LOW = 85.0, 4.0, 0.4
-"""Upper threshold of edges: percentile of the gradient, and least value in standard deviations of
-noise; lower threshold as a part of the upper one."""
 REACH_RELATIVE = 0.03
 """Reach of an ellipse per px of its geometric mean semi-axis."""
 FLATTEST = 0.18
@@ -148,16 +144,8 @@ class ContourArcs:
         where = None if roi is None else roi[top:bottom, left:right]
         # The map of nearest edges must cover the reach of the largest ellipse.
         near_px = int(np.ceil(self.limit_reach(limits.highest_px))) + ROUNDING_PX
-        edges = ellipse_edges.detect_edges(
-            part,
-            where,
-            self._choose_blur(part, limits),
-            PERCENTILE,
-            NOISE,
-            LOW,
-            self.arc_points,
-            near_px,
-        )
+        blur_px = self._choose_blur(part, limits)
+        edges = ellipse_edges.detect_edges(part, where, blur_px, self.arc_points, near_px)
         if edges is None:
             return []
         # An arc of a large ellipse must be long; a short one fits any curvature.
@@ -429,3 +417,14 @@ class _ArcSearch:
         # An ellipse of semi-axis `a` is at most 2 a long; 10 % allow for the error of the prior.
         fits = extent.max(1) <= 2.2 * self._limits.highest_px
         return spans[fits & (np.hypot(*extent.T) >= 0.5 * self._limits.lowest_px)]
+
+
+def estimate_noise(gray: np.ndarray) -> float:
+    """Return the standard deviation of a picture's noise, grey levels (Immerkær 1996).
+
+    Edges of surfaces cancel in the mask, and the median leaves those of things out.
+    """
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    away = np.abs(cv2.filter2D(gray, cv2.CV_32F, mask))[::2, ::2]
+    # The mask's norm is 6; the median of a normal distribution's absolute value is 0.6745.
+    return float(np.median(away)) / (6.0 * 0.6745)

@@ -15,6 +15,9 @@ SCALE = 16.0
 
 # Each of these times 0.8 or 1.25 left every count of 8 drawn patterns, 3 pictures of hidden discs and
 # 6 negatives as it was. MANY, SCALE, NUM_SEEDS and BACKWARD_RAD were not varied.
+PERCENTILE, NOISE, LOW = 85.0, 4.0, 0.4
+"""Upper threshold of edges: percentile of the gradient, and least value in standard deviations of
+noise; lower threshold as a part of the upper one."""
 END_PX = 3.0
 """Length at both ends of an arc that the blur bends towards the edge it meets, px."""
 BLUNT_PX = 5.0
@@ -102,28 +105,17 @@ class Edges:
 
 
 def detect_edges(
-    gray: np.ndarray,
-    roi: np.ndarray | None,
-    sigma_px: float,
-    percentile: float,
-    noise: float,
-    low: float,
-    least: int,
-    near_px: int,
+    gray: np.ndarray, roi: np.ndarray | None, sigma_px: float, least: int, near_px: int
 ) -> Edges | None:
     """Return the edges of a picture, `None` where there are none.
 
-    The thresholds adapt to dark and hazy pictures. The upper one is the given percentile of the
-    gradient, at least `noise` times the gradient of noise, and at least 1 grey level a pixel.
+    The thresholds adapt to dark and hazy pictures. The upper one is a percentile of the gradient,
+    at least `NOISE` times the gradient of noise, and at least 1 grey level a pixel.
 
     Args:
         gray: `(h, w)` uint8.
         roi: `(h, w)` bool, `None` for everywhere.
         sigma_px: Gaussian blur before the gradient.
-        percentile: Of the gradient's magnitude, 0 to 100.
-        noise: Least upper threshold, in standard deviations of the gradient of noise, estimated by
-            the median magnitude.
-        low: Lower threshold as a part of the upper one.
         least: Least number of points of a contour.
         near_px: Largest distance at which `Edges.nearest` names an edge point.
     """
@@ -136,13 +128,13 @@ def detect_edges(
     looked = magnitude[some].ravel() if roi is None else magnitude[some][roi[some]]
     if not looked.size:
         return None
-    ranks = [round(part / 100.0 * (looked.size - 1)) for part in (50.0, percentile)]
+    ranks = [round(part / 100.0 * (looked.size - 1)) for part in (50.0, PERCENTILE)]
     median, upper = np.partition(looked, ranks)[ranks]
     # The median gradient is nearly all noise, since edges are rare.
     sigma = float(median) / RAYLEIGH_MEDIAN
-    upper = max(float(upper), noise * sigma, 1.0)
+    upper = max(float(upper), NOISE * sigma, 1.0)
     # Below the lower threshold, chains of noise would connect edges.
-    weak = max(low * upper, WEAK * sigma)
+    weak = max(LOW * upper, WEAK * sigma)
     # Canny accepts own gradients as 16-bit integers only.
     whole = [cv2.addWeighted(g, SCALE, g, 0.0, 0.0, dtype=cv2.CV_16S) for g in (gx, gy)]
     canny = cv2.Canny(whole[0], whole[1], weak * SCALE, max(upper, weak) * SCALE, L2gradient=True)

@@ -23,6 +23,8 @@ MAX_ERROR_RATIO = 3.0
 The poses of the arm then decide between the two.
 """
 NUM_CANDIDATES = 2
+SMALL_MOTION = 1e-6
+"""Step of the derivatives of a projection, m or rad: a thousandth of a pixel."""
 SAME_CORNER_M = 1e-6
 """Distance below which two corners are the same one."""
 
@@ -74,9 +76,9 @@ def estimate_board_pose(
         # A pose behind the camera reproduces the picture too.
         depth_m = (corners_m @ pose[:3, :3].T + pose[:3, 3])[:, 2]
         if not np.isfinite(pose).all() or depth_m.min() <= 0:
-            continue  # behind the camera
-        projected = cv2.projectPoints(corners_m, turn, shift, matrix, distortion)[0][:, 0]
-        fits.append((float(np.sqrt(((projected - corners_px) ** 2).sum(1).mean())), pose))
+            continue
+        away_px = _project_corners(frame, pose, corners_m) - corners_px
+        fits.append((float(np.sqrt((away_px**2).sum(1).mean())), pose))
     fits.sort(key=lambda fit: fit[0])
     if not fits:
         raise FrameError(f"{frame.name}: the board's corners fit no pose")
@@ -94,29 +96,26 @@ def estimate_board_pose(
     # two numbers a corner, six of them spent on the pose
     freedom = max(2 * len(corners_m) - 6, 1)
     std_px = max(corner_px, best_px * np.sqrt(len(corners_m) / freedom))
-    information = [_compute_pose_information(pose, corners_m, matrix) for pose in poses]
-    return BoardPose(
-        poses, np.stack([std_px**2 * np.linalg.inv(one) for one in information]), best_px
-    )
+    information = np.stack([_compute_information(frame, pose, corners_m) for pose in poses])
+    return BoardPose(poses, std_px**2 * np.linalg.inv(information), best_px)
 
 
-def _compute_pose_information(
-    pose: np.ndarray, corners_m: np.ndarray, matrix: np.ndarray
-) -> np.ndarray:
-    """Return the information of the corners on a small motion of the board, `(6, 6)`, px^2.
-
-    Lens distortion is neglected: its slope is small.
-    """
-    point = corners_m @ pose[:3, :3].T + pose[:3, 3]
-    x, y, z = point.T
-    slope = np.zeros((len(point), 2, 3))
-    slope[:, 0, 0], slope[:, 0, 2] = matrix[0, 0] / z, -matrix[0, 0] * x / z**2
-    slope[:, 1, 1], slope[:, 1, 2] = matrix[1, 1] / z, -matrix[1, 1] * y / z**2
-    shift = np.broadcast_to(np.eye(3), (len(point), 3, 3))
-    motion = np.concatenate([shift, -transforms.build_cross_matrices(corners_m)], 2)
-    rows = (slope @ pose[:3, :3] @ motion).reshape(-1, 6)
+def _compute_information(frame: Frame, pose: np.ndarray, corners_m: np.ndarray) -> np.ndarray:
+    """Return the information of the corners on a small motion of the board, `(6, 6)`, px^2."""
+    slopes = []
+    for motion in SMALL_MOTION * np.eye(6):
+        forth = _project_corners(frame, transforms.apply_motion(pose, motion), corners_m)
+        back = _project_corners(frame, transforms.apply_motion(pose, -motion), corners_m)
+        slopes.append((forth - back).ravel() / (2.0 * SMALL_MOTION))
+    rows = np.stack(slopes)
     # The small addition keeps a board seen edge-on invertible.
-    return rows.T @ rows + 1e-9 * np.eye(6)
+    return rows @ rows.T + 1e-9 * np.eye(6)
+
+
+def _project_corners(frame: Frame, pose: np.ndarray, corners_m: np.ndarray) -> np.ndarray:
+    """Return the pixels, `(n, 2)`, at which a frame shows the corners of a board at a pose."""
+    turn, matrix = np.asarray(cv2.Rodrigues(pose[:3, :3])[0]), frame.camera_matrix
+    return cv2.projectPoints(corners_m, turn, pose[:3, 3], matrix, frame.distortion)[0][:, 0]
 
 
 @spec
@@ -144,13 +143,9 @@ class Charuco:
     def check(self) -> None:
         known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
         if self.dictionary not in known:
-            raise ConfigError(
-                f"dictionary: OpenCV has no '{self.dictionary}'; choices: {', '.join(known)}"
-            )
+            raise ConfigError(f"dictionary: '{self.dictionary}' is none of {', '.join(known)}")
         if self.marker_m >= self.square_m:
-            raise ConfigError(
-                f"marker_m: expected less than square_m={self.square_m}, got {self.marker_m}"
-            )
+            raise ConfigError(f"marker_m: {self.marker_m} is not below square_m={self.square_m}")
 
     def find_corners(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners in the board's frame, `(n, 3)` m, and in the picture, `(n, 2)` px.

@@ -13,7 +13,7 @@ from brokk_rl.errors import ConfigError, StorageError
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception.label.camera_pose import Charuco
-from perception.render.printed_board import draw_board_picture
+from perception.render.board_on_arm import draw_board_picture
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.spec import spec
 from perception.calibrate.board import BoardCalibration
-from perception.calibrate.verdict import GOOD
+from perception.calibrate.evaluation import GOOD
 
 log = logging.getLogger(__name__)
 

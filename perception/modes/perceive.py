@@ -131,9 +131,8 @@ class Perceive:
                 self._write(folder, entries, finder)
         # One refused frame is a warning, only refused frames are an error.
         if entries and not any(entry.found for entry in entries):
-            raise FrameError(
-                f"none of {len(entries)} frames can be used. The first: {entries[0].refused}"
-            )
+            first = f"The first: {entries[0].refused}"
+            raise FrameError(f"none of {len(entries)} frames can be used. {first}")
         self._show(entries)
         log.info("holes: %s", folder / "holes.json")
 

@@ -11,11 +11,9 @@ from brokk_rl.errors import FrameError
 from brokk_rl.session import Session
 from brokk_rl.spec import Count, spec
 from perception import dataset
-from perception.camera import CameraModel, RawFrame, read_camera, write_camera
+from perception.camera import CameraModel, RawFrame, read_camera, read_pair_lens, write_camera
 from perception.sources import validation
-from perception.sources.lens_file import read_pair_lens
-from perception.sources.recorded import ExportedPictures, SourceCapture, StereoVideo
-from perception.sources.ros_log import RosLog
+from perception.sources.recorded import ExportedPictures, RosLog, SourceCapture, StereoVideo
 
 log = logging.getLogger(__name__)
 
@@ -73,11 +71,9 @@ class RecordCamera:
             return frame.camera
         path = Path(self.lens)
         size_px = frame.color.shape[1], frame.color.shape[0]
-        content = (
-            None
-            if path.suffix == ".conf"
-            else validation.read_mapping(path, "the numbers of a lens")
-        )
+        content = None
+        if path.suffix != ".conf":
+            content = validation.read_mapping(path, "the numbers of a lens")
         if content is None or "K1" in content:
             return read_pair_lens(path, content, size_px)
         camera = read_camera(path)

@@ -22,7 +22,7 @@ from brokk_rl.session import Session, write_json
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.label.camera_pose import Charuco
-from perception.label.measured import MeasuredHole, read_measured
+from perception.label.labeller import MeasuredHole, read_measured
 from perception.sources.look import look_at_frames
 
 log = logging.getLogger(__name__)
@@ -99,9 +99,8 @@ class ScoreCamera:
         scene = read_measured(Path(self.score.truth), "score.truth")
         frames, refused = self._score_frames(scene.holes)
         if not frames:
-            raise FrameError(
-                f"score_camera: no frame can be judged; the first: {next(iter(refused.values()), 'none')}"
-            )
+            first = next(iter(refused.values()), "none")
+            raise FrameError(f"score_camera: no frame can be judged; the first: {first}")
         errors = [one for some, _ in frames for one in some]
         median_m = high_m = normal_rad = None
         if errors:

@@ -20,6 +20,7 @@ from perception.robust_fit import (
     compute_biweight,
     compute_psi_slope,
     estimate_sandwich_covariance,
+    estimate_spread,
     number_cells,
 )
 
@@ -48,6 +49,9 @@ LARGEST_PX = 1.0
 """Largest shift of the whole face, px; beyond it the alignment has found something else."""
 
 
+RimParts = tuple[float, tuple[float, float]]
+
+
 @dataclass(frozen=True)
 class StereoPatch:
     """A part of both pictures, blurred and shrunk.
@@ -71,6 +75,16 @@ class StereoPatch:
     camera_matrix: np.ndarray
     pull_px: float
     error_per_m: np.ndarray
+
+    def compared(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return columns and rows of the picture that are compared; see `places`."""
+        height, width = self.left.shape
+        return self.places(np.arange(width), np.arange(0, height, self.stride))
+
+    @property
+    def stride(self) -> int:
+        """Step between the rows that are compared; columns are kept: disparity is read along rows."""
+        return max(1, round(self.left.size / MOST))
 
     def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return columns `(1, w)` and rows `(h, 1)` of the picture for those of `left`."""
@@ -136,12 +150,8 @@ def crop_pair(
     others = (last - first) // shrink
     if others < 16:
         return None
-    partner = cv2.cvtColor(
-        np.ascontiguousarray(
-            frame.right[top : top + rows * shrink, first : first + others * shrink]
-        ),
-        cv2.COLOR_RGB2GRAY,
-    )
+    strip = frame.right[top : top + rows * shrink, first : first + others * shrink]
+    partner = cv2.cvtColor(np.ascontiguousarray(strip), cv2.COLOR_RGB2GRAY)
     mine = gray[top : top + rows * shrink, left : left + columns * shrink]
     # Area interpolation keeps the sub-pixel position of edges; nearest pixels would shift them.
     small = [cv2.resize(picture, (size, rows), interpolation=cv2.INTER_AREA) if shrink > 1 else picture
@@ -183,15 +193,10 @@ def align_plane(
         inner: Inner limit in radii: nearer, both cameras see different sides of the rim.
         cell_px: Side of the squares within which errors may be correlated.
     """
-    height, width = both.left.shape
-    # Rows are left out and columns kept: disparity is read along rows.
-    stride = max(1, round(height * width / MOST))
-    lines = np.arange(0, height, stride)
-    u, v = both.places(np.arange(width), lines)
-    on = _find_face_pixels(both, face, frame, allowed, ellipse, inner, stride, u, v)
+    on = _find_face_pixels(both, face, frame, allowed, ellipse, inner)
     if np.count_nonzero(on) < LEAST:
         return face
-    agreed, likeness, moved_px = _register_pictures(both, face, on, stride, u, v, cell_px)
+    agreed, likeness, moved_px = _register_pictures(both, face, on, cell_px)
     # Pictures of different scenes correlate little, whatever the plane.
     if likeness < ALIKE:
         return None
@@ -205,13 +210,7 @@ def align_plane(
 
 
 def _register_pictures(
-    both: StereoPatch,
-    face: FacePlane,
-    on: np.ndarray,
-    stride: int,
-    u: np.ndarray,
-    v: np.ndarray,
-    cell_px: int,
+    both: StereoPatch, face: FacePlane, on: np.ndarray, cell_px: int
 ) -> tuple[FacePlane | None, float, float]:
     """Fit the plane by which the pictures agree best at the pixels `on`; see `align_plane`.
 
@@ -219,6 +218,7 @@ def _register_pictures(
         The plane, `None` where the pixels determine none; the correlation of left and warped right
             picture; and the largest shift on the face, px.
     """
+    stride, (u, v) = both.stride, both.compared()
     at = np.flatnonzero(on)
     weight = on.astype(np.float32)
     window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
@@ -278,14 +278,12 @@ def _find_face_pixels(
     allowed: np.ndarray,
     ellipse: np.ndarray,
     inner: float,
-    stride: int,
-    u: np.ndarray,
-    v: np.ndarray,
 ) -> np.ndarray:
-    """Find the pixels at `u`, `v` that show the face in both pictures, `(h, w)` bool.
+    """Find the places of `both` that show the face in both pictures, `(h, w)` bool.
 
-    See `align_plane` for the arguments; of `stride` rows one is looked at.
+    See `align_plane` for the arguments.
     """
+    stride, (u, v) = both.stride, both.compared()
     pixel = np.ix_(
         np.rint(v[:, 0]).astype(int).clip(0, allowed.shape[0] - 1),
         np.rint(u[0]).astype(int).clip(0, allowed.shape[1] - 1),
@@ -318,12 +316,7 @@ def _find_face_pixels(
 
 
 def measure_parallax(
-    both: StereoPatch,
-    face: FacePlane,
-    depth_m: np.ndarray,
-    ellipse: np.ndarray,
-    inner: float,
-    ring: tuple[float, float],
+    both: StereoPatch, face: FacePlane, depth_m: np.ndarray, ellipse: np.ndarray, parts: RimParts
 ) -> tuple[float, float]:
     """Return the difference of both pictures inside an ellipse over that on the face around it.
 
@@ -336,9 +329,9 @@ def measure_parallax(
         face: Plane of the face.
         depth_m: Depth, `(h, w)`; occluders are left out.
         ellipse: Rim, `(5,)`.
-        inner: Outer limit of the inside, radii.
-        ring: Limits of the ring on the face, radii.
+        parts: Outer limit of the inside, and limits of the ring on the face, radii.
     """
+    inner, ring = parts
     reach = ring[1] * ellipse[2] / both.shrink
     across, down = (
         (max(0, int(middle - reach)), min(size, int(middle + reach) + 2))
@@ -374,7 +367,7 @@ def measure_parallax(
         return float("nan"), covered
     off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
     # Not below 0.1 grey levels: a saturated face has no scatter at all.
-    usual = 1.4826 * float(np.median(np.abs(off[around] - np.median(off[around]))))
+    usual = estimate_spread(off[around] - np.median(off[around]))
     return float(np.std(off[within])) / max(usual, 0.1), covered
 
 

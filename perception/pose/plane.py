@@ -219,14 +219,9 @@ def fit_plane(
         for _ in range(3):
             residual = inverse - rays @ m
             tight = np.abs(residual)
-            scale = max(
-                1.4826
-                * compute_upper_median(
-                    # Gross errors are left out of the scale, or they would widen their own limit.
-                    tight[tight < max(8 * sigma, compute_upper_median(tight) * 1.5)]
-                ),
-                floor,
-            )
+            # Gross errors are left out of the scale, or they would widen their own limit.
+            tight = tight[tight < max(8 * sigma, compute_upper_median(tight) * 1.5)]
+            scale = max(1.4826 * compute_upper_median(tight), floor)
             # Other faces that come into reach are no noise.
             sigma = scale if ring == rings[0] else min(scale, 1.2 * first)
             reach = (TUKEY if ring == rings[0] else GROWING) * sigma

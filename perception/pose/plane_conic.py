@@ -15,11 +15,10 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, Share, spec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, consistency, plane, rim
-from perception.pose.appearance import Interior
-from perception.pose.focal_belief import FocalBelief, FocalDoubt, compute_focal_covariances
+from perception.pose.appearance import IN_DUST, Interior, WallLight, measure_wall_light
+from perception.pose.consistency import FocalBelief, FocalDoubt, compute_focal_covariances
 from perception.pose.plane import FacePlane, FaceSupport
 from perception.pose.rim import PlaneChart, RimCircle
-from perception.pose.wall_light import IN_DUST, WallLight, measure_wall_light
 
 # Each of these times 0.8 or 1.25 left every count of holes and discs in 8 rendered frames as it was,
 # and changed their median error by 0.4 mm at most. UNDECIDED_SCORE and WHOLE were not varied.
@@ -146,9 +145,7 @@ class PlaneConic:
 
     def check(self) -> None:
         if not self.rings or list(self.rings) != sorted(self.rings) or self.rings[0] <= self.inner:
-            raise ConfigError(
-                f"rings: expected increasing limits above inner={self.inner}, got {list(self.rings)}"
-            )
+            raise ConfigError(f"rings: {self.rings} do not increase from inner={self.inner} on")
 
     def build(self) -> PlaneConicEstimator:
         """Return an estimator."""
@@ -317,11 +314,8 @@ class _Candidate:
             self._judge_focal_length(chart, face, outline)
         hidden = consistency.measure_hidden_part(face, row, self._frame)
         is_broken = 1.0 - seen - hidden > s.broken
-        if (
-            s.broken < 1.0
-            and both is not None
-            and broken_rim.is_below_face(self._light, chart, both, row)
-        ):
+        pair = both if s.broken < 1.0 else None
+        if pair is not None and broken_rim.is_below_face(self._light, chart, pair, row):
             # The circle lies below the face: a refusal is better than its place.
             is_broken, circle, seen = True, None, 0.0
         if is_broken:
@@ -361,19 +355,17 @@ class _Candidate:
         """Return the factor on the score of a rim that looks like a hole."""
         looks, frame, row = self._settings.looks, self._frame, circle.ellipse
         # The first ellipse may follow the shade within: the fitted circle counts.
-        inside = appearance.measure_interior(self._light, frame.depth_m, row, self._matrix, face)
+        inside = appearance.measure_interior(self._light, frame, row, face)
         parallax, covered = float("nan"), 0.0
         if both is not None:
-            parallax, covered = alignment.measure_parallax(
-                both, face, frame.depth_m, row, *looks.parts
-            )
+            parts = looks.parts
+            parallax, covered = alignment.measure_parallax(both, face, frame.depth_m, row, parts)
         is_veiled = inside.darkness > looks.veiled
         # Behind an occluder, or in dust, hole and disc look the same.
         is_undecided = is_veiled or (covered > UNDECIDED and inside.unknown > UNDECIDED)
         wall = None
         if is_veiled:
-            place = (self._matrix, face, circle.center_m, circle.radius_m)
-            wall = measure_wall_light(self._light, frame.depth_m, row, *place)
+            wall = measure_wall_light(self._light, frame, circle, face)
             if covered > COVERED:
                 parallax = float("nan")
         self._check_appearance(inside, parallax, wall, row, is_undecided)

@@ -16,12 +16,11 @@ from perception import dataset
 from perception.camera import write_camera
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.render.board_on_arm import BoardOnArm, BoardScenes
-from perception.render.camera_sensor import draw_dust, take_picture
 from perception.render.drilled_block import DrilledHole
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
 from perception.render.scene_sampler import SceneSampler, compute_hidden_share, sample_rim
-from perception.render.stereo_camera import StereoRig
+from perception.render.stereo_camera import StereoRig, draw_dust, take_picture
 from perception.segment.window import Window
 from perception.stereo import Stereo
 
@@ -72,9 +71,7 @@ class FrameRenderer:
 
     def check(self) -> None:
         if self.depth == "matched" and not self.pair:
-            raise ConfigError(
-                "studio.pair=false: there is no pair to match; choose studio.depth=exact or none"
-            )
+            raise ConfigError("studio.pair=false: no pair to match; studio.depth=exact or none")
 
     def prepare(self, folder: Path, session: Session, count: int) -> ComposeScene:
         """Return what composes scene `number`, and write what the frames share.
@@ -155,11 +152,8 @@ class FrameRenderer:
         block = scene.block
         if block is None:
             return SceneTruth(self.scene.name, scene.conditions, (), (), {})
-        place = {
-            "center_m": np.asarray(block.pose.center_m).tolist(),
-            "rotation": np.asarray(block.pose.rotation).tolist(),
-            "half_m": np.asarray(block.half_m).tolist(),
-        }
+        parts = vars(block.pose) | {"half_m": block.half_m}
+        place = {name: np.asarray(part).tolist() for name, part in sorted(parts.items())}
 
         def describe(circle: DrilledHole) -> TrueCircle:
             return TrueCircle.place(

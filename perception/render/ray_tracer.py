@@ -117,9 +117,8 @@ class RenderedView:
     def label(self) -> np.ndarray:
         """A number for each surface, lit or not: where it changes, there is an edge."""
         # Powers of two keep the four parts of the label apart.
-        return (
-            self.solid.astype(np.int32) * 4096 + self.part * 4 + self.mouth * 2 + self.sunlit
-        ).astype(np.int32)
+        label = self.solid.astype(np.int32) * 4096 + self.part * 4 + self.mouth * 2 + self.sunlit
+        return label.astype(np.int32)
 
 
 class Tracer:
@@ -135,11 +134,10 @@ class Tracer:
         self, solids: Sequence[Solid], light: Light, sky: tuple[float, float, float]
     ) -> None:
         self.solids, self.light, self.sky = tuple(solids), light, np.array(sky, np.float32)
-        self._casters = [
-            Caster(solid, light.to_sun)
-            for solid in (*solids, *light.shade)
-            if solid.corners_m is not None
-        ]
+        self._casters = []
+        for solid in (*solids, *light.shade):
+            if solid.corners_m is not None:
+                self._casters.append(Caster(solid, light.to_sun))
 
     def view(self, camera: Pinhole) -> RenderedView:
         """Return the ideal picture of `camera`."""
@@ -161,16 +159,12 @@ class Tracer:
         # Only pixels at edges are oversampled: everywhere else one ray is enough.
         edges = np.flatnonzero(_find_edges(whole.label).ravel())
         # Centres of the sub-pixels, relative to the pixel's centre.
-        offsets = (
-            np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5
-        ) / OVER - 0.5
+        corners = np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2)
+        offsets = (corners + 0.5) / OVER - 0.5
         for part in np.array_split(edges, max(1, len(edges) * OVER**2 // CHUNK)):
             pixel = np.stack([part % camera.width, part // camera.width], 1)[:, None] + offsets
-            radiance[part] = (
-                self._shoot(camera, pixel.reshape(-1, 2))
-                .radiance.reshape(len(part), OVER**2, 3)
-                .mean(1)
-            )
+            fine = self._shoot(camera, pixel.reshape(-1, 2)).radiance
+            radiance[part] = fine.reshape(len(part), OVER**2, 3).mean(1)
         # NaN, as a camera reports missing depth.
         whole.depth_m[whole.solid == NOTHING] = np.nan
         return whole
@@ -258,13 +252,8 @@ class Caster:
     def darken(self, point: np.ndarray, lit: np.ndarray) -> None:
         """Clear `lit`, `(M,)` bool, at the points, `(M, 3)`, that the solid shades."""
         x, y = point @ self._across[:, 0], point @ self._across[:, 1]
-        rows = np.flatnonzero(
-            lit
-            & (x > self._low[0])
-            & (x < self._high[0])
-            & (y > self._low[1])
-            & (y < self._high[1])
-        )
+        within = (x > self._low[0]) & (x < self._high[0]) & (y > self._low[1]) & (y < self._high[1])
+        rows = np.flatnonzero(lit & within)
         if len(rows):
             sun = np.broadcast_to(self._to_sun, (len(rows), 3))
             lit[rows[np.isfinite(self.solid.hit(point[rows], sun).t)]] = False

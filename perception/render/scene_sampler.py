@@ -7,22 +7,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from perception.render.block_sampler import BlockSampler
-from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import DrilledBlock, DrilledHole
-from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
 from perception.render.ray_tracer import Light
-from perception.render.scene_ranges import RangeSampler, Scene, SceneRanges
+from perception.render.scene_ranges import BlockSampler, RangeSampler, Scene, SceneRanges
 from perception.render.solids import (
+    NUM_TEXTURES,
+    TEXTURE_SIDE,
     Box,
     Cylinder,
+    Material,
     PlaneSolid,
     Solid,
     SolidPose,
     build_frame,
     move_solid,
 )
-from perception.render.stereo_camera import StereoRig
+from perception.render.stereo_camera import CameraExposure, StereoRig
 
 _CLEAR = 1.6
 """Where the arm hides nothing it stays away from the rim's centre by this factor of the rim's size
@@ -31,6 +31,8 @@ _BISECTIONS = 14
 NUM_RIM_POINTS = 360
 _CLUTTER_TRIES = 30
 _GREY = 1 / 3
+DRAWN = ("patchiness", "blur_px", "full_well_e", "read_noise_e", "gamma", "vignetting")
+"""Settings of an exposure that are drawn as they stand in `LightRanges`, in this order."""
 
 
 class SceneSampler(RangeSampler):
@@ -251,11 +253,9 @@ class SceneSampler(RangeSampler):
         elevation = self.uniform(ranges.elevation_rad)
         azimuth = generator.uniform(-np.pi, np.pi)
         frame = build_frame(-self._down, 0.0)
-        to_sun = frame @ [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ]
+        level = math.cos(elevation)
+        toward = [level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)]
+        to_sun = frame @ toward
         shade = []
         for _ in range(self.integer(ranges.shadows)):
             # About 3 m towards the sun, out of sight of the camera.
@@ -285,12 +285,7 @@ class SceneSampler(RangeSampler):
             gain=self.uniform(ranges.exposure) / face * level,
             extinction_per_m=extinction,
             airlight=self.uniform(ranges.airlight) * (light.ambient + light.sun * _GREY),
-            patchiness=self.uniform(ranges.patchiness),
-            blur_px=self.uniform(ranges.blur_px),
-            full_well_e=self.uniform(ranges.full_well_e),
-            read_noise_e=self.uniform(ranges.read_noise_e),
-            gamma=self.uniform(ranges.gamma),
-            vignetting=self.uniform(ranges.vignetting),
+            **{name: self.uniform(getattr(ranges, name)) for name in DRAWN},
         )
         return exposure, level
 

@@ -7,6 +7,8 @@ matcher in it is the same at every distance.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -76,10 +78,7 @@ class DepthPlane:
 
     def check(self) -> None:
         if self.min_extent_m >= self.max_extent_m:
-            raise ConfigError(
-                f"min_extent_m: expected less than max_extent_m={self.max_extent_m}, got "
-                f"{self.min_extent_m}"
-            )
+            raise ConfigError(f"min_extent_m: {self.min_extent_m} is not < {self.max_extent_m}")
 
     def build(self) -> DepthPlane:
         """Return the segmenter, which is the spec itself."""
@@ -112,10 +111,11 @@ class DepthPlane:
         return Masks(mask, None)
 
 
+@dataclass(frozen=True)
 class _PlaneSearch:
     """Search for the faces of a block in the depth of one frame.
 
-    Args:
+    Attributes:
         settings: Sizes, and the number of trials.
         rays: Lines of sight of the cells, `(h, w, 3)`.
         inverse: Inverse depth, 1/m, `(h, w)` float32.
@@ -123,29 +123,24 @@ class _PlaneSearch:
         tolerance: Of a plane, 1/m.
     """
 
-    def __init__(
-        self,
-        settings: DepthPlane,
-        rays: np.ndarray,
-        inverse: np.ndarray,
-        known: np.ndarray,
-        tolerance: float,
-    ) -> None:
-        self._settings, self._rays, self._inverse = settings, rays, inverse
-        self._known, self._tolerance = known, tolerance
+    settings: DepthPlane
+    rays: np.ndarray
+    inverse: np.ndarray
+    known: np.ndarray
+    tolerance: float
 
     def find_faces(self) -> np.ndarray:
         """Return the cells of all faces, `(h, w)` uint8."""
-        face = np.zeros(self._inverse.shape, np.uint8)
+        face = np.zeros(self.inverse.shape, np.uint8)
         for plane in self._find_planes():
             face |= self._select_faces(plane)
         return face
 
     def _find_planes(self) -> list[np.ndarray]:
         """Return planes `n / d`, `(3,)`, the best supported first, each of pixels left by those before."""
-        s, rays, inverse = self._settings, self._rays, self._inverse
+        s, rays, inverse = self.settings, self.rays, self.inverse
         generator = np.random.default_rng(s.seed)
-        found, rest = [], self._known.copy()
+        found, rest = [], self.known.copy()
         for _ in range(s.num_planes):
             there = np.flatnonzero(rest)
             if len(there) < s.min_area * rest.size:
@@ -153,45 +148,45 @@ class _PlaneSearch:
             trials = self._draw_trials(rest, there, generator)
             judge = there[generator.integers(len(there), size=s.num_samples)]
             off = trials @ rays.reshape(-1, 3)[judge].T - inverse.ravel()[judge]
-            votes = np.count_nonzero(np.abs(off) < self._tolerance, axis=1)
+            votes = np.count_nonzero(np.abs(off) < self.tolerance, axis=1)
             best = int(votes.argmax()) if len(votes) else 0
             if not len(votes) or votes[best] / s.num_samples * len(there) < s.min_area * rest.size:
                 break
             found.append(self._refine(trials[best], rest))
-            rest &= np.abs(rays @ found[-1].astype(np.float32) - inverse) >= self._tolerance
+            rest &= np.abs(rays @ found[-1].astype(np.float32) - inverse) >= self.tolerance
         return found
 
     def _draw_trials(
         self, rest: np.ndarray, there: np.ndarray, generator: np.random.Generator
     ) -> np.ndarray:
         """Return planes through three neighbouring pixels of `rest`, at many scales, `(trials, 3)`."""
-        count, (height, width) = self._settings.num_trials, rest.shape
+        count, (height, width) = self.settings.num_trials, rest.shape
         row, column = np.divmod(there[generator.integers(len(there), size=count)], width)
-        reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
+        reach = width * self.settings.neighbourhood * generator.uniform(0.2, 1.0, count)
         shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
         corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
         corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
         corners = corner_rows, corner_columns
         # (trials, 3 pixels, 3)
-        triples = np.moveaxis(self._rays[corners], 0, 1)
+        triples = np.moveaxis(self.rays[corners], 0, 1)
         usable = rest[corners].all(0) & (np.abs(np.linalg.det(triples)) > 1e-5)
-        values = self._inverse[corners].T[usable]
+        values = self.inverse[corners].T[usable]
         return np.linalg.solve(triples[usable], values[..., None])[..., 0]
 
     def _refine(self, plane: np.ndarray, rest: np.ndarray) -> np.ndarray:
         """Return the least-squares plane of the pixels of `rest` that agree with `plane`."""
         # A quarter of the pixels tells it as well.
         rest = rest[::2, ::2]
-        rays, inverse = self._rays[::2, ::2][rest].astype(float), self._inverse[::2, ::2][rest]
+        rays, inverse = self.rays[::2, ::2][rest].astype(float), self.inverse[::2, ::2][rest]
         for _ in range(2):
-            inside = np.abs(rays @ plane - inverse) < self._tolerance
+            inside = np.abs(rays @ plane - inverse) < self.tolerance
             plane = np.linalg.lstsq(rays[inside], inverse[inside], rcond=None)[0]
         return plane
 
     def _select_faces(self, plane: np.ndarray) -> np.ndarray:
         """Return the connected pieces of a plane that can be faces of a block, `(h, w)` uint8."""
-        s, known, rays, tolerance = self._settings, self._known, self._rays, self._tolerance
-        excess = self._inverse - rays @ plane.astype(np.float32)  # > 0: nearer than the plane
+        s, known, rays, tolerance = self.settings, self.known, self.rays, self.tolerance
+        excess = self.inverse - rays @ plane.astype(np.float32)  # > 0: nearer than the plane
         support = (known & (np.abs(excess) < tolerance)).astype(np.uint8)
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
@@ -221,11 +216,11 @@ class _PlaneSearch:
 
     def _fits(self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray) -> bool:
         """Return whether a piece of a plane has the size of a face and is turned to the camera."""
-        s = self._settings
+        s = self.settings
         if extents_m.min() < s.min_extent_m or extents_m.max() > s.max_extent_m:
             return False
         sums = cv2.moments(piece, binaryImage=True)
-        sight = self._rays[round(sums["m01"] / sums["m00"]), round(sums["m10"] / sums["m00"])]
+        sight = self.rays[round(sums["m01"] / sums["m00"]), round(sums["m10"] / sums["m00"])]
         tilt_rad = np.arccos(
             np.clip(abs(sight @ plane) / np.linalg.norm(sight) / np.linalg.norm(plane), 0.0, 1.0)
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -67,12 +67,6 @@ class Onnx:
             CheckpointError: there is no such network, or it is none of ours.
         """
         import onnxruntime
-        from onnxruntime.capi.onnxruntime_pybind11_state import (
-            Fail,
-            InvalidArgument,
-            InvalidProtobuf,
-            NoSuchFile,
-        )
 
         path = find_weights(self.weights)
         options = onnxruntime.SessionOptions()
@@ -81,7 +75,7 @@ class Onnx:
             session = onnxruntime.InferenceSession(
                 path.read_bytes(), options, providers=["CPUExecutionProvider"]
             )
-        except (Fail, InvalidArgument, InvalidProtobuf, NoSuchFile) as error:
+        except Exception as error:  # the library's errors have no common base
             raise CheckpointError(
                 f"{path}: corrupt or no ONNX file ({error}); copy it again or train a new one"
             ) from error
@@ -101,49 +95,45 @@ class Onnx:
         return NetworkSegmenter(infer, size_px, self.margin, gate)
 
 
+@dataclass(frozen=True)
 class NetworkSegmenter:
     """Apply a network to frames of any size.
 
-    Args:
+    Attributes:
         infer: The network.
         size_px: Width and height of its input.
         margin: Room around the block in the second run; `None` for one run.
         gate: Drops pieces of block that it does not see; `None` for none.
     """
 
-    def __init__(
-        self,
-        infer: Infer,
-        size_px: tuple[int, int],
-        margin: float | None,
-        gate: NetworkSegmenter | None = None,
-    ) -> None:
-        self._infer, self._size_px, self._margin, self._gate = infer, size_px, margin, gate
+    infer: Infer
+    size_px: tuple[int, int]
+    margin: float | None
+    gate: NetworkSegmenter | None = None
 
     def segment(self, frame: Frame) -> Masks:
         """Return both masks."""
         masks = self._segment_alone(frame)
-        if self._gate is None or not (masks.block > THRESHOLD).any():
+        if self.gate is None or not (masks.block > THRESHOLD).any():
             return masks
-        seen = self._gate.segment(frame).block > THRESHOLD
-        return _drop_pieces(masks, lambda pieces, count: np.isin(range(count), pieces[seen]))
+        return _drop_pieces(masks, self.gate.segment(frame).block > THRESHOLD)
 
     def _segment_alone(self, frame: Frame) -> Masks:
         """Return both masks, without the gate."""
-        window = cover_picture(frame.color.shape, self._size_px)
+        window = cover_picture(frame.color.shape, self.size_px)
         block, holes = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
         self._write_masks(frame, window, block, holes)
-        if self._margin is None:
-            return _drop_specks(block, holes)
+        if self.margin is None:
+            return _drop_pieces(Masks(block, holes), None)
         box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
         if box is None:
             part = np.zeros_like(block)
-            for half in tile_halves(block.shape, self._size_px):
+            for half in tile_halves(block.shape, self.size_px):
                 self._write_masks(frame, half, part, np.zeros_like(part))
                 np.maximum(block, part, out=block)
             box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
         for _ in range(MAX_CLOSE_RUNS):
-            closer = window if box is None else center_window(box, self._size_px, self._margin)
+            closer = window if box is None else center_window(box, self.size_px, self.margin)
             if box is None or closer.width >= window.width:
                 break
             holes[:] = 0.0
@@ -153,42 +143,33 @@ class NetworkSegmenter:
                 before[2:]
             ):
                 break
-        return _drop_specks(block, holes)
+        return _drop_pieces(Masks(block, holes), None)
 
     def _write_masks(
         self, frame: Frame, window: Window, block: np.ndarray, holes: np.ndarray
     ) -> None:
         """Write the network's answer for a window into both masks."""
-        seen = self._infer(as_input(window.take(frame.color, self._size_px)))
+        seen = self.infer(as_input(window.take(frame.color, self.size_px)))
         window.put(seen[0], block)
         window.put(seen[1], holes)
 
 
-def _drop_specks(block: np.ndarray, holes: np.ndarray) -> Masks:
-    """Return masks without pieces of block that are too small."""
-    least = LEAST_BLOCK * block.size
-    return _drop_pieces(
-        Masks(block, holes),
-        lambda pieces, count: np.bincount(pieces.ravel(), minlength=count) >= least,
-    )
+def _drop_pieces(masks: Masks, seen: np.ndarray | None) -> Masks:
+    """Return masks without small pieces of block, and without those that touch nothing of `seen`.
 
-
-def _drop_pieces(masks: Masks, choose: Callable[[np.ndarray, int], np.ndarray]) -> Masks:
-    """Return masks with some pieces of block; where none is left there are no holes.
-
-    Args:
-        masks: Both masks.
-        choose: From the number of each pixel's piece, `(h, w)`, 0 beside all, and their count, to
-            which pieces are kept, `(count,)` bool.
+    Where none is left there are no holes.
     """
-    count, numbers = cv2.connectedComponents((masks.block > THRESHOLD).astype(np.uint8))
+    block = (masks.block > THRESHOLD).astype(np.uint8)
+    count, numbers, stats, _ = cv2.connectedComponentsWithStats(block)
     pieces = np.asarray(numbers, int)
-    kept = choose(pieces, count)
+    kept = stats[:, cv2.CC_STAT_AREA] >= LEAST_BLOCK * block.size
+    if seen is not None:
+        kept &= np.isin(range(count), pieces[seen])
     kept[0] = True
-    block = np.where(kept[pieces], masks.block, np.float32(0.0))
+    left = np.where(kept[pieces], masks.block, np.float32(0.0))
     if masks.hole_mask is None or kept[1:].any():
-        return Masks(block, masks.hole_mask)
-    return Masks(block, np.zeros_like(masks.hole_mask))
+        return Masks(left, masks.hole_mask)
+    return Masks(left, np.zeros_like(masks.hole_mask))
 
 
 def as_input(picture: np.ndarray) -> np.ndarray:

@@ -102,12 +102,8 @@ def center_window(
     left, top, width, height = box
     scale = (1.0 + 2.0 * margin) * max(width / size_px[0], height / size_px[1])
     across, down = max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
-    return Window(
-        round(left + width / 2.0 - across / 2.0),
-        round(top + height / 2.0 - down / 2.0),
-        across,
-        down,
-    )
+    first, highest = left + width / 2.0 - across / 2.0, top + height / 2.0 - down / 2.0
+    return Window(round(first), round(highest), across, down)
 
 
 def bound_block(

@@ -12,9 +12,7 @@ from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
-from perception.mount.approach import plan_approach_motion
-from perception.mount.mounts import AxesMount
-from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewPlanner
+from perception.mount.mounts import AxesMount, ExpectedCovariance, HoleBelief, ViewPlanner
 from perception.sources.simulator import SimulatedCamera
 
 
@@ -78,9 +76,8 @@ class MovingSource:
         self._seen_s, self._is_taken = seen_s, False
         scene = s.camera.task_scene
         belief = HoleBelief.expect(hole, np.array(scene[:3]), scene[5], s.hint_m)
-        step_s = s.next_view.horizon_s / (s.next_view.num_times - 1)
-        plan_q = plan_approach_motion(s.machine, q, belief.center_m, s.next_view.num_times, step_s)
-        return planner.aim(belief, plan_q, t_s)
+        # No plan of the arm is known here: it is taken to rest.
+        return planner.aim(belief, np.stack([q] * s.next_view.num_times), t_s)
 
     def read_latest(self) -> Frame:
         """Return a frame of the present scene from the present view.

@@ -59,8 +59,7 @@ class RealSenseDevice:
             FrameError: there is no library, no camera, or it cannot run as configured.
         """
         missing = "RealSense camera: the Python package `pyrealsense2` is not installed"
-        rs = import_library("pyrealsense2", missing)
-        self._rs = rs
+        self._rs = rs = import_library("pyrealsense2", missing)
         settings, config = self._settings, rs.config()
         if settings.serial is not None:
             config.enable_device(settings.serial)
@@ -126,12 +125,8 @@ def invert_distortion(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, 
         size: Width and height of the picture, px.
     """
     columns, rows = np.meshgrid(np.linspace(0, size[0] - 1, 24), np.linspace(0, size[1] - 1, 16))
-    seen = np.stack(
-        [
-            (columns.ravel() - matrix[0, 2]) / matrix[0, 0],
-            (rows.ravel() - matrix[1, 2]) / matrix[1, 1],
-        ]
-    )
+    pixels = np.stack([columns.ravel(), rows.ravel()])
+    seen = (pixels - matrix[:2, 2:]) / np.diag(matrix)[:2, None]
     ray = seen + _tabulate_distortion(seen) @ inverse
     table = _tabulate_distortion(ray)
     return np.linalg.lstsq(table.reshape(-1, 5), (seen - ray).ravel(), rcond=None)[0]

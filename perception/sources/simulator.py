@@ -11,11 +11,10 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.kinematics import rotate_about_axis
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
-from perception.mount.occlusion import ArmShape
-from perception.render.block_sampler import BlockSampler
+from perception.mount.mounts import ArmShape
 from perception.render.drilled_block import FRONT, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer, RenderedFrame
-from perception.render.scene_ranges import Scene, SceneRanges, view_from
+from perception.render.scene_ranges import BlockSampler, Scene, SceneRanges, view_from
 from perception.render.scene_sampler import SceneSampler
 from perception.render.solids import SolidPose, build_rods
 from perception.render.stereo_camera import StereoRig

@@ -50,9 +50,8 @@ def check_matrix(value: Any, where: str) -> np.ndarray:
     across_px, down_px = found[0, 0], found[1, 1]
     is_positive = across_px > 0 and down_px > 0
     if not is_positive or not _ASPECT[0] <= across_px / down_px <= _ASPECT[1]:
-        raise FrameError(
-            f"{where}: K has focal lengths {across_px:g} and {down_px:g} px, expected more than 0 and about equal"
-        )
+        told = f"K has focal lengths {across_px:g} and {down_px:g} px"
+        raise FrameError(f"{where}: {told}, expected more than 0 and about equal")
     if (
         np.abs(found[[1, 2, 2], [0, 0, 1]]).max() > 1e-9
         or abs(found[2, 2] - 1.0) > 1e-9
@@ -124,9 +123,7 @@ def check_distortion(value: Any, where: str) -> np.ndarray | None:
         parse_numbers([] if value is None else value, None, f"{where}: dist")
     ).reshape(-1)
     if len(found) not in _NUM_DISTORTION:
-        raise FrameError(
-            f"{where}: dist has {len(found)} coefficients, expected {', '.join(map(str, _NUM_DISTORTION))} of them"
-        )
+        raise FrameError(f"{where}: dist has {len(found)} numbers, expected {_NUM_DISTORTION}")
     if np.abs(found).max(initial=0.0) > 100:
         raise FrameError(f"{where}: dist is absurd, {found.tolist()}")
     return found if np.any(found) else None
@@ -141,9 +138,7 @@ def check_pose(value: Any, where: str, name: str = "T_base_cam") -> np.ndarray:
         or np.abs(turn @ turn.T - np.eye(3)).max() > _RIGID
         or np.linalg.det(turn) < 0
     ):
-        raise FrameError(
-            f"{where}: {name} is no rigid transform: expected a rotation, a shift in m and the row 0 0 0 1"
-        )
+        raise FrameError(f"{where}: {name} is no rotation with a shift in m and the row 0 0 0 1")
     return found
 
 
@@ -203,28 +198,20 @@ def convert_color(picture: np.ndarray, where: str) -> np.ndarray:
         bits = max(int(picture.max(initial=0)).bit_length(), 8)
         picture = (picture >> (bits - 8)).astype(np.uint8)
     if picture.dtype != np.uint8:
-        raise FrameError(
-            f"{where}: {picture.dtype} in each channel, expected 8 bits, or 16 bits of a grey picture"
-        )
+        raise FrameError(f"{where}: {picture.dtype}, expected 8 bits, or 16 bits of a grey picture")
     if picture.ndim == 2:
         return np.ascontiguousarray(np.repeat(picture[..., None], 3, 2))
     if picture.ndim != 3 or picture.shape[2] not in (3, 4):
-        raise FrameError(
-            f"{where}: a picture of shape {picture.shape}, expected 1, 3 or 4 channels"
-        )
+        raise FrameError(f"{where}: shape {picture.shape}, expected 1, 3 or 4 channels")
     return np.ascontiguousarray(picture[..., 2::-1])
 
 
 def convert_png_depth(picture: np.ndarray, where: str, unit_m: float = 0.001) -> np.ndarray:
     """Return depth in m, `(h, w)` float32, NaN for 0, of a picture in steps of `unit_m`."""
     if picture.ndim != 2:
-        raise FrameError(
-            f"{where}: {picture.shape[2]} channels, expected one of 16 bits (depth in mm)"
-        )
+        raise FrameError(f"{where}: {picture.shape[2]} channels, expected one of 16 bits (mm)")
     if picture.dtype != np.uint16:
-        raise FrameError(
-            f"{where}: {picture.dtype}, expected 16 bits (depth in mm); 8 bits cannot hold depth"
-        )
+        raise FrameError(f"{where}: {picture.dtype}, expected 16 bits (depth in mm)")
     depth_m = picture.astype(np.float32) / np.float32(1.0 / unit_m)
     return np.where(picture > 0, depth_m, np.float32(np.nan))
 
@@ -239,9 +226,8 @@ def check_depth(values: np.ndarray, where: str, least_known: float) -> np.ndarra
         found = np.where(np.isfinite(values) & (values > 0), values, np.nan).astype(np.float32)
     known = np.isfinite(found)
     if not known.any() or known.mean() < least_known:
-        raise FrameError(
-            f"{where}: depth is known for {100 * known.mean():.2g} % of the picture, expected {100 * least_known:g} % or more"
-        )
+        share = f"{100 * known.mean():.2g} %, expected {100 * least_known:g} % or more"
+        raise FrameError(f"{where}: depth is known for {share}")
     if (middle := float(np.median(found[known]))) > _FARTHEST_M:
         raise FrameError(f"{where}: the median depth is {middle:g} m; is it in mm?")
     return found
@@ -265,9 +251,7 @@ def read_mapping(path: Path, expected: str) -> dict[str, Any]:
     try:
         told = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FrameError(
-            f"{path}: cannot be read as YAML ({error}); expected {expected}"
-        ) from error
+        raise FrameError(f"{path}: cannot be read as YAML ({error}): {expected}") from error
     return told if isinstance(told, dict) else {}
 
 

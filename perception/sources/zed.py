@@ -52,13 +52,9 @@ class Zed:
 
     def check(self) -> None:
         if self.sensing == "fill":
-            raise ConfigError(
-                "sensing: 'fill' invents depth where nothing was seen, also across boreholes; use standard"
-            )
+            raise ConfigError("sensing: 'fill' invents depth, also across boreholes; use standard")
         if self.nearest_m >= self.farthest_m:
-            raise ConfigError(
-                f"nearest_m: expected less than farthest_m={self.farthest_m}, got {self.nearest_m}"
-            )
+            raise ConfigError(f"nearest_m: {self.nearest_m} is not < farthest_m={self.farthest_m}")
 
     def build(self) -> LiveSource:
         """Return the source, not yet opened."""
@@ -122,10 +118,8 @@ class ZedDevice:
         """Return the next capture, `None` when there is none in time or the recording has ended."""
         sl, until = self._sl, time.monotonic() + timeout_s
         while (status := self._camera.grab(self._runtime)) != sl.ERROR_CODE.SUCCESS:
-            self.has_ended = (
-                self._settings.recording is not None
-                and status == sl.ERROR_CODE.END_OF_SVOFILE_REACHED
-            )
+            is_recording = self._settings.recording is not None
+            self.has_ended = is_recording and status == sl.ERROR_CODE.END_OF_SVOFILE_REACHED
             if self.has_ended or time.monotonic() > until:
                 return None
             time.sleep(_RETRY_S)
@@ -140,12 +134,9 @@ class ZedDevice:
 
     def now_s(self) -> float:
         """Return the time on the SDK's clock; that of a recording stands at its pictures."""
-        reference = (
-            self._sl.TIME_REFERENCE.IMAGE
-            if self._settings.recording
-            else self._sl.TIME_REFERENCE.CURRENT
-        )
-        return self._camera.get_timestamp(reference).get_nanoseconds() * 1e-9
+        clocks = self._sl.TIME_REFERENCE
+        clock = clocks.IMAGE if self._settings.recording else clocks.CURRENT
+        return self._camera.get_timestamp(clock).get_nanoseconds() * 1e-9
 
     def close(self) -> None:
         """Close the camera."""

@@ -43,9 +43,7 @@ class VarianceFusion:
 
     def check(self) -> None:
         if self.stale_s > self.forget_s:
-            raise ConfigError(
-                f"stale_s: expected forget_s={self.forget_s} or less, got {self.stale_s}"
-            )
+            raise ConfigError(f"stale_s: {self.stale_s} is above forget_s={self.forget_s}")
 
     def build(self) -> FusionTracker:
         """Return a tracker that has seen nothing yet."""

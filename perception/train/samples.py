@@ -1,25 +1,31 @@
-"""Training samples: each frame as the segmenter's two views, with room to crop.
+"""Training samples: each frame as the segmenter's two views, cropped and changed.
 
 All of a batch is made by torch where the network is: a processor's cores took five times as long to
 make a batch as a graphics card takes to learn from it.
+
+Changes of brightness, sharpness and noise are the paper's blur, contrast, gamma and noise; crop, its
+fifth, alone moves what is in the pictures. Rendered scenes vary light, dust and sensor by themselves.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
 import torch
+from annotated_types import Ge, MultipleOf
 from torch.nn import functional
 
 from brokk_rl.errors import FrameError
 from brokk_rl.progress import track_items
-from brokk_rl.spec import PositiveRange, spec
+from brokk_rl.spec import NonNegative, PositiveRange, Share, spec
 from perception import dataset
 from perception.segment.network import SMALLEST_PIECE, THRESHOLD
 from perception.segment.window import Window, bound_block, center_window, cover_picture
@@ -109,10 +115,11 @@ class TrainingViews:
         return TrainingViews(self.layers[chosen], self.conditions[chosen], self.names[chosen])
 
 
+@dataclass
 class Samples:
     """Endless batches, cut and changed where the network is trained.
 
-    Args:
+    Attributes:
         views: They are cut from these; kept on the device where it has room for them, else in the
             computer's memory.
         crop: How.
@@ -122,35 +129,31 @@ class Samples:
         device: Where samples are made.
     """
 
-    def __init__(
-        self,
-        views: TrainingViews,
-        crop: Crop,
-        change: torch.nn.Module,
-        size_px: tuple[int, int],
-        closer: float,
-        device: torch.device,
-    ) -> None:
-        layers = views.layers
-        if (
-            device.type == "cuda"
-            and layers.nbytes < PART_OF_MEMORY * torch.cuda.mem_get_info(device)[0]
-        ):
-            layers = layers.to(device)
-        self._layers, self._crop, self._change, self._size_px = layers, crop, change, size_px
-        self._closer, self._device = closer, device
+    views: TrainingViews
+    crop: Crop
+    change: torch.nn.Module
+    size_px: tuple[int, int]
+    closer: float
+    device: torch.device
+
+    def __post_init__(self) -> None:
+        self._layers = self.views.layers
+        if self.device.type == "cuda":
+            free_bytes, _ = torch.cuda.mem_get_info(self.device)
+            if self._layers.nbytes < PART_OF_MEMORY * free_bytes:
+                self._layers = self._layers.to(self.device)
 
     def draw(self, count: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return pictures, `(count, 3, h, w)`, and shares of block and mouth, `(count, 2, h, w)`."""
         frame = torch.randint(len(self._layers), (count,))
-        look = (torch.rand(count) < self._closer).long()
+        look = (torch.rand(count) < self.closer).long()
         # Nothing here waits until the device has taken something.
         place = (index.to(self._layers.device, non_blocking=True) for index in (frame, look))
-        taken = self._layers[tuple(place)].to(self._device, non_blocking=True)
-        seen = torch.tensor(SEEN)[look].to(self._device, non_blocking=True)
-        windows = self._crop.windows(seen, (taken.shape[2], taken.shape[3]))
-        layers = cut_windows(taken, windows, self._size_px)
-        return self._change(layers[:, :3]).clamp(0.0, 1.0), layers[:, 3:]
+        taken = self._layers[tuple(place)].to(self.device, non_blocking=True)
+        seen = torch.tensor(SEEN)[look].to(self.device, non_blocking=True)
+        windows = self.crop.windows(seen, (taken.shape[2], taken.shape[3]))
+        layers = cut_windows(taken, windows, self.size_px)
+        return self.change(layers[:, :3]).clamp(0.0, 1.0), layers[:, 3:]
 
 
 def cut_windows(
@@ -251,9 +254,7 @@ def _read_frame(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         return picture, np.zeros((*picture.shape[:2], 2), np.uint8), "negative"
     label = dataset.read_label(path)
     if label.block.shape != picture.shape[:2]:
-        raise FrameError(
-            f"{color}: {picture.shape[1::-1]} px, its mask {label.block.shape[::-1]} px"
-        )
+        raise FrameError(f"{color}: {picture.shape[1::-1]} px, mask {label.block.shape[::-1]} px")
     condition = dataset.read_truth(path).scene if dataset.is_whole(path) else "unknown"
     known = np.stack([label.block, label.hole_mask], axis=-1).astype(np.uint8) * np.uint8(255)
     return picture, known, condition
@@ -273,3 +274,41 @@ def _choose_windows(
     closer = center_window(box, size_px, (room - 1.0) / 2.0)
     room *= max(1.0, size_px[0] / ENLARGED / closer.width)
     return [first, center_window(box, size_px, (room - 1.0) / 2.0)]
+
+
+@spec
+class Augmentation:
+    """Changes of pictures by kornia, each drawn for itself.
+
+    Attributes:
+        probability: Share of the pictures that each change meets.
+        brightness: Range of the added brightness plus 1: 1 changes nothing.
+        contrast: Range of the factor on the brightness.
+        gamma: Range of the exponent of the tone curve.
+        blur_px: Range of the standard deviation of the blur, px of the network's picture.
+        motion_px: Way of the camera while the shutter was open, px.
+        noise: Standard deviation of the noise, of full scale.
+    """
+
+    probability: Share
+    brightness: PositiveRange
+    contrast: PositiveRange
+    gamma: PositiveRange
+    blur_px: PositiveRange
+    motion_px: Annotated[int, Ge(4), MultipleOf(2)]
+    noise: NonNegative
+
+    def build(self) -> torch.nn.Module:
+        """Return the changes of RGB pictures in [0, 1], `(B, 3, h, w)`; they draw from torch."""
+        from kornia import augmentation
+
+        share = self.probability
+        side_px = 2 * math.ceil(3.0 * self.blur_px[1]) + 1
+        return torch.nn.Sequential(
+            augmentation.RandomBrightness(self.brightness, p=share),
+            augmentation.RandomContrast(self.contrast, p=share),
+            augmentation.RandomGamma(self.gamma, p=share),
+            augmentation.RandomGaussianBlur((side_px, side_px), self.blur_px, p=share),
+            augmentation.RandomMotionBlur(self.motion_px + 1, 180.0, 0.0, p=share),
+            augmentation.RandomGaussianNoise(0.0, self.noise, p=share),
+        )

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from annotated_types import Ge
 
@@ -15,12 +17,82 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import Count, Positive, spec
+from perception.segment import unet
 from perception.segment.network import LEAST_BLOCK, THRESHOLD, find_weights
 from perception.segment.unet import UNet, compute_loss, read_checkpoint
-from perception.train import evaluation, export
+from perception.segment.window import center_window, cover_picture
 from perception.train import samples as training_data
-from perception.train.augmentation import Augmentation
-from perception.train.samples import PICTURES, Crop, Samples
+from perception.train.samples import (
+    LOOKS,
+    PICTURES,
+    ROOM,
+    Augmentation,
+    Crop,
+    Samples,
+    TrainingViews,
+)
+
+BATCH = 32
+
+
+def crop_segmenter_views(
+    views: TrainingViews, size_px: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the segmenter's pictures, `(F, 2, 3, h, w)` uint8, and their masks, `(F, 2, 2, h, w)`."""
+    width, height = size_px
+    full = tuple(views.layers.shape[3:])
+    height_px, width_px = full
+    beside = 0.5 * (1.0 - 1.0 / ROOM)
+    room = (width_px * beside, height_px * beside, width_px / ROOM, height_px / ROOM)
+    seen = np.empty((len(views), len(LOOKS), 5, height, width), np.uint8)
+    windows = cover_picture(full, size_px), center_window(room, size_px, 0.0)
+    for look, window in enumerate(windows):
+        for frame in range(len(views)):
+            layers = views.layers[frame, look].numpy().transpose(1, 2, 0)
+            for part in (slice(0, 3), slice(3, 5)):
+                taken = window.take(np.ascontiguousarray(layers[..., part]), size_px)
+                seen[frame, look, part] = taken.transpose(2, 0, 1)
+    layers = torch.from_numpy(seen)
+    return layers[:, :, :3], layers[:, :, 3:] > 127
+
+
+@torch.no_grad()
+def predict(network: UNet, pictures: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """Return probabilities, `(F, 2, 2, h, w)` on the CPU, for pictures `(F, 2, 3, h, w)` uint8."""
+    network.eval()
+    flat, found = pictures.flatten(0, 1), []
+    for first in range(0, len(flat), BATCH):
+        batch = flat[first : first + BATCH].to(device).float() / 255.0
+        found.append(torch.sigmoid(network(batch)).float().cpu())
+    return torch.cat(found).unflatten(0, pictures.shape[:2])
+
+
+def compute_metrics(
+    probabilities: torch.Tensor, known: torch.Tensor, conditions: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """Return figures for each condition, and for all frames under `all`.
+
+    `block`: intersection over union of the block, seen as a whole. `mouth`: that of mouths, in the
+    closer view; both over all pixels of all frames, `None` where there is nothing to find.
+    `frames`: how many.
+    """
+    said = probabilities > THRESHOLD
+    block, mouth = (said[:, 0, 0], known[:, 0, 0]), (said[:, 1, 1], known[:, 1, 1])
+    table = {}
+    for name in ("all", *sorted(set(conditions))):
+        chosen = np.array([name in ("all", condition) for condition in conditions])
+        index = torch.from_numpy(chosen)
+        table[name] = {
+            "block": _compute_iou(block[0][index], block[1][index]),
+            "mouth": _compute_iou(mouth[0][index], mouth[1][index]),
+            "frames": int(chosen.sum()),
+        }
+    return table
+
+
+def _compute_iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
+    return float((said & known).sum() / (said | known).sum()) if known.any() else None
+
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +164,7 @@ class SegmenterTraining:
         One that is stopped leaves the best network so far, with which `start` goes on.
 
         Returns:
-            The content of `training.json`: `conditions` (see `evaluation.compute_metrics`),
+            The content of `training.json`: `conditions` (see `compute_metrics`),
                 `best_update`, `parameters`, `parity`, …
 
         Raises:
@@ -124,7 +196,7 @@ class _Training:
 
     def run(self) -> dict[str, Any]:
         settings = self._settings
-        pictures, known = evaluation.crop_segmenter_views(self._unseen, settings.size_px)
+        pictures, known = crop_segmenter_views(self._unseen, settings.size_px)
         total = torch.zeros((), device=self._device)
         counts = len(self._train), len(self._unseen)
         log.info("%d frames to train on, %d to judge by, %s", *counts, self._device)
@@ -197,7 +269,7 @@ class _Training:
         self._train, self._unseen = views.part(slice(0, ends[0])), views.part(slice(*ends))
         # As the segmenter sees them, `(F, 2, 3, h, w)`; none where there are no negatives.
         rest = views.part(slice(ends[1], None))
-        self._negatives = evaluation.crop_segmenter_views(rest, settings.size_px)[0]
+        self._negatives = crop_segmenter_views(rest, settings.size_px)[0]
 
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         self._network.train()
@@ -244,23 +316,21 @@ class _Training:
         # A separate network: the one under training must not change.
         network = UNet(self._settings.widths).to(self._device)
         network.load_state_dict(self._mean)
-        probabilities = evaluation.predict(network, pictures, self._device)
-        figures = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)["all"]
+        probabilities = predict(network, pictures, self._device)
+        figures = compute_metrics(probabilities, known, self._unseen.conditions)["all"]
         block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
         quiet = self._measure_quiet(network)
         point = {"update": self._update, "loss": mean_loss}
         self._curve.append(point | {"block": block, "mouth": mouth, "quiet": quiet})
         if mean_loss is not None and not math.isfinite(mean_loss):
-            raise CheckpointError(
-                f"the training diverged before update {self._update}; try a smaller training.rate"
-            )
+            raise CheckpointError(f"diverged before update {self._update}; lower training.rate")
         score = block + mouth + (quiet or 0.0)
         if score > self._best["score"]:
             self._best = {"score": score, "update": self._update}
             # On the processor: the best weights must not occupy the card twice.
             self._best_network = network.cpu().eval().requires_grad_(False)
             header = self._build_header(block, mouth)
-            export.write_checkpoint(self._folder / export.TENSORS, self._best_network, header)
+            unet.write_checkpoint(self._folder / unet.TENSORS, self._best_network, header)
         passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
         told = self._update, passed, block, mouth
         log.info("update %d: %soverlap of blocks %.3f, of mouths %.3f", *told)
@@ -269,7 +339,7 @@ class _Training:
         """Return the share of unseen negatives on which the network names no block."""
         if not len(self._negatives):
             return None
-        probabilities = evaluation.predict(network, self._negatives, self._device)
+        probabilities = predict(network, self._negatives, self._device)
         named = (probabilities[:, :, 0] > THRESHOLD).float().mean((2, 3)).amax(1)
         return float((named < LEAST_BLOCK).float().mean())
 
@@ -281,17 +351,17 @@ class _Training:
             "update": self._update,
             "margin": self._settings.margin,
         }
-        return export.build_header(self._network, self._settings.size_px, facts)
+        return unet.build_header(self._network, self._settings.size_px, facts)
 
     def _finish(self, pictures: torch.Tensor, known: torch.Tensor) -> dict[str, Any]:
         network = self._best_network
-        probabilities = evaluation.predict(network.to(self._device), pictures, self._device)
-        conditions = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)
+        probabilities = predict(network.to(self._device), pictures, self._device)
+        conditions = compute_metrics(probabilities, known, self._unseen.conditions)
         network.cpu()
-        _, header = read_checkpoint(self._folder / export.TENSORS)
+        _, header = read_checkpoint(self._folder / unet.TENSORS)
         # Eight pictures show a wrong export as surely as all.
         compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
-        parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
+        parity = unet.write_onnx(self._folder / unet.ONNX, network, header, compared)
         return {
             "schema": 1,
             "conditions": conditions,
@@ -299,7 +369,7 @@ class _Training:
             "updates": self._update,
             "seconds": self._seconds,
             "parameters": sum(value.numel() for value in network.parameters()),
-            "onnx_bytes": (self._folder / export.ONNX).stat().st_size,
+            "onnx_bytes": (self._folder / unet.ONNX).stat().st_size,
             "parity": parity,
             "frames": {"train": len(self._train), "validation": len(self._unseen)},
             "device": str(self._device),

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from composed import option
-from drawn import AXIS, CENTER, K, both_views, drawn
+from drawn import AXIS, CENTER, K, as_color, both_views, drawn
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks
-from perception import rim_scale, search
+from perception import dataset, pair_check, search
+from perception.camera import CameraModel, write_camera
 from perception.contracts import SizePrior
 from perception.finder import StagedFinder, rectify
 
@@ -57,10 +61,10 @@ def test_depth_of_a_wrong_scale_is_named_by_its_factor(factor: float) -> None:
     finder = finder_with(masks)
     found = finder.find(wrong)
     assert not found.holes
-    (named,) = [one for one in found.rejected if one.reason == rim_scale.OF_DEPTH]
+    (named,) = [one for one in found.rejected if one.reason == pair_check.OF_DEPTH]
     assert named.value == pytest.approx(factor, rel=0.1)
     assert "unit of depth" in finder.explain(named)
-    assert not any(one.reason == rim_scale.OF_DEPTH for one in finder.find(frame).rejected)
+    assert not any(one.reason == pair_check.OF_DEPTH for one in finder.find(frame).rejected)
 
 
 @pytest.mark.parametrize(("score", "is_kept"), [(0.3, False), (0.9, True)])
@@ -75,7 +79,7 @@ def test_a_rim_of_another_size_outweighs_holes_that_are_less_sure(
     doubled = replace(frame, depth_m=(2.0 * frame.depth_m).astype(np.float32))
     found = settings.build().find(doubled)
     assert bool(found.holes) == is_kept
-    assert any(one.reason == rim_scale.OF_DEPTH for one in found.rejected) != is_kept
+    assert any(one.reason == pair_check.OF_DEPTH for one in found.rejected) != is_kept
 
 
 def test_a_pair_without_depth_is_matched_and_its_hole_is_where_it_is() -> None:
@@ -84,13 +88,9 @@ def test_a_pair_without_depth_is_matched_and_its_hole_is_where_it_is() -> None:
     views = both_views(AXIS / (AXIS @ CENTER), K[0, 0] * 0.12, np.random.default_rng(5))
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(float)
     shift = K[0, 0] * 0.12 / frame.depth_m
-    moved = cv2.remap(
-        gray.astype(np.float32), (u + shift).astype(np.float32), v.astype(np.float32), 1
-    )
-    left, right = gray + 12 * views[0], moved + 12 * views[1]
-    color, other = (
-        np.repeat(np.clip(one, 0, 255).astype(np.uint8)[..., None], 3, 2) for one in (left, right)
-    )
+    place = (u + shift).astype(np.float32), v.astype(np.float32)
+    moved = cv2.remap(gray.astype(np.float32), *place, 1)
+    color, other = as_color(gray + 12 * views[0]), as_color(moved + 12 * views[1])
     nothing = np.full_like(frame.depth_m, np.nan)
     pair = replace(frame, color=color, right=other, baseline_m=0.12, depth_m=nothing)
     (hole,) = finder_with(masks).find(pair).holes
@@ -142,21 +142,14 @@ class Drawn:
 def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
     depth_m = np.full((480, 640), 2.0, np.float32)
     depth_m[:, 320:] = 3.2  # two faces: holes of 26 and 16 px
-    frame = replace(
-        drawn()[0],
-        depth_m=depth_m,
-        camera_matrix=np.array([[1056.0, 0, 319.5], [0, 1056.0, 239.5], [0, 0, 1]]),
-    )
-    seen = [
-        Ellipse(x, 240.0, 25.0, 20.0, 0.0, rms_px=0.1, coverage=1.0, score=0.8)
-        for x in (150.0, 500.0)
-    ]
-    levels = search.plan_search_levels(frame, np.ones(depth_m.shape, bool), 0.05, 0.35, 10.0)
-    missed = {
-        one.x: level.find_missed_limit(one)
-        for level in levels
-        for one in level.detect(Drawn(seen), np.zeros(depth_m.shape, np.uint8))
-    }
+    matrix = np.array([[1056.0, 0, 319.5], [0, 1056.0, 239.5], [0, 0, 1]])
+    frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=matrix)
+    one = Ellipse(150.0, 240.0, 25.0, 20.0, 0.0, rms_px=0.1, coverage=1.0, score=0.8)
+    detector, missed = Drawn([one, replace(one, x=500.0)]), {}
+    everywhere, gray = np.ones(depth_m.shape, bool), np.zeros(depth_m.shape, np.uint8)
+    for level in search.plan_search_levels(frame, everywhere, 0.05, 0.35, 10.0):
+        for found in level.detect(detector, gray):
+            missed[found.x] = level.find_missed_limit(found)
     assert missed[150.0] is None
     # 16.5 px at 3.2 m, and a slack of 35 %
     assert missed[500.0] == pytest.approx(16.5 * 1.35, rel=1e-6)
@@ -179,9 +172,8 @@ def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks
         where = np.zeros(mask.shape, bool)
         top, left = (np.flatnonzero(level.region.any(1 - k))[0] * search.STEP for k in (0, 1))
         part = np.kron(detector.roi, np.ones((level.shrink, level.shrink))) > 0
-        where[top : top + part.shape[0], left : left + part.shape[1]] = part[
-            : 480 - top, : 640 - left
-        ]
+        part = part[: 480 - top, : 640 - left]
+        where[top : top + part.shape[0], left : left + part.shape[1]] = part
         return level.shrink, where
 
     plain, everywhere = looked(1 / inverse)
@@ -190,3 +182,59 @@ def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks
     assert closer < plain
     assert not beside[[260, 261, 262, 338, 339, 340]][:, 160:480].any()  # its edges
     assert beside[240:257, 160:480].all() and beside[344:360, 160:480].all()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    place = tmp_path / "frames"
+    place.mkdir()
+    write_camera(place, CameraModel(K, size_px=(640, 480), base_from_camera=np.eye(4)))
+    frame, masks, _ = drawn()
+    label = dataset.FrameLabel(
+        masks.block > 0.5, np.zeros(masks.block.shape, bool), np.zeros(masks.block.shape, bool)
+    )
+    for number in range(3):
+        dataset.write_frame(place / f"{number:05d}", frame.color, frame.depth_m, label=label)
+    cut = (place / "00001.color.png").read_bytes()
+    (place / "00001.color.png").write_bytes(cut[: len(cut) // 2])
+    return place
+
+
+def test_holes_overlays_and_refusals_are_written(folder: Path, brokk: Callable) -> None:
+    done = brokk(
+        "mode=perceive", f"perceive.input={folder}", "session.out=out", "tracker.confirm=1",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    frames = json.loads(Path("out/holes.json").read_text())["frames"]
+    assert [("refused" in frame) for frame in frames] == [False, True, False]
+    assert "truncated" in frames[1]["refused"] and "00001" in frames[1]["refused"]
+    hole = frames[0]["holes"][0]
+    assert hole["center_m"] == pytest.approx(CENTER.tolist(), abs=1e-3)
+    assert hole["frame"] == "base" and np.array(hole["cov_m2"]).shape == (3, 3)
+    assert frames[2]["target"]["num_frames"] == 2
+    assert cv2.imread("out/overlays/00000.png") is not None
+    assert not Path("out/overlays/00001.png").exists()
+    assert "1 hole" in Path("out/explain.txt").read_text()
+
+
+def test_ellipses_of_a_picture_need_no_depth(folder: Path, brokk: Callable) -> None:
+    for path in folder.glob("*.depth.npy"):
+        path.unlink()
+    command = ("mode=perceive", f"perceive.input={folder}", "perceive.until=ellipses")
+    done = brokk(*command, "source.needs=camera", "session.out=out")
+    assert done.code == 0, done.err
+    frame = json.loads(Path("out/holes.json").read_text())["frames"][0]
+    x, y, z = K @ CENTER
+    away_px = [np.hypot(one["x"] - x / z, one["y"] - y / z) for one in frame["ellipses"]]
+    assert min(away_px) < 2.0 and frame["holes"] == []
+    refused = brokk(*command, "perception=truth", "session.out=no")
+    assert refused.code == 2 and "expected perception=plane_conic" in refused.err
+
+
+def test_a_finder_that_only_finds_holes_is_enough(folder: Path, brokk: Callable) -> None:
+    done = brokk("mode=perceive", f"perceive.input={folder}", "perception=truth", "session.out=out")
+    assert done.code == 0, done.err
+    frames = json.loads(Path("out/holes.json").read_text())["frames"]
+    assert [len(frame["holes"]) for frame in (frames[0], frames[2])] == [1, 1]
+    assert frames[0]["holes"][0]["center_m"] == [2.6, 0.0, 0.4]
+    assert Path("out/overlays/00000.png").exists()

@@ -12,8 +12,13 @@ from composed import every, option
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
-from perception.mount.next_view import HoleBelief, ViewPlanner
-from perception.mount.occlusion import Capsules, compute_visible_share, sample_circle
+from perception.mount.mounts import (
+    Capsules,
+    HoleBelief,
+    ViewPlanner,
+    compute_visible_share,
+    sample_circle,
+)
 from perception.render.scene_ranges import view_from
 from perception.target_sensor import WatchedHole
 
@@ -141,10 +146,10 @@ def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) ->
 
 
 def watch(machine: Machine) -> WatchedHole:
-    settings = replace(option("target", "perceived"), delay_s=0.35, hint_m=0.03)
-    mount, planner = plan(machine, "mast")
+    mast = option("perception/mount", "mast")
+    settings = replace(option("target", "perceived"), mount=mast, delay_s=0.35, hint_m=0.03)
     scene = np.array([*HOLE_M, 0.0, 1.0, 0.05, 0.0])
-    return WatchedHole(settings, mount, planner, scene, np.random.default_rng(0))
+    return WatchedHole(settings, machine, scene, (0,))
 
 
 def detect(center_m: np.ndarray) -> HolePose:

@@ -8,25 +8,24 @@ import cv2
 import numpy as np
 import pytest
 from composed import option
-from drawn import K, drawn
+from drawn import K, as_color, drawn
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
-from brokk_rl.contracts.vision import HolePose
+from brokk_rl.contracts.vision import Ellipse, HolePose
 from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import pair_check
 from perception.render.stereo_camera import MisalignedPinhole, PairMisalignment
+from perception.segment.window import Window
+from perception.stereo import PairDepth, Stereo
 
 BASELINE_M, DEPTH_M = 0.12, 2.0
 
 
 def test_a_misaligned_camera_is_the_one_of_opencv() -> None:
-    error = PairMisalignment(
-        turn_rad=(2e-4, -3e-4, 5e-4),
-        focal=4e-4,
-        offset_px=(0.25, -0.3),
-        distortion_px=0.2,
-        seed=None,
-    )
+    shifts = {"offset_px": (0.25, -0.3), "distortion_px": 0.2, "seed": None}
+    error = PairMisalignment(turn_rad=(2e-4, -3e-4, 5e-4), focal=4e-4, **shifts)
     camera = MisalignedPinhole(1920, 1080, 1056.0, np.array([0.12, 0.0, 0.0]), error)
     pixel = np.random.default_rng(0).uniform([0, 0], [1919, 1079], (200, 2))
     points = camera.origin_m + 3.0 * camera.rays(pixel).astype(float)
@@ -56,19 +55,9 @@ def pair(down_px: float, roll_rad: float, seed: int = 0) -> Frame:
         borderMode=cv2.BORDER_REFLECT,
     )  # fmt: skip
     noise = np.random.default_rng(seed + 1).normal(0, 1.5, (2, 540, 960))
-    left, right = (
-        (one + n).clip(0, 255).astype(np.uint8)
-        for one, n in zip((grain, right), noise, strict=True)
-    )
-    return Frame(
-        color=np.repeat(left[..., None], 3, 2),
-        depth_m=np.full((540, 960), DEPTH_M, np.float32),
-        camera_matrix=matrix,
-        base_from_camera=None,
-        t_s=0.0,
-        right=np.repeat(right[..., None], 3, 2),
-        baseline_m=BASELINE_M,
-    )
+    left, right = as_color(grain + noise[0]), as_color(right + noise[1])
+    depth_m = np.full((540, 960), DEPTH_M, np.float32)
+    return Frame(left, depth_m, matrix, None, 0.0, right=right, baseline_m=BASELINE_M)
 
 
 def fault(frame: Frame) -> str | None:
@@ -103,14 +92,11 @@ def test_a_good_pair_of_a_repeated_pattern_is_not_refused() -> None:
         on = (x > 0) & (x < 12) & (y > 0) & (y < 9)
         gray = np.where(on, 60 + 140 * ((np.floor(x) + np.floor(y)) % 2), 130.0)
         noise = np.random.default_rng(seed).normal(0, 4.0, gray.shape)
-        gray = cv2.GaussianBlur(gray, (0, 0), 1.0) + noise
-        return np.repeat(gray.clip(0, 255).astype(np.uint8)[..., None], 3, 2)
+        return as_color(cv2.GaussianBlur(gray, (0, 0), 1.0) + noise)
 
     disparity_px = 528.0 * BASELINE_M / DEPTH_M
-    board = replace(
-        pair(0.0, 0.0), color=draw_chessboard(0.0, 1), right=draw_chessboard(disparity_px, 2)
-    )
-    assert fault(board) is None
+    left, right = draw_chessboard(0.0, 1), draw_chessboard(disparity_px, 2)
+    assert fault(replace(pair(0.0, 0.0), color=left, right=right)) is None
 
 
 def turn(frame: Frame, quarters: int) -> Frame:
@@ -184,9 +170,8 @@ def test_the_shared_covariance_is_what_a_wrong_disparity_does() -> None:
     moved_m2, turned_rad2 = np.zeros((3, 3)), np.zeros((3, 3))
     for pattern in (np.ones_like(x), x, y):
         disparity = pull_px / frame.depth_m + std_px * pattern
-        wrong = replace(
-            frame, depth_m=(pull_px / disparity).astype(np.float32), disparity_std_px=0.0
-        )
+        depth_m = (pull_px / disparity).astype(np.float32)
+        wrong = replace(frame, depth_m=depth_m, disparity_std_px=0.0)
         pose = estimator.estimate(wrong, masks, ellipse)
         assert isinstance(pose, HolePose)
         moved_m2 += np.outer(pose.center_m - plain.center_m, pose.center_m - plain.center_m)
@@ -194,3 +179,63 @@ def test_the_shared_covariance_is_what_a_wrong_disparity_does() -> None:
     # relative to the largest entry: the circle on the plane moves a little with it
     np.testing.assert_allclose(told.shared_m2, moved_m2, atol=0.06 * moved_m2.max())
     np.testing.assert_allclose(told.shared_rad2, turned_rad2, atol=0.06 * turned_rad2.max())
+
+
+FOCAL_PX = 1056.0
+PULL_PX = FOCAL_PX * BASELINE_M
+HEIGHT, WIDTH = 240, 480
+SLANT = 30.0 + 0.02 * np.arange(WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT, 0)
+"""Disparity of a slanted face at about 4 m, px."""
+
+
+@pytest.fixture(scope="module")
+def stereo() -> Stereo:
+    return instantiate(OmegaConf.load("conf/stereo.yaml"))
+
+
+def make_pair(disparity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a textured right picture and the left one that it makes by a disparity, grey."""
+    chance = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(chance.normal(0.0, 1.0, disparity.shape), (0, 0), 1.2)
+    right = np.clip(128.0 + 40.0 * texture / texture.std(), 0, 255).astype(np.float32)
+    columns, rows = np.meshgrid(*[np.arange(n, dtype=np.float32) for n in disparity.shape[::-1]])
+    left = cv2.remap(right, columns - disparity, rows, cv2.INTER_CUBIC)
+    return np.clip(left, 0, 255).astype(np.uint8), right.astype(np.uint8)
+
+
+def make_frame(disparity: np.ndarray, coarse_px: np.ndarray, shrink: int) -> Frame:
+    left, right = (cv2.cvtColor(some, cv2.COLOR_GRAY2RGB) for some in make_pair(disparity))
+    matrix = np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    depth_m = (PULL_PX / coarse_px).astype(np.float32)
+    return Frame(
+        left, depth_m, matrix, None, 0.0,
+        right=right, baseline_m=BASELINE_M, depth_shrink=shrink,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_a_part_in_a_band_is_matched_as_exactly_as_the_picture(stereo: Stereo, shrink: int) -> None:
+    left, right = make_pair(SLANT)
+    part = Window(200, 40, 161, 121)
+    found = replace(stereo, shrink=shrink).match_part(left, right, part, 25.0, 45.0)
+    assert found.shape == (121, 161)
+    error = (found - SLANT[40:161, 200:361])[:, :-8]
+    assert np.isfinite(error).mean() > 0.9
+    assert np.nanmedian(np.abs(error)) < 0.1 * shrink
+
+
+@pytest.mark.parametrize(("size_px", "shrink"), [(13.0, 1), (53.0, 4)])
+def test_the_face_of_a_known_hole_is_matched_as_finely_as_it_needs(
+    stereo: Stereo, size_px: float, shrink: int
+) -> None:
+    nothing = np.full_like(SLANT, np.nan)
+    frame = make_frame(SLANT, nothing, 1)
+    rise = np.array([SLANT[0, 1] - SLANT[0, 0], SLANT[1, 0] - SLANT[0, 0], SLANT[0, 0]])
+    place = Ellipse(260.0, 120.0, size_px, size_px, 0.0, rms_px=0.0, coverage=1.0, score=1.0)
+    matcher = PairDepth(stereo=stereo, radius_px=12.0, extent=3.0)
+    seen, face = matcher.match_near(frame, place, frame.camera_matrix.T @ rise / PULL_PX)
+    assert seen.depth_shrink == shrink
+    near = np.s_[100:140, 240:280]
+    assert np.nanmedian(np.abs(PULL_PX / seen.depth_m[near] - SLANT[near])) < 0.1 * shrink
+    assert face[near].mean() > 0.9
+    assert not np.isfinite(seen.depth_m[:, :90]).any() and not face[:, :90].any()

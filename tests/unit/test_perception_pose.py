@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from composed import option
-from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
+from drawn import AXIS, CENTER, RAYS, K, as_color, both_views, drawn
 
 from brokk_rl.contracts.vision import HolePose, Masks, Rejection
 from perception.ellipse import conic
 from perception.ellipse.conic import as_row as pose_row
-from perception.pose import alignment, appearance, consistency, plane
+from perception.pose import alignment, appearance, broken_rim, consistency, plane, rim
+from perception.pose.appearance import IN_DUST
+from perception.pose.consistency import FocalBelief, compute_focal_covariances
+from perception.pose.plane import FacePlane
 from perception.pose.plane_conic import convert_to_gray
-from perception.pose.wall_light import IN_DUST
+from perception.pose.rim import build_chart
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +29,8 @@ def estimator():
 def test_a_hole_is_where_it_was_drawn(estimator) -> None:
     pose = estimator.estimate(*drawn())
     assert isinstance(pose, HolePose)
-    assert pose.center_m == pytest.approx(
-        CENTER, abs=8e-4
-    )  # 0.3 px: the lit wall beyond the far rim blurs into it
+    # 0.3 px: the lit wall beyond the far rim blurs into it
+    assert pose.center_m == pytest.approx(CENTER, abs=8e-4)
     assert pose.axis == pytest.approx(AXIS, abs=1e-3)
     assert pose.radius_m == pytest.approx(0.05, abs=6e-4)
 
@@ -37,9 +40,8 @@ def test_a_third_of_a_rim_that_is_hidden_is_not_missed(estimator) -> None:
     color, depth_m = frame.color.copy(), frame.depth_m.copy()
     edge = int(ellipse.x + 0.35 * ellipse.a)
     color[:, edge:], depth_m[:, edge:] = 210, 0.5
-    hidden = replace(
-        ellipse, x=ellipse.x - 1.5, a=ellipse.a - 1.5
-    )  # an ellipse that takes the arm's edge for the rim
+    # an ellipse that takes the arm's edge for the rim
+    hidden = replace(ellipse, x=ellipse.x - 1.5, a=ellipse.a - 1.5)
     pose = estimator.estimate(replace(frame, color=color, depth_m=depth_m), masks, hidden)
     assert isinstance(pose, HolePose)
     assert pose.center_m == pytest.approx(CENTER, abs=1.5e-3)
@@ -60,14 +62,8 @@ def test_a_tone_curve_moves_no_rim_and_changes_no_evidence_once_it_is_known(esti
     slopes = []
     for one in (frame, curved):
         gray = convert_to_gray(one)  # not linearised: the ratio of logarithms needs no exponent
-        slopes.append(
-            appearance.measure_interior(gray, one.depth_m, pose_row(ellipse), K, face).slope
-        )
+        slopes.append(appearance.measure_interior(gray, one, pose_row(ellipse), face).slope)
     assert slopes[0] < -0.17 and slopes[1] == pytest.approx(slopes[0], rel=0.2)
-
-
-def as_color(gray: np.ndarray) -> np.ndarray:
-    return np.repeat(np.rint(np.clip(gray, 0, 255)).astype(np.uint8)[..., None], 3, 2)
 
 
 def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -> None:
@@ -76,16 +72,14 @@ def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -
     m, row, pull_px = AXIS / (AXIS @ CENTER), pose_row(ellipse), K[0, 0] * 0.12
     off, ray = 0.3 / pull_px, CENTER / CENTER[2]
     depth = (1.0 / (RAYS @ m + off)).astype(np.float32)
-    begin = plane.FacePlane(
-        m + np.array([0.0, 0.0, off]), np.diag([1e-4, 1e-4, 1.0]), 0.5 / pull_px, 7.0
-    )
+    start = m + np.array([0.0, 0.0, off])
+    begin = plane.FacePlane(start, np.diag([1e-4, 1e-4, 1.0]), 0.5 / pull_px, 7.0)
     errors, claims = [], []
     for _ in range(16):
         views = both_views(m, pull_px, generator)
         # dust: grain of four grey levels, noise of six
-        color, partner = (
-            as_color(120 + 16 * one + generator.normal(0, 6, one.shape)) for one in views
-        )
+        dusty = [120 + 16 * one + generator.normal(0, 6, one.shape) for one in views]
+        color, partner = map(as_color, dusty)
         seen = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
         both = alignment.crop_pair(seen, convert_to_gray(seen), begin.m, row, begin.extent)
         assert both is not None
@@ -106,9 +100,8 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     color = as_color(120 + 60 * left)
     partner = as_color(0.9 * np.clip(120 + 60 * right, 0, 255) + 8)
     off = 0.1 / pull_px  # a tenth of a pixel
-    depth = (1.0 / (RAYS @ m + off + generator.normal(0, 0.3, (480, 640)) / pull_px)).astype(
-        np.float32
-    )
+    noisy = RAYS @ m + off + generator.normal(0, 0.3, (480, 640)) / pull_px
+    depth = (1.0 / noisy).astype(np.float32)
     frame = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
     allowed = masks.block > 0.5
     points = plane.collect_support(depth, allowed, K, row, 0.05, 1.25, 2.6, 7.0, 8000, 24)
@@ -121,9 +114,8 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     shifted = replace(frame, right=np.roll(partner, 7, 0))
     other = alignment.crop_pair(shifted, convert_to_gray(frame), face.m, row, face.extent)
     assert other is not None
-    assert (
-        alignment.align_plane(other, face, shifted, allowed, row, 1.25, 24) is None
-    )  # rows that belong to others
+    # rows that belong to others
+    assert alignment.align_plane(other, face, shifted, allowed, row, 1.25, 24) is None
     ray = CENTER / CENTER[2]
     assert mended is not None
     assert (face.m - m) @ ray == pytest.approx(off, rel=0.2)
@@ -149,9 +141,8 @@ def test_what_is_no_hole_of_this_kind_is_refused(
 
 def test_an_ellipse_that_is_no_circle_on_the_face_is_refused(estimator) -> None:
     frame, masks, ellipse = drawn()
-    refused = estimator.estimate(
-        frame, masks, replace(ellipse, a=ellipse.a * 1.25, b=ellipse.b / 1.25)
-    )
+    longer = replace(ellipse, a=ellipse.a * 1.25, b=ellipse.b / 1.25)
+    refused = estimator.estimate(frame, masks, longer)
     assert isinstance(refused, Rejection) and refused.reason == "axis ratio on the face"
 
 
@@ -198,13 +189,8 @@ def test_an_arc_may_be_taken_for_a_smaller_rim_where_something_hides_the_rest(
     arm: bool, estimator
 ) -> None:
     frame, masks, ellipse = drawn()
-    smaller = replace(
-        ellipse,
-        x=ellipse.x - 0.24 * ellipse.a,
-        a=0.75 * ellipse.a,
-        b=0.75 * ellipse.b,
-        coverage=0.65,
-    )
+    smaller = replace(ellipse, x=ellipse.x - 0.24 * ellipse.a, coverage=0.65)
+    smaller = replace(smaller, a=0.75 * ellipse.a, b=0.75 * ellipse.b)
     if arm:
         color, depth_m = frame.color.copy(), frame.depth_m.copy()
         edge = int(ellipse.x + 0.4 * ellipse.a)
@@ -234,27 +220,23 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(
         right[:, edge - 127 : edge - 37] = 60
         depth_m[:, edge : edge + 90] = 0.5
         depth_m[:, edge - 74 : edge] = np.nan
-    frame = replace(
-        frame, color=as_color(left), right=as_color(right), baseline_m=0.12, depth_m=depth_m
-    )
+    pair = {"color": as_color(left), "right": as_color(right), "baseline_m": 0.12}
+    frame = replace(frame, **pair, depth_m=depth_m)
     found = estimator.estimate(frame, masks, ellipse)
     if arm:
         assert isinstance(found, HolePose) and found.score == pytest.approx(0.5 * ellipse.score)
     else:
         assert isinstance(found, Rejection) and found.reason == "evidence of depth inside"
-        learned = estimator.estimate(
-            frame, replace(masks, hole_mask=np.ones_like(masks.block)), ellipse
-        )
-        assert isinstance(learned, Rejection) and learned.reason == found.reason, (
-            "no network overrules two cameras"
-        )
+        # no network overrules two cameras
+        everywhere = replace(masks, hole_mask=np.ones_like(masks.block))
+        learned = estimator.estimate(frame, everywhere, ellipse)
+        assert isinstance(learned, Rejection) and learned.reason == found.reason
 
 
 def test_the_mouth_channel_is_believed(estimator) -> None:
     frame, masks, ellipse = drawn()
-    refused = estimator.estimate(
-        frame, replace(masks, hole_mask=np.zeros_like(masks.block)), ellipse
-    )
+    none = replace(masks, hole_mask=np.zeros_like(masks.block))
+    refused = estimator.estimate(frame, none, ellipse)
     assert isinstance(refused, Rejection) and refused.reason == "mouth probability inside"
 
 
@@ -272,16 +254,11 @@ def test_points_on_a_line_or_of_one_patch_alone_determine_no_plane() -> None:
         support = plane.FaceSupport(rays, rays @ m, np.full(400, 2.0), np.arange(400) // 20)
         assert plane.fit_plane(support, (2.6,), 2e-4, generator) is None
     rays = np.column_stack([generator.uniform(-0.1, 0.1, (400, 2)), np.ones(400)])
-    lonely = np.where(
-        np.arange(400) < 240, rays @ m, rays @ m + generator.uniform(1.0, 9.0, 400)
-    )  # the rest agrees with nothing
+    # the rest agrees with nothing
+    lonely = rays @ m + np.where(np.arange(400) < 240, 0.0, generator.uniform(1.0, 9.0, 400))
     cell = np.maximum(np.arange(400) - 240, 0) // 10
-    assert (
-        plane.fit_plane(
-            plane.FaceSupport(rays, lonely, np.full(400, 2.0), cell), (2.6,), 2e-4, generator
-        )
-        is None
-    )
+    support = plane.FaceSupport(rays, lonely, np.full(400, 2.0), cell)
+    assert plane.fit_plane(support, (2.6,), 2e-4, generator) is None
 
 
 def test_an_inside_that_is_nearer_than_its_face_is_no_hole(estimator) -> None:
@@ -330,3 +307,127 @@ def test_a_baseline_by_which_a_rim_has_another_size_is_refused_by_its_factor(
     assert isinstance(found, Rejection)
     assert found.reason == consistency.SIZE
     assert found.value == pytest.approx(factor, rel=0.01)
+
+
+M = AXIS / (AXIS @ CENTER)
+
+
+def draw_broken(depths_m: np.ndarray) -> np.ndarray:
+    """Returns a dark hole `(480, 640)` whose wall begins at these depths below the face, by angle."""
+    chart = rim.build_chart(CENTER, M, K)
+    angle = np.linspace(0.0, 2 * np.pi, len(depths_m), endpoint=False)
+    circle = np.cos(angle)[:, None] * chart.first + np.sin(angle)[:, None] * chart.second
+    # the axis points out of the hole
+    points = CENTER + 0.05 * circle - depths_m[:, None] * AXIS
+    pixels = points @ K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    picture = np.full((480 * 4, 640 * 4), 170, np.uint8)
+    cv2.fillPoly(picture, [np.rint(4 * pixels + 1.5).astype(np.int32)], 25)
+    small = cv2.resize(picture, (640, 480), interpolation=cv2.INTER_AREA)
+    return cv2.GaussianBlur(small, (0, 0), 0.7)
+
+
+@pytest.mark.parametrize("broken", [0.0, 0.5, 0.8])
+def test_the_centre_of_a_broken_rim_is_that_of_its_whole_pieces(broken: float) -> None:
+    angle = np.linspace(0.0, 1.0, 360, endpoint=False)
+    # four chips of 12 mm around the rim, of which a part is whole
+    depths_m = 0.012 * np.maximum(np.sin(8 * np.pi * angle) - np.cos(np.pi * broken), 0.0)
+    depths_m = depths_m * (broken > 0)
+    chart = rim.build_chart(CENTER, M, K)
+    start_m = np.array([0.012, -0.008])
+    found = broken_rim.fit_broken_rim(draw_broken(depths_m), chart, None, start_m, 0.05, 0.024)
+    assert found is not None
+    assert found.coverage > 0.7
+    off = found.center_m - CENTER
+    assert np.linalg.norm(off) < 3e-3
+    # the error is what is claimed, within three deviations
+    claimed = np.sqrt(np.trace(found.cov_m2))
+    assert np.linalg.norm(off) < 3.0 * claimed
+    # without a right picture the depth of the breaks is unknown
+    assert claimed < 6e-3
+
+
+def test_the_depth_of_a_break_is_read_from_both_pictures() -> None:
+    frame, _, ellipse = drawn()
+    # all of the surroundings lie 16 mm below the face
+    below = M / (1.0 + 0.016 * np.linalg.norm(M))
+    views = both_views(below, K[0, 0] * 0.12, np.random.default_rng(5))
+    color, right = (as_color(120 + 60 * one) for one in views)
+    frame = replace(frame, color=color, right=right, baseline_m=0.12)
+    row = pose_row(ellipse)
+    both = alignment.crop_pair(frame, convert_to_gray(frame), M, row, 4.0)
+    chart = rim.build_chart(CENTER, M, K)
+    profiles = rim.find_profile_edges(convert_to_gray(frame), row, 10.0, chart)
+    assert both is not None and profiles is not None
+    odds = broken_rim.compare_depths(both, chart, profiles, float(np.sqrt(row[2] * row[3])))
+    assert broken_rim.DEPTHS_M[int(np.argmax(odds.sum(0)))] == pytest.approx(0.016, abs=2e-3)
+
+
+DOUBT = option("perception/pose", "plane_conic").focal
+
+
+def believe(factors: tuple[float, ...], is_same_rim: bool = False) -> FocalBelief:
+    """Returns what rims with these factors leave, each measured to a hundredth."""
+    belief = FocalBelief(DOUBT)
+    belief.begin(drawn()[0])
+    for number, factor in enumerate(factors):
+        place = 0.0 if is_same_rim else 100.0 * number
+        row = np.array([place, 200.0, 20.0, 15.0, 0.0])
+        belief.learn(row, K, float(np.log(factor)), 0.01)
+    return belief
+
+
+def test_without_a_rim_a_focal_length_may_be_off_by_the_usual_slip() -> None:
+    # The grid ends at three of these deviations.
+    assert believe(()).std == pytest.approx(np.sqrt(DOUBT.wrong) * DOUBT.slip_std, rel=0.03)
+    assert believe(()).find_slip() is None
+
+
+def test_rims_that_agree_make_a_right_focal_length_surer() -> None:
+    stds = [believe((1.0,) * number).std for number in (0, 1, 2, 4)]
+    assert stds == sorted(stds, reverse=True)
+    assert stds[-1] < 0.003
+    assert believe((1.0,) * 4, is_same_rim=True).std > stds[-1]
+
+
+def test_a_wrong_focal_length_is_covered_before_it_is_named_and_named_by_several_rims() -> None:
+    once = believe((1.15,))
+    assert once.find_slip() is None and 3.0 * once.std > np.log(1.15)
+    assert believe((1.15, 1.14, 1.16)).find_slip() == pytest.approx(1.15, abs=0.01)
+    gross = believe((1.0, 1.0, 1.3))
+    assert gross.find_slip() is None and gross.std < 0.03
+
+
+def test_another_camera_is_believed_anew_and_another_part_of_the_picture_is_not() -> None:
+    belief, frame = believe((1.0,) * 4), drawn()[0]
+    matrix = K.copy()
+    matrix[0, 2] += 200.0
+    belief.begin(replace(frame, camera_matrix=matrix))
+    assert belief.std < 0.003
+    belief.begin(replace(frame, camera_matrix=K * [[1.1], [1.1], [1.0]]))
+    assert belief.std > 0.2
+
+
+def test_the_covariance_of_a_hole_is_what_stretched_depth_does_to_it() -> None:
+    std, m = 0.01, AXIS / (AXIS @ CENTER)
+    shared_m2, shared_rad2 = compute_focal_covariances(CENTER, AXIS, std)
+    longer = m / [1.0, 1.0, 1.0 + std]
+    moved_m = CENTER * [1.0, 1.0, 1.0 + std] - CENTER
+    turned = -longer / np.linalg.norm(longer) - AXIS
+    np.testing.assert_allclose(shared_m2, np.outer(moved_m, moved_m), atol=1e-12)
+    np.testing.assert_allclose(shared_rad2, np.outer(turned, turned), atol=2e-6)
+
+
+def test_a_face_whose_tilt_is_wrong_stretches_a_rim_as_a_wrong_focal_length_does() -> None:
+    tilt_rad, std_rad = 0.6, 0.01
+    normal, across = np.array([0.0, -np.sin(tilt_rad), -np.cos(tilt_rad)]), np.eye(3)[0]
+    m = normal / float(normal @ [0.0, 0.0, 2.0])
+    # The plane of such a covariance turns about the axis across the slope by `std_rad`.
+    moved = float(np.linalg.norm(m)) * std_rad * np.cross(across, normal)
+    face = FacePlane(m, np.outer(moved, moved), 1e-4, 7.0)
+    chart = build_chart(np.array([0.0, 0.0, 2.0]), m, K)
+    # As it is seen, a rim is shorter by the cosine; on a steeper plane it is longer than it is wide.
+    longer = np.cos(tilt_rad) / np.cos(tilt_rad + std_rad)
+    by_focal = np.sqrt((longer**2 - np.cos(tilt_rad) ** 2) / np.sin(tilt_rad) ** 2)
+    doubt = consistency.measure_tilt_doubt(chart, face)
+    assert doubt == pytest.approx(np.log(by_focal), rel=0.03)

@@ -16,21 +16,20 @@ from composed import names, option
 
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
-from perception.render.camera_sensor import (
-    CameraExposure,
-    LinearCamera,
-    MosaicCamera,
-    draw_dust,
-    take_picture,
-)
 from perception.render.drilled_block import Chip, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer
-from perception.render.materials import Material
 from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import SceneSampler, compute_hidden_share, sample_rim
-from perception.render.solids import Box, PlaneSolid, SolidPose, build_frame
-from perception.render.stereo_camera import StereoRig
+from perception.render.solids import Box, Material, PlaneSolid, SolidPose, build_frame
+from perception.render.stereo_camera import (
+    CameraExposure,
+    LinearCamera,
+    MosaicCamera,
+    StereoRig,
+    draw_dust,
+    take_picture,
+)
 
 GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
 STONE = Material((0.5, 0.5, 0.5), 0.25, 0.0006, 2)
@@ -69,9 +68,8 @@ def kind(name: str) -> SceneRanges:
 def studio(
     name: str, rig: StereoRig, depth: Literal["matched", "exact", "none"] = "exact"
 ) -> FrameRenderer:
-    return FrameRenderer(
-        rig=rig, scene=kind(name), stereo=load_part("stereo"), depth=depth, pair=True
-    )  # type: ignore[arg-type]
+    stereo: Any = load_part("stereo")
+    return FrameRenderer(rig=rig, scene=kind(name), stereo=stereo, depth=depth, pair=True)
 
 
 def test_a_wall_that_fills_the_picture_is_drawn_though_no_edge_crosses_it() -> None:
@@ -89,18 +87,8 @@ def test_depths_into_a_hole_are_those_worked_by_hand() -> None:
     # the face.
     camera = Pinhole(321, 241, 400.0, np.zeros(3))  # its axis goes through pixel (160, 120)
     block = drilled(FACING, np.array([0.0, 0.0, 2.0]))
-    rays = camera.rays(
-        np.array(
-            [
-                [160.0, 120.0],
-                [168.0, 120.0],
-                [169.6, 120.0],
-                [172.0, 120.0],
-                [160.0, 129.6],
-                [160.0, 20.0],
-            ]
-        )
-    )
+    columns, rows = [160.0, 168.0, 169.6, 172.0, 160.0, 160.0], [120.0] * 4 + [129.6, 20.0]
+    rays = camera.rays(np.column_stack([columns, rows]))
     depth, part, _ = block.hit(np.zeros(3), rays)
     np.testing.assert_allclose(depth[:5], [2.3, 2.3, 0.05 / 0.024, 2.0, 0.05 / 0.024], atol=1e-5)
     assert part[0] == part[1] == 7 and part[2] == part[4] == 6 and part[3] == 5  # floor, wall, face
@@ -109,23 +97,19 @@ def test_depths_into_a_hole_are_those_worked_by_hand() -> None:
 
 @pytest.mark.parametrize("obliquity", [0.0, 0.61, 1.05])
 def test_the_mouth_is_the_projected_circle(obliquity: float) -> None:
-    rotation = (
-        FACING
-        @ cv2.Rodrigues(np.array([obliquity, 0.0, 0.0]))[0]
-        @ cv2.Rodrigues(np.array([0.0, 0.0, 0.4]))[0]
+    lean, turn = (
+        cv2.Rodrigues(np.array(one))[0] for one in ([obliquity, 0.0, 0.0], [0.0, 0.0, 0.4])
     )
+    rotation = FACING @ lean @ turn
     center = np.array([0.05, -0.03, 0.8])
     view = seen([drilled(rotation, center)])
     angle = np.linspace(0, 2 * np.pi, 2000)
     rim = center + 0.05 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) @ rotation.T
-    pixels = cv2.projectPoints(rim, np.zeros(3), np.zeros(3), SMALL.matrix, None)[0][:, 0].astype(
-        np.float32
-    )
-    inside = [
-        [cv2.pointPolygonTest(pixels, (float(x), float(y)), False) > 0 for x in range(320)]
-        for y in range(240)
-    ]
-    wrong = np.array(inside) != view.mouth
+    projected = cv2.projectPoints(rim, np.zeros(3), np.zeros(3), SMALL.matrix, None)[0]
+    pixels, inside = projected[:, 0].astype(np.float32), np.zeros((240, 320), bool)
+    for y, x in np.ndindex(inside.shape):
+        inside[y, x] = cv2.pointPolygonTest(pixels, (float(x), float(y)), False) > 0
+    wrong = inside != view.mouth
     assert view.mouth.sum() > 500
     assert wrong.sum() <= 2  # the polygon of 2000 points against the circle
 
@@ -133,9 +117,8 @@ def test_the_mouth_is_the_projected_circle(obliquity: float) -> None:
 def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
     # On the rim, 1 cm above the face: a bowl 22.9 mm wide, 15 mm deep.
     chip = Chip(np.array([0.05, 0.0, 0.31]), 0.025)
-    plain, chipped = (
-        drilled(FACING, np.array([0.0, 0.0, 1.0]), chips=chips) for chips in ((), (chip,))
-    )
+    ahead_m = np.array([0.0, 0.0, 1.0])
+    plain, chipped = drilled(FACING, ahead_m), drilled(FACING, ahead_m, chips=(chip,))
     before, after = seen([plain]), seen([chipped])
     np.testing.assert_array_equal(before.mouth, after.mouth)  # the drilled circle stays what it is
     deeper = after.depth_m - before.depth_m
@@ -149,9 +132,8 @@ def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
 
 def test_a_shadow_lies_where_the_light_is_blocked() -> None:
     wall = PlaneSolid("ground", SolidPose(FACING, np.array([0.0, 0.0, 2.0])), (GREY,))
-    board = Box(
-        "arm", SolidPose(np.eye(3), np.array([0.5, 0.0, 1.0])), np.array([0.1, 0.1, 0.01]), (GREY,)
-    )
+    pose = SolidPose(np.eye(3), np.array([0.5, 0.0, 1.0]))
+    board = Box("arm", pose, np.array([0.1, 0.1, 0.01]), (GREY,))
     # From x = 0 on the wall through x = 0.5, z = 1: the middle of the board.
     to_sun = np.array([1.0, 0.0, -2.0]) / np.sqrt(5)
     view = seen([wall, board], light=Light(to_sun, 1.0, 0.5))
@@ -165,33 +147,28 @@ def test_a_shadow_lies_where_the_light_is_blocked() -> None:
 def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: StereoRig) -> None:
     full = replace(rig, width=960, height=540, focal_px=1056.0)  # the middle of a 1080p picture
     rotation, center = build_frame(np.array([0.1, -0.57, -0.82]), 0.3), np.array([0.0, 0.0, 2.5])
-    tracer = Tracer(
-        [
-            drilled(rotation, center, STONE),
-            PlaneSolid("ground", SolidPose(FACING, np.array([0.0, 0.0, 5.0])), (STONE,)),
-        ],
-        NOON,
-        (0, 0, 0),
-    )
+    wall = PlaneSolid("ground", SolidPose(FACING, np.array([0.0, 0.0, 5.0])), (STONE,))
+    tracer = Tracer([drilled(rotation, center, STONE), wall], NOON, (0, 0, 0))
     exposure = CameraExposure(1.0, 0.0, 0.0, 0.0, 0.5, 8000.0, 8.0, 1.0, 0.0)
     chance = np.random.default_rng(0)
     views = [tracer.view(camera) for camera in (full.left, full.right)]
-    left, right = (
-        take_picture(
-            view.radiance, view.depth_m, exposure, draw_dust(0.0, chance), LinearCamera(), chance
-        )
-        for view in views
-    )
+    pictures = []
+    for view in views:
+        dust = draw_dust(0.0, chance)
+        seen_by = (exposure, dust, LinearCamera(), chance)
+        pictures.append(take_picture(view.radiance, view.depth_m, *seen_by))
+    left, right = pictures
     stereo = load_part("stereo")
     face = cv2.erode((views[0].solid == 0).astype(np.uint8), np.ones((21, 21))).astype(bool)
     face &= ~cv2.dilate(views[0].mouth.astype(np.uint8), np.ones((21, 21))).astype(bool)
     error, known = {}, {}
-    half = replace(stereo, shrink=2)
-    for name, matcher in (
-        ("refined", stereo),
-        ("plain", replace(stereo, refinements=0)),
-        ("half", half),
-    ):
+    changes: dict[str, dict[str, int]] = {
+        "refined": {},
+        "plain": {"refinements": 0},
+        "half": {"shrink": 2},
+    }
+    for name, change in changes.items():
+        matcher = replace(stereo, **change)
         depth = matcher.depth_m(left, right, 1056.0, 0.12)
         wrong = (1056.0 * 0.12 * (1 / depth - 1 / views[0].depth_m))[face]
         known[name], error[name] = np.isfinite(wrong).mean(), wrong[np.isfinite(wrong)]
@@ -218,16 +195,13 @@ def test_raw_noise_of_a_mosaic_is_that_of_its_electrons() -> None:
     # Red sees 0.5 / 2 of 8000 e: 2000 e, whose noise with 5 e of reading and 1 % of unevenness is
     # sqrt(2000 + 25 + 20^2) = 49.2 e. Green: 4000 e, sqrt(4000 + 25 + 40^2) = 75.0 e.
     camera = plain_mosaic(full_well_e=8000.0, read_noise_e=5.0, photo_response=0.01, pattern=7)
-    raw = 8000.0 * camera.read_out(
-        np.full((600, 600, 3), 0.5, np.float32), np.random.default_rng(0)
-    )
+    light = np.full((600, 600, 3), 0.5, np.float32)
+    raw = 8000.0 * camera.read_out(light, np.random.default_rng(0))
     assert raw[::2, ::2].mean() == pytest.approx(2000, rel=0.002)
     assert raw[::2, ::2].std() == pytest.approx(49.2, rel=0.02)
     assert raw[::2, 1::2].std() == pytest.approx(75.0, rel=0.02)
     # Another picture of the same camera: unevenness is the same, the rest is new.
-    again = 8000.0 * camera.read_out(
-        np.full((600, 600, 3), 0.5, np.float32), np.random.default_rng(1)
-    )
+    again = 8000.0 * camera.read_out(light, np.random.default_rng(1))
     assert (raw - again)[::2, ::2].std() == pytest.approx(np.sqrt(2 * 2025), rel=0.02)
 
 
@@ -249,9 +223,8 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(
         for hole in shot.truth.holes[:1]:
             center, base = np.array(hole.center_m), rig.base_from_camera
             assert np.array(hole.axis) @ center < 0  # out of the hole, towards the camera
-            np.testing.assert_allclose(
-                base[:3, :3] @ center + base[:3, 3], hole.center_in_base_m, atol=1e-9
-            )
+            in_base_m = base[:3, :3] @ center + base[:3, 3]
+            np.testing.assert_allclose(in_base_m, hole.center_in_base_m, atol=1e-9)
             x, y = rig.left.project(center)
             if hole.hidden == 0:
                 assert shot.label.hole_mask[round(y), round(x)]
@@ -268,19 +241,16 @@ def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: Ste
         scene = SceneSampler(near, large, chance).compose()
         shot = studio("hidden", large).shot(scene, chance)
         assert scene.block is not None
-        pixel = np.round(large.left.project(sample_rim(scene.block, scene.block.holes[0]))).astype(
-            int
-        )
+        rim = sample_rim(scene.block, scene.block.holes[0])
+        pixel = np.round(large.left.project(rim)).astype(int)
         covered = shot.label.arm[pixel[:, 1], pixel[:, 0]].mean()
         assert covered == pytest.approx(scene.conditions["hidden"], abs=0.05)
         assert compute_hidden_share([], scene.block, scene.block.holes[0]) == 0.0
 
 
 def digests(folder: Path) -> dict[str, str]:
-    return {
-        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.iterdir())
-    }
+    files = sorted(folder.iterdir())
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cuboid
 import numpy as np
 import pytest
 import torch
 from composed import option
+from drawn import blank
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.extensions import load_part
@@ -17,9 +19,9 @@ from brokk_rl.signals import Frame
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_sampler import SceneSampler
 from perception.segment import network as segment_network
+from perception.segment import unet
 from perception.segment.network import NetworkSegmenter
 from perception.segment.unet import UNet, read_checkpoint
-from perception.train import export
 
 SIZE_PX = (640, 360)
 
@@ -45,36 +47,25 @@ def test_planes_before_their_surroundings_are_the_block(
 
 def test_ground_alone_is_no_block_and_the_same_frame_gives_the_same_mask() -> None:
     segmenter = option("perception/segmenter", "depth_plane").build()
-    empty = cuboid.seen(
-        cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3)), SIZE_PX, 0.0024, with_box=False
-    )
+    pose = cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3))
+    empty = cuboid.seen(pose, SIZE_PX, 0.0024, with_box=False)
     assert segmenter.segment(empty.frame).block.max() < 0.5
-    view = cuboid.seen(cuboid.looking((-2.0, 0.4, 1.0), (0.0, 0.0, 0.3)), SIZE_PX, 0.0024)
-    np.testing.assert_array_equal(
-        segmenter.segment(view.frame).block, segmenter.segment(view.frame).block
-    )
+    view = cuboid.seen(pose, SIZE_PX, 0.0024)
+    one, other = (segmenter.segment(view.frame).block for _ in range(2))
+    np.testing.assert_array_equal(one, other)
 
 
 def test_what_stands_before_a_face_is_not_part_of_it_and_a_mouth_is() -> None:
-    view = cuboid.seen(
-        cuboid.looking((-1.6, -0.3, 0.8), (0.1, 0.0, 0.3)),
-        SIZE_PX,
-        0.0024,
-        occluder_m=(-0.4, -0.2, 0.45),
-    )
+    pose = cuboid.looking((-1.6, -0.3, 0.8), (0.1, 0.0, 0.3))
+    view = cuboid.seen(pose, SIZE_PX, 0.0024, occluder_m=(-0.4, -0.2, 0.45))
     found = option("perception/segmenter", "depth_plane").build().segment(view.frame).block > 0.5
     assert view.occluder.sum() > 1000
     assert (found & view.occluder).mean() < 0.1 * view.occluder.mean()
     assert (found & view.mouth).sum() > 0.9 * view.mouth.sum()
 
 
-def black() -> Frame:
-    color = np.zeros((360, 640, 3), np.uint8)
-    return Frame(color, np.ones((360, 640), np.float32), np.eye(3), None, 0.0)
-
-
 def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
-    frame = black()
+    frame = blank(360, 640)
     frame.color[100:200, 300:450] = 128  # the block
     frame.color[140:150, 380:390] = 255  # its mouth, two pixels at the first look
     shown = []
@@ -82,9 +73,8 @@ def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
     def infer(picture: np.ndarray) -> np.ndarray:
         shown.append(picture)
         bright = picture[0]
-        return np.stack([bright > 0.3, (bright > 0.95) & ((bright > 0.95).sum() > 20)]).astype(
-            np.float32
-        )
+        mouth = (bright > 0.95) & ((bright > 0.95).sum() > 20)
+        return np.stack([bright > 0.3, mouth]).astype(np.float32)
 
     once = NetworkSegmenter(infer, (160, 96), None).segment(frame)
     assert once.hole_mask is not None and once.hole_mask.max() == 0.0
@@ -95,10 +85,8 @@ def test_a_network_looks_twice_and_sees_a_mouth_it_was_too_far_from() -> None:
     assert cuboid.overlap(twice.block > 0.5, true_block) > 0.95
 
 
-def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_where_more_of_it_is() -> (
-    None
-):
-    frame = black()
+def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts() -> None:
+    frame = blank(360, 640)
     frame.color[100:200, 300:450] = 128
     shown = []
 
@@ -112,23 +100,21 @@ def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts_and_again_
         return np.stack([bright, 0.0 * bright]).astype(np.float32)
 
     masks = NetworkSegmenter(infer, (160, 96), 0.15).segment(frame)
-    assert len(shown) == 9, (
-        "the whole, six parts, and two closer looks, since the first of them changed the box"
-    )
+    # the whole, six parts, and two closer looks, since the first of them changed the box
+    assert len(shown) == 9
     assert cuboid.overlap(masks.block > 0.5, frame.color[..., 0] > 0) > 0.9
     shown.clear()
-    empty = NetworkSegmenter(
-        lambda picture: np.zeros((2, 96, 160), np.float32), (160, 96), 0.15
-    ).segment(frame)
+    nothing = np.zeros((2, 96, 160), np.float32)
+    empty = NetworkSegmenter(lambda picture: nothing, (160, 96), 0.15).segment(frame)
     assert not empty.block.any() and empty.hole_mask is not None and not empty.hole_mask.any()
 
 
 def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = UNet((4, 8, 8)).eval().requires_grad_(False)
-    header = export.build_header(network, (64, 32), {"update": 7})
-    export.write_checkpoint(tmp_path / "a.safetensors", network, header)
-    parity = export.write_onnx(tmp_path / "a.onnx", network, header, torch.rand(3, 3, 32, 64))
+    header = unet.build_header(network, (64, 32), {"update": 7})
+    unet.write_checkpoint(tmp_path / "a.safetensors", network, header)
+    parity = unet.write_onnx(tmp_path / "a.onnx", network, header, torch.rand(3, 3, 32, 64))
     assert parity < 1e-5
 
 
@@ -138,26 +124,19 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
     shared, either = np.zeros(2), np.zeros(2)
     for seed in (101, 103):
         chance, kind = np.random.default_rng(seed), option("scene", "clean")
-        studio = FrameRenderer(
-            rig=rig, scene=kind, stereo=load_part("stereo"), depth="none", pair=False
-        )
+        parts: Any = {"rig": rig, "scene": kind, "stereo": load_part("stereo")}
+        studio = FrameRenderer(**parts, depth="none", pair=False)
         shot = studio.shot(SceneSampler(kind, rig, chance).compose(), chance)
-        frame = Frame(
-            color=shot.color,
-            depth_m=shot.exact_depth_m,
-            camera_matrix=rig.left.matrix,
-            base_from_camera=None,
-            t_s=0.0,
-        )
+        frame = Frame(shot.color, shot.exact_depth_m, rig.left.matrix, None, 0.0)
         masks = segmenter.segment(frame)
         assert masks.hole_mask is not None
-        for k, (said, known) in enumerate(
-            ((masks.block > 0.5, shot.label.block), (masks.hole_mask > 0.5, shot.label.hole_mask))
-        ):
+        blocks, mouths = (masks.block, shot.label.block), (masks.hole_mask, shot.label.hole_mask)
+        for k, (said, known) in enumerate((blocks, mouths)):
+            said = said > 0.5
             shared[k] += (said & known).sum()
             either[k] += (said | known).sum()
     assert (shared / either > [0.9, 0.6]).all()
-    for name in (export.ONNX, export.TENSORS):
+    for name in (unet.ONNX, unet.TENSORS):
         assert (segment_network.SHIPPED / name).stat().st_size < 5_000_000
 
 
@@ -172,8 +151,8 @@ def test_files_that_are_no_network_of_ours_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"there is no file 'nowhere\.onnx'"):
         replace(onnx, weights="nowhere.onnx").build()
     network = UNet((4, 8)).eval()
-    other = export.build_header(network, (64, 32), {}) | {"channels": ["cat", "dog"]}
-    export.write_onnx(tmp_path / "other.onnx", network, other, torch.rand(1, 3, 32, 64))
+    other = unet.build_header(network, (64, 32), {}) | {"channels": ["cat", "dog"]}
+    unet.write_onnx(tmp_path / "other.onnx", network, other, torch.rand(1, 3, 32, 64))
     with pytest.raises(CheckpointError, match="channels block, mouth"):
         replace(onnx, weights=str(tmp_path / "other.onnx")).build()
     with pytest.raises(ConfigError, match="margin"):

@@ -8,21 +8,25 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cuboid
 import cv2
 import numpy as np
 import pytest
 import yaml
+from composed import option
+from drawn import blank
 
 from brokk_rl.contracts.vision import FrameDetections, HolePose
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
+from perception import dataset
+from perception.camera import CameraModel, read_pair_lens, write_camera
 from perception.label.camera_pose import BoardPose, Charuco
-from perception.label.measured import read_measured
+from perception.label.labeller import BlockLabelling, read_measured
 from perception.modes.score_camera import ScoreCamera, ScoreOptions
 from perception.segment.network import NetworkSegmenter
-from perception.sources.lens_file import read_pair_lens
 
 SIZE_PX = (96, 64)
 
@@ -60,9 +64,8 @@ def test_a_stereo_video_becomes_frames(
     assert len(list((out / "frames").glob("*.color.png"))) == 2
     both = [cv2.imread(str(out / f"frames/00001.{side}.png")) for side in ("color", "right")]
     pictures = [one for one in both if one is not None]
-    np.testing.assert_allclose(
-        np.concatenate(pictures, 1), draw_pair(2), atol=12
-    )  # YUV of the codec
+    # YUV of the codec
+    np.testing.assert_allclose(np.concatenate(pictures, 1), draw_pair(2), atol=12)
     refused = brokk("mode=record_camera", "capture.input=gone.mp4", f"lens={lens}", "session.out=x")
     assert refused.code == 2 and "gone.mp4" in refused.err
 
@@ -77,12 +80,8 @@ def test_exported_files_are_paired_by_their_number(
         depth = np.full(SIZE_PX[::-1], 1500, np.uint16)
         depth[0, 0] = 0
         cv2.imwrite(str(tmp_path / f"depth{number}.png"), depth)
-    words = (
-        "mode=record_camera",
-        "capture=zed_export",
-        f"capture.folder={tmp_path}",
-        f"lens={lens}",
-    )
+    words = ("mode=record_camera", "capture=zed_export", f"capture.folder={tmp_path}")
+    words = (*words, f"lens={lens}")
     done = brokk(*words, "capture.depth=depth*.png", "session.out=out")
     assert done.code == 0, done.err
     frames = tmp_path / "out/frames"
@@ -98,15 +97,12 @@ def test_exported_files_are_paired_by_their_number(
 
 def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> float | None:
     """Scores one frame whose camera is 2 m before the board, which has a hole 0.3 m to its right."""
-    (tmp_path / "measured.yaml").write_text(
-        "std_m: 0.0005\nholes: [{name: A, center_m: [0.3, 0.0, 0.0], radius_m: 0.05}]\n"
-    )
-    black = np.zeros((8, 8, 3), np.uint8)
+    hole_a = "{name: A, center_m: [0.3, 0.0, 0.0], radius_m: 0.05}"
+    (tmp_path / "measured.yaml").write_text(f"std_m: 0.0005\nholes: [{hole_a}]\n")
     pose, base = np.eye(4), np.eye(4)
     pose[2, 3], base[:3, 3] = -2.0, (1.0, 2.0, 3.0)
-    depth_m = black[..., 0].astype(np.float32)
     # A camera whose place in the base is known too: the truth is told in its own coordinates.
-    frames = iter([Frame(black, depth_m, np.eye(3), base, 0.0, name="a/0")])
+    frames = iter([blank(8, 8, base_from_camera=base, name="a/0")])
     hole = HolePose(
         np.array(found_m), np.array([0.0, 0.0, -1.0]), 0.05, np.eye(3) * 1e-6, np.zeros((3, 3)), "camera", 1.0, 0.0,
     )  # fmt: skip
@@ -123,16 +119,11 @@ def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> f
         def read_latest(self) -> Frame | None:
             return next(frames, None)
 
-    parts: dict[str, Any] = {
-        "perception": SimpleNamespace(find=FrameDetections([hole]).in_base_frame),
-        "source": Source(),
-    }
+    finder, source = SimpleNamespace(find=FrameDetections([hole]).in_base_frame), Source()
     built: dict[str, Any] = {
-        key: SimpleNamespace(build=lambda part=part: part) for key, part in parts.items()
-    }
-    options = ScoreOptions(
-        truth=str(tmp_path / "measured.yaml"), kind=kind, name=name,
-    )  # fmt: skip
+        "perception": SimpleNamespace(build=lambda: finder), "source": SimpleNamespace(build=lambda: source),
+    }  # fmt: skip
+    options = ScoreOptions(truth=str(tmp_path / "measured.yaml"), kind=kind, name=name)
     session = Session(out=str(tmp_path / name), seed=0, device="cpu")
     (tmp_path / name).mkdir(exist_ok=True)
     seen = BoardPose(np.linalg.inv(pose)[None], np.zeros((1, 6, 6)), 0.1)
@@ -173,10 +164,7 @@ def test_a_speck_is_no_block(side: int, named: bool) -> None:
         found[:, 8 : 8 + side, 8 : 8 + side] = 0.9
         return found
 
-    frame = Frame(
-        np.zeros((320, 640, 3), np.uint8), np.zeros((320, 640), np.float32), np.eye(3), None, 0.0
-    )
-    masks = NetworkSegmenter(infer, (64, 32), None).segment(frame)
+    masks = NetworkSegmenter(infer, (64, 32), None).segment(blank(320, 640))
     assert bool((masks.block > 0.5).any()) is named
     assert bool((np.asarray(masks.hole_mask) > 0.5).any()) is named
 
@@ -191,9 +179,7 @@ def test_a_gate_drops_the_blocks_that_it_does_not_see() -> None:
 
         return NetworkSegmenter(infer, (64, 32), None, gates.pop() if gates else None)
 
-    frame = Frame(
-        np.zeros((32, 64, 3), np.uint8), np.zeros((32, 64), np.float32), np.eye(3), None, 0.0
-    )
+    frame = blank(32, 64)
     gates: list[NetworkSegmenter] = []
     gates.append(build(42))
     masks = build(4, 40).segment(frame)
@@ -215,9 +201,9 @@ def write_ros_log(path: Path, pictures: list[tuple[np.ndarray, np.ndarray]], ben
     messages = []
     for number, pair in enumerate(pictures):
         stamp = types["builtin_interfaces/msg/Time"](sec=7, nanosec=100_000_000 * number)
-        head: dict[str, Any] = {"stamp": stamp, "frame_id": ""} | (
-            {"seq": number} if is_bag else {}
-        )
+        head: dict[str, Any] = {"stamp": stamp, "frame_id": ""}
+        if is_bag:
+            head["seq"] = number
         header = types["std_msgs/msg/Header"](**head)
         for side, gray, pull in (("left", pair[0], 0.0), ("right", pair[1], -80 * 0.12)):
             height, width = gray.shape
@@ -347,7 +333,7 @@ def test_rows_correspond_after_a_factory_file_and_another_size_is_refused(tmp_pa
 @pytest.mark.parametrize(
     ("name", "value", "told"),
     [
-        ("D2", None, "got no D2"), ("R", 2 * np.eye(3), "no rigid transform"), ("R", np.eye(2), r"R has shape \(2, 2\)"),
+        ("D2", None, "got no D2"), ("R", 2 * np.eye(3), "no rotation with a shift"), ("R", np.eye(2), r"R has shape \(2, 2\)"),
         ("T", [-0.12, 0.0], r"T has shape \(2,\)"), ("D1", [np.nan] * 5, "camera 1: dist"), ("T", [-120.0, 0.0, 0.0], "mm"),
     ],
 )  # fmt: skip
@@ -361,3 +347,71 @@ def test_a_lens_file_without_a_number_or_with_impossible_ones_is_refused(
     wrong = content | {name: value}
     with pytest.raises(FrameError, match=told):
         read_pair_lens(Path("lens.yaml"), wrong, (1280, 720))
+
+
+EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-2.4, -0.3, 0.7))
+BALL_M = (-0.5, 0.15, 0.55)
+WORLD_FROM_BOARD = np.eye(4)[[2, 0, 1, 3]]
+"""A board in the drilled face: its z axis is the world's x."""
+
+
+@pytest.fixture(scope="module")
+def views() -> list[cuboid.View]:
+    """Frames around one block, something hanging before it, with what is true."""
+    found = []
+    for number, eye in enumerate(EYES_M):
+        pose = cuboid.looking(eye, (0.1, 0.0, 0.3))
+        found.append(cuboid.seen(pose, (480, 270), 0.003, BALL_M, seed=number))
+    return found
+
+
+def write_labels(views: list[cuboid.View], folder: Path, **block: list[float]) -> dict[str, Any]:
+    board_from_world = np.linalg.inv(WORLD_FROM_BOARD)
+    hole_m = (board_from_world[:3, :3] @ cuboid.HOLE_M).tolist()
+    measured = {
+        "std_m": 0.001, "block": block, "holes": [{"center_m": hole_m, "radius_m": cuboid.RADIUS_M}],
+    }  # fmt: skip
+    (folder / "measured.yaml").write_text(yaml.safe_dump(measured))
+    for number, view in enumerate(views):
+        stem = folder / "in" / f"{number:02d}"
+        dataset.write_frame(stem, view.frame.color, view.frame.depth_m)
+    first = views[0].frame
+    size_px = first.color.shape[1::-1]
+    write_camera(folder / "in", CameraModel(first.camera_matrix, size_px=size_px))
+
+    def locate(_: Charuco, frame: Frame) -> BoardPose:
+        pose = board_from_world @ views[int(frame.name[-2:])].world_from_camera
+        return BoardPose(np.linalg.inv(pose)[None], np.zeros((1, 6, 6)), 0.1)
+
+    source = option("perception/source", "folder", folder=str(folder / "in"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Charuco, "locate", locate)
+        labelling = BlockLabelling(
+            source=source, board=load_part("board"), measured=str(folder / "measured.yaml"), noise_per_m=0.003,
+            stereo=load_part("stereo"), num_sigma=3.0, min_depth_share=0.5,
+        )  # fmt: skip
+        return labelling.label(folder)
+
+
+def test_labels_of_a_measured_block_are_those_of_the_renderer(
+    views: list[cuboid.View], tmp_path: Path
+) -> None:
+    result = write_labels(views, tmp_path, corner_m=[-0.4, 0.0, 0.0], size_m=[0.8, 0.6, 1.2])
+    assert result["num_labelled"] == len(views)
+    for number, view in enumerate(views):
+        label = dataset.read_label(tmp_path / "frames" / f"{number:02d}")
+        assert cuboid.overlap(label.block, view.block) > 0.95
+        assert cuboid.overlap(label.hole_mask, view.mouth) > 0.9
+        assert (label.arm & ~view.occluder).sum() < 0.01 * view.block.sum()
+        assert (label.block & view.occluder).sum() < 0.01 * view.block.sum()
+    truth = dataset.read_truth(tmp_path / "frames" / "00")
+    local = (cuboid.HOLE_M - views[0].world_from_camera[:3, 3]) @ views[0].world_from_camera[:3, :3]
+    np.testing.assert_allclose(truth.holes[0].center_m, local, atol=1e-9)
+    assert len(list((tmp_path / "overlays").glob("*.png"))) == len(views)
+
+
+def test_a_block_in_the_wrong_place_is_left_out_and_said(
+    views: list[cuboid.View], tmp_path: Path
+) -> None:
+    with pytest.raises(FrameError, match="of the depth agrees with the block"):
+        write_labels(views, tmp_path, corner_m=[-0.4, 0.0, -0.1], size_m=[0.8, 0.6, 1.2])

@@ -28,9 +28,7 @@ from perception.sources.live import Freshness, LiveSource
 
 HEIGHT, WIDTH = 90, 160
 MATRIX = np.array([[88.0, 0.0, 79.5], [0.0, 88.0, 44.5], [0.0, 0.0, 1.0]])
-POSE = np.array(
-    [[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.4], [0.0, -1.0, 0.0, 1.9], [0.0, 0.0, 0.0, 1.0]]
-)
+POSE = np.array([[0, 0, 1, 0.3], [-1, 0, 0, 0.4], [0, -1, 0, 1.9], [0, 0, 0, 1.0]])
 
 
 @pytest.fixture
@@ -86,9 +84,8 @@ def test_zero_and_infinity_are_no_depths(frames: Path) -> None:
     depth[0, :4] = [0.0, np.inf, -np.inf, -1.0]
     np.save(frames / "00000.depth.npy", depth)
     found = read(frames)[0].depth_m
-    assert (
-        np.isnan(found[0, :4]).all() and (found[0, 4:] == 2.0).all() and found.dtype == np.float32
-    )
+    assert np.isnan(found[0, :4]).all() and (found[0, 4:] == 2.0).all()
+    assert found.dtype == np.float32
 
 
 def camera(frames: Path, **changes: Any) -> None:
@@ -118,10 +115,10 @@ BREACHES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "damaged colour": (lambda f: flip(f / "00000.color.png"), r"00000.color.png: truncated, damaged or no picture"),
     "no picture": (lambda f: (f / "00000.color.png").write_text("hello"), r"00000.color.png: truncated, damaged or no picture"),
     "truncated depth": (lambda f: cut(f / "00000.depth.npy", 0.5), r"00000.depth.npy: truncated"),
-    "16 bit colour": (lambda f: save(f / "00000.color.png", np.zeros((*SIZE, 3), np.uint16)), r"uint16 in each channel"),
+    "16 bit colour": (lambda f: save(f / "00000.color.png", np.zeros((*SIZE, 3), np.uint16)), r"uint16, expected 8 bits"),
     "8 bit depth": (lambda f: save(f / "00000.depth.png", np.full(SIZE, 9, np.uint8)), r"00000.depth.png: uint8, expected 16 bits"),
     "coloured depth": (lambda f: save(f / "00000.depth.png", np.zeros((*SIZE, 3), np.uint16)), r"3 channels, expected one"),
-    "unknown depth": (lambda f: save(f / "00000.depth.png", np.zeros(SIZE, np.uint16)), r"known for 0 % of the picture"),
+    "unknown depth": (lambda f: save(f / "00000.depth.png", np.zeros(SIZE, np.uint16)), r"known for 0 %"),
     "depth in mm": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, 2000.0)), r"median depth is 2000 m; is it in mm"),
     "depth in integers": (lambda f: save(f / "00000.depth.npy", np.full(SIZE, 2000)), r"expected float32 in m"),
     "misaligned depth": (lambda f: save(f / "00000.depth.npy", np.ones((HEIGHT // 2, WIDTH // 2))), r"depth has 80 x 45 pixels"),
@@ -150,10 +147,10 @@ def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read
         ({"K": [[-88, 0, 80], [0, 88, 45], [0, 0, 1]]}, "expected more than 0"),
         ({"K": [[88, 0, 80], [0, 300, 45], [0, 0, 1]]}, "about equal"),
         ({"K": [[88, 0, 80], [0, 88, 45], [0, 1, 1]]}, "no camera matrix"),
-        ({"dist": [0.1, 0.2, 0.3]}, "3 coefficients, expected 0, 4, 5, 8, 12, 14"),
+        ({"dist": [0.1, 0.2, 0.3]}, "3 numbers, expected"),
         ({"baseline_m": 120.0}, "is it in mm"),
-        ({"T_base_cam": (np.eye(4) * [[2], [1], [1], [1]]).tolist()}, "no rigid transform"),
-        ({"T_base_cam": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "no rigid transform"),
+        ({"T_base_cam": (np.eye(4) * [[2], [1], [1], [1]]).tolist()}, "no rotation with a shift"),
+        ({"T_base_cam": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "no rotation with a shift"),
         ({"gamma": 0.45}, r"gamma is 0.45, expected 1 \(linear\) to 4"),
     ],
 )
@@ -296,26 +293,20 @@ def test_a_live_source_gives_each_frame_once_and_no_stale_one() -> None:
         with pytest.raises(FrameError, match=r"no new frame for 0.3 s\. Is it plugged in"):
             source.read_latest()
     assert device.closed == 1
-    with (
-        LiveSource(
-            Clock([1.0, 1.1], lag_s=0.6), "camera", FRESH, CameraExtrinsics(POSE, None)
-        ) as source,
-        pytest.raises(FrameError, match=r"up to 0.60 s old, 0.2"),
-    ):
+    late = LiveSource(Clock([1.0, 1.1], 0.6), "camera", FRESH, CameraExtrinsics(POSE, None))
+    with late as source, pytest.raises(FrameError, match=r"up to 0.60 s old, 0.2"):
         source.read_latest()
 
 
 def test_a_live_source_is_closed_when_opening_fails_and_read_only_when_open() -> None:
     device = Clock([1.0])
     device.opened = False
-    with (
-        pytest.raises(FrameError, match="no camera"),
-        LiveSource(device, "camera", FRESH, CameraExtrinsics(None, None)),
-    ):
+    source = LiveSource(device, "camera", FRESH, CameraExtrinsics(None, None))
+    with pytest.raises(FrameError, match="no camera"), source:
         pass
     assert device.closed == 1
     with pytest.raises(FrameError, match="not open"):
-        LiveSource(Clock([1.0]), "camera", FRESH, CameraExtrinsics(None, None)).read_latest()
+        source.read_latest()
 
 
 class StubZed:
@@ -335,25 +326,20 @@ class StubZed:
     def get_camera_information(self) -> Any:
         left = SimpleNamespace(fx=88.0, fy=88.0, cx=79.5, cy=44.5, disto=[-0.04, 0.01, 0, 0, 0])
         calibration = SimpleNamespace(left_cam=left, get_camera_baseline=lambda: 0.11986)
-        return SimpleNamespace(
-            camera_configuration=SimpleNamespace(calibration_parameters=calibration)
-        )
+        configuration = SimpleNamespace(calibration_parameters=calibration)
+        return SimpleNamespace(camera_configuration=configuration)
 
     def retrieve_image(self, mat: Any, view: str) -> None:
-        mat.values = np.full((*SIZE, 4), {"left": 10, "right": 20}[view], np.uint8) + np.array(
-            [0, 1, 2, 0], np.uint8
-        )
+        level = np.full((*SIZE, 4), {"left": 10, "right": 20}[view], np.uint8)
+        mat.values = level + np.array([0, 1, 2, 0], np.uint8)
 
     def retrieve_measure(self, mat: Any, measure: str) -> None:
         mat.values = np.full(SIZE, 1.5, np.float32)
         mat.values[0, :3] = [np.nan, np.inf, -np.inf]
 
     def get_timestamp(self, reference: str) -> Any:
-        return SimpleNamespace(
-            get_nanoseconds=lambda: (
-                1_700_000_000_000_000_000 + (50_000_000 if reference == "current" else 0)
-            )
-        )
+        ns = 1_700_000_000_000_000_000 + 50_000_000 * (reference == "current")
+        return SimpleNamespace(get_nanoseconds=lambda: ns)
 
     def close(self) -> None:
         StubZed.opened = None
@@ -371,9 +357,8 @@ class Mat:
 def pyzed(monkeypatch: pytest.MonkeyPatch) -> None:
     sl: Any = ModuleType("pyzed.sl")
     sl.Camera, sl.Mat = StubZed, Mat
-    sl.InitParameters = sl.RuntimeParameters = lambda: SimpleNamespace(
-        enable_fill_mode=True, set_from_svo_file=lambda path: None
-    )
+    usual = {"enable_fill_mode": True, "set_from_svo_file": lambda path: None}
+    sl.InitParameters = sl.RuntimeParameters = lambda: SimpleNamespace(**usual)
     sl.ERROR_CODE = SimpleNamespace(SUCCESS="SUCCESS", END_OF_SVOFILE_REACHED="END")
     sl.RESOLUTION = SimpleNamespace(HD1080="HD1080")
     sl.DEPTH_MODE = SimpleNamespace(NEURAL="NEURAL")
@@ -412,14 +397,9 @@ def test_a_lens_whose_inverse_is_told_bends_as_opencv_says() -> None:
     x, y = ((pixel - matrix[:2, 2]) / 640.0).T
     r2, (k1, k2, p1, p2, k3) = x * x + y * y, inverse
     bent = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3  # the library's own deprojection, written down
-    ray = np.stack(
-        [
-            x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-            1 + 0 * x,
-        ],
-        1,
-    )
+    across = x * bent + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = y * bent + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    ray = np.stack([across, down, 1 + 0 * x], 1)
     seen = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
     np.testing.assert_allclose(seen, pixel, atol=0.3)
 
@@ -433,14 +413,11 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
     rs.distortion = SimpleNamespace(inverse_brown_conrady="inverse")
     rs.timestamp_domain = SimpleNamespace(hardware_clock="own")
     lens = SimpleNamespace(fx=88.0, fy=88.0, ppx=79.5, ppy=44.5, coeffs=[0.0] * 5, model="inverse")
-    profile = SimpleNamespace(
-        get_device=lambda: SimpleNamespace(
-            first_depth_sensor=lambda: SimpleNamespace(get_depth_scale=lambda: 0.001)
-        ),
-        get_stream=lambda _: SimpleNamespace(
-            as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens)
-        ),
-    )
+    sensor = SimpleNamespace(get_depth_scale=lambda: 0.001)
+    device = SimpleNamespace(first_depth_sensor=lambda: sensor)
+    video = SimpleNamespace(get_intrinsics=lambda: lens)
+    stream = SimpleNamespace(as_video_stream_profile=lambda: video)
+    profile = SimpleNamespace(get_device=lambda: device, get_stream=lambda _: stream)
     z16 = np.full(SIZE, 1500, np.uint16)
     z16[0] = 0
     frames = SimpleNamespace(
@@ -460,14 +437,12 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
         return frames
 
     stopped: list[bool] = []
-    rs.pipeline = lambda: SimpleNamespace(
-        start=lambda _: profile, wait_for_frames=wait, stop=lambda: stopped.append(True)
-    )
+    ways = {"start": lambda _: profile, "stop": lambda: stopped.append(True)}
+    rs.pipeline = lambda: SimpleNamespace(**ways, wait_for_frames=wait)
     rs.align = lambda to: SimpleNamespace(process=lambda found: found if to == "color" else None)
     monkeypatch.setitem(sys.modules, "pyrealsense2", rs)
-    with replace(
-        option("perception/source", "realsense"), fresh=FRESH, serial=None
-    ).build() as source:
+    camera = replace(option("perception/source", "realsense"), fresh=FRESH, serial=None)
+    with camera.build() as source:
         frame = source.read_latest()
         with pytest.raises(FrameError, match="no new frame"):
             source.read_latest()
@@ -483,9 +458,8 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
 
 def test_the_simulated_camera_sees_the_hole_of_the_task() -> None:
     rig: StereoRig = replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
-    spec: simulator.SimulatedCamera = replace(
-        option("perception/source", "simulator"), rig=rig, num_frames=1
-    )
+    shipped: simulator.SimulatedCamera = option("perception/source", "simulator")
+    spec = replace(shipped, rig=rig, num_frames=1)
     chain_m = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 2.6], [2.0, 0.0, 2.4], [2.0, 0.0, 1.6]])
     shot = spec.shoot((2.4, 0.0, 0.7, 0.3, 1.0, 0.06, 0.1), chain_m, np.random.default_rng(0))
     with spec.build() as source:
