@@ -36,11 +36,8 @@ from deploy.runtime.shared_memory import RecordLayout
 
 TOKEN = "correct horse battery staple"
 SIZE = {"width": 1280, "height": 800}
-CHROMIUM = (
-    os.environ.get("CHROMIUM")
-    or shutil.which("chromium")
-    or shutil.which("chromium-headless-shell")
-)
+INSTALLED = shutil.which("chromium") or shutil.which("chromium-headless-shell")
+CHROMIUM = os.environ.get("CHROMIUM") or INSTALLED
 # the page itself is painted by the processor: a card that is only simulated would be kept busy with
 # it
 FLAGS = [
@@ -52,12 +49,8 @@ FLAGS = [
 ]
 
 LEVERS = LeverPositions(0.0, 0.0, 0.0, 0.0, False)
-STATE = replace(
-    RecordLayout(OperatorState, 5).new(),
-    q=np.array([0.0, -0.95, 0.55, 1.15, 0.6]),
-    deadman=True,
-    bus_up=True,
-)
+POSE = np.array([0.0, -0.95, 0.55, 1.15, 0.6])
+STATE = replace(RecordLayout(OperatorState, 5).new(), q=POSE, deadman=True, bus_up=True)
 """A guard that sends nothing and a dead-man that is held; all levers in neutral."""
 SHOWN = PageState(
     t_s=0.0, alive=True, guiding=True, advice=ShownAdvice(True, "valid", 1, LEVERS, None), state=STATE,
@@ -117,9 +110,8 @@ class Scripted:
 
     def advise(self, number: int, due_s: float | None = None, **axes: Any) -> None:
         """Advises these lever positions, of full."""
-        self.now = replace(
-            self.now, advice=ShownAdvice(True, "valid", number, replace(LEVERS, **axes), due_s)
-        )
+        advice = ShownAdvice(True, "valid", number, replace(LEVERS, **axes), due_s)
+        self.now = replace(self.now, advice=advice)
 
 
 @contextmanager
@@ -133,12 +125,8 @@ def served(
     """Serves the page of `conf/page/local.yaml` with `changes`, and the pages of `extensions`; yields the port."""
     page: PageSettings = replace(option("page", "local"), port=port, token=TOKEN, **changes)
     server = PageServer(page, machine or option("machine", "brokk170"), feed, TOKEN, *extensions)
-    ready, ending, found, failed = (
-        threading.Event(),
-        threading.Event(),
-        list[int](),
-        list[BaseException](),
-    )
+    ready, ending = threading.Event(), threading.Event()
+    found, failed = list[int](), list[BaseException]()
 
     def serve() -> None:
         try:

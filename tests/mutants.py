@@ -54,9 +54,9 @@ CORE = {
 """Modules that decide what reaches the valves, and the tests of each."""
 SCIENCE = {
     "brokk_rl.kinematics": ["test_kinematics.py"],
-    "brokk_rl.observation": ["test_observation.py", "test_term_task.py"],
+    "brokk_rl.observation": ["test_reward.py", "test_term_task.py"],
     "brokk_rl.statistics": ["test_compare.py"],
-    "tasks.control": ["test_classical.py", "test_task_masks.py", "test_advice.py"],
+    "tasks.control": ["test_classical.py", "test_reward.py", "test_advice.py"],
     "tasks.terms": ["test_reward.py", "test_term_task.py", "test_termination.py"],
     "diagnosis.engine.decide": ["test_diagnosis_simulated.py", "test_servo_engine.py"],
     "diagnosis.engine.measure": ["test_diagnosis_simulated.py", "test_servo_engine.py"],

@@ -275,9 +275,8 @@ class Stage:
         self.clock_jump_s, self._times = 0.0, 0
         with self._time():
             self._twin_settings = build_twin(NO_WIRE, dbc=twin_dbc, again_s=again_s)
-            self._link = NominalMachine().build(
-                machine, 1, Session(out=str(folder), seed=0, device="cpu")
-            )
+            session = Session(out=str(folder), seed=0, device="cpu")
+            self._link = NominalMachine().build(machine, 1, session)
             self.start_twin()
             limits, wire = option("guard", "default"), self.air
             observer = replace(limits.observer, path=str(write_nominal_observer(machine, folder)))
@@ -290,9 +289,8 @@ class Stage:
             config = BusProcessConfig(wire, dbc, machine, limits, needs_page=False)  # type: ignore[arg-type]
             self.bus_process = BusProcess(config, self.memory)
             policy = "tasks:policies/borehole_insertion"
-            counsel = PolicyProcessConfig(
-                machine, policy, option("guidance", "machine"), limits.joints_s, 600.0, None
-            )
+            guidance = option("guidance", "machine")
+            counsel = PolicyProcessConfig(machine, policy, guidance, limits.joints_s, 600.0, None)
             self.adviser = PolicyAdviser(counsel, PolicyBundle(policy, machine), self.memory)
             if mode == "collect":
                 self.adviser = None

@@ -112,11 +112,8 @@ def imports(tree: ast.Module) -> list[Import]:
 
 def is_for_types(node: ast.AST) -> bool:
     """Returns whether a statement is a block that only a type checker reads."""
-    return (
-        isinstance(node, ast.If)
-        and isinstance(node.test, ast.Name)
-        and node.test.id == "TYPE_CHECKING"
-    )
+    test = node.test if isinstance(node, ast.If) else None
+    return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
 
 
 def floor(module: str) -> int | None:
@@ -169,12 +166,8 @@ def doors(sources: Mapping[str, str]) -> list[str]:
 
 def vague_names(sources: Mapping[str, str]) -> list[str]:
     """Modules and folders are nouns that say what is in them."""
-    return [
-        f"{module}: '{part}' says nothing"
-        for module in sources
-        for part in module.split(".")
-        if part in VAGUE
-    ]
+    vague = [(module, part) for module in sources for part in VAGUE & set(module.split("."))]
+    return [f"{module}: '{part}' says nothing" for module, part in vague]
 
 
 def docstrings(sources: Mapping[str, str]) -> list[str]:
@@ -183,11 +176,9 @@ def docstrings(sources: Mapping[str, str]) -> list[str]:
     for module, tree in read_trees(sources):
         if not ast.get_docstring(tree):
             found.append(f"{module} has no docstring")
-        found += [
-            f"{module}:{node.lineno} {node.name} has no docstring"
-            for node in _public(tree.body)
-            if not ast.get_docstring(node)
-        ]
+        for node in _public(tree.body):
+            if not ast.get_docstring(node):
+                found.append(f"{module}:{node.lineno} {node.name} has no docstring")
     return found
 
 

@@ -121,9 +121,8 @@ def test_no_file_names_the_workplace_it_was_written_at() -> None:
         "/opt" + "/wheels",
         "/opt" + "/pypi",
     ]
-    listed = subprocess.run(
-        ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True
-    )
+    words = ["git", "-C", str(ROOT), "ls-files", "-z"]
+    listed = subprocess.run(words, capture_output=True, text=True)
     if listed.returncode:
         pytest.skip("no checkout")
     found = []

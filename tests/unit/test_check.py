@@ -70,9 +70,8 @@ def read(text: str, folder: Path, **changes: Any) -> ImportedMachine:
 
 
 def import_file(path: Path, **changes: Any) -> ImportedMachine:
-    choices = dict.fromkeys(("chain", "tip", "name")) | dict.fromkeys(
-        ("num_poses", "num_starts"), 1
-    )
+    counts = dict.fromkeys(("num_poses", "num_starts"), 1)
+    choices = dict.fromkeys(("chain", "tip", "name")) | counts
     choices |= {"model": str(path), "packages": (), "drive": "auto", "command": "auto"} | changes
     return import_model(path, "model", CheckSubject(**choices))
 

@@ -164,9 +164,8 @@ def test_without_positions_the_command_is_withdrawn_at_once_and_the_history_begi
 ) -> None:
     desk.advised()
     later_s = desk.now_s + MACHINE.period_s
-    changes = {
-        name: later_s + value if name.endswith("t_s") else value for name, value in changes.items()
-    }
+    for name in changes:
+        changes[name] += later_s * name.endswith("t_s")
     assert desk.go(**changes) is status
     assert desk.request.t_s == -math.inf and not desk.advice.u.any() and not desk.advice.valid
     assert desk.advice.infer_s == 0.0
@@ -212,9 +211,8 @@ def test_an_answer_that_makes_no_sense_is_told_to_the_guard_at_once(
     assert not desk.advice.u.any()
     desk.bundle.answer = ANSWER
     assert desk.go() is AdviceStatus.VALID and desk.request.u.tolist() == ANSWER.tolist()
-    assert not desk.bundle.encoder.given["proposals"][0, -1].any(), (
-        "nothing was proposed in that period"
-    )
+    # nothing was proposed in that period
+    assert not desk.bundle.encoder.given["proposals"][0, -1].any()
 
 
 @pytest.mark.parametrize("answer", [[1.0, 0, 0, 0, -1.0], [0, 1.0, 0, 0, 0], [1.0000009] + [0] * 4])
@@ -264,9 +262,8 @@ def sample(
 ) -> None:
     each = np.ones(NUM_JOINTS)
     blank = RecordLayout(OperatorState, NUM_JOINTS).new()
-    state = replace(
-        blank, flow_number=number, flow_sum=flow_sum * each, flow=flow * each, q=q * each
-    )
+    flows = {"flow_number": number, "flow_sum": flow_sum * each, "flow": flow * each}
+    state = replace(blank, **flows, q=q * each)
     history.sample(state, missed)
 
 

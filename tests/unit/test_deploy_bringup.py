@@ -110,9 +110,8 @@ def test_an_offset_to_the_pose_measured_by_hand_is_named(offset: float, told: st
     pose = tuple(MACHINE.home.tolist())
     checklist = SimpleNamespace(pose=pose, pose_error=0.03)
     checks = _StateChecks(checklist, MACHINE, SimpleNamespace(memory=None), print)  # type: ignore[arg-type]
-    assert checks._list_offsets(np.add(MACHINE.home, [0, 0, offset, 0, 0])) == (
-        [told] if told else []
-    )
+    found = checks._list_offsets(np.add(MACHINE.home, [0, 0, offset, 0, 0]))
+    assert found == ([told] if told else [])
 
 
 @pytest.mark.parametrize(("dead_s", "passed"), [(0.64, True), (0.66, False)])

@@ -42,9 +42,8 @@ def test_commands_arrive_as_they_were_sent_to_half_a_step(
     assert isinstance(values, dict)
     assert values["Counter"] == counter % 16
     assert values["CommandMode"] == 1
-    assert all(
-        abs(values[name] - wanted) <= 0.002 + 1e-12 for name, wanted in zip(names, u, strict=True)
-    )
+    for name, wanted in zip(names, u, strict=True):
+        assert abs(values[name] - wanted) <= 0.002 + 1e-12
 
 
 def test_every_single_wrong_bit_is_found_in_every_message(bus: BusDescription) -> None:
@@ -166,12 +165,8 @@ def test_another_layout_with_the_same_names_is_as_good(machine: Machine, tmp_pat
 
 
 def test_a_description_for_other_joints_is_refused(machine: Machine) -> None:
-    other = replace(
-        machine,
-        joints=tuple(replace(joint, name=f"j{n}") for n, joint in enumerate(machine.joints)),
-        exclusive=(),
-        levers=(),
-    )
+    joints = tuple(replace(joint, name=f"j{n}") for n, joint in enumerate(machine.joints))
+    other = replace(machine, joints=joints, exclusive=(), levers=())
     with pytest.raises(ConfigError, match="Command_j0"):
         BusDescription(DBC, other)
 
@@ -182,9 +177,8 @@ HEADER_TIMES = (0.15, 0.13, 0.07)
 def compile_c(tmp_path: Path, bus: BusDescription, body: str) -> list[str]:
     """Compile a program with the header; return its output as words."""
     (tmp_path / "bus.h").write_text(generate_c_header(bus, *HEADER_TIMES))
-    (tmp_path / "main.c").write_text(
-        f'#include <stdio.h>\n#include "bus.h"\nint main(void) {{\n{body}\nreturn 0;\n}}'
-    )
+    text = f'#include <stdio.h>\n#include "bus.h"\nint main(void) {{\n{body}\nreturn 0;\n}}'
+    (tmp_path / "main.c").write_text(text)
     flags = ["-Wall", "-Wextra", "-Werror", "-std=c99"]
     subprocess.run(["cc", *flags, "-o", "main", "main.c"], cwd=tmp_path, check=True)
     done = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True)

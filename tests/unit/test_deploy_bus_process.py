@@ -163,9 +163,8 @@ def test_frames_are_taken_until_the_deadline_and_logged_with_their_time(rig: Rig
     rig.wire.arriving += [(BEGIN_S + 0.011, FRAMES[2])]
     rig.cycle()
     assert rig.wire.opened == [BEGIN_S] and rig.wire.frame_ids == rig.logic.receiver.frame_ids
-    times = [
-        (pytest.approx(BEGIN_S + s), frame) for s, frame in ((0.003, FRAMES[0]), (0.007, FRAMES[1]))
-    ]
+    first, second = pytest.approx(BEGIN_S + 0.003), pytest.approx(BEGIN_S + 0.007)
+    times = [(first, FRAMES[0]), (second, FRAMES[1])]
     assert rig.logic.taken == times
     assert rig.clock.now_s == pytest.approx(BEGIN_S + CYCLE_S)
     frames, texts = rig.read_log()

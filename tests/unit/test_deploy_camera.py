@@ -47,9 +47,8 @@ PIXELS = 640 * 360
 
 def pose(x: float, y: float, std_m: float = 0.004, score: float = 0.9) -> HolePose:
     center_m, cov = np.array([x, y, 0.75]), std_m**2 * np.eye(3)
-    return HolePose(
-        center_m, np.array([0.0, 0.0, 1.0]), 0.05, cov, 1e-4 * np.eye(3), "base", score, 0.0
-    )
+    up, turn = np.array([0.0, 0.0, 1.0]), 1e-4 * np.eye(3)
+    return HolePose(center_m, up, 0.05, cov, turn, "base", score, 0.0)
 
 
 @pytest.fixture
@@ -63,9 +62,8 @@ def exchange() -> Iterator[LoopMemory]:
 def test_a_click_into_a_borehole_gives_its_centre_though_its_mouth_has_no_depth(
     target: Any,
 ) -> None:
-    found = locate_borehole(
-        FRAME, *seen_at(FRAME, np.array(target.center_in_base_m)), target.radius_m
-    )
+    place = seen_at(FRAME, np.array(target.center_in_base_m))
+    found = locate_borehole(FRAME, *place, target.radius_m)
     assert found is not None
     off_m = np.linalg.norm(found[0] - np.array(target.center_in_base_m))
     assert off_m < 0.012 and 0.005 < found[1] < 0.05
@@ -137,9 +135,8 @@ def eyes_place(exchange: LoopMemory, row: int) -> Any:
 def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(
     exchange: LoopMemory,
 ) -> None:
-    aim = TargetSelector(
-        GivenTarget(center_in_base_m=(2.6, 0.0, 0.4)).build(), exchange.target, exchange.holes
-    )
+    given = GivenTarget(center_in_base_m=(2.6, 0.0, 0.4)).build()
+    aim = TargetSelector(given, exchange.target, exchange.holes)
     aim.refresh()
     first = exchange.target.peek("t_s")
     aim.refresh()
@@ -153,25 +150,22 @@ def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(
     aim.refresh()
     show(exchange, pose(2.2, 0.4, score=0.95), pose(2.9, 0.4, score=0.6))
     aim.refresh()
-    assert aimed(exchange) == [2.9, 0.4, 0.75], (
-        "it does not leap to another that looks surer for a moment"
-    )
+    # it does not leap to another that looks surer for a moment
+    assert aimed(exchange) == [2.9, 0.4, 0.75]
 
 
 @pytest.fixture
 def feed(exchange: LoopMemory, tmp_path: Path) -> LoopFeed:
     session = Session(out=str(tmp_path), seed=1, device="cpu")
-    return LoopFeed(
-        PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0, 1.0), exchange
-    )
+    config = PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0, 1.0)
+    return LoopFeed(config, exchange)
 
 
 def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     exchange: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
-    aim = TargetSelector(
-        FileTarget(path=str(tmp_path / "none.json")).build(), exchange.target, exchange.holes
-    )
+    file = FileTarget(path=str(tmp_path / "none.json")).build()
+    aim = TargetSelector(file, exchange.target, exchange.holes)
     group: Any = SimpleNamespace(memory=exchange)
     wanted = RequestHandler(
         exchange,
@@ -193,10 +187,8 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     assert next(one for one in shown.streams if one.name == "camera").age_s is not None
     show(exchange, pose(2.95, -0.4), pose(2.25, 0.41))
     wanted.refresh()
-    assert [(one.name, one.chosen) for one in feed.read_state().targets] == [
-        ("1", False),
-        ("2", True),
-    ], "perception knows it by now"
+    chosen = {one.name: one.chosen for one in feed.read_state().targets}
+    assert chosen == {"1": False, "2": True}, "perception knows it by now"
     assert feed.submit(OperatorRequest("target", "1"))
     assert not feed.submit(OperatorRequest("target", "9"))
     wanted.refresh()
@@ -271,15 +263,8 @@ def test_a_camera_that_moves_is_told_arm_and_hole_and_the_page_where_it_looks(
 
 
 def camera(source: Any) -> CameraConfig:
-    return CameraConfig(
-        source=source,
-        finder=source,
-        tracker=load_part("tracker"),
-        rate_hz=100.0,
-        num_px=PIXELS,
-        stale_s=1.0,
-        record_hz=1.0,
-    )
+    parts = {"source": source, "finder": source, "tracker": load_part("tracker")}
+    return CameraConfig(**parts, rate_hz=100.0, num_px=PIXELS, stale_s=1.0, record_hz=1.0)
 
 
 def test_pictures_are_recorded_as_often_as_asked_and_come_back(
@@ -301,8 +286,7 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(
 
     views = capture_reader.read_capture(tmp_path / "capture.mcap", ("camera",)).views["camera"]
     assert len(views) == 1, "the other two came within half a second"
-    picture = cv2.imdecode(
-        np.frombuffer(CompressedImage.FromString(views[0][1]).data, np.uint8), cv2.IMREAD_COLOR
-    )
+    data = np.frombuffer(CompressedImage.FromString(views[0][1]).data, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert picture is not None and np.abs(picture[..., ::-1].astype(int) - FRAME.color).mean() < 6
     assert PictureSampler(exchange.frame, 0.0).due() is None

@@ -98,9 +98,8 @@ def add_ground_and_wall(spec: mujoco.MjSpec) -> None:
     lower, upper = np.array(WALL.lower_m), np.array(WALL.upper_m)
     box = mujoco.mjtGeom.mjGEOM_BOX
     spec.worldbody.add_geom(name="ground", type=box, size=[30, 30, 5], pos=[0, 0, -5])
-    spec.worldbody.add_geom(
-        name="wall", type=box, size=(upper - lower) / 2, pos=(lower + upper) / 2
-    )
+    size, middle = (upper - lower) / 2, (lower + upper) / 2
+    spec.worldbody.add_geom(name="wall", type=box, size=size, pos=middle)
 
 
 def build_own_model() -> tuple[mujoco.MjModel, list[int], list[int]]:
@@ -113,10 +112,8 @@ def build_own_model() -> tuple[mujoco.MjModel, list[int], list[int]]:
     kinds = mujoco.mjtGeom
     for number, one in enumerate(SHAPES.arm):
         body = spec.body(BODIES[one.link + 1])
-        ends = [*one.begin_m, *one.end_m]
-        body.add_geom(
-            name=f"arm{number}", type=kinds.mjGEOM_CAPSULE, size=[one.radius_m, 0, 0], fromto=ends
-        )
+        place = {"size": [one.radius_m, 0, 0], "fromto": [*one.begin_m, *one.end_m]}
+        body.add_geom(name=f"arm{number}", type=kinds.mjGEOM_CAPSULE, **place)
     for number, one in enumerate(SHAPES.body):
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, one.rotation.flatten())
@@ -177,9 +174,8 @@ def test_distances_beyond_interest_may_be_left_out_but_no_near_one_is_missed() -
     exact = measure_clearance(envelope, poses)
     for near_m in (0.05, 0.4):
         # One by one, as in a cycle: what is left out depends on the pose.
-        found = np.array(
-            [envelope._measure_pairs(q[None], near_m).min(initial=np.inf) for q in poses[:400]]
-        )
+        each = [envelope._measure_pairs(q[None], near_m) for q in poses[:400]]
+        found = np.array([one.min(initial=np.inf) for one in each])
         near = exact[:400] <= near_m
         assert near.sum() > 9 and found[near] == pytest.approx(exact[:400][near], abs=1e-12)
         far = ~near
@@ -336,11 +332,8 @@ def test_capsules_enclose_boxes_and_balls(end_m: tuple[float, float, float]) -> 
         rotation = np.linalg.qr(draw.normal(size=(3, 3)))[0]
         radius_m = 0.1 if number % 2 else 0.0
         half = draw.uniform(0.01, 0.2, 3)
-        boxes.append(
-            make_box(
-                1, draw.uniform(-0.3, 0.3, 3) + np.array([number, 0, 0]), rotation, half, radius_m
-            )
-        )
+        center_m = draw.uniform(-0.3, 0.3, 3) + np.array([number, 0, 0])
+        boxes.append(make_box(1, center_m, rotation, half, radius_m))
     capsules = shapes.fit_capsules(boxes, np.array(end_m))
     assert 1 <= len(capsules) <= 2
     for box in boxes:
@@ -402,10 +395,10 @@ def test_without_ground_nothing_is_withheld() -> None:
     arm.go((0.0, 0.0, 1.0, 0.0, 0.0), 3.0)
     assert arm.held == 0 and measure_clearance(build_envelope(ground_m=None), HOME[None]) > 0
     # The boom's foot is always as near to the undercarriage, whatever the height of the ground.
-    higher = measure_clearance(build_envelope(ground_m=0.9), HOME[None])[0]
-    assert higher == pytest.approx(
-        measure_clearance(build_envelope(ground_m=0.8), HOME[None])[0] - 0.1
+    higher, lower = (
+        measure_clearance(build_envelope(ground_m=z), HOME[None])[0] for z in (0.9, 0.8)
     )
+    assert higher == pytest.approx(lower - 0.1)
 
 
 def test_a_stay_out_box_holds_the_slew() -> None:
@@ -435,26 +428,17 @@ def test_a_withheld_command_passes_again_only_with_more_room() -> None:
         for _ in range(40):
             middle = (low + high) / 2
             at[2] = middle
-            low, high = (
-                (middle, high)
-                if measure_clearance(envelope, at[None])[0] > clear_m
-                else (low, middle)
-            )
+            is_clear = measure_clearance(envelope, at[None])[0] > clear_m
+            low, high = (middle, high) if is_clear else (low, middle)
         return low
 
     begin = find_angle(LIMITS.margin_m - 0.01)
     between = find_angle(LIMITS.margin_m + LIMITS.release_m / 2)
     outside = find_angle(LIMITS.margin_m + LIMITS.release_m + 0.01)
     found = []
-    for angle, u in (
-        (between, down),
-        (begin, down),
-        (between, down),
-        (outside, down),
-        (between, down),
-    ):
+    for angle in (between, begin, between, outside, between):
         at[2] = angle
-        found.append(limit(envelope, u, at)[1])
+        found.append(limit(envelope, down, at)[1])
     assert found == [False, True, True, False, False]
     at[2] = begin
     assert limit(envelope, down, at)[1]

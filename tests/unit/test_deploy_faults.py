@@ -7,6 +7,7 @@ do the same with real processes.
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import time
 from collections.abc import Iterator
@@ -51,9 +52,7 @@ STOPS: list[tuple[str, str, float]] = [
     ("second_remote", "", UNTRUSTED),
 ]  # fmt: skip
 """Faults that end a motion, and within which time."""
-HARMLESS = [
-    (fault, message) for fault in ("drop_some", "duplicate", "reorder") for message in MESSAGES
-] + [("flood", "")]
+HARMLESS = [*itertools.product(("drop_some", "duplicate", "reorder"), MESSAGES), ("flood", "")]
 """Faults that are borne, or end in zero; what is wrong is never used."""
 OPERATORS = {"deadman_released", "estop", "remote_off", "second_sender", "lever"}
 """Faults that say nothing against the positions: an advice goes on."""
@@ -85,9 +84,8 @@ def test_what_must_stop_the_machine_stops_it_in_time_and_for_good(
     stage.fault("none")
     stage.go(0.3)
     if fault != "deadman_released":
-        assert not stage.moves, (
-            "nothing moves again before somebody has released the dead-man and pressed it"
-        )
+        # nothing moves again before somebody has released the dead-man and pressed it
+        assert not stage.moves
 
 
 @pytest.mark.parametrize(("mode", "fault", "message", "limit_s"), against(STOPS, "listen"))
@@ -140,9 +138,8 @@ def test_a_process_that_stood_still_moves_nothing_when_it_wakes_up(
     stage.get_going()
     begun_ms = stage.ms
     stage.pause(seconds)
-    assert stage.stopped_ms is not None and (stage.stopped_ms - begun_ms) / 1e3 <= 0.1, (
-        "the gateway waits for nobody"
-    )
+    # the gateway waits for nobody
+    assert stage.stopped_ms is not None and (stage.stopped_ms - begun_ms) / 1e3 <= 0.1
     stage.go(0.5)
     state = stage.view.state
     assert not stage.moves and state is not None and state.guard.name in ("LATCHED", "READY")

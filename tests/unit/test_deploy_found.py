@@ -180,9 +180,7 @@ def test_ends_of_other_descriptions_never_get_ready(
         text = text.replace(old, new)
     path.write_text(text)
     ends = {"dbc": DBC, "twin_dbc": DBC} | {side: str(path)}
-    stage = Stage(
-        machine, "collect", tmp_path, again_s=0.5, dbc=ends["dbc"], twin_dbc=ends["twin_dbc"]
-    )
+    stage = Stage(machine, "collect", tmp_path, again_s=0.5, **ends)
     highest, moved_ms = [0], [0]
 
     def look() -> bool:
@@ -197,11 +195,8 @@ def test_ends_of_other_descriptions_never_get_ready(
     record_property(f"description: {kind} at the {side}; ms of motion in 6 s", moved_ms[0])
 
 
-PLACES = {
-    "50 m ahead": (50.0, 0.0, 0.75),
-    "behind the machine": (-2.6, 0.0, 0.75),
-    "1.5 m underground": (2.6, 0.0, -1.5),
-}
+PLACES = {"50 m ahead": (50.0, 0.0, 0.75), "behind the machine": (-2.6, 0.0, 0.75)}
+PLACES["1.5 m underground"] = (2.6, 0.0, -1.5)
 
 
 @pytest.mark.parametrize("kind", PLACES)
@@ -318,9 +313,8 @@ def test_a_joint_with_a_long_dead_time_rests_before_its_stop(
     stage.go(14.0, look)
     stage.close()
     assert -0.2 < beyond_rad[0] <= 0.0
-    record_property(
-        f"stops: 0.55 s of dead time, side {side:+.0f}; beyond, rad", round(beyond_rad[0], 3)
-    )
+    what = f"stops: 0.55 s of dead time, side {side:+.0f}; beyond, rad"
+    record_property(what, round(beyond_rad[0], 3))
 
 
 def send_one_early(stage: Stage) -> None:

@@ -125,14 +125,10 @@ def test_numbers_on_the_bus_mean_what_the_description_says() -> None:
     states = signals.get_signal_by_name("GatewayState").choices
     sources = signals.get_signal_by_name("FlowSource").choices
     assert states is not None and sources is not None
-    assert {one.value: one.name.lower() for one in GatewayState} == {
-        number: str(name) for number, name in states.items()
-    }
-    assert {number: str(name) for number, name in sources.items()} == {
-        NOBODY: "nobody",
-        LEVERS: "levers",
-        PC: "pc",
-    }
+    described = {number: str(name) for number, name in states.items()}
+    assert {one.value: one.name.lower() for one in GatewayState} == described
+    described = {number: str(name) for number, name in sources.items()}
+    assert described == {NOBODY: "nobody", LEVERS: "levers", PC: "pc"}
 
 
 def test_only_commands_measure_the_way_there_and_back(around: Around) -> None:

@@ -28,14 +28,8 @@ from deploy.kernel.plausibility import PlausibilityFilter
 BODY = JointBounds((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0), (0.5, 0.5, 0.5), (False, True, False), 0.2)
 FLOW = FlowLimits(tolerance=0.02, settle_s=0.04, num_messages=2, lever_scale=1.5)
 TARGET = TargetLimits(
-    age_s=600.0,
-    jump_m=0.05,
-    settle_s=0.5,
-    seen_s=5.0,
-    face_step_m=0.15,
-    face_radius_m=1.0,
-    contact_m=0.1,
-)
+    age_s=600.0, jump_m=0.05, settle_s=0.5, seen_s=5.0, face_step_m=0.15, face_radius_m=1.0, contact_m=0.1,
+)  # fmt: skip
 LIMITS = GuardLimits(
     max_command=0.8, max_rate_1_s=5.0, max_reversals_1_s=3, max_starts_1_s=30, overrun=0.001, neutral=0.05,
     stop_margin=0.1, stop_release=0.05, speed_margin=1.0, coast_s=0.1, reaction_s=0.02, joints_s=0.15, page_s=0.08,
@@ -134,10 +128,8 @@ def test_arming_alone_moves_nothing_and_neither_does_a_dead_man_held_from_the_st
 
 def test_the_way_to_the_valves_is_release_then_press() -> None:
     hand = Hand().active()
-    decision = hand.decide(u=(0.05, 0.0, -0.05))
-    assert decision == GuardDecision(
-        GuardState.ACTIVE, (0.05, 0.0, -0.05), GuardTrip.NONE, GuardTrip.NONE
-    )
+    expected = (GuardState.ACTIVE, (0.05, 0.0, -0.05), GuardTrip.NONE, GuardTrip.NONE)
+    assert hand.decide(u=(0.05, 0.0, -0.05)) == GuardDecision(*expected)
 
 
 def test_the_first_cycle_with_the_dead_man_pressed_still_sends_zero() -> None:
@@ -470,9 +462,8 @@ def test_numbers_of_the_states_mean_what_the_description_says() -> None:
     bus = BusDescription(DBC, option("machine", "brokk170"))
     choices = bus._messages["PcHeartbeat"].get_signal_by_name("PcState").choices
     assert choices is not None
-    assert {one.value: one.name.lower() for one in GuardState} == {
-        number: str(name) for number, name in choices.items()
-    }
+    described = {number: str(name) for number, name in choices.items()}
+    assert {one.value: one.name.lower() for one in GuardState} == described
     assert [one.sends for one in GuardState] == [False, True, True, True]
 
 
@@ -602,10 +593,8 @@ def test_limits_that_make_no_sense_are_refused(change: dict[str, Any]) -> None:
 def test_a_gateway_that_does_not_follow_is_noticed() -> None:
     hand = Hand().active()
     for _ in range(3):
-        assert (
-            hand.decide(u=(0.05, 0.0, 0.0), dt=0.1 - 1e-9, followed=False).state
-            is GuardState.ACTIVE
-        )
+        decision = hand.decide(u=(0.05, 0.0, 0.0), dt=0.1 - 1e-9, followed=False)
+        assert decision.state is GuardState.ACTIVE
     assert hand.decide(u=(0.05, 0.0, 0.0), followed=True).u == (0.05, 0.0, 0.0)
     for _ in range(3):
         hand.decide(u=(0.05, 0.0, 0.0), dt=0.1, followed=False)

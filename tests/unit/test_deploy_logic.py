@@ -570,9 +570,8 @@ def test_a_flow_that_is_not_as_commanded_latches_within_100_ms(change: Any, trip
         loop.follows = False
         sent = loop.commands()[-1][1]
         flow = change(np.array([sent[f"Command_{name}"] for name in MACHINE.joint_names]))
-        loop.sender.values |= dict(
-            zip(map("Flow_{}".format, MACHINE.joint_names), flow, strict=False)
-        )
+        for name, value in zip(MACHINE.joint_names, flow, strict=True):
+            loop.sender.values[f"Flow_{name}"] = value
         loop.cycle()
         if loop.state is GuardState.LATCHED:
             break

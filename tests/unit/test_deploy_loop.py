@@ -61,9 +61,8 @@ def test_a_writer_killed_in_the_middle_leaves_the_record_before_it() -> None:
         record["a"] = number
         slot.write(record)
     at = 8 + slot._stride * (3 % 2)
-    slot.memory.bytes[at : at + 8] = (
-        b"torn ..."  # the third record was begun, its number never written
-    )
+    # the third record was begun, its number never written
+    slot.memory.bytes[at : at + 8] = b"torn ..."
     found = slot.read()
     assert found is not None and found["a"] == 2.0
     slot.memory.close()
@@ -173,9 +172,8 @@ def change(folder: Path, name: str, **values: Any) -> None:
 
 def test_the_shipped_policy_acts_here_as_where_it_was_made(machine: Machine) -> None:
     bundle = PolicyBundle(SHIPPED, machine)
-    golden = json.loads(
-        (Path(__file__).parents[2] / "tasks/policies/borehole_insertion/golden.json").read_text()
-    )
+    policy = Path(__file__).parents[2] / "tasks/policies/borehole_insertion"
+    golden = json.loads((policy / "golden.json").read_text())
     found = bundle.command(np.array(golden["observation"], np.float32))
     assert np.abs(found - np.array(golden["command"])).max() < 1e-3 and np.abs(found).max() > 0.5
 
@@ -196,11 +194,8 @@ def test_a_policy_is_done_where_its_task_says_so(machine: Machine, copied: Path,
         depth_m = generator.uniform(0.05, 0.15) if name != "goal_pose" else 0.0
         off_m = generator.uniform(-0.015, 0.015, 3) - depth_m * axis
         target_m = pose.tip_in_base_m.numpy()[0] + off_m
-        start = {
-            "target_m": torch.tensor(target_m, dtype=torch.float32)[None],
-            "target_pitch_rad": pitch_rad,
-            "scene": make_nominal_scenes(1),
-        }
+        start = {"target_m": torch.tensor(target_m, dtype=torch.float32)[None]}
+        start |= {"target_pitch_rad": pitch_rad, "scene": make_nominal_scenes(1)}
         judged = task.judge(pose.tip_in_base_m, pose.pitch_rad, torch.zeros(1), start)
         assert bundle.is_done(np.array(machine.home), target_m, told) == bool(judged.reached)
         outcomes.add(bool(judged.reached))

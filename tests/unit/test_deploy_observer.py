@@ -31,12 +31,8 @@ def build_tables(**change: Any) -> dict[str, Any]:
     """Tables of a plain machine: a dead time of 0.2 s, speed times command."""
     ones = [1.0] * 5
     none = [0.0] * 5
-    tables: dict[str, Any] = {
-        "dead_time_s": [0.2] * 5,
-        "play": none,
-        "spool_s": none,
-        "speed_s": none,
-    }
+    tables: dict[str, Any] = dict.fromkeys(("play", "spool_s", "speed_s"), none)
+    tables["dead_time_s"] = [0.2] * 5
     tables |= {"demand": none, "knots": [0.0, 1.0], "curve_extend": [[0.0, one] for one in ones]}
     return tables | {"curve_retract": [[0.0, one] for one in ones], "pose": None} | change
 
@@ -92,10 +88,8 @@ def compare_models(machine: Any, config: Any, q: np.ndarray) -> None:
     largest = 0.0
     for u in draw_commands(500, 1)[:, :num]:
         u_past, before = np.concatenate([u_past[1:], u[None]]), q_past[-1]
-        history = History(
-            u=torch.as_tensor(u_past[None], dtype=torch.float32),
-            q=torch.as_tensor(q_past[None], dtype=torch.float32),
-        )
+        past = [torch.as_tensor(one[None], dtype=torch.float32) for one in (q_past, u_past)]
+        history = History(q=past[0], u=past[1])
         after = model.step(history)[0].numpy().astype(float)
         moved = predictor.predict(u, before.astype(np.float32).astype(float))
         assert moved == pytest.approx(after - before, abs=3e-5)
@@ -319,9 +313,8 @@ def test_the_newest_quarter_of_the_window_names_the_fault() -> None:
     ):
         before = [0.9] * 15 if expected[1] > 0 else [0.2] * 15
         assert name_fault(before + newest, moves + expected) is fault
-    assert name_fault([*moves[:14], 0.0, -0.5, -0.5, -0.5, -0.5, 0.0], [1.0] * 20) is (
-        GuardTrip.JOINT_TURNED
-    )
+    turned = [*moves[:14], 0.0, -0.5, -0.5, -0.5, -0.5, 0.0]
+    assert name_fault(turned, [1.0] * 20) is GuardTrip.JOINT_TURNED
     # Of a short window the last motion alone.
     assert name_fault([0.0, 0.0, 2.0, -1.0], [1.0] * 4) is GuardTrip.JOINT_TURNED
     assert name_fault([0.0, 2.0, -1.0], [1.0] * 3) is GuardTrip.JOINT_TURNED

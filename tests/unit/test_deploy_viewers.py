@@ -172,9 +172,7 @@ def test_the_shipped_layout_names_topics_and_fields_that_exist(folder: Path) -> 
     text = (resources.files("deploy") / "recorder" / "foxglove_layout.json").read_text()
     layout = json.loads(text)
     bus = BusDescription(DBC, option("machine", "brokk170"))
-    fields: dict[str, set[str]] = {
-        topic: {one.name for one in own} for topic, own in TOPICS.items()
-    }
+    fields = {topic: {one.name for one in own} for topic, own in TOPICS.items()}
     fields |= {layout.name: set(bus.units(layout.name)) for layout in bus.layouts.values()}
     paths = [
         path["value"] for panel in layout["configById"].values() for path in panel.get("paths", [])

@@ -90,11 +90,8 @@ def test_it_ends_where_the_task_does(example: Any, machine: Machine) -> None:
     outcomes = set()
     for _ in range(200):
         target_m = tip_m + generator.uniform((-0.015, -0.015, 0.05), (0.015, 0.015, 0.15))
-        start = {
-            "target_m": torch.tensor(target_m, dtype=torch.float32)[None],
-            "target_pitch_rad": torch.zeros(1),
-            "scene": make_nominal_scenes(1),
-        }
+        start = {"target_m": torch.tensor(target_m, dtype=torch.float32)[None]}
+        start |= {"target_pitch_rad": torch.zeros(1), "scene": make_nominal_scenes(1)}
         tip = torch.tensor(tip_m, dtype=torch.float32)[None]
         expected = bool(task.judge(tip, torch.zeros(1), torch.zeros(1), start).reached)
         assert (policy.find_end(target_m, q, 0.0) == "success") == expected

@@ -1,5 +1,7 @@
 """Forward kinematics against MuJoCo, against differences, and by hand."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 
@@ -8,8 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
 from brokk_rl.kinematics import Gravity, Kinematics, compute_tool_kinematics, solve_joint_step
 from brokk_rl.machine import Dimension, Machine
+from brokk_rl.sim.model import compile_model
 
 
 def _random_positions(machine: Machine, count: int) -> torch.Tensor:
@@ -143,3 +148,64 @@ def test_the_weight_on_each_joint_is_mujocos_in_both_libraries(machine):
         np.testing.assert_allclose(load[i], -data.qfrc_bias, rtol=1e-6, atol=1e-3)
     tensors = Gravity(machine, torch.device("cpu")).load(torch.tensor(q).float())
     np.testing.assert_allclose(tensors, load, rtol=1e-4, atol=0.1)
+
+
+def of_one_joint(num_envs: int = 1) -> History:
+    return History(q=torch.zeros(num_envs, 3, 1), u=torch.zeros(num_envs, 3, 1))
+
+
+def rows(history: History, env: int = 0) -> tuple[list[float], list[float]]:
+    return history.q[env, :, 0].tolist(), history.u[env, :, 0].tolist()
+
+
+def test_one_control_step_follows_the_trace_of_the_docstring() -> None:
+    history = of_one_joint()
+    history.q[0, :, 0] = torch.tensor([8.0, 9.0, 10.0])  # q(t-2), q(t-1), q(t) at t = 10
+    history.u[0, :, 0] = torch.tensor([7.0, 8.0, 9.0])  # u(t-3), u(t-2), u(t-1)
+    history.push_u(torch.tensor([[10.0]]))
+    # the actuator model sees position and command of the same moment in one row
+    assert rows(history) == ([8, 9, 10], [8, 9, 10])
+    history.push_q(torch.tensor([[11.0]]))
+    # the next observation knows one position more than commands
+    assert rows(history) == ([9, 10, 11], [8, 9, 10])
+
+
+def test_a_reset_backfills_its_environments_and_leaves_the_others() -> None:
+    history = of_one_joint(2)
+    history.q += 1.0
+    history.u += 0.5
+    history.reset(torch.tensor([False, True]), torch.tensor([[7.0], [8.0]]))
+    assert rows(history, 0) == ([1, 1, 1], [0.5, 0.5, 0.5])
+    assert rows(history, 1) == ([8, 8, 8], [0, 0, 0])
+
+
+def test_every_update_keeps_the_addresses() -> None:
+    history = of_one_joint()
+    before = history.q.data_ptr(), history.u.data_ptr()
+    history.push_u(torch.ones(1, 1))
+    history.push_q(torch.ones(1, 1))
+    history.reset(torch.tensor([True]), torch.zeros(1, 1))
+    assert (history.q.data_ptr(), history.u.data_ptr()) == before
+
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def unseen(machine: Machine) -> Machine:
+    joints = tuple(replace(joint, body=None) for joint in machine.joints)
+    return replace(machine, name="unseen", mjcf=None, tool_m=None, joints=joints)
+
+
+@pytest.mark.parametrize(
+    "use", [lambda m: Kinematics(m), lambda m: Gravity(m, CPU), lambda m: compile_model(m, 0.01)]
+)
+def test_what_needs_its_links_says_what_is_missing(unseen: Machine, use) -> None:
+    with pytest.raises(ConfigError, match=r"'?unseen'? (is known by its joints|has no MJCF)"):
+        use(unseen)
+
+
+def test_bodies_stand_in_the_fingerprint(machine: Machine, unseen: Machine) -> None:
+    assert machine.has_bodies
+    known, other = machine.fingerprint(), unseen.fingerprint()
+    assert {key for key in known if known[key] != other[key]} == {"name", "geometry"}

@@ -88,9 +88,8 @@ def test_the_button_is_announced_and_then_green(
     assert time.monotonic() - began_s < 2.0
     assert button.evaluate("node => getComputedStyle(node).backgroundColor") == "rgb(0, 117, 43)"
     assert "HOLD" in button.inner_text()
-    assert page.locator("#right text", has_text="Arm 1").count() == 1, (
-        "the shared axis bears the name of the joint that is meant"
-    )
+    # the shared axis bears the name of the joint that is meant
+    assert page.locator("#right text", has_text="Arm 1").count() == 1
 
 
 def test_what_is_stale_is_grey_and_says_so(
@@ -106,15 +105,12 @@ def test_what_is_stale_is_grey_and_says_so(
     feed.now = replace(feed.now, streams=old)
     page.wait_for_selector("#left.stale")
     page.wait_for_selector("#button.stale:not(.now)")
-    stroke = page.locator("#left .advised .target").evaluate(
-        "node => getComputedStyle(node).stroke"
-    )
+    target = page.locator("#left .advised .target")
+    stroke = target.evaluate("node => getComputedStyle(node).stroke")
     assert stroke == "rgb(118, 118, 118)"
     assert page.locator("#streams li.stale").get_attribute("data-stream") == "advice"
-    assert (
-        page.locator("#right .own circle").evaluate("node => getComputedStyle(node).fill")
-        == "rgb(10, 75, 209)"
-    ), "the rest stays"
+    own = page.locator("#right .own circle").evaluate("node => getComputedStyle(node).fill")
+    assert own == "rgb(10, 75, 209)", "the rest stays"
 
 
 def test_a_stream_that_stops_grows_old_by_itself(
@@ -226,9 +222,8 @@ def test_safety_and_connection_are_told_apart_in_words(
     latched = change_state(SHOWN, guard=GuardState.LATCHED, trip=GuardTrip.CHANNEL_INVALID)
     feed.now = replace(latched, commands=True)
     page.wait_for_selector("#safety.bad")
-    assert (
-        page.locator("#safety").inner_text() == "LATCHED – messages corrupted or from two senders"
-    )
+    told = "LATCHED – messages corrupted or from two senders"
+    assert page.locator("#safety").inner_text() == told
     feed.now = change_state(SHOWN, estop=True, trip=GuardTrip.ESTOP)
     until(page, "document.getElementById('safety').textContent.includes('EMERGENCY STOP')")
     page.wait_for_selector("#deadman.careful")
@@ -243,12 +238,8 @@ def test_alarms_are_listed_by_gravity_and_stay_a_while_after_they_have_passed(
     page = opened(port)
     assert page.locator("#alarms").is_hidden()
     dead = (SourceAge("camera", 3.0, 1.0), *SHOWN.streams)
-    feed.now = replace(
-        SHOWN,
-        streams=dead,
-        recording=FAILED,
-        health=replace(SHOWN.health, delay_s=0.09, supervisor_silent=True),
-    )
+    health = replace(SHOWN.health, delay_s=0.09, supervisor_silent=True)
+    feed.now = replace(SHOWN, streams=dead, recording=FAILED, health=health)
     page.wait_for_selector("#alarms .alarm")
     lines = page.locator("#alarms li")
     eventually(lambda: lines.count() == 4)
@@ -310,9 +301,8 @@ def test_the_night_is_dark_and_can_be_read(port: int, opened: Callable[..., Any]
     for name in ("body", "#safety", "#streams li", "#deadman", "#targets button"):
         # contrast of WCAG 2
         assert (luminance(name, "color") + 0.05) / (paper + 0.05) >= 4.5, name
-    assert (luminance("#stop", "color") + 0.05) / (
-        luminance("#stop", "backgroundColor") + 0.05
-    ) >= 4.5
+    text, behind = luminance("#stop", "color"), luminance("#stop", "backgroundColor")
+    assert (text + 0.05) / (behind + 0.05) >= 4.5
     page.reload()
     page.wait_for_selector(":root.night")
 
@@ -346,9 +336,8 @@ def test_everything_is_done_by_keys_and_by_gloves(
     reached = set()
     for _ in range(13):
         page.keyboard.press("Tab")
-        reached.add(
-            page.evaluate("document.activeElement.id || document.activeElement.dataset.target")
-        )
+        focus = "document.activeElement"
+        reached.add(page.evaluate(f"{focus}.id || {focus}.dataset.target"))
     assert {"language", "scene", "A", "B", "start", "stop", "record"} <= reached
     assert {"along", "sound", "night"} <= reached
 
@@ -388,9 +377,7 @@ def test_the_scene_shows_machine_points_and_picture(
 ) -> None:
     color = np.zeros((90, 160, 3), np.uint8)
     color[:] = (230, 20, 200)  # nothing else on the page is magenta
-    pose = np.array(
-        [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.6], [0, 0, 0, 1]]
-    )
+    pose = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.6], [0, 0, 0, 1.0]])
     matrix = np.array([[120.0, 0, 79.5], [0, 120.0, 44.5], [0, 0, 1.0]])
     feed.now = replace(SHOWN, streams=(*SHOWN.streams, SourceAge("camera", 0.0, 1e6)))
     page = opened(port, scene=True)
@@ -404,9 +391,8 @@ def test_the_scene_shows_machine_points_and_picture(
 
 
 def _share(page: Any, name: str, color: list[int], within: int = 25) -> float:
-    picture = np.asarray(
-        Image.open(io.BytesIO(page.locator(name).screenshot())).convert("RGB")
-    ).astype(int)
+    shot = Image.open(io.BytesIO(page.locator(name).screenshot()))
+    picture = np.asarray(shot.convert("RGB")).astype(int)
     return float((np.abs(picture - color) < within).all(-1).mean())
 
 

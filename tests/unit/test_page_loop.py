@@ -160,9 +160,8 @@ def wanted(
         started.append(Process(arguments[0].folder))
         return started[-1]
 
-    aim = TargetSelector(
-        FileTarget(path=str(tmp_path / "none.json")).build(), memory.target, memory.holes
-    )
+    file = FileTarget(path=str(tmp_path / "none.json")).build()
+    aim = TargetSelector(file, memory.target, memory.holes)
     group: Any = SimpleNamespace(memory=memory, start=start)
     recorder = RecordingControl(group, CaptureConfig(tmp_path, "", MACHINE, {}, 0.0), False)
     return RequestHandler(memory, recorder, aim, armed=False, commands=commands), started

@@ -215,9 +215,8 @@ def test_a_recording_without_guard_page_and_camera_can_be_shown(
     with CaptureWriter(CaptureConfig(tmp_path, DBC, machine, {}, 0.0)) as log:
         for k in range(5):
             payload = bus.encode("JointPos1", {"Position_q1": 0.2, "Valid_q1": 1}, k)
-            header = FRAME.pack(
-                BEGIN_S + 0.1 * k, bus.layouts["JointPos1"].frame_id, 0, len(payload)
-            )
+            frame_id = bus.layouts["JointPos1"].frame_id
+            header = FRAME.pack(BEGIN_S + 0.1 * k, frame_id, 0, len(payload))
             log.add(FRAMES + header + payload)
     found = read_settings(tmp_path)
     shown = ReplayFeed(found, machine, read_capture(tmp_path / MCAP), clock).read_state()

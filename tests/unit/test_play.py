@@ -111,9 +111,8 @@ def test_a_target_that_is_moved_takes_block_estimate_and_arm_with_it(made: Calla
 
 def test_a_target_stays_out_of_the_machine_and_is_drawn_again_when_freed(made: Callable) -> None:
     session = made()
-    assert np.hypot(*session.move_target(np.array([0.1, 0.0, 0.7]))[:2]) == pytest.approx(
-        DISTANCE_M[0]
-    )
+    moved_m = session.move_target(np.array([0.1, 0.0, 0.7]))
+    assert np.hypot(*moved_m[:2]) == pytest.approx(DISTANCE_M[0])
     session.reset()
     session.step()
     assert np.hypot(*session.read().target_m[0, :2]) == pytest.approx(DISTANCE_M[0], abs=1e-4)
@@ -180,6 +179,5 @@ def test_effects_begin_off_and_a_dial_gives_them_to_all_machines(made: Callable)
     torch.testing.assert_close(dial.parameters[dial.key], expected)
     dial.turn(-5.0)
     assert not dial.parameters[dial.key].any()
-    assert (
-        made(neutral=False).dials["dead_time.dead_time_s"].parameters["dead_time.dead_time_s"].any()
-    )
+    name = "dead_time.dead_time_s"
+    assert made(neutral=False).dials[name].parameters[name].any()

@@ -1,16 +1,28 @@
 """PPO on the device against rsl-rl's own."""
 
+from __future__ import annotations
+
 import copy
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from composed import option
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
+from training import make, small, train
 
-from brokk_rl.rl.ppo import DevicePPO
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
 from brokk_rl.rl.rollout import CapturedRollout
+from brokk_rl.rl.settings import CAPPED, Exploration, Teacher, TrainingConfig
 
 NUM_ENVS, STEPS, GROUPS = 16, 6, {"actor": ["policy"], "critic": ["policy"]}
 GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.3, "std_type": "log"}
@@ -107,9 +119,8 @@ def test_captured_and_compiled_parts_learn_the_same_as_rsl_rls_own(
         theirs.storage = copy.deepcopy(ours.storage)
         found = _learn(ours, seed, last)
         assert found == pytest.approx(_learn(theirs, seed, last), rel=1e-3, abs=1e-5)
-        torch.testing.assert_close(
-            ours.storage.returns, theirs.storage.returns, rtol=1e-4, atol=1e-5
-        )
+        one, other = ours.storage.returns, theirs.storage.returns
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
     torch.set_float32_matmul_precision(precision)
     if device == "cuda":
         assert len(ours._epoch) == 1, "a pass over all mini-batches is one graph"
@@ -185,21 +196,78 @@ def test_a_rollout_stores_what_rsl_rl_would_store(device: str) -> None:
     with torch.no_grad():
         values = algorithm.critic(obs)
         actor(obs, stochastic_output=True)
-        torch.testing.assert_close(
-            storage.actions_log_prob[..., 0], actor.get_output_log_prob(storage.actions)
-        )
+        expected = actor.get_output_log_prob(storage.actions)
+        torch.testing.assert_close(storage.actions_log_prob[..., 0], expected)
         for stored, wanted in zip(
             storage.distribution_params, actor.output_distribution_params, strict=True
         ):
             torch.testing.assert_close(stored, wanted)
     torch.testing.assert_close(storage.observations["policy"], seen)
     torch.testing.assert_close(storage.values, values)
-    torch.testing.assert_close(
-        storage.rewards[..., 0], rewards + algorithm.gamma * values[..., 0] * ends[1]
-    )
+    expected = rewards + algorithm.gamma * values[..., 0] * ends[1]
+    torch.testing.assert_close(storage.rewards[..., 0], expected)
     assert torch.equal(storage.dones[..., 0].bool(), ends[0] | ends[1])
     drawn = (storage.actions - storage.distribution_params[0]) / storage.distribution_params[1]
     assert abs(float(drawn.mean())) < 0.2 and 0.85 < float(drawn.std()) < 1.15  # 288 draws
     assert len(drawn.unique()) == drawn.numel()
     with pytest.raises(OverflowError, match="full"):
         rollout.store(rewards[0], ends[0, 0], ends[1, 0])
+
+
+def capped(training: TrainingConfig, **schedule: Any) -> TrainingConfig:
+    """Returns a training whose cap falls from 0.5 to 0.125 between shares 0.2 and 0.6 of its budget."""
+    runner = copy.deepcopy(training.runner)
+    runner["actor"]["distribution_cfg"] = {
+        "class_name": CAPPED, "init_std": 0.6, "std_type": None, "std_range": [0.01, 0.5],
+    }  # fmt: skip
+    parts = {"cap": (0.5, 0.125), "over": (0.2, 0.6)} | schedule
+    return replace(training, runner=runner, exploration=Exploration(**parts))
+
+
+def test_the_cap_falls_in_equal_ratios() -> None:
+    schedule = Exploration(cap=(0.5, 0.125), over=(0.2, 0.6))
+    caps = [schedule.cap_at(share) for share in (0.0, 0.2, 0.4, 0.6, 1.0)]
+    assert caps == pytest.approx([0.5, 0.5, 0.25, 0.125, 0.125])
+
+
+def test_below_the_cap_it_is_the_gaussian_of_rsl_rl() -> None:
+    ours = CappedGaussian(3, 0.4, (0.1, 1.0))
+    theirs = GaussianDistribution(3, 0.4, (0.1, 1.0), std_type="log")
+    mean, action = torch.randn(5, 3), torch.randn(5, 3)
+    for one in (ours, theirs):
+        one.update(mean)
+    assert torch.equal(ours.log_prob(action), theirs.log_prob(action))
+    assert torch.equal(ours.entropy, theirs.entropy)
+
+
+@pytest.mark.parametrize(
+    ("std", "cap", "expected"), [(0.05, 0.2, 0.1), (0.15, 0.2, 0.15), (3.0, 0.2, 0.2), (0.5, 0.05, 0.1)]
+)  # fmt: skip
+def test_the_noise_lies_between_bound_and_cap(std: float, cap: float, expected: float) -> None:
+    noise = CappedGaussian(2, std, (0.1, 1.0))
+    noise.set_cap(cap)
+    noise.update(torch.zeros(1, 2))
+    assert noise.std[0].tolist() == pytest.approx([expected] * 2)
+
+
+def test_training_moves_the_cap_and_a_checkpoint_keeps_it(machine: Machine, tmp_path: Path) -> None:
+    training = capped(small(max_env_steps=16 * 4 * 40, save_interval=10))
+    runner = train(machine, tmp_path, training)
+    cap = runner.alg.actor.distribution.log_cap
+    # moved at the start of every tenth iteration, the last time when 30 of 40 were done
+    assert cap.item() == pytest.approx(math.log(0.125))
+    again = make(machine, tmp_path / "again", training)
+    assert again.alg.actor.distribution.log_cap.item() == pytest.approx(math.log(0.5))
+    again.load(str(tmp_path / "model_40.pt"))
+    assert again.alg.actor.distribution.log_cap.item() == pytest.approx(math.log(0.125))
+
+
+def test_a_schedule_for_another_distribution_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"expected the distribution .*CappedGaussian.*, got Gau"):
+        replace(option("rl", "ppo"), exploration=Exploration(cap=(0.5, 0.1), over=(0.0, 1.0)))
+
+
+def test_the_weights_of_a_teacher_fall_to_nothing() -> None:
+    teacher = Teacher(weight=4.0, until=(1.0, 0.5))
+    found = [teacher.weights_at(share) for share in (0.0, 0.25, 0.5, 1.0, 1.1)]
+    assert found == [[4.0, 4.0], [3.0, 2.0], [2.0, 0.0], [0.0, 0.0], [0.0, 0.0]]

@@ -9,9 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import training as runs
+from composed import option
 from rsl_rl.models import RNNModel
 
 from brokk_rl.errors import (
@@ -22,7 +24,14 @@ from brokk_rl.errors import (
     TrainingError,
 )
 from brokk_rl.machine import Machine
-from brokk_rl.policy_folder import find_checkpoint, list_checkpoints, read_checkpoint
+from brokk_rl.policy_folder import (
+    describe_policy,
+    find_checkpoint,
+    list_checkpoints,
+    read_checkpoint,
+    write_policy,
+)
+from brokk_rl.rl.policy import load_initial_weights, make_actor
 from brokk_rl.rl.settings import TrainingBudget
 
 ITERATION = 16 * runs.STEPS
@@ -194,9 +203,8 @@ def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path, machine: 
 
 
 def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: Path) -> None:
-    runner = runs.make(
-        machine, tmp_path, runs.small(max_env_steps=100 * ITERATION, max_fault_rate=0.001)
-    )
+    training = runs.small(max_env_steps=100 * ITERATION, max_fault_rate=0.001)
+    runner = runs.make(machine, tmp_path, training)
     step = runner.env.world.step
 
     def diverges(increment: torch.Tensor) -> None:
@@ -250,9 +258,38 @@ def test_a_weight_that_the_last_update_spoils_is_named_and_not_written(
 
 def test_the_divergence_of_updates_falls_to_a_tenth_while_the_policy_settles() -> None:
     training = runs.small(max_env_steps=100, settling=0.5)
-    assert [training.divergence(share) for share in (0.0, 0.5, 0.75, 1.0, 1.2)] == pytest.approx(
-        [0.01, 0.01, 0.0055, 0.001, 0.001]
-    )
+    found = [training.divergence(share) for share in (0.0, 0.5, 0.75, 1.0, 1.2)]
+    assert found == pytest.approx([0.01, 0.01, 0.0055, 0.001, 0.001])
     assert runs.small(max_env_steps=100, settling=0.0).divergence(0.99) == 0.01
     with pytest.raises(ConfigError, match=r"settling: expected .* 1, got 1.5"):
         runs.small(max_env_steps=100, settling=1.5)
+
+
+def spread(actor: Any) -> torch.Tensor:
+    return actor.distribution.log_std_param
+
+
+def test_training_that_begins_with_a_policy_has_its_network_and_its_own_exploration(
+    machine: Machine, tmp_path: Path
+) -> None:
+    training = runs.small(max_env_steps=64)
+    runner = runs.train(machine, tmp_path / "old", training)
+    old = runner.alg.actor
+    with torch.no_grad():
+        spread(old).fill_(-3.0)  # as one that has settled
+    env = runner.env
+    network = training.describe_network()
+    contract = describe_policy(network, env.task, env.description, machine)
+    write_policy(tmp_path / "old", contract, old.state_dict())
+    loop = runs.plant(machine).build(runs.CPU, 16, 64, 0)
+    actor = make_actor(network, loop.get_observations(), loop.num_actions)
+    load_initial_weights(actor, str(tmp_path / "old"), machine)
+    groups = loop.get_observations()
+    np.testing.assert_array_equal(actor(groups).detach(), old(groups).detach())
+    shipped = option("rl", "ppo").runner["actor"]["distribution_cfg"]["init_std"]
+    torch.testing.assert_close(spread(actor).exp(), torch.full((5,), shipped))
+
+    network["actor"]["hidden_dims"] = [8]
+    other = make_actor(network, loop.get_observations(), loop.num_actions)
+    with pytest.raises(CheckpointError, match="policy="):
+        load_initial_weights(other, str(tmp_path / "old"), machine)

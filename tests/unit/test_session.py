@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 import torch
 
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, DeviceError, StorageError
 from brokk_rl.explain import explain
+from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session, read_record, require_new_folder, write_json
 
 
@@ -127,3 +129,60 @@ def test_a_broken_record_is_named(tmp_path: Path) -> None:
     (tmp_path / "session.json").write_text("{")
     with pytest.raises(StorageError, match=r"session\.json"):
         read_record(tmp_path)
+
+
+HEADINGS = ["policy", *(f"quantity {k}" for k in range(20))]
+
+
+def test_a_file_gets_every_row_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    print_table(HEADINGS, [[name, *(f"{k}.5" for k in range(20))] for name in ("a[b]", "c")])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["policy", "a[b]", "c"]
+    assert lines[1].split()[1:] == [f"{k}.5" for k in range(20)]
+
+
+def test_missing_values_are_dashes_and_text_is_no_markup(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_table([], [["a", None], ["b", 1.5]], title="[bold]")
+    print_text("position[foot] " * 20)
+    out = capsys.readouterr().out
+    assert "–" in out and "1.5" in out and "[bold]" in out
+    assert "position[foot] " * 20 in out
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time that the module reads, s."""
+    now = [0.0]
+    monkeypatch.setattr("rich.console.monotonic", lambda: now[0])
+    return now
+
+
+def test_a_log_file_gets_a_line_a_minute(
+    clock: list[float], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    work = ItemProgress("training", SHARE)
+    for second in range(0, 181, 10):
+        clock[0] = float(second)
+        work.reach(second / 360.0, note="300 steps/s")
+    # 70 s are 0.194 of the whole: 290 s are left; the next line comes more than a minute later
+    assert caplog.messages == [
+        "training: 19%, about 5 min left, 300 steps/s",
+        "training: 39%, about 4 min left, 300 steps/s",
+    ]
+
+
+def test_a_repeated_step_does_not_go_back_and_quiet_work_says_nothing(
+    clock: list[float], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    work = ItemProgress("frames", None, quiet=True)
+    work.reach(7)
+    clock[0] = 100.0
+    work.reach(3, title="looking")
+    assert work.describe() == "7" and caplog.messages == []

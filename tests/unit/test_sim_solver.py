@@ -23,10 +23,9 @@ def _arm(num_joints):
         f'<geom name="side{i}" type="sphere" pos="0.4 0.2 0" size="0.1" mass="3" contype="0"/>'
         for i in range(num_joints)
     ]
-    pairs = "".join(
-        f'<pair geom1="floor" geom2="side{i}" friction="0.3 {0.4 + 0.1 * i}"/>'
-        for i in range(num_joints)
-    )
+    pairs = ""
+    for i in range(num_joints):
+        pairs += f'<pair geom1="floor" geom2="side{i}" friction="0.3 {0.4 + 0.1 * i}"/>'
     # the floor takes the friction and the dimension of what touches it
     floor = '<geom name="floor" type="plane" size="9 9 1" priority="-1" contype="0" conaffinity="1" condim="1"/>'
     option = '<option cone="elliptic" impratio="2" timestep="0.01" tolerance="0" iterations="200"/>'

@@ -38,10 +38,8 @@ class HoldStillProcess(TaskProcess):
     def __init__(self, machine: Machine, num_envs: int, device: torch.device) -> None:
         self._machine = machine
         self.num_actions = machine.num_joints
-        self.state = {
-            "steps": torch.zeros(num_envs, device=device),
-            "q": torch.zeros(num_envs, machine.num_joints, device=device),
-        }
+        self.state = {"steps": torch.zeros(num_envs, device=device)}
+        self.state["q"] = torch.zeros(num_envs, machine.num_joints, device=device)
         self.episode = {"success_strict": torch.zeros(num_envs, device=device)}
         self.episode |= {"moved": torch.zeros(num_envs, device=device)}
         self._policy = torch.zeros(num_envs, machine.num_joints, device=device)
@@ -69,9 +67,8 @@ class HoldStillProcess(TaskProcess):
         self.episode["moved"].copy_(moved)
         self.episode["success_strict"].copy_((timed_out & (moved < 0.1)).float())
         reason = torch.where(world.faults, 0.0, torch.where(timed_out, 1.0, -1.0))
-        return Transition(
-            reward=-moved, terminated=world.faults.clone(), timed_out=timed_out, reason=reason
-        )
+        ends = {"terminated": world.faults.clone(), "timed_out": timed_out, "reason": reason}
+        return Transition(reward=-moved, **ends)
 
     def observe(self, history: Any, shift_m: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         self._policy.copy_(history.q[:, -1] - self.state["q"])

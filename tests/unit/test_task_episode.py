@@ -79,9 +79,8 @@ def test_starts_lie_within_the_limits_and_in_the_open(name: str, machine: Machin
 def test_starts_are_the_same_for_every_controller(machine: Machine) -> None:
     task = option("task", "borehole_insertion")
     other = replace(task.classical, gain_1_s=0.1, margin_rad=0.3, straight=False, damping=1.0)
-    first, second = (
-        one.build(machine, 1, CPU).starts(64, 3) for one in (task, replace(task, classical=other))
-    )
+    both = (task, replace(task, classical=other))
+    first, second = (one.build(machine, 1, CPU).starts(64, 3) for one in both)
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 

@@ -56,9 +56,8 @@ def term(function: str, **changes: Any) -> term_task.ObservedTerm:
 
 
 def figure(function: str, title: str) -> term_task.FigureTerm:
-    return term_task.FigureTerm(
-        function=function, reduce="last", title=title, unit="share", factor=1.0, digits=2
-    )
+    shown: Any = {"title": title, "unit": "share", "factor": 1.0, "digits": 2}
+    return term_task.FigureTerm(function=function, reduce="last", **shown)
 
 
 TIME = term_task.TerminationTerm(function="tasks.terms:time_limit", outcome="time")
@@ -137,9 +136,8 @@ def test_the_vector_holds_the_terms_in_order_oldest_sample_first(
     assert float(stage.first[0, 15]) == pytest.approx((-asked - 1.0) / 2.0)
     stage.turn(0.3)
     seen = stage.process.observe(stage.history)
-    assert seen["policy"][0, [0, 5, 10]].tolist() == pytest.approx(
-        [scale(q0), scale(q0), scale(q0 + 0.3 * machine.period_s)]
-    )
+    expected = [scale(q0), scale(q0), scale(q0 + 0.3 * machine.period_s)]
+    assert seen["policy"][0, [0, 5, 10]].tolist() == pytest.approx(expected)
     assert float(seen["policy"][0, 15]) == pytest.approx((0.3 - asked - 1.0) / 2.0, abs=1e-4)
     assert seen["privileged"].shape == (1, 1)
 
@@ -219,10 +217,8 @@ def test_the_contract_names_each_part_and_gives_the_vector_back(
 
 def test_its_description_gives_the_same_terms_back() -> None:
     task = make()
-    other = make(
-        observation={"error": term("tasks.terms:commands")},
-        action=term_task.JointAction(scale=1.0, mask=False),
-    )
+    action = term_task.JointAction(scale=1.0, mask=False)
+    other = make(observation={"error": term("tasks.terms:commands")}, action=action)
     node = describe_task(task).apply_to(describe_spec(other))
     assert build_node(node, "task") == task
 
