@@ -57,7 +57,7 @@ SCIENCE = {
     "brokk_rl.observation": ["test_reward.py", "test_term_task.py"],
     "brokk_rl.statistics": ["test_compare.py"],
     "tasks.control": ["test_classical.py", "test_reward.py", "test_advice.py"],
-    "tasks.terms": ["test_reward.py", "test_term_task.py", "test_termination.py"],
+    "tasks.terms": ["test_reward.py", "test_term_task.py"],
     "diagnosis.engine.decide": ["test_diagnosis_simulated.py", "test_servo_engine.py"],
     "diagnosis.engine.measure": ["test_diagnosis_simulated.py", "test_servo_engine.py"],
     "diagnosis.engine.rows": ["test_diagnosis_simulated.py", "test_servo_engine.py"],

@@ -577,35 +577,32 @@ def test_shapes_of_another_machine_are_none(tmp_path: Path) -> None:
     assert guard_setup.build_envelope(GUARD, MACHINE, commands=True) is not None
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"schema": 2}', "[" * 50_000])
-def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "shapes.json"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_machine_shapes(path, MACHINE)
+def write_shapes(**change: Any) -> str:
+    """Returns the shipped shapes with changes of the first of the arm."""
+    content = json.loads(SHIPPED.read_text())
+    content["arm"][0].update(change)
+    return json.dumps(content)
 
 
 @pytest.mark.parametrize(
-    "change",
+    "text",
     [
-        {"link": "first"}, {"link": 17}, {"link": -2}, {"radius_m": -0.1}, {"radius_m": math.inf},
-        {"begin_m": [math.nan, 0.0, 0.0]}, {"end_m": [0.0, 0.0]}, None,
+        "", "[]", "{}", '{"schema": 2}', "[" * 50_000,
+        # with these nothing would be withheld
+        write_shapes(link="first"), write_shapes(link=17), write_shapes(link=-2), write_shapes(radius_m=-0.1),
+        write_shapes(radius_m=math.inf), write_shapes(begin_m=[math.nan, 0.0, 0.0]), write_shapes(end_m=[0.0, 0.0]),
+        json.dumps(json.loads(SHIPPED.read_text()) | {"arm": []}), None,
     ],
+    ids=range(14),
 )  # fmt: skip
-def test_shapes_with_which_nothing_would_be_withheld_are_refused(
-    tmp_path: Path, change: dict[str, object] | None
+def test_shapes_that_cannot_be_read_or_withhold_nothing_are_refused(
+    tmp_path: Path, text: str | None
 ) -> None:
-    content = json.loads(SHIPPED.read_text())
-    if change is None:
-        content["arm"] = []
-    else:
-        content["arm"][0].update(change)
     path = tmp_path / "shapes.json"
-    path.write_text(json.dumps(content))
+    if text is not None:
+        path.write_text(text)
     with pytest.raises(ConfigError, match="cannot be read"):
         read_machine_shapes(path, MACHINE)
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_machine_shapes(tmp_path / "none.json", MACHINE)
 
 
 def test_a_longer_link_has_longer_capsules() -> None:

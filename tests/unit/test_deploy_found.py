@@ -72,6 +72,15 @@ def watches(
         watch.stage.close()
 
 
+@pytest.fixture
+def stage(machine: Machine, tmp_path: Path) -> Iterator[Stage]:
+    """A stage of its own that collects and is under way."""
+    stage = Stage(machine, "collect", tmp_path)
+    stage.get_going()
+    yield stage
+    stage.close()
+
+
 def change_valves(stage: Stage, change: Callable[[np.ndarray], np.ndarray]) -> None:
     """Let the gateway's valves do something else than it decides, and say so truly."""
     decide = type(stage.twin._gateway).decide
@@ -237,11 +246,8 @@ def test_a_borehole_that_jumps_is_not_followed(
 
 
 def test_the_seen_face_is_met_slowly_whatever_borehole_is_chosen(
-    machine: Machine, tmp_path: Path, record_property: Note
+    machine: Machine, stage: Stage, record_property: Note
 ) -> None:
-    stage = Stage(machine, "collect", tmp_path)
-    stage.get_going()
-
     def locate_tip() -> np.ndarray:
         return np.asarray(compute_tool_kinematics(machine, np.asarray(stage.twin._q)).tip_in_base_m)
 
@@ -271,7 +277,6 @@ def test_the_seen_face_is_met_slowly_whatever_borehole_is_chosen(
     stage.go(0.1)
     stage.fault("none")
     stage.go(5.0)
-    stage.close()
     assert len(speeds_m_s) > 3 and max(speeds_m_s) < 0.28
     record_property("borehole: wrong one; speed at the seen face, m/s", round(max(speeds_m_s), 3))
 
@@ -352,14 +357,8 @@ def flood(stage: Stage) -> None:
     ("inject", "goes_on"), [(send_one_early, True), (set_back, False), (flood, False)]
 )
 def test_a_healthy_sender_is_heard_again_after_a_press(
-    machine: Machine,
-    tmp_path: Path,
-    inject: Callable[[Stage], None],
-    goes_on: bool,
-    record_property: Note,
+    stage: Stage, inject: Callable[[Stage], None], goes_on: bool, record_property: Note
 ) -> None:
-    stage = Stage(machine, "collect", tmp_path)
-    stage.get_going()
     inject(stage)
     stage.go(3.5)
     moves_on = stage.moves
@@ -372,7 +371,6 @@ def test_a_healthy_sender_is_heard_again_after_a_press(
         if stage.moves:
             break
     moves, seconds = stage.moves, (stage.ms - begun_ms) / 1e3
-    stage.close()
     assert moves and moves_on == goes_on
     what = (inject.__doc__ or "").rstrip(".")
     record_property(f"clock: {what}; moves on", moves_on)
@@ -381,10 +379,8 @@ def test_a_healthy_sender_is_heard_again_after_a_press(
 
 @pytest.mark.parametrize("kind", ["dead-man bounces at 10 Hz", "policy asks for 1, 0, 1, 0"])
 def test_valves_are_not_hammered(
-    machine: Machine, tmp_path: Path, kind: str, record_property: Note
+    stage: Stage, tmp_path: Path, kind: str, record_property: Note
 ) -> None:
-    stage = Stage(machine, "collect", tmp_path)
-    stage.get_going()
     watch, begun_ms, starts, before = Watch(stage, tmp_path), stage.ms, [0], [True]
     if kind.startswith("dead-man"):
         stage.twin._holds_deadman = lambda now_s: int(20.0 * now_s) % 2 == 0  # type: ignore[method-assign]
@@ -397,7 +393,6 @@ def test_valves_are_not_hammered(
 
     stage.meddle = count
     watch.go(3.0)
-    stage.close()
     assert 5 <= starts[0] <= 16, "five a second"
     assert any("valves switched too often" in one for one in watch.told_ms)
     record_property(f"pulses: {kind}; in 3 s", starts[0])

@@ -22,8 +22,9 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
+from perception.calibrate import transforms
 from perception.calibrate.arm import compute_link_poses
-from perception.label.camera_pose import Charuco
+from perception.label.camera_pose import Charuco, estimate_board_pose
 from perception.modes.board import draw_board
 from perception.modes.score_camera import match_found_holes
 from perception.render.board_on_arm import BoardOnArm, BoardScenes
@@ -42,6 +43,29 @@ def test_the_page_is_to_scale(brokk: Callable[..., Any], tmp_path: Path) -> None
     # 8 x 6 squares of 5 cm, 3 cm of margin on each side: 46 x 36 cm
     size = [float(value) for value in box.group(1).split()][2:]
     np.testing.assert_allclose(size, np.array([0.46, 0.36]) * POINTS_PER_M, atol=0.01)
+
+
+def test_a_pose_of_the_board_is_as_uncertain_as_it_says() -> None:
+    """Of a bent lens, with 0.2 px of noise: squared distances of six numbers are 6 on average."""
+    chance, matrix = (
+        np.random.default_rng(0),
+        np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]]),
+    )
+    frame = blank(480, 640, camera_matrix=matrix, distortion=np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
+    corners_m = np.stack(
+        [*np.meshgrid(np.arange(7) * 0.05, np.arange(5) * 0.05), np.zeros((5, 7))], -1
+    )
+    corners_m, turn = corners_m.reshape(-1, 3), np.array([0.5, -0.6, 0.2])
+    shift_m = np.array([-0.1, 0.05, 0.9])
+    true = transforms.make_transform(np.asarray(cv2.Rodrigues(turn)[0]), shift_m)
+    seen = cv2.projectPoints(corners_m, turn, shift_m, matrix, frame.distortion)[0][:, 0]
+    distances = []
+    for _ in range(100):
+        noisy = seen + chance.normal(0.0, 0.2, seen.shape)
+        found = estimate_board_pose(frame, corners_m, noisy, 0.2, 1.0)
+        away = transforms.compute_motion(found.camera_from_board[0], true)
+        distances.append(away @ np.linalg.solve(found.cov[0], away))
+    assert 5.0 < np.mean(distances) < 7.0
 
 
 def test_opencv_finds_every_corner_at_its_place_on_the_page() -> None:

@@ -1,4 +1,4 @@
-"""A task made of terms: its vector, its success, its masks and its contract, against numbers by hand."""
+"""A task made of terms: its vector, its success, its endings, its masks and its contract, against numbers by hand."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from motion import rest
 from brokk_rl.build import build_node, describe_spec
 from brokk_rl.checks import check_task
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import restore_encoder
@@ -27,6 +28,7 @@ from brokk_rl.sim.simulator import find_site
 from brokk_rl.spec import spec
 from deploy.policy.bundle import PolicyBundle
 from tasks import term_task
+from tasks.process import TerminationManager
 from tasks.terms import StepState
 
 CPU = torch.device("cpu")
@@ -285,3 +287,79 @@ def test_a_scene_that_cannot_be_built_is_refused(machine: Machine, tmp_path: Pat
         find_site("nowhere.xml", native)
     with pytest.raises(ConfigError, match="sim=kinematic builds no scene"):
         find_site(str(path), cast(Any, Kinematic()))
+
+
+NOWHERE = torch.zeros(3, dtype=torch.bool)
+
+
+def state(q: torch.Tensor | None = None, **changes: Any) -> StepState:
+    """Returns three environments in the middle of an episode in which nothing ends."""
+    names = ("pitch_rad", "contact_force_n", "peak_force_n", "steps", "age", "held_share")
+    fields: dict[str, Any] = {name: torch.zeros(3) for name in names}
+    fields |= {name: torch.zeros(3, 2) for name in ("u", "u_before")}
+    still = (torch.zeros(3, 2) if q is None else q)[:, None]
+    fields |= {"history": History(q=still, u=still), "start": {}}
+    fields |= {"lower": -torch.ones(2), "upper": torch.ones(2), "tip_m": torch.zeros(3, 3)}
+    fields |= {"max_steps": 10, "period_s": 0.05, "success": NOWHERE, "failed": NOWHERE}
+    return StepState(**fields | changes)
+
+
+def ends(name: str, outcome: Any = "failure", **params: Any) -> term_task.TerminationTerm:
+    return term_task.TerminationTerm(function=f"tasks.terms:{name}", params=params, outcome=outcome)
+
+
+START = ends("start_in_contact", "void")
+
+
+@pytest.mark.parametrize(
+    ("term", "changes"),
+    [
+        (ends("joint_limit", margin=0.1), {"q": [[0.0, 0.0], [0.0, -0.91], [0.89, 0.0]]}),
+        (ends("force_limit", largest_n=100.0), {"contact_force_n": [0.0, 101.0, 100.0]}),
+        (TIME, {"steps": [0.0, 10.0, 9.0]}),
+        (SUCCESS, {"success": [False, True, False]}),
+        (START, {"age": [1.0, 1.0, 2.0], "contact_force_n": [0.0, 1.0, 1.0]}),
+    ],
+    ids=lambda value: getattr(value, "function", ""),
+)
+def test_a_term_holds_in_the_second_environment_only(term: Any, changes: dict[str, Any]) -> None:
+    here = state(**{name: torch.tensor(value) for name, value in changes.items()})
+    assert term.resolve()(here).tolist() == [False, True, False]
+
+
+def test_the_first_term_counts_and_time_counts_last() -> None:
+    blow, limit = ends("force_limit", largest_n=100.0), ends("joint_limit", margin=0.0)
+    terms = TerminationManager({"time_limit": TIME, "blow": blow, "off": None, "limit": limit})
+    assert terms.reasons == ("blow", "limit", "fault", "time_limit")
+    q, force_n = torch.tensor([[2.0, 0.0], [0.0, 0.0], [2.0, 0.0]]), torch.tensor([200.0, 0.0, 0.0])
+    here = state(q, steps=torch.tensor([10.0, 10.0, 1.0]), contact_force_n=force_n)
+    endings = terms.judge(here, torch.tensor([False, False, True]))
+    counted = [terms.reasons[int(index)] for index in endings.reason]
+    assert counted == ["blow", "time_limit", "limit"]
+    assert endings.terminated.tolist() == [True, False, True]
+    assert endings.timed_out.tolist() == [False, True, False]
+    assert here.failed.tolist() == [True, False, True]
+    assert endings.is_sound.tolist() == [True, True, False]
+
+
+def test_a_void_start_is_no_success_and_no_failure() -> None:
+    terms = TerminationManager({"success": SUCCESS, "start": START, "time_limit": TIME})
+    here = state(age=torch.ones(3), success=~NOWHERE, contact_force_n=torch.tensor([1.0, 0.0, 0.0]))
+    endings = terms.judge(here, NOWHERE)
+    assert here.success.tolist() == [False, True, True] and not here.failed.any()
+    assert endings.reason.tolist() == [1.0, 0.0, 0.0]
+    assert endings.is_sound.tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("terms", "told"),
+    [
+        ({"success": SUCCESS}, "expected a time limit"),
+        ({"time_limit": None}, "expected a time limit"),
+        ({"fault": TIME}, "termination.fault: the simulator's own faults"),
+    ],
+)
+def test_a_list_that_cannot_end_an_episode_is_refused(terms: dict[str, Any], told: str) -> None:
+    task = option("task", "goal_pose")
+    with pytest.raises(ConfigError, match=told):
+        replace(task, termination=terms)
