@@ -80,11 +80,9 @@ class Convert:
             log.info("%s: %d recordings, %.1f minutes", path, len(several), minutes)
             if several and DAMAGE in several[0].metadata:
                 damages.append(f"{path}: {several[0].metadata[DAMAGE]}")
-        count = sum(map(len, pieces.values()))
-        log.info("%d recordings of %d logs in %s", count, len(pieces), folder)
         recordings = list(chain.from_iterable(pieces.values()))
-        remarks = examine_recordings(recordings, self.machine)
-        head, rows = tabulate_remarks(remarks)
+        log.info("%d recordings of %d logs in %s", len(recordings), len(pieces), folder)
+        head, rows = tabulate_remarks(examine_recordings(recordings, self.machine))
         if rows:
             print_table(head, rows, "look at these first")
         choices = (read_record(self.session.folder) or {}).get("choices", {})

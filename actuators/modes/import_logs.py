@@ -110,8 +110,8 @@ class ImportLogs:
         }
         write_text(folder / PAGE_FILE, render_page(TEMPLATE, values))
         print_table(HEAD, [(one.subject, one.value, one.sureness, one.reason) for one in guesses])
-        texts = (values["summary"], f"look at {folder / PAGE_FILE}, then:", command)
-        for text in (*draft.remarks, *texts):
+        look = f"look at {folder / PAGE_FILE}, then:"
+        for text in (*draft.remarks, values["summary"], look, command):
             print_text(text)
 
 

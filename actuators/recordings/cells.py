@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -50,13 +50,15 @@ def tell_kind(cell: Any, decimal: str) -> CellKind:
     return "number" if is_number else "text"
 
 
-def tell_column(cells: Iterable[Any], decimal: str) -> CellKind:
-    """Return the kind of most of the cells of a column; one of empty cells counts as numbers."""
-    counts = Counter[CellKind]()
-    for cell in cells:
-        if isinstance(cell, np.ndarray) or cell not in MISSING:
-            counts[tell_kind(cell, decimal)] += 1
-    return counts.most_common(1)[0][0] if counts else "number"
+def tell_column(cells: Any, decimal: str) -> CellKind:
+    """Return the kind of most of the cells of a column, a series of pandas; one of empty cells counts as text."""
+    if cells.dtype.kind != "O":
+        return "number"
+    filled = cells.dropna()
+    sample = filled[:: max(1, len(filled) // SAMPLED_CELLS)]
+    shown = [cell for cell in sample if str(cell) not in MISSING]
+    counts = Counter[CellKind](tell_kind(cell, decimal) for cell in shown)
+    return counts.most_common(1)[0][0] if counts else "text"
 
 
 def convert_frame(frame: Any, decimal: str, labels: Labels) -> dict[str, np.ndarray]:
@@ -72,11 +74,7 @@ def convert_frame(frame: Any, decimal: str, labels: Labels) -> dict[str, np.ndar
     """
     found: dict[str, np.ndarray] = {}
     for name, cells in frame.items():
-        kind = "number"
-        if cells.dtype.kind == "O":
-            filled = cells.dropna()
-            sample = filled[:: max(1, len(filled) // SAMPLED_CELLS)]
-            kind = tell_column(sample, decimal) if len(filled) else "text"
+        kind = tell_column(cells, decimal)
         if kind == "list":
             items = _convert_lists(cells)
             given = labels.get(name, ())

@@ -37,6 +37,8 @@ FOLLOWED = {"position": "position", "velocity": "speed", "torque": "acceleration
 """Quantity of the motion that follows each kind of command."""
 TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
+SAME_SHARE = 0.1
+"""Part by which slope and offset of the line may differ from 1 : 1 for a target in the unit of the position."""
 MOST_TURNS = 2.0
 """Turns beyond which a joint with a target is in doubt: joints of arms and legs stop before, winches do not."""
 LAST_LAG = 0.95
@@ -212,7 +214,7 @@ class JointGuess:
         """
         slope, rest = matrix.fit_target(at)
         r = {kind: float(several[at, at]) for kind, several in matrix.r.items()}
-        self._judge_kind(r, slope, given.command)
+        self._judge_kind(r, slope, rest, given.command)
         if self.u.is_changing:
             self._judge_motion(matrix, at)
             self._check_steps(slope, rest)
@@ -241,18 +243,26 @@ class JointGuess:
         guess = Guess(f"{self.name}: {what}", value, evidence, (), is_given)
         self.guesses[what] = guess.advise(advise(what)) if what in GIVEN_BY_KEY else guess
 
-    def _judge_kind(self, r: Mapping[str, float], slope: float, given: CommandKind | None) -> None:
+    def _judge_kind(
+        self, r: Mapping[str, float], slope: float, rest: float, given: CommandKind | None
+    ) -> None:
         """Choose which quantity the command sets."""
         named, size = self.u.name.quantity, {kind: abs(value) for kind, value in r.items()}
         weights = {}
         for kind in KIND_TEXTS:
             weights[kind] = 2.5 * (kind == named) - math.log(max(1.0 - size[kind], 0.005))
-        weights["position"] += 0.5 if TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] else -0.5
+        # a line of 1 : 1 from targets to positions is no coincidence
+        is_through = abs(rest) <= SAME_SHARE * float(np.ptp(self.q.values))
+        if abs(slope - 1.0) <= SAME_SHARE and is_through:
+            weights["position"] += 3.0
+        else:
+            weights["position"] += 0.5 if TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] else -0.5
         if named != "torque":  # an acceleration that follows a target is that of a servo
             weights["torque"] = -math.inf
         self.kind = chosen = given or max(weights, key=lambda kind: weights[kind])
-        with_speed = f"with speed {size['velocity']:.2f}"
-        text = f"correlation with position {size['position']:.2f}, {with_speed}"
+        text = (
+            f"correlation with position {size['position']:.2f}, with speed {size['velocity']:.2f}"
+        )
         if given is not None:
             is_refuted = given != "torque" and self.u.is_changing and size[given] < NO_CORRELATION
             evidence = [("as given by log.command", 5.0), (text, -6.0 if is_refuted else 0.0)]

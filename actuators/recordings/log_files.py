@@ -81,7 +81,7 @@ def _find_reader(path: Path) -> str:
     """Return the reader of a log; refuse an empty file, and one whose first bytes are those of another kind."""
     if path.is_dir():
         reader = tell_folder(path)
-        if reader is None and len(_list_csv_files(path)) < 2:
+        if reader is None and len([*path.glob("*.csv")]) < 2:
             raise RecordingError(
                 f"{path}: expected a folder with the CSV files of one run, a LeRobotDataset (meta/info.json) or a bag of "
                 "ROS 2 (metadata.yaml)"
@@ -156,15 +156,11 @@ def _expand_log(path: Path) -> list[Path]:
     return found
 
 
-def _list_csv_files(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.glob("*.csv"))
-
-
 def _list_csv_runs(folder: Path) -> list[Path]:
     """Return the folders below that hold several CSV files by the same names: each is a run."""
     files = {}
     for entry in folder.iterdir():
         if entry.is_dir() and not entry.name.startswith(".") and tell_folder(entry) is None:
-            files[entry] = tuple(_list_csv_files(entry))
+            files[entry] = tuple(sorted(path.name for path in entry.glob("*.csv")))
     counts = Counter(files.values())
     return [entry for entry, names in files.items() if len(names) > 1 and counts[names] > 1]

@@ -33,10 +33,7 @@ COMMENT_MARKS = "#%;/!*"
 FIRST_ROWS = 3
 """Rows on end from which data begin; a block of describing lines may hold some numbers too."""
 
-COMMAS = {
-    ",": "; if the comma is both delimiter and decimal sign, export again with a decimal point, or with ; or tab between the cells"
-}
-"""Further advice in the error about a delimiter, by that delimiter."""
+COMMA_ADVICE = "; if the comma is both delimiter and decimal sign, export with a decimal point, or ; or tab between cells"
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
 
@@ -106,8 +103,7 @@ class TextLog(LogFile):
             encoding = "cp1252"
             text = head.decode(encoding, errors="replace")
         if "\0" in text:
-            known = "neither text nor a kind of log that is known by its ending"
-            self.refuse(f"{known} (it holds bytes of 0)")
+            self.refuse("neither text nor a kind of log that is known by its ending (bytes of 0)")
         lines = text.splitlines()
         return lines if is_all else lines[:-1], encoding
 
@@ -143,7 +139,8 @@ class TextLog(LogFile):
                 )
                 if is_near and len(cells) > 1:
                     counts = f"{len(cells)} cells, the rows below it have {width}"
-                    mend = f"mend the header, or the delimiter '{delimiter}'{COMMAS.get(delimiter, '')}"
+                    mend = f"mend the header, or the delimiter '{delimiter}'"
+                    mend += COMMA_ADVICE if delimiter == "," else ""
                     self.refuse(f"the header has {counts}: '{line.strip()[:80]}'; {mend}")
                 continue
             if not units and all(cell in MISSING or is_unit(cell) for cell in cells):
