@@ -26,6 +26,7 @@ from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, 
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate
 from diagnosis.effect_library import DetectedEffect, EffectType
+from diagnosis.engine.coverage import measure_uncovered
 from diagnosis.engine.decide import LEAST_NATS, Decider, Decision, EffectFinding
 from diagnosis.engine.side import measure_units, stack_side
 from diagnosis.engine.sizes import SIGMAS, describe_numbers
@@ -64,6 +65,7 @@ class SearchResult:
         rivals: All effects with what they earn, the best first.
         otherwise: The reason where nothing is named.
         evidence: Further evidence, plain JSON data.
+        gates: Conditions of any verdict that the search itself found.
     """
 
     verdict: Verdict
@@ -72,6 +74,7 @@ class SearchResult:
     rivals: Sequence[EffectFinding]
     otherwise: str
     evidence: Mapping[str, Any]
+    gates: Sequence[Gate] = ()
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,7 @@ class Diagnosis(ABC):
         known = examine_recordings(self.case.reference, machine)
         told = gates.judge_recordings(remarks, known, self.case.field, self.case.reference, machine)
         found = self.search(told, tell)
+        told += found.gates
         tell("sizes and proof", 0.9)
         proof, verdict, detected = found.proof, found.verdict, self.detected
         named = {j for one in proof.findings for j in one.joints}
@@ -217,6 +221,9 @@ class ReferenceDiagnosis(Diagnosis):
             rivals=decision.table.list_found(),
             otherwise=_explain(decision, self.case.machine),
             evidence=_describe_evidence(decision),
+            gates=[
+                gates.judge_coverage(measure_uncovered(field, decider.evidence.covered), machine)
+            ],
         )
 
     def size(self, one: EffectFinding, proof: RepairProof) -> tuple[str, SizesByName]:
@@ -295,8 +302,10 @@ def list_alike(
     return (), None
 
 
-ACCEPTED_FINDINGS = ("does_not_obey", "unlogged_input")
-"""Findings about a joint that a named effect may be the cause of."""
+ACCEPTED_FINDINGS = ("does_not_obey", "unlogged_input", "interlock")
+"""Findings about a joint that a named effect may be the cause of: a pump that is too small starves a joint while
+others move, as an interlock does. Of opened cases two with such effects are told so since; two with a stop that
+moved, whose joints stand still for half of the time, stay unknown."""
 
 
 def accept_named_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate]:

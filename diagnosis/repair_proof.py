@@ -33,6 +33,7 @@ from diagnosis.free_runs import (
     draw_weights,
     summarise_draws,
 )
+from diagnosis.gates import MAX_RIVAL_RATIO
 from diagnosis.rivals import measure_rivals
 
 NOISE_FACTOR = 3.0
@@ -180,17 +181,21 @@ class RepairProof(ABC):
         return found
 
     def judge(self) -> list[Gate]:
-        """Return whether the repaired simulator beats standing still on every named joint, without names on all."""
+        """Return whether the repaired simulator is of use on every named joint, without names on all.
+
+        It errs less than standing still does, or hardly more than is foretold of the unchanged machine.
+        """
         named = {j for one in self.findings for j in one.joints}
         joints = sorted(named or range(self.machine.num_joints))
         noise = sensors.estimate_sensor_noise(self._case.reference or self._case.field)
         after = np.sqrt(self.measure_squares(self.after)[0])
+        usual = MAX_RIVAL_RATIO * np.sqrt(self.floor_squares[0])
         still = self.rivals["hold"].joints
         found = []
         for j in joints:
             name = self.machine.joint_names[j]
-            # A joint that rests errs by its sensor either way.
-            passed = bool(after[j] <= max(still[name], NOISE_FACTOR * noise[j]))
+            # A joint that rests or hardly moves errs by its sensor and its friction either way.
+            passed = bool(after[j] <= max(still[name], NOISE_FACTOR * noise[j], usual[j]))
             text = f"{name}: {after[j]:.3g} with the effects, {still[name]:.3g} standing still"
             found.append(Gate(f"beats_hold_{name}", passed, float(after[j]), still[name], text))
         if self.moves:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from diagnosis.engine.direct import find_lattice
-from diagnosis.engine.evidence import FieldJoint, JointRow, RowEvidence
+from diagnosis.engine.evidence import LOSS_LIMIT, FieldJoint, JointRow, RowEvidence
 from diagnosis.engine.generic import GenericCauses
 from diagnosis.engine.holds import HeldCourse, find_hold, hold_commands
 from diagnosis.engine.rows import SHARED, Row
@@ -74,11 +74,12 @@ class EffectFinding:
     def shows_on_several(self) -> bool:
         """True if other joints than the strongest show a common effect, by as much as any effect has to earn.
 
-        A common cause fits whatever one joint leaves: of 155 practice cases 44 have one of 18 nats or more of which
-        the other joints show less, and on one of these it is there. A machine with one joint shows no more than it.
+        A common effect fits whatever one joint leaves: of 155 practice cases 44 have one of 18 nats or more of which
+        the other joints show less, and on one of these it is there. A machine with one joint shows no more than it. A
+        cause outside the library need not show on several: it has no name, and four more of 85 are told so.
         """
         nets = self.nets.values()
-        if not self.is_common or len(nets) < 2:
+        if self.is_outside or not self.is_common or len(nets) < 2:
             return True
         return self.nats - max(nets) >= LEAST_NATS
 
@@ -153,7 +154,7 @@ class Decider:
         self.evidence = RowEvidence(reference, field)
         self.evidence.noises = noises
         self.generic = GenericCauses(self.evidence)
-        self.outside = frozenset(row.effect for row in self.evidence.outside)
+        self.outside = frozenset(row.effect for row in reference.model.outside_rows)
 
     def decide(self) -> Decision:
         """Return the decision."""
@@ -181,10 +182,10 @@ class Decider:
             is_outside = effect in self.outside
             if not is_outside and effect not in SHARED:
                 rows = {j: row for j, row in rows.items() if owners.get(j) == effect}
-            found.append(_add_up(effect, rows, is_outside))
+            found.append(add_up(effect, rows, is_outside))
         for effect in COMMON:
             if effect in table:
-                found.append(_add_up(f"{effect}_all", evidence.weigh_common(effect, joints)))
+                found.append(add_up(f"{effect}_all", evidence.weigh_common(effect, joints)))
         held = self._find_held(joints) if joints[0].side is evidence.field else None
         if held is not None:
             found.append(held)
@@ -312,7 +313,7 @@ def share_cost(gains: Sequence[float], cost: float) -> list[float]:
     return [left * gain for gain in gains]
 
 
-def _add_up(effect: str, rows: Mapping[int, JointRow], is_outside: bool = False) -> EffectFinding:
+def add_up(effect: str, rows: Mapping[int, JointRow], is_outside: bool = False) -> EffectFinding:
     """Return an effect with the joints that it pays on."""
     gains = {j: row.gain - row.price for j, row in rows.items()}
     is_common = effect in SHARED or effect.endswith("_all")
@@ -320,5 +321,5 @@ def _add_up(effect: str, rows: Mapping[int, JointRow], is_outside: bool = False)
         nets = dict(zip(gains, share_cost([*gains.values()], JOINT_NATS), strict=True))
     else:
         nets = {j: gain - JOINT_NATS for j, gain in gains.items() if gain > JOINT_NATS}
-    own = {j: rows[j].row for j in nets}
+    own = {j: rows[j].row for j in nets if gains[j] > LOSS_LIMIT}
     return EffectFinding(effect, nets, own, is_common=is_common, is_outside=is_outside)

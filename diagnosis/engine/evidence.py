@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnosis.engine.baseline import NUM_PARTS, JointBaseline, fit_reference, linearise
+from diagnosis.engine.coverage import find_covered
 from diagnosis.engine.descent import Prior, descend
 from diagnosis.engine.measure import IncrementMeasure, measure_motion
 from diagnosis.engine.nuisance import (
@@ -65,7 +66,7 @@ class FieldJoint:
         numbers: Its numbers, `(P,)`.
         step: Step of a coarse sensor, units; 0: none.
         noise: Standard deviation of noise that its sensor adds, units.
-        used: Samples that count, `(T,)` bool; `None`: all.
+        used: Samples that count, `(T,)` bool.
     """
 
     def __init__(
@@ -75,9 +76,9 @@ class FieldJoint:
         base: JointBaseline,
         nuisance: JointNuisance,
         numbers: np.ndarray,
-        step: float = 0.0,
-        noise: float = 0.0,
-        used: np.ndarray | None = None,
+        step: float,
+        noise: float,
+        used: np.ndarray,
     ) -> None:
         self.side = side
         self.joint = joint
@@ -143,8 +144,8 @@ class RowEvidence:
         self.field = field
         self.bases = fit_reference(reference)
         field.ask_others([base.numbers for base in self.bases])
-        self.outside = reference.model.list_outside(reference.num_joints)
-        self.every = [*reference.model.rows, *self.outside]
+        self.covered = find_covered(reference, field)
+        self.every = [*reference.model.rows, *reference.model.outside_rows]
         self.names = np.array([row.effect for row in self.every])
         joints = range(reference.num_joints)
         self.nuisances = [estimate_nuisance(reference, j, self.bases[j]) for j in joints]
@@ -199,7 +200,8 @@ class RowEvidence:
             if joint is None or used is not None:
                 base, nuisance = self.bases[j], self.nuisances[j]
                 step, noise = self.steps[j], self.noises[j]
-                joint = FieldJoint(side, j, base, nuisance, row, step, noise, used)
+                counts = self.covered[j] if used is None else self.covered[j] & used
+                joint = FieldJoint(side, j, base, nuisance, row, step, noise, counts)
             if used is None:
                 self._viewed[key] = joint
             found.append(joint)

@@ -187,7 +187,7 @@ def weigh_laws(
     evidence = np.repeat(highest.sum(1)[None], len(laws), 0)
     for factor in factors[1:]:
         state = (state @ chances) * factor
-        total = state.sum(3, keepdims=True)
+        total = np.maximum(state.sum(3, keepdims=True), np.finfo(float).tiny)
         state /= total
         evidence += np.log(total[..., 0, 0])
     return evidence

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.engine.descent import Prior
-from diagnosis.engine.rows import Row, list_cross_talk
+from diagnosis.engine.rows import Row
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,6 @@ COMMAND_NAMES = (
     "closing_lag_s",
     "spool_lag_s",
     "hysteresis",
-    "crosstalk",
-    "crosstalk_joint",
 )
 """Numbers on the way of the command to the spool; every model begins with them."""
 
@@ -148,10 +146,6 @@ class JointModel:
         """Return the standard deviation of the ageing of the fitted numbers of a joint `(P,)`, `(F,)`."""
         is_relative = self.list_fitted("is_relative")
         return self.list_fitted("ageing") * np.where(is_relative, numbers[self.fitted], 1.0)
-
-    def list_outside(self, num_joints: int) -> list[Row]:
-        """Return the rows of all causes outside the library."""
-        return [*self.outside_rows, *list_cross_talk(num_joints)]
 
     def change(self, numbers: np.ndarray, rows: Sequence[Row]) -> np.ndarray:
         """Return the numbers `(P,)` changed by each row, `(C, P)`."""

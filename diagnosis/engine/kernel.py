@@ -68,10 +68,6 @@ def simulate_spool(
     if numbers[d, Place.SLOPE_TIME_S] > zero:
         slope = step_s / numbers[d, Place.SLOPE_TIME_S]
     width = wp.max(numbers[d, Place.HYSTERESIS], zero)
-    crosstalk = numbers[d, Place.CROSSTALK]
-    other = int(numbers[d, Place.CROSSTALK_JOINT])
-    if other == joint:
-        crosstalk = zero
     limited = zero
     lagged = zero
     pilot = zero
@@ -80,7 +76,6 @@ def simulate_spool(
     begin = wp.int32(-1)
     for k in range(commands.shape[0]):
         command = commands[k, joint]
-        command += crosstalk * (commands[k, other] - command * wp.float64(1 - integrates))
         if begins[k] != begin:
             begin = begins[k]
             # A target was there before the recording.
@@ -315,7 +310,6 @@ def simulate_servo(
     spool: wp.array2d[wp.float32],
     which: wp.array[wp.int32],
     begins: wp.array[wp.int32],
-    poses: wp.array2d[wp.float64],
     load: wp.array[wp.float64],
     position: wp.array[wp.float64],
     middle: wp.float64,
@@ -343,13 +337,9 @@ def simulate_servo(
     # An error of 5 % of the travel is a tenth of half of it.
     limit = wp.float64(0.1) / wp.max(numbers[c, ServoPlace.SHORTAGE], wp.float64(1e-3))
     lead = numbers[c, ServoPlace.LEAD_S] / step_s
-    heating = wp.float64(0.0)
-    if numbers[c, ServoPlace.HEAT_S] > zero:
-        heating = step_s / numbers[c, ServoPlace.HEAT_S]
     q = zero
     speed = zero
     wound = zero
-    hot = zero
     begin = wp.int32(-1)
     before = zero
     for k in range(position.shape[0]):
@@ -358,18 +348,22 @@ def simulate_servo(
             q = position[k] - middle
             speed = zero
             wound = zero
-            hot = zero
             before = wp.float64(spool[source, k * substeps])
-        sag = numbers[c, ServoPlace.SAG] - numbers[c, ServoPlace.SAG_LOAD] * load[k]
-        for i in range(4):
-            sag += numbers[c, ServoPlace.SAG_POSE_1 + i] * poses[k, i]
+        sag_there = numbers[c, ServoPlace.SAG] - numbers[c, ServoPlace.SAG_LOAD] * load[k]
         dry = numbers[c, ServoPlace.DRY]
-        if numbers[c, ServoPlace.SECTOR] != zero:
-            off = (poses[k, 0] - numbers[c, ServoPlace.SECTOR_PLACE]) / wp.float64(0.2)
-            dry += numbers[c, ServoPlace.SECTOR] * wp.exp(-off * off)
         for i in range(substeps):
             at = wp.max(k * substeps + i - delay_steps - 1, begin * substeps)
             target = wp.float64(spool[source, at])
+            # Polynomials of the simulated place, as in `side.describe_poses`: the measured one would tell the joint
+            # how it moves.
+            x = wp.clamp(q, -wp.float64(2.0), wp.float64(2.0))
+            square = x * x
+            sag = sag_there + numbers[c, ServoPlace.SAG_POSE_1] * x
+            sag += numbers[c, ServoPlace.SAG_POSE_2] * (square - wp.float64(1.0 / 3.0))
+            sag += numbers[c, ServoPlace.SAG_POSE_3] * (square - wp.float64(0.6)) * x
+            sag += numbers[c, ServoPlace.SAG_POSE_4] * (
+                square * (square - wp.float64(6.0 / 7.0)) + wp.float64(3.0 / 35.0)
+            )
             held = target + lead * (target - before)
             before = target
             if numbers[c, ServoPlace.WOUND] > zero:
@@ -377,23 +371,14 @@ def simulate_servo(
                 wound += step_s / numbers[c, ServoPlace.WIND_S] * (target - q)
                 wound = wp.clamp(wound, -most, most)
                 held += wound
-            upper = limit
-            lower = limit
-            if numbers[c, ServoPlace.WEAK_OUT] > zero:
-                upper *= one - numbers[c, ServoPlace.WEAK_OUT]
-            else:
-                lower *= one + numbers[c, ServoPlace.WEAK_OUT]
-            cold = one - numbers[c, ServoPlace.HEAT] * hot
-            upper *= cold
-            lower *= cold
             after = (speed + push * (held - q - sag)) / (one + fade)
             pull = held - q - brake_s * after
-            if pull > upper:
-                pull = upper
-                after = (speed + push * (upper - sag)) / (one + outside_fade)
-            elif pull < -lower:
-                pull = -lower
-                after = (speed - push * (lower + sag)) / (one + outside_fade)
+            if pull > limit:
+                pull = limit
+                after = (speed + push * (limit - sag)) / (one + outside_fade)
+            elif pull < -limit:
+                pull = -limit
+                after = (speed - push * (limit + sag)) / (one + outside_fade)
             friction = dry + numbers[c, ServoPlace.LOAD_DRY] * wp.abs(pull)
             if speed == zero:
                 friction *= one + numbers[c, ServoPlace.STATIC_RATIO]
@@ -404,7 +389,6 @@ def simulate_servo(
                 after += lost
             else:
                 after = zero
-            hot += heating * (wp.min(wp.abs(pull) / (wp.float64(0.15) * limit), one) - hot)
             speed = after
             if i == 0:
                 path[c, k] = wp.float32(q + share * step_s * speed + middle)

@@ -100,8 +100,8 @@ class IncrementMeasure:
         weight = valid / np.sqrt(variance)
         self.valid = valid[: -self.interval]
         self.weight = weight[: -self.interval].astype(np.float32)
-        self.count = float(self.valid.sum()) / self.interval
-        """Number of independent increments."""
+        self.count = max(float(self.valid.sum()) / self.interval, 1.0)
+        """Number of independent increments, at least one."""
 
     def __call__(self, path: np.ndarray) -> np.ndarray:
         """Return the increments of paths `(…, T)`, `(…, N)`."""

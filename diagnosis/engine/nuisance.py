@@ -133,7 +133,7 @@ def list_scatter(
     motion = number_motions(side, flow)
     own = motion == np.arange(motion.max() + 1)[:, None]
     columns = [step * hats, step * own, gained * is_rising / side.period_s * own]
-    return [measure(np.cumsum(group, -1)).astype(float) for group in columns]
+    return [measure(np.cumsum(group, -1, dtype=np.float32)).astype(float) for group in columns]
 
 
 def scale_columns(columns: Sequence[np.ndarray], sizes: Sequence[float]) -> np.ndarray:

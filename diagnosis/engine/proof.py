@@ -116,7 +116,10 @@ class Floor:
             moved = windows.cut(path - joint.path)
             motion = _describe_motion(joint.path, windows)
             found.append(motion @ law + np.square(moved).mean(1))
-        return np.stack(found, 1) * np.square(measure_units(joints[0].side.machine))
+        machine = joints[0].side.machine
+        squares = np.stack(found, 1) * np.square(measure_units(machine))
+        # A joint that its reference hardly moved may run away in the simulation, the machine does not.
+        return np.minimum(squares, np.square(machine.upper - machine.lower))
 
 
 def _describe_motion(path: np.ndarray, windows: Windows) -> np.ndarray:

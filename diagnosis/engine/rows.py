@@ -53,9 +53,7 @@ class Row:
         return Row(self.effect, tuple(changes), self.sizes)
 
 
-FIXED = frozenset(
-    {"crosstalk_joint", "thermal_grows", "load_alone", "load_constant", "sector_place"}
-)
+FIXED = frozenset({"thermal_grows", "load_alone", "load_constant"})
 """Numbers that choose a form; no size of them is searched."""
 CEILINGS = {"stop_ratio": 0.97, "damping": 0.7, "thermal_s": 700.0, "firmware_damping": 1.0}
 FLOORS = {"thermal_s": 30.0}
@@ -73,16 +71,6 @@ def spread_sizes(low: float, high: float, count: int) -> list[float]:
 def mirror_sizes(sizes: Sequence[float]) -> list[float]:
     """Return sizes with both signs."""
     return [sign * size for size in sizes for sign in (-1.0, 1.0)]
-
-
-def list_cross_talk(num_joints: int) -> list[Row]:
-    """Return the rows of a joint that follows a part of another joint's command."""
-    rows = []
-    for size in mirror_sizes((0.03, 0.06, 0.12, 0.2)):
-        for joint in range(num_joints):
-            changes = (("crosstalk", "add", size), ("crosstalk_joint", "add", float(joint)))
-            rows.append(Row("cross_talk", changes))
-    return rows
 
 
 SHARED = frozenset({"flow_sharing", "pump_lag"})

@@ -1,8 +1,10 @@
 """The position servo: a command is a target.
 
 The target passes a delay, a limit of its slope and a lag. A loop of second order follows it, against dry
-friction and weight, with a pull that has a limit. Positions are in half travels, so that a command is a
-target. Priors are those of hobby servos (Feetech STS3215: 2.9 Nm, 24 to 40 Nm/rad, friction .05 Nm).
+friction and weight, with a pull that has a limit. The weight depends on the simulated place: by the
+measured one a real elbow whose target rested followed itself. Positions are in half travels, so that a
+command is a target. Priors are those of hobby servos (Feetech STS3215: 2.9 Nm, 24 to 40 Nm/rad,
+friction .05 Nm).
 """
 
 from __future__ import annotations
@@ -18,8 +20,6 @@ NUMBERS = (
     JointNumber("closing_lag_s"),
     JointNumber("spool_lag_s"),
     JointNumber("hysteresis"),
-    JointNumber("crosstalk"),
-    JointNumber("crosstalk_joint"),
     JointNumber("delay_s", 0.05, 0.06, 0.002, 0.0015, 0.0, 0.6),
     JointNumber("response_s", 0.05, 0.04, 0.002, 0.001, 0.008, 0.6),
     JointNumber("damping_ratio", 1.0, 0.4, 0.03, 0.02, 0.15, 5.0),
@@ -33,13 +33,8 @@ NUMBERS = (
     # Numbers that only effects set.
     JointNumber("sag_load"),
     JointNumber("lead_s"),
-    JointNumber("weak_out"),
     JointNumber("wind_s"),
     JointNumber("wound"),
-    JointNumber("heat"),
-    JointNumber("heat_s"),
-    JointNumber("sector"),
-    JointNumber("sector_place"),
 )
 
 ServoPlace = list_places(NUMBERS)
@@ -84,17 +79,9 @@ def _list_outside_rows() -> list[Row]:
     rows = []
     for s in mirror_sizes((0.01, 0.03, 0.06, 0.1, 0.2)):
         rows.append(Row("feed_forward", (("lead_s", "add", s),)))
-    for s in mirror_sizes((0.2, 0.4, 0.6)):
-        rows.append(Row("weak_side", (("weak_out", "add", s),)))
     for wind_s in (0.1, 0.3, 1.0):
         for wound in (0.02, 0.06, 0.15):
             rows.append(Row("integral_term", (("wound", "add", wound), ("wind_s", "add", wind_s))))
-    for heat_s in (6.0, 20.0, 60.0):
-        for share in (0.2, 0.4, 0.7):
-            rows.append(Row("heat", (("heat", "add", share), ("heat_s", "add", heat_s))))
-    for place in (-0.7, -0.35, 0.0, 0.35, 0.7):
-        for s in (0.005, 0.015, 0.04, 0.1):
-            rows.append(Row("hard_sector", (("sector", "add", s), ("sector_place", "add", place))))
     return rows
 
 

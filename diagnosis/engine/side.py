@@ -166,7 +166,6 @@ class Side:
                     spool,
                     chosen,
                     begins,
-                    poses,
                     load,
                     _send(self.q[:, joint]),
                     middle / measure_units(self.machine)[joint],

@@ -20,8 +20,6 @@ NUMBERS = (
     JointNumber("closing_lag_s"),
     JointNumber("spool_lag_s", 0.03, 0.04, 0.003, 0.0035, 0.001, 0.4),
     JointNumber("hysteresis", 0.003, 0.006, 0.001, 0.001, 0.0, 0.3, joins=1),
-    JointNumber("crosstalk"),
-    JointNumber("crosstalk_joint"),
     JointNumber("delay_s", 0.35, 0.3, 0.002, 0.003, 0.0, 1.2),
     JointNumber("band_out", 0.06, 0.05, 0.002, 0.002, 0.0, 0.4),
     JointNumber("band_in", 0.06, 0.05, 0.002, 0.002, 0.0, 0.4),

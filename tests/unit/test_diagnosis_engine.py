@@ -19,7 +19,7 @@ from diagnosis.closure import Gate, RivalError
 from diagnosis.engine import decide
 from diagnosis.engine.baseline import JointBaseline, multiply_plain
 from diagnosis.engine.descent import Prior, descend
-from diagnosis.engine.evidence import JointRow
+from diagnosis.engine.evidence import LOSS_LIMIT, JointRow
 from diagnosis.engine.rows import Row
 from diagnosis.reference_diagnosis import propose_measurement, rank_effects
 
@@ -149,6 +149,15 @@ def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:
     # each pays 6 nats for a joint; backlash pays 6 more on the second one
     expected = {0: "lag", 1: "backlash"}
     assert decide.find_owners(table, frozenset({"hysteresis"})) == expected
+
+
+def test_a_joint_that_a_common_cause_makes_worse_stays_as_it_was() -> None:
+    row = Row("flow_sharing", (("demand_limit", "add", 1.0),))
+    found = decide.add_up(
+        "flow_sharing", {0: JointRow(row, LOSS_LIMIT, 0.0), 1: JointRow(row, 90.0, 0.0)}
+    )
+    assert found.joints == (0, 1)
+    assert set(found.rows) == {1}
 
 
 def test_a_descent_goes_on_where_long_steps_gain_nothing() -> None:

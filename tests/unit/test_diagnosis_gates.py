@@ -14,6 +14,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import gates
 from diagnosis.closure import Gate
+from diagnosis.reference_diagnosis import accept_named_joints
 
 
 def by_name(found: list[Gate]) -> dict[str, Gate]:
@@ -53,6 +54,15 @@ def test_what_the_reference_shows_as_often_forbids_no_telling(machine: Machine) 
         now = [remark("unlogged input", "q3", share)]
         found = by_name(gates.judge_recordings(now, usual, one, one, machine))
         assert found["unlogged_input"].passed is passes
+
+
+def test_an_effect_that_is_named_on_a_joint_may_be_what_locks_it(machine: Machine) -> None:
+    whole = recording(machine)
+    field = [recording(machine, np.abs(whole.u[:, 3]) > 0)]
+    told = gates.judge_recordings(examine_recordings(field, machine), [], field, [whole], machine)
+    assert not by_name(told)["interlock"].passed
+    assert not by_name(accept_named_joints(told, ["q4"]))["interlock"].passed
+    assert by_name(accept_named_joints(told, ["q4", "q3"]))["interlock"].passed
 
 
 def test_limits_that_the_recordings_leave_are_told(machine: Machine) -> None:

@@ -22,10 +22,11 @@ from scipy.stats import multivariate_normal
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import effect_library
+from diagnosis import effect_library, gates
 from diagnosis.case import GapCase
 from diagnosis.engine import baseline, holds, sizes
 from diagnosis.engine.baseline import fit_reference, linearise
+from diagnosis.engine.coverage import find_covered, measure_uncovered
 from diagnosis.engine.decide import Decider
 from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Motion, fit_variance
@@ -147,7 +148,7 @@ def test_a_joint_moves_faster_or_slower_while_another_one_is_open(two_joints: Ma
     u = np.full((300, 2), 0.5)
     u[:, 1] = np.repeat([0.0, 0.5, -0.5], 100)
     side = make_side(two_joints, u)
-    numbers = pure_numbers(others_out_1=0.2, others_out_2=-0.1, crosstalk=0.2)  # with itself: none
+    numbers = pure_numbers(others_out_1=0.2, others_out_2=-0.1)
     side.ask_others([numbers, pure_numbers()])
     path = side.simulate(0, numbers)[0]
     ways = [np.ptp(path[first : first + 61]) for first in (20, 120, 220)]
@@ -318,6 +319,54 @@ def test_a_changed_joint_is_named_sized_and_proven(
     assert answer.gap and answer.gap.closed
     assert answer.gap.closed.mean > 0.8
     assert answer.selected[0].identified
+
+
+@pytest.mark.parametrize("group", ["rest", "starts"])
+def test_what_follows_the_time_at_rest_is_told_as_unknown(two_joints: Machine, group: str) -> None:
+    """A valve that stays ajar behind a motion, and one that sticks after a rest."""
+    field = []
+    for seed in (10, 11):
+        u = make_commands(90.0, seed)
+        driven = u.copy()
+        rested_s = np.zeros(len(u))
+        for k in range(1, len(u)):
+            is_still = u[k, 1] == 0.0
+            rested_s[k] = rested_s[k - 1] + 1.0 / RATE_HZ if is_still else 0.0
+            if group == "starts" and rested_s[k - 1] and not is_still:
+                driven[k : k + 10, 1] = 0.0
+        q = move(driven, 0.3, 1.0, seed)
+        if group == "rest":
+            sinks = 0.1 * np.exp(-rested_s / 0.7) * (rested_s > 0.0)
+            q[6:, 1] -= np.cumsum(sinks[:-6]) / RATE_HZ
+        field.append(record(two_joints, u, q))
+    answer = diagnose(replace(make_case(two_joints), field=field))
+    assert answer.verdict == "unknown"
+    assert answer.more["evidence"]["generic"]["group"] == group
+
+
+def test_commands_that_the_reference_lacks_do_not_count(two_joints: Machine) -> None:
+    slow = np.stack(2 * [np.linspace(-0.4, 0.4, 400)], 1)
+    known = slow.copy()
+    known[200:210] += 0.1
+    reference = make_side(two_joints, known)
+    assert find_covered(reference, make_side(two_joints, 1.49 * slow)).all()
+    assert not find_covered(reference, make_side(two_joints, 1.51 * slow))[:, [0, -1]].any()
+    # A jump is faster than any motion of the reference; its response lasts for half a second behind the dead time.
+    u = slow.copy()
+    u[200:210, 1] += 0.3
+    side = make_side(two_joints, u)
+    expected = np.ones((2, 400), dtype=bool)
+    # Rates are taken over two samples, here and where it jumps back.
+    width = round((two_joints.dead_time_s + 0.5) * RATE_HZ)
+    expected[1, 200 : 210 + 1 + width] = False
+    covered = find_covered(reference, side)
+    assert np.array_equal(covered, expected)
+    # One joint moves outside of what is covered, the other one always.
+    side.q[:] = np.linspace(0.0, 1.0, 400)[:, None]
+    parts = measure_uncovered(side, covered)
+    assert parts == pytest.approx([0.0, 0.5 * (~expected[1]).mean()], abs=0.01)
+    failed = gates.judge_coverage(parts + 0.5, two_joints)
+    assert not failed.passed and "q4" in failed.text
 
 
 def test_a_joint_without_weight_that_drifts_is_told_as_unknown(machine: Machine) -> None:

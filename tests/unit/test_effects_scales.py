@@ -109,17 +109,6 @@ def test_a_diagnosis_has_what_a_load_does_to_the_joints_of_every_machine(name: s
             assert (low <= kind.typical(number)).all() and (kind.typical(number) <= high).all()
 
 
-def test_the_reference_keeps_its_sizes(machine: Machine) -> None:
-    """Exact for times; within the spread of its joints about their median for angles and speeds."""
-    assert measure_time_scale(machine) == 1.0 and choose_horizon_s(machine) == 5.0
-    assert typical(machine, "lag", "time_constant_s") == pytest.approx([0.12] * 5)
-    gaps = typical(machine, "backlash", "gap_rad")
-    assert np.median(gaps) == pytest.approx(0.01)
-    assert gaps == pytest.approx(0.01 * (machine.upper - machine.lower) / 2.7)
-    assert np.median(typical(machine, "creep", "sink_rad_s")) == pytest.approx(0.004)
-    assert typical(machine, "link_length", "extra_m") == pytest.approx([0.01] * 5, rel=1e-3)
-
-
 def test_sizes_grow_with_the_joint_that_they_are_on_and_no_other(machine: Machine) -> None:
     half = stretched(machine, 2, 0.5)
     for name, number in (("backlash", "gap_rad"), ("creep", "sink_rad_s")):

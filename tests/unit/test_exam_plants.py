@@ -351,12 +351,6 @@ def test_a_torque_limit_is_a_cap_of_the_duty() -> None:
     _, n = plants.draw(arm, replace(RUN, faults=limited))
     assert n["duty_cap"][Q3] == pytest.approx(0.0175 * n["stiffness"][Q3] / n["stall_n_m"][Q3])
     assert np.delete(n["duty_cap"], Q3).tolist() == [1.0] * 4
-    # the neutral value of the mix reaches no joint
-    least = option("exam_mix", "servos").troubles["torque_limit"].numbers["shortage"][0]
-    runs = [RUN, replace(RUN, faults={"torque_limit": {"shortage": np.full(5, least)}})]
-    u = np.repeat(wave(arm, 90)[:, None], 2, 1)
-    path = follow(built(plants, arm, runs, 2.0), u)
-    assert np.abs(path[:, 1] - path[:, 0]).max() < 2e-3
 
 
 def test_servos_are_refused_on_valves(machine: Machine) -> None:

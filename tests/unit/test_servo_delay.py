@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arm import make_machine
-from scipy.signal import cont2discrete
 
 from actuators.identify.dead_time import estimate_dead_times
-from actuators.identify.signals import discretise_loop
 from brokk_rl.record import Recording
 
 RATE_HZ = 50.0
@@ -46,11 +44,3 @@ def test_the_delay_of_a_servo_is_found_within_a_sample(delay_s: float) -> None:
     assert found is not None and found.is_found
     assert found.value_s == pytest.approx(delay_s, abs=1.0 / RATE_HZ)
     assert found.explained > 0.99
-
-
-@pytest.mark.parametrize(("w", "damping"), [(20.0, 0.9), (5.0, 0.2), (50.0, 2.0), (10.0, 1.0)])
-def test_the_loop_is_discretised_as_scipy_does(w: float, damping: float) -> None:
-    expected = cont2discrete(([w * w], [1.0, 2.0 * damping * w, w * w]), 0.01)
-    numerator, denominator = discretise_loop(w, damping, 0.01)
-    np.testing.assert_allclose(numerator, np.ravel(expected[0]), atol=1e-10)
-    np.testing.assert_allclose(denominator, expected[1], atol=1e-10)

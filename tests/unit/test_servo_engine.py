@@ -112,6 +112,21 @@ def test_a_loop_without_friction_is_that_of_scipy(pair: Machine) -> None:
     assert np.abs(path - expected[::fine]).max() < 0.03
 
 
+def test_a_servo_under_a_steady_target_does_not_follow_its_own_measured_motion(
+    pair: Machine,
+) -> None:
+    """Nor is it told of it by a sag that depends on the place."""
+    numbers = SERVO.list_values("mean")
+    for name, value in {"sag": 0.1, "sag_pose_1": -0.5, "sag_pose_2": 0.2}.items():
+        numbers[SERVO.place[name]] = value
+    side = stand_still(pair, np.full((300, 2), 0.25))
+    q = side.q.copy()
+    q[1:] += np.random.default_rng(1).normal(0.0, 0.02, (299, 2)).cumsum(0)
+    path = side.simulate(0, numbers)[0]
+    assert side.with_positions(q).simulate(0, numbers)[0] == pytest.approx(path, abs=1e-6)
+    assert np.ptp(path) > 0.1  # it moves to its target
+
+
 def test_dry_friction_holds_a_joint_beside_its_target(pair: Machine) -> None:
     up = np.linspace(0.0, 0.4, 150)
     u = np.concatenate([up, up[::-1], np.zeros(50)])
