@@ -75,11 +75,10 @@ class EffectFinding:
         """True if other joints than the strongest show a common effect, by as much as any effect has to earn.
 
         A common effect fits whatever one joint leaves: of 155 practice cases 44 have one of 18 nats or more of which
-        the other joints show less, and on one of these it is there. A machine with one joint shows no more than it. A
-        cause outside the library need not show on several: it has no name, and four more of 85 are told so.
+        the other joints show less, and on one of these it is there. A machine with one joint shows no more than it.
         """
         nets = self.nets.values()
-        if self.is_outside or not self.is_common or len(nets) < 2:
+        if not self.is_common or len(nets) < 2:
             return True
         return self.nats - max(nets) >= LEAST_NATS
 

@@ -1,8 +1,8 @@
 """Flexible columns: what one quantity alone could explain, whatever the law.
 
 A group of columns lets the simulated speed follow any function of one quantity: place, level of the
-command, a slow oscillation, or the time that the joint rested. Their marginal likelihood pays for
-their number. Where a group earns much more than any effect, the cause is unknown.
+command, motion of the other joints, a slow oscillation, or the time that the joint rested. Their marginal
+likelihood pays for their number. Where a group earns much more than any effect, the cause is unknown.
 Axes: `T` samples, `K` columns, `N` increments.
 """
 
@@ -56,6 +56,8 @@ def list_groups(
     groups = {"place": 0.15 * np.concatenate([forward * by_pose, backward * by_pose])}
     up, down = draw_hats(speed / top, LEVELS), draw_hats(-speed / top, LEVELS)
     groups["level"] = 0.2 * np.concatenate([forward * up, backward * down])
+    others = [simulate_speed(side, one) for one in np.delete(side.q, joint, 1).T]
+    groups["other joints"] = 0.1 * np.array(others).reshape(-1, side.num_samples)
     groups |= _view_rest(side, joint, speed, top)
     waves = 2.0 * np.pi * HUNTING_HZ[:, None] * side.time_s
     groups["hunting"] = 0.2 * speed * np.concatenate([np.sin(waves), np.cos(waves)])
