@@ -51,18 +51,18 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "32 simulated machines, answered once. A person drives 15 fields. The exam before, of 44, had 10 of 15 and 3 of 9.",
-        "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
+        "26 simulated machines, answered once. A person drives 19 fields. The exam before, of 32, had 8 of 11 and 5 of 7.",
+        "exam_plants=valves exam_recording=operators", 26, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "18 simulated cranes, answered once. A person drives 9 fields. The exam before, of 24, had 6 of 8.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 18, "diagnosis", "valve",
+        "14 simulated cranes, answered once. A person drives 6 fields. The exam before, of 18, had 4 of 6.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 14, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "14 simulated arms, answered once. The exam before, of 26, had 9 of 9.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 14, "servo_diagnosis", "servo",
+        "12 simulated arms, answered once. The exam before, of 14, had 5 of 5.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 12, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
