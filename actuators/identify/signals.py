@@ -33,5 +33,6 @@ def apply_play(u: np.ndarray, width: float) -> np.ndarray:
 def discretise_loop(w: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Return numerator and denominator of a second-order loop under targets that are held for a step."""
     loop = ([w * w], [1.0, 2.0 * damping * w, w * w])
-    numerator, denominator, _ = cont2discrete(loop, step_s)
-    return numerator[0], denominator
+    # The stubs of scipy know no kind of system that is discretised.
+    numerator, denominator, _ = cont2discrete(loop, step_s)  # pyright: ignore[reportAssignmentType, reportGeneralTypeIssues]
+    return numerator[0], denominator  # pyright: ignore[reportIndexIssue, reportReturnType]
