@@ -39,8 +39,7 @@ MAX_RIVAL_RATIO = 1.5
 """Error over that of a rival fitted to the field, above which something is left to find: on 15
 unchanged practice machines the ratio is 1.46 at most, and 1.12 on all but one."""
 MAX_UNCOVERED = 0.5
-"""Part of the field's motion with commands that the reference lacks, above which there is no telling. Chosen by hand;
-of eight practice cases none has more than 0.03."""
+"""Part of the field's motion with commands that the reference lacks, above which there is no telling. Chosen by hand."""
 MAX_SCATTER_GROWTH = 3.0
 """Scatter of tool points about any law of geometry, over that of the reference, above which encoders slip. In 168
 practice cases it is 0.9 to 1.17, with a clock that is late or a sensor that is noisy or coarse up to 12, and with a

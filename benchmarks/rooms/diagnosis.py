@@ -51,17 +51,17 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "26 simulated machines, answered once. A person drives 19 fields. The exam before, of 32, had 8 of 11 and 5 of 7.",
+        "26 simulated machines, answered once. A person drives 19 fields. Versions before: 8/14, 6/8, 0/6 of 40 others; 6/10, 0/6, 2/4 of 28.",
         "exam_plants=valves exam_recording=operators", 26, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "14 simulated cranes, answered once. A person drives 6 fields. The exam before, of 18, had 4 of 6.",
+        "14 simulated cranes, answered once. A person drives 6 fields. The version before: 5/8, 2/5, 0/4 of 24 others.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 14, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "12 simulated arms, answered once. The exam before, of 14, had 5 of 5.",
+        "12 simulated arms, answered once. The version before: 6/7, 4/4, 1/3 of 20 others.",
         "machine=so101 exam_plants=servos exam_mix=servos", 12, "servo_diagnosis", "servo",
     ),
     Measurement(

@@ -12,8 +12,8 @@ import numpy as np
 from diagnosis.engine.side import Side
 
 MARGIN = 0.25
-"""Part of the reference's range by which a command or its rate may lie beyond it. Practice cases have nothing beyond,
-those of a plant from elsewhere 3 % of their time; a real arm whose reference hardly moves its elbow has 68 %."""
+"""Part of the reference's range by which a command or its rate may lie beyond it. Four sealed cases have nothing
+beyond, two of a plant from elsewhere up to 3 % of their time; a real arm whose reference hardly moves its elbow has 68 %."""
 RATE_S = 0.1
 """Time over which the rate of a command is taken."""
 RESPONSE_S = 0.5

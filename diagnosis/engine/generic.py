@@ -36,7 +36,7 @@ START_S = 0.8
 MOVING = 0.01
 """Speed from which a joint moves, of its top speed."""
 LATE_S = 0.06
-"""How late a servo becomes where its delay changes with time."""
+"""Delay of a servo in the columns of a delay that changes with time."""
 CHANGE_S = 20.0
 """Distance of the knots between which a servo changes with time."""
 

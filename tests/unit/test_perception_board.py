@@ -46,7 +46,7 @@ def test_the_page_is_to_scale(brokk: Callable[..., Any], tmp_path: Path) -> None
 
 
 def test_a_pose_of_the_board_is_as_uncertain_as_it_says() -> None:
-    """Of a bent lens, with 0.2 px of noise: squared distances of six numbers are 6 on average."""
+    """A lens with distortion and 0.2 px of noise: squared distances of six numbers are 6 on average."""
     chance, matrix = (
         np.random.default_rng(0),
         np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]]),

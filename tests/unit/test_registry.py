@@ -1,4 +1,4 @@
-"""What the command shows: registries, help, and the comments of composed values."""
+"""Registries, help and the comments of composed values, as the command shows them."""
 
 from __future__ import annotations
 
