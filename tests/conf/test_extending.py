@@ -42,7 +42,7 @@ def test_the_package_passes_its_own_tests(site: Path) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stdout
-    assert "6 passed" in done.stdout
+    assert "12 passed" in done.stdout
 
 
 def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machine) -> None:
