@@ -50,6 +50,8 @@ def export_mean(run, out):
         content, str(run), machine, describe_task(task), groups, process.num_actions
     )
     contract = read_contract(run, str(run))
+    for name in ("parity", "training_observations"):  # those of the last checkpoint
+        contract.pop(name, None)
     contract["trained"] |= newest["book"]
     contract["trained"]["mean_of_iterations"] = [int(path.stem[6:]) for path in paths]
     observations = newest["answers"][0]
