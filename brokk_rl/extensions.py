@@ -24,10 +24,12 @@ from brokk_rl import registry
 from brokk_rl.arguments import ROBOT_FILES, explain_robot, list_names, parse_words
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.explain import explain_missing_value
-from brokk_rl.plain_files import check_yaml_size, read_plain_file
+from brokk_rl.plain_files import read_plain_file
 
 MOST_BYTES = 1 << 20
 """Size beyond which a file holds no option."""
+MOST_ALIASES = 20
+"""YAML aliases in a file: aliases of aliases grow beyond all bounds when they are written out."""
 EVERYWHERE = "_global_"
 """Package of options that may change any part of the configuration, such as experiments."""
 
@@ -170,9 +172,11 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
         raise ConfigError(f"{where}: expected a YAML file; {explain_robot(name)}")
     try:
         text = read_plain_file(Path(name).expanduser(), MOST_BYTES).decode()
-        check_yaml_size(text)
+        events = yaml.parse(text, Loader=yaml.SafeLoader)
+        if sum(isinstance(event, yaml.AliasEvent) for event in events) > MOST_ALIASES:
+            raise ValueError(f"expected at most {MOST_ALIASES} aliases")
         loaded = OmegaConf.create(text)
-    except (OSError, yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
+    except (OSError, yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"{where}: no plain YAML (seen from {Path.cwd()}): {reason}") from error
     node = OmegaConf.to_container(loaded, resolve=False) if isinstance(loaded, DictConfig) else None
@@ -183,36 +187,30 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     beside = Path(name).expanduser().parent / str(node.get("mjcf"))
     if group == "machine" and beside.is_file():
         node["mjcf"] = str(beside.resolve())
-    _drop_parts(node)
     packages = {one.target or one.name: one.place for one in registry.list_options(group)}
     package = _find_package(where, group, text, node, packages)
+    targets, module = registry.list_targets(), _name_module(node.get("_target_"))
     for place, target in registry.iterate_leaves(node):
         if place[-1] != "_target_":
             continue
         # the option itself, or those of a file that holds several by name
         itself = package != EVERYWHERE and len(place) == (1 if "_target_" in node else 2)
-        known = packages.keys() if itself else registry.list_targets()
-        if target not in known:
+        known = packages.keys() if itself else targets
+        # a part's class lies beside that of the option, and its annotation names it
+        is_part = not itself and _name_module(target) == module
+        if target not in known and not is_part:
             kind = f"no {group}" if itself else "nothing of ours"
             raise ConfigError(
                 f"{where}: '{'.'.join(place)}: {target}' is {kind}; {list_choices(str(target), known)}"
             )
-    return {str(key): value for key, value in node.items()}, package
+    from brokk_rl.build import drop_targets  # the command composes without it
+
+    plain = drop_targets(node, targets)
+    return {str(key): value for key, value in plain.items()}, package
 
 
-def _drop_parts(node: dict[Any, Any]) -> None:
-    """Take the names of classes from the parts of an option: its annotations name them.
-
-    A part has its class in the module of the option's own class, and is no option itself.
-    """
-    from brokk_rl.build import drop_targets
-
-    own, kept = str(node.get("_target_")).rpartition(".")[0], set(registry.list_targets())
-    for place, target in registry.iterate_leaves(node):
-        if place[-1] == "_target_" and str(target).rpartition(".")[0] != own:
-            kept.add(target)
-    for key in node.keys() - {"_target_"}:
-        node[key] = drop_targets(node[key], kept)
+def _name_module(target: object) -> str:
+    return str(target).rpartition(".")[0]
 
 
 def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:

@@ -8,15 +8,10 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from brokk_rl.errors import ConfigError
 
 MOST_JSON_BYTES = 1 << 28
 """Size beyond which no file of ours is. Chosen by hand: an evaluation of 10^5 episodes has 10 MB."""
-MOST_NODES, MOST_DEPTH = 20_000, 40
-"""Values of a YAML file with its aliases written out, and levels of nesting, beyond which it is no
-file of options: the largest that the commands write has some hundred values in five levels."""
 
 
 def check_plain_file(path: Path, most_bytes: int) -> None:
@@ -65,39 +60,6 @@ def parse_json(text: str | bytes) -> Any:
         return json.loads(text)
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
-
-
-def check_yaml_size(text: str) -> None:
-    """Refuse YAML that grows beyond reason when its aliases are written out, without writing them.
-
-    Raises:
-        ValueError: it has too many values or levels, or a value that contains itself.
-        yaml.YAMLError: it is no YAML.
-    """
-    sizes: dict[str, int] = {}
-    # Anchor and size of each collection that is not yet closed; the first is the whole text.
-    is_open: list[tuple[str | None, int]] = [(None, 0)]
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        anchor, size = getattr(event, "anchor", None), 1
-        if isinstance(event, yaml.CollectionStartEvent):
-            is_open.append((anchor, 1))
-            if len(is_open) > MOST_DEPTH:
-                raise ValueError(f"expected at most {MOST_DEPTH} levels")
-            continue
-        if isinstance(event, yaml.AliasEvent):
-            if anchor not in sizes:
-                raise ValueError(f"expected an alias of an earlier value, got *{anchor}")
-            size = sizes[anchor]
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, size = is_open.pop()
-        elif not isinstance(event, yaml.ScalarEvent):
-            continue
-        if anchor is not None:
-            sizes[anchor] = size
-        outer, total = is_open[-1]
-        is_open[-1] = outer, total + size
-        if total + size > MOST_NODES:
-            raise ValueError(f"expected at most {MOST_NODES} values with all aliases written out")
 
 
 def parse_model(path: Path) -> ElementTree.Element:
