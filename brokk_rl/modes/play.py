@@ -89,7 +89,7 @@ class Play(SimulatedPlant):
         played = PlaySession(loop, policies, settings.neutral)
         if settings.driver not in (POLICY, played.driver):
             played.choose_driver(settings.driver)
-        played.set_speed(settings.speed)
+        played.speed = settings.speed
         name = f"{name_spec(self.policy)} {getattr(self.policy, 'path', '')}".rstrip()
         log.info("%s drives; policy=%s", played.driver, name)
         if isinstance(self.policy, TrainedPolicy) and find_policy(self.policy.path).is_checkpoint:

@@ -131,7 +131,7 @@ class PlayPage:
         run = gui.add_button_group("Time", ("Pause", "Step", "Reset", "Reset all"))
         self._ask_on_click(run, self._press)
         speed = gui.add_slider("Speed", *SPEEDS, 0.1, session.speed, hint="Share of real time")
-        self._ask_on_change(speed, session.set_speed)
+        self._ask_on_change(speed, partial(setattr, session, "speed"))
         tabs = gui.add_tab_group()
         with tabs.add_tab("Touch"):
             self._build_touch()
@@ -167,8 +167,6 @@ class PlayPage:
             lever = gui.add_slider(f"{name}  ({keys})", -1.0, 1.0, 0.05, 0.0)
             self._ask_on_change(lever, partial(session.put_lever, joint))
             self._levers.append(lever)
-        centre = gui.add_button("Centre all levers (X)")
-        centre.on_click(lambda _: self._ask(session.release_levers))
 
     def _build_dials(self) -> None:
         gui, session = self._server.gui, self._session
@@ -176,11 +174,9 @@ class PlayPage:
             gui.add_markdown("*No effects: start with `effect=[library]`, or `effect=[backlash]`.*")
             return
         gui.add_markdown("0 is none, 1 is typical of a machine that has the effect.")
-        neutral = gui.add_button("All effects off")
-        sliders = {}
-        for label, dial in session.dials.items():
-            size = 0.0 if session.starts_neutral else 1.0
-            sliders[label] = gui.add_slider(
+        size = 0.0 if session.starts_neutral else 1.0
+        for dial in session.dials.values():
+            slider = gui.add_slider(
                 f"{dial.effect}: {dial.number}",
                 dial.low,
                 dial.high,
@@ -188,14 +184,7 @@ class PlayPage:
                 min(max(size, dial.low), dial.high),
                 hint=f"typical: {dial.typical.tolist()}",
             )
-            self._ask_on_change(sliders[label], dial.turn)
-
-        def turn_all_off() -> None:
-            for label, slider in sliders.items():
-                session.dials[label].turn(0.0)
-                slider.value = 0.0
-
-        neutral.on_click(lambda _: self._ask(turn_all_off))
+            self._ask_on_change(slider, dial.turn)
 
     def _build_traces(self) -> None:
         """Build the panel with commands, error and observation over time."""
@@ -264,9 +253,9 @@ class PlayPage:
     def _press(self, button: str) -> None:
         session = self._session
         if button == "Pause":
-            session.pause(not session.paused)
+            session.paused = not session.paused
         elif button == "Step":
-            session.pause(True)
+            session.paused = True
             session.step()
         else:
             session.reset(session.selected if button == "Reset" else None)

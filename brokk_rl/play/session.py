@@ -18,7 +18,6 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.play.dials import EffectDial, list_dials
-from brokk_rl.play.settings import SPEEDS
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.scene import FAR_M
 
@@ -28,8 +27,8 @@ TRACE_S = 15.0
 """Time that traces show, s. Chosen by hand: about one insertion."""
 MAX_CATCH_UP = 16
 """Control steps between two pictures at most; a computer that is too slow falls behind the clock."""
-NUM_RATED = 60
-"""Pictures over which the rate is measured: two seconds. Chosen by hand."""
+NUM_RATED = 30
+"""Pictures over which the rate is measured: a second. Chosen by hand."""
 DISTANCE_M, HEIGHT_M = (1.6, 4.6), (0.0, 1.6)
 """Where a target may be put: distance from the slew axis and height. Chosen by hand: a block that
 is nearer would stand in the undercarriage, and the arm of a Brokk 170 reaches 5.2 m."""
@@ -118,6 +117,7 @@ class PlaySession:
         selected: World that traces and commands are about.
         paused: Whether time stands still.
         speed: Wanted share of real time.
+        note: About the policy that was loaded last, such as its checkpoint.
         endings: Number of finished episodes by ending, of the present driver.
         successes: Number of them with success.
     """
@@ -136,7 +136,7 @@ class PlaySession:
         self.starts_neutral = neutral
         self.driver = next(iter(policies))
         self.selected, self.paused, self.speed = 0, False, 1.0
-        self._notes = dict.fromkeys(policies, "")
+        self.note = ""
         self._acting = self.driver
         self._owed_s, self._steps = 0.0, 0
         self._pins: dict[int, torch.Tensor] = {}
@@ -182,7 +182,8 @@ class PlaySession:
 
     def replace_policy(self, name: str, policy: Policy, note: str) -> None:
         """Put a newer policy in the place of the one called `name`; episodes go on."""
-        self._policies[name], self._notes[name] = policy, note
+        self._policies[name] = policy
+        self.note = note
         self.endings.clear()
         self.successes = 0
 
@@ -190,16 +191,6 @@ class PlaySession:
         """Choose the world that traces and commands are about."""
         self.selected = index
         self.release_levers()
-
-    def pause(self, paused: bool) -> None:
-        """Stop time, or let it go on."""
-        self.paused = paused
-        self._clock.clear()
-
-    def set_speed(self, speed: float) -> None:
-        """Set the share of real time, limited to `SPEEDS`."""
-        self.speed = min(max(speed, SPEEDS[0]), SPEEDS[1])
-        self._clock.clear()
 
     def nudge_lever(self, joint: int, change: float) -> None:
         """Move the person's lever of a joint by `change`, of full stroke."""
@@ -213,11 +204,6 @@ class PlaySession:
         """Let all levers spring back to neutral."""
         self._person.levers.zero_()
         self._person.env = self.selected if self.driver == PERSON else None
-
-    @property
-    def note(self) -> str:
-        """About the policy that drives, such as its checkpoint."""
-        return self._notes[self._acting]
 
     @property
     def t_s(self) -> float:
@@ -319,9 +305,9 @@ class PlaySession:
     def read_traces(self) -> dict[str, np.ndarray]:
         """Return the last seconds of the selected world by name, oldest first; empty before any.
 
-        `t_s` `(T,)`; `proposed` and `given`, commands of the policy and in force, `(T, J)`; `q`
-        `(T, J)`, rad or m; `lateral_m` and `height_m` of the tip from the target, `(T,)`;
-        `force_n`, peak contact force, `(T,)`.
+        `t_s` `(T,)`; `proposed` and `given`, commands of the policy and in force, `(T, J)`;
+        `lateral_m` and `height_m` of the tip from the target, `(T,)`; `force_n`, peak contact
+        force, `(T,)`.
         """
         traces = {}
         for name in self._trace[0] if self._trace else ():
@@ -366,7 +352,6 @@ class PlaySession:
                 "t_s": seconds,
                 "proposed": _to_numpy(proposed),
                 "given": _to_numpy(loop.end_u),
-                "q": _to_numpy(loop.end_q),
                 "lateral_m": _to_numpy(error[:, :2].norm(dim=1)),
                 "height_m": _to_numpy(error[:, 2]),
                 "force_n": _to_numpy(loop.end_force_n),

@@ -51,7 +51,7 @@ def test_simulated_time_follows_the_clock_at_the_wanted_speed(made: Callable) ->
         session.advance(1 / 30)
     assert session.t_s == pytest.approx(1.0, abs=PERIOD_S)
     assert session.measure_rate() == pytest.approx(1.0, abs=0.06)
-    session.set_speed(3.0)
+    session.speed = 3.0
     for _ in range(30):
         session.advance(1 / 30)
     assert session.t_s == pytest.approx(4.0, abs=PERIOD_S)
@@ -61,13 +61,13 @@ def test_simulated_time_follows_the_clock_at_the_wanted_speed(made: Callable) ->
 def test_a_pause_stops_time_and_a_step_is_one_control_period(made: Callable) -> None:
     session = made()
     run(session, 3)
-    session.pause(True)
+    session.paused = True
     assert session.advance(1.0) == 0
     before_s = session.t_s
     assert session.measure_rate() == 0.0
     session.step()
     assert session.t_s == pytest.approx(before_s + PERIOD_S)
-    session.pause(False)
+    session.paused = False
     assert session.advance(PERIOD_S) == 1
 
 
