@@ -15,15 +15,23 @@ import reprlib
 import types
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform
 
 from annotated_types import Ge, Gt, Interval, Lt
-from pydantic import AllowInfNan, BeforeValidator, ConfigDict, Strict, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BeforeValidator,
+    ConfigDict,
+    PlainValidator,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic import dataclasses as pydantic_dataclasses
-from pydantic_core import ArgsKwargs, CoreSchema, PydanticCustomError, core_schema
+from pydantic_core import ArgsKwargs, PydanticCustomError
 from typing_extensions import get_protocol_members, is_protocol
 
 from brokk_rl.errors import ConfigError, list_choices
@@ -42,20 +50,14 @@ WORDS = {
 """Words of pydantic's messages, and those of the people who write YAML."""
 
 
-@dataclass(frozen=True)
-class Ordered:
-    """Constraint of a range: its first value is not above its second."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(self.check, handler(source))
-
-    def check(self, value: tuple[float, float]) -> tuple[float, float]:
-        """Return the range; raise an error of pydantic where it is reversed."""
-        if value[0] > value[1]:
-            raise PydanticCustomError("order", "expected (lowest, highest)")
-        return value
+def _require_order(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise PydanticCustomError("order", "expected (lowest, highest)")
+    return value
 
 
+Ordered = functools.partial(AfterValidator, _require_order)
+"""Constraint of a range: its first value is not above its second."""
 Finite = Annotated[float, AllowInfNan(False)]
 Positive = Annotated[float, Gt(0), AllowInfNan(False)]
 NonNegative = Annotated[float, Ge(0), AllowInfNan(False)]
@@ -145,27 +147,17 @@ def require_value(key: str, hint: Any, value: Any) -> Any:
         raise ConfigError(f"{key}: {_describe_problem(problem)}") from None
 
 
-@dataclass(frozen=True)
-class _InstanceOf:
-    """Constraint of a field that holds an object: its class, or the members of a protocol."""
-
-    kind: type
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(self.check)
-
-    def check(self, value: Any) -> Any:
-        if not is_protocol(self.kind):
-            if not isinstance(value, self.kind):
-                raise PydanticCustomError("class", "expected {name}", {"name": self.kind.__name__})
-            return value
-        members = get_protocol_members(self.kind)
-        if lacking := sorted(name for name in members if not _has_member(value, name)):
-            text = (
-                f"expected an option of its group ({self.kind.__name__} with {', '.join(lacking)})"
-            )
-            raise PydanticCustomError("members", "{text}", {"text": text})
+def _require_kind(kind: type, value: Any) -> Any:
+    """Return an object of the class `kind`, or with the members of the protocol `kind`."""
+    if not is_protocol(kind):
+        if not isinstance(value, kind):
+            raise PydanticCustomError("class", "expected {name}", {"name": kind.__name__})
         return value
+    members = get_protocol_members(kind)
+    if lacking := sorted(name for name in members if not _has_member(value, name)):
+        text = f"expected an option of its group ({kind.__name__} with {', '.join(lacking)})"
+        raise PydanticCustomError("members", "{text}", {"text": text})
+    return value
 
 
 def _has_member(value: object, name: str) -> bool:
@@ -200,7 +192,7 @@ def _constrain(hint: Any) -> Any:
     )
     if plain or not isinstance(kind, type) or hasattr(kind, "__pydantic_fields__"):
         return hint
-    return Annotated[hint, _InstanceOf(kind)]
+    return Annotated[hint, PlainValidator(functools.partial(_require_kind, kind))]
 
 
 def _read_whole(value: Any) -> Any:
