@@ -13,8 +13,6 @@ import traceback
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
-from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -223,48 +221,22 @@ class _SlowImport(BaseException):
     """Code uses torch; no `Exception`, so that nothing takes it for a missing package."""
 
 
-class _LateModule(ModuleType):
-    """A module that its import does not execute, but the first use of a member."""
-
-    def __getattr__(self, name: str) -> Any:
-        if _LateImport.is_refusing:
-            raise _SlowImport(name)
-        return getattr(importlib.import_module(self.__name__), name)
-
-
-class _LateImport(MetaPathFinder, Loader):
-    """Imports torch, within the block of `defer_slow_import` without executing it.
-
-    All imports give one object, so that a module which has torch unexecuted has it executed later.
-    """
+class _LateTorch(ModuleType):
+    """Stands for torch in modules that import it, until one of them uses a member."""
 
     is_refusing = False
 
-    def __init__(self) -> None:
-        self._module = ModuleType(SLOW)
-        self._loader: Loader | None = None
-
-    def find_spec(self, fullname: str, path: Any, target: Any = None) -> ModuleSpec | None:
-        """Return where the module lies, and that it is loaded here."""
-        found = PathFinder.find_spec(fullname, path, target) if fullname == SLOW else None
-        if found is not None:
-            self._loader = found.loader
-            found.loader = self
-        return found
-
-    def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """Return the module that earlier imports have given."""
-        self._module.__class__ = ModuleType
-        return self._module
-
-    def exec_module(self, module: ModuleType) -> None:
-        """Execute the module, or leave that for later."""
+    def __getattr__(self, name: str) -> Any:
         if self.is_refusing:
-            del module.__path__  # the import of a part asks for it
-            module.__class__ = _LateModule
-        elif self._loader is not None and module.__spec__ is not None:
-            module.__spec__.loader = module.__loader__ = self._loader
-            self._loader.exec_module(module)
+            raise _SlowImport(name)
+        real = importlib.import_module(SLOW)
+        for module in list(sys.modules.values()):
+            if getattr(module, "__dict__", {}).get(SLOW) is self:
+                setattr(module, SLOW, real)
+        return getattr(real, name)
+
+
+_late_torch = _LateTorch(SLOW)
 
 
 @contextmanager
@@ -278,14 +250,13 @@ def defer_slow_import() -> Iterator[None]:
         yield
         return
     before = set(sys.modules)
-    if not any(isinstance(finder, _LateImport) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _LateImport())
-    _LateImport.is_refusing = True
+    sys.modules[SLOW] = _late_torch
+    _late_torch.is_refusing = True
     try:
         yield
     finally:
-        _LateImport.is_refusing = False
-        sys.modules.pop(SLOW, None)
+        _late_torch.is_refusing = False
+        del sys.modules[SLOW]
         for name in sorted(sys.modules.keys() - before):  # a package before its modules
             package = name.rpartition(".")[0]
             if package and package not in sys.modules:
