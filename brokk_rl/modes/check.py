@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from brokk_rl.checks import ProportionalModel, build_rest_history
@@ -32,16 +33,6 @@ from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
 
-JOINT_COLUMNS = {
-    "lower": "lower",
-    "upper": "upper",
-    "home": "home",
-    "max_speed": "max speed",
-    "travel_s": "travel, s",
-    "largest_weight": "weight",
-    "yield_force": "yield force",
-}
-"""Figures of a joint in the table."""
 LARGEST_REACH_M = 80.0
 """Reach beyond which lengths are doubted: the longest booms of concrete pumps have some 70 m."""
 TRIAL_S = 1.0
@@ -60,7 +51,8 @@ class MachineCheck:
         problems: Conditions under which the machine cannot be simulated or trained.
         unfit: What the task or the actuator has against this machine.
         missing: Numbers and parts that the file lacks, guesses or does not know well.
-        joints: Limits, speed and weight of each joint by name.
+        joints: Limits, home, speed, time from end to end (`travel_s`), weight in the worst pose and
+            yield force of each joint by name; without bodies neither of the last two.
         reach: Extent of the tool point over random poses, m; empty where it is not known.
         contact: Links that may touch something; empty where there is no model.
         starts: Shares of starts of the task that can be done.
@@ -69,7 +61,7 @@ class MachineCheck:
     problems: list[str] = field(default_factory=list)
     unfit: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
-    joints: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    joints: dict[str, dict[str, float]] = field(default_factory=dict)
     reach: dict[str, float] = field(default_factory=dict)
     contact: list[str] = field(default_factory=list)
     starts: dict[str, float] = field(default_factory=dict)
@@ -197,7 +189,13 @@ def check_machine(machine: Machine, num_poses: int, generator: np.random.Generat
     """Check a machine on `num_poses` random poses within its joint limits."""
     found = MachineCheck()
     q = generator.uniform(machine.lower, machine.upper, (num_poses, machine.num_joints))
-    load = None
+    figures: dict[str, np.ndarray] = {
+        "lower": machine.lower,
+        "upper": machine.upper,
+        "home": machine.home,
+        "max_speed": machine.max_speed,
+        "travel_s": (machine.upper - machine.lower) / machine.max_speed,
+    }
     if machine.has_bodies:
         x_m, y_m, height_m = compute_tool_kinematics(machine, q).tip_in_base_m.T
         distance_m = np.hypot(x_m, y_m)
@@ -212,23 +210,15 @@ def check_machine(machine: Machine, num_poses: int, generator: np.random.Generat
             found.missing.append(
                 f"a reach of {distance_m.max():.3g} m is doubted: lengths count in m, not mm"
             )
-        load = np.abs(Gravity(machine).load(q)).max(0)
+        figures["largest_weight"] = load = np.abs(Gravity(machine).load(q)).max(0)
         yields = np.array([body.yield_force.value for body in machine.bodies])
+        figures["yield_force"] = yields
         if weak := np.array(machine.joint_names)[yields < load].tolist():
             found.missing.append(
                 f"{', '.join(weak)}: the yield force is less than the weight in the worst pose. The drive counts it "
                 "beyond the weight, so this is allowed; look at masses (kg) and force limits"
             )
-    for j, joint in enumerate(machine.joints):
-        found.joints[joint.name] = {
-            "lower": joint.lower.value,
-            "upper": joint.upper.value,
-            "home": joint.home,
-            "max_speed": joint.max_speed.value,
-            "travel_s": (joint.upper.value - joint.lower.value) / joint.max_speed.value,
-            "largest_weight": None if load is None else float(load[j]),
-            "yield_force": joint.body.yield_force.value if joint.body else None,
-        }
+    found.joints = pd.DataFrame(figures, index=machine.joint_names).to_dict("index")
     if not machine.has_bodies or machine.mjcf is None:
         found.missing.append(
             "without joints[].body, tool_m and mjcf it can be recorded and identified, not simulated"
@@ -343,11 +333,9 @@ def _list_guesses(value: object, name: str) -> Iterator[str]:
 def _show(machine: Machine, found: MachineCheck) -> None:
     """Print the verdict, the joints, and every remark."""
     print_text(f"{machine.name}: {found.summarise()}")
-    rows = []
-    for name, figures in found.joints.items():
-        values = [figures[key] for key in JOINT_COLUMNS]
-        rows.append([name, *(None if one is None else f"{round(one, 9):.4g}" for one in values)])
-    print_table(["joint", *JOINT_COLUMNS.values()], rows)
+    figures = pd.DataFrame.from_dict(found.joints, "index").round(9).map("{:.4g}".format)
+    headings = [name.replace("_", " ") for name in figures]
+    print_table(["joint", *headings], figures.reset_index().to_numpy().tolist())
     print_text(JOINT_UNITS)
     if reach := found.reach:
         print_text(

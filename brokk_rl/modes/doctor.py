@@ -6,21 +6,19 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
-from importlib import metadata, util
+from importlib import metadata
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from packaging.utils import canonicalize_name
 from rich.text import Text
 
-import brokk_rl
 from brokk_rl import extras
 from brokk_rl.console_table import print_table
 from brokk_rl.session import read_output
 from brokk_rl.sim import probe
 from brokk_rl.spec import NonNegative, spec
 
-IMPORT_NAMES = ("brokk_rl", "conf", "tasks", "actuators", "perception", "deploy", "diagnosis", "exam", "study")  # fmt: skip
 COLORS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 
@@ -69,7 +67,6 @@ class Doctor:
             "Warp": check_warp,
             "rendering": check_rendering,
             "disk": lambda: check_disk(Path(self.doctor.folder), self.doctor.min_free_gib),
-            "import names": check_import_names,
         }
         rows = []
         has_failed = False
@@ -174,18 +171,3 @@ def check_disk(folder: Path, min_free_gib: float) -> DoctorFinding:
     if free_gib < min_free_gib:
         return DoctorFinding("warn", text, "checkpoints and recordings need more; free some space")
     return DoctorFinding("ok", text)
-
-
-def check_import_names() -> DoctorFinding:
-    """Check that names such as `tasks` and `conf` import this package, not another one."""
-    home = Path(brokk_rl.__file__).parents[1]
-    foreign = []
-    for name in IMPORT_NAMES:
-        found = util.find_spec(name)
-        places = list(found.submodule_search_locations or ()) if found else ["missing"]
-        if places[:1] != [str(home / name)]:
-            foreign.append(f"'{name}' is {', '.join(places)}, not {home / name}")
-    if foreign:
-        advice = "install the project in an environment of its own"
-        return DoctorFinding("fail", "; ".join(foreign), advice)
-    return DoctorFinding("ok", f"all {len(IMPORT_NAMES)} come from {home}")

@@ -5,6 +5,7 @@ It knows no browser and runs in one thread; the page hands its commands over.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
@@ -12,12 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl.contracts.actuator import FollowerModel
+from brokk_rl.contracts.actuator import ActuatorModel, FollowerModel
 from brokk_rl.contracts.task import STEPS, SUCCESS, Policy
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine, mask_exclusive_joints
-from brokk_rl.play.dials import EffectDial, list_dials
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.scene import FAR_M
 
@@ -38,6 +38,8 @@ KEY_STEP = 0.25
 """Stroke by which one press of a key moves a lever. Chosen by hand: four presses to full speed."""
 PUSH_S = 0.5
 """Time for which a push lasts, s. Chosen by hand."""
+LARGEST_EFFECT = 3.0
+"""Largest size of an effect, in typical sizes. Chosen by hand: three times what a machine has."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,83 @@ class PersonAtLevers(FollowerModel):
         """Return the person's command, `(J,)`: a lever of an exclusive joint rules out the others."""
         positioning = bool(self.levers[self._is_exclusive].any())
         return self.levers * mask_exclusive_joints(self._is_exclusive, positioning)
+
+
+@dataclass(frozen=True)
+class EffectDial:
+    """One number of an effect: 0 is none of it, 1 the typical size on a machine that has it.
+
+    Attributes:
+        effect: Name of the effect.
+        number: Name of the number, with its unit.
+        low: Smallest size, in typical sizes.
+        high: Largest size.
+        typical: Number at size 1 on each joint, `(J,)` or `(1,)`.
+        none: Number at size 0, likewise.
+        parameters: Numbers of the model by name, `(N, J)` or `(N, 1)`; an entry is replaced.
+        key: Name of the number there.
+    """
+
+    effect: str
+    number: str
+    low: float
+    high: float
+    typical: torch.Tensor
+    none: torch.Tensor
+    parameters: dict[str, torch.Tensor]
+    key: str
+
+    @property
+    def label(self) -> str:
+        """Name of the dial."""
+        return f"{self.effect}.{self.number}"
+
+    def turn(self, size: float) -> None:
+        """Give all machines the effect in `size`, limited to what makes sense."""
+        size = min(max(size, self.low), self.high)
+        value = self.none + size * (self.typical - self.none)
+        before = self.parameters[self.key]
+        # a replaced entry is not drawn anew when an episode begins
+        self.parameters[self.key] = value.to(before).expand_as(before).clone()
+
+
+def list_dials(model: ActuatorModel, machine: Machine) -> list[EffectDial]:
+    """Return a dial for each number of each effect around an actuator model.
+
+    Numbers that only shape an effect, such as its time constant, have none.
+    """
+    found = []
+    layer: Any = model
+    while layer is not None:
+        if hasattr(layer, "effects") and hasattr(layer, "parameters"):
+            for name, effect in layer.effects.items():
+                for key, number in effect.numbers.items():
+                    if number.none is None or not number.is_on(machine):
+                        continue
+                    dial = _make_dial(layer, name, effect.name(), key, number, machine)
+                    if dial.low < dial.high:
+                        found.append(dial)
+        layer = getattr(layer, "inner", None)
+    return found
+
+
+def _make_dial(
+    chain: Any, prefix: str, effect: str, key: str, number: Any, machine: Machine
+) -> EffectDial:
+    """Return the dial of one number; `prefix` is the name of its effect in the chain."""
+    none, typical = (number.scale_to(machine, value) for value in (number.none, number.typical))
+    ends = (np.array(number.limit_on(machine)) - none) / (typical - none)
+    low, high = max(-LARGEST_EFFECT, ends.min(0).max()), min(LARGEST_EFFECT, ends.max(0).min())
+    return EffectDial(
+        effect=effect,
+        number=key,
+        low=math.ceil(low * 10 - 1e-6) / 10,
+        high=math.floor(high * 10 + 1e-6) / 10,
+        typical=torch.as_tensor(typical, dtype=torch.float32),
+        none=torch.as_tensor(none, dtype=torch.float32),
+        parameters=chain.parameters,
+        key=f"{prefix}.{key}" if prefix else key,
+    )
 
 
 class PlaySession:
