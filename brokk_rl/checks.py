@@ -223,22 +223,13 @@ def _check_optional(
     known = restore_encoder(machine, description).size
     assert known == size, f"describe: a vector of {size} numbers, but its parts have {known}"
     assert vector.shape == (NUM_ENVS, size), f"observe: expected a policy vector of {size} numbers"
+    resting = torch.nn.Module()  # a network whose action is zero
+    resting.forward = lambda groups: groups["policy"].new_zeros(NUM_ENVS, num_actions)
     with torch.no_grad():
-        u = process.deployable(_RestingNetwork(num_actions))(vector)
+        u = process.deployable(resting)(vector)
     is_command = u.shape == (NUM_ENVS, machine.num_joints) and bool((u.abs() <= 1).all())
     text = "deployable: expected commands (B, J) in [-1, 1] for policy vectors (B, O)"
     assert is_command, text
-
-
-class _RestingNetwork(torch.nn.Module):
-    """A network whose action is zero."""
-
-    def __init__(self, num_actions: int) -> None:
-        super().__init__()
-        self._num_actions = num_actions
-
-    def forward(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        return groups["policy"].new_zeros(len(groups["policy"]), self._num_actions)
 
 
 def _check_episode(process: TaskProcess, history: History, device: torch.device) -> None:

@@ -153,8 +153,11 @@ def _take_over(cfg: DictConfig) -> DictConfig:
         cfg = _choose_option(cfg, own, given, stored)
     if "machine" in cfg:
         brought = _insert_plant(cfg, stored, given)
-    if "task" in cfg and (num := _insert_behaviour(cfg, own, given, stored)):
-        brought.append(f"{num} value{'s' if num > 1 else ''} of its task")
+    if "task" in cfg and (changes := _insert_behaviour(cfg, own, given, stored)):
+        brought.append(f"{len(changes)} value{'s' if len(changes) > 1 else ''} of its task")
+        named = _list_named()
+        if yielding := [text for key, text in changes.items() if _is_given(key, named)]:
+            log.warning("the experiment yields to its policy: %s", "; ".join(yielding))
     if brought:
         log.info("the policy in %s brings %s", stored.name, " and ".join(brought))
     return cfg
@@ -204,8 +207,8 @@ def _insert_plant(cfg: DictConfig, stored: StoredPolicy, given: set[str]) -> lis
 
 def _insert_behaviour(
     cfg: DictConfig, own: TaskDescription, given: set[str], stored: StoredPolicy
-) -> int:
-    """Put the behaviour of the policy into the task; return how many values changed.
+) -> dict[str, str]:
+    """Put the behaviour of the policy into the task; return what changed, in words, by key.
 
     The classical controller as a rival keeps the numbers that were composed, and what it knows of a
     person: a policy may rest on those of an earlier version, which are no honest opponent.
@@ -223,22 +226,13 @@ def _insert_behaviour(
             f"{'; '.join(refused)}. Leave these out, and the policy's own values are taken; or "
             "give a policy that was trained with them"
         )
-    named = _list_named()
-    if yielding := [text for key, text in said.items() if _is_given(key, named)]:
-        log.warning("the experiment yields to its policy: %s", "; ".join(yielding))
     if changes:
         cfg.task = after
         own_values = {key: before[key] for key in RIVALS_OWN if key in before}
         for node in _list_rivals(cfg):
             if node[TARGET] == CLASSICAL and own_values:
                 node.task = after | own_values
-        if before.get("advice") and not after.get("advice"):
-            log.warning(
-                "the policy in %s was trained without a person at the levers and proposes as if it moved "
-                "them itself; the classical controller beside it knows of the person",
-                stored.name,
-            )
-    return len(changes)
+    return said
 
 
 def _insert_task(cfg: DictConfig, node: DictConfig) -> None:

@@ -217,7 +217,7 @@ def find_differences(runs: Sequence[EvaluatedRun]) -> list[str]:
 
 
 def tabulate_runs(runs: Sequence[EvaluatedRun], columns: Sequence[str]) -> pd.DataFrame:
-    """Return the table of all policies that the runs evaluated; rates come first of the figures.
+    """Return the table of all policies that the runs evaluated.
 
     Raises:
         ConfigError: An evaluation lacks what every evaluation has.
@@ -235,11 +235,7 @@ def tabulate_runs(runs: Sequence[EvaluatedRun], columns: Sequence[str]) -> pd.Da
             rows.append(row | _read_figures(run.folder, evaluation))
     table = pd.DataFrame(rows)
     about = ["folder", "policy", "seed", *columns, "episodes"]
-    figures = list(table.columns.drop(about))
-    ordered = sorted(
-        figures, key=lambda name: re.sub(f"{LOW}$|{HIGH}$", "", name) + LOW not in table
-    )
-    return table[about].join(table[ordered].astype(float))
+    return table[about].join(table.drop(columns=about).astype(float))
 
 
 def _read_figures(folder: Path, evaluation: Mapping[str, Any]) -> dict[str, Any]:
