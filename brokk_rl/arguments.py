@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import NoReturn
@@ -34,9 +34,6 @@ def read_arguments(words: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: A word cannot be read; the message says how to write what was meant.
     """
-    groups: dict[str, list[str]] = {}
-    for option in registry.list_options():
-        groups.setdefault(option.group, []).append(option.name)
     parser = get_args_parser()
     parser.error = _refuse_option  # type: ignore[method-assign]
     given = parser.parse_intermixed_args(words)
@@ -47,32 +44,34 @@ def read_arguments(words: Sequence[str]) -> list[str]:
     if sum(word.startswith("mode=") for word in given.overrides) > 1:
         raise ConfigError("expected one mode, got several: for each a command of its own")
     options = [word for word in words if word not in given.overrides]
-    return options + [_read_value(word, groups) for word in given.overrides]
+    offered = registry.list_options()
+    return options + [_read_value(word, offered) for word in given.overrides]
 
 
 def _refuse_option(message: str) -> NoReturn:
     raise ConfigError(f"{message}; values have no dashes, as in brokk mode=train session.seed=3")
 
 
-def _read_value(word: str, groups: Mapping[str, list[str]]) -> str:
+def _read_value(word: str, options: Sequence[registry.Option]) -> str:
     """Return an override as Hydra can read it."""
     key, equals, value = word.partition("=")
     name = key.lstrip("~")
+    offered = {option.name for option in options if option.group == name}
     is_nothing = word == f"~{name}" or value in NOTHING
-    if is_nothing and name in groups and value not in groups[name] and name != "mode":
+    if is_nothing and offered and value not in offered and name != "mode":
         return f"{name}=[]" if is_list_group(name) else f"~{name}"
     if key.startswith(PLACES):
         raise ConfigError(f"{word}: folders are made by the command; give session.out=<folder>")
     if word.startswith("~"):
         return word
     if not equals or not key:
-        raise ConfigError(_explain_word(word, groups["mode"]))
+        raise ConfigError(_explain_word(word, options))
     if value.startswith("~/"):  # a shell leaves it after '='
         value = str(Path(value).expanduser())
     quoted = f"{key}={_quote(value)}"
     is_plain = MEANINGFUL.isdisjoint(value)
     if override := _parse_word(f"{key}={value}"):
-        _refuse_empty(key, value, override, key in groups and not is_list_group(key))
+        _refuse_empty(key, value, override, bool(offered) and not is_list_group(key))
         return f"{key}={value}"
     if is_plain and _parse_word(quoted):
         return quoted
@@ -98,10 +97,11 @@ def _refuse_empty(key: str, value: str, override: Override, is_single: bool) -> 
         raise ConfigError(f"{key}={value}: expected one option, as in {key}={options[0]}")
 
 
-def _explain_word(word: str, modes: Sequence[str]) -> str:
+def _explain_word(word: str, options: Sequence[registry.Option]) -> str:
     """Explain a word that is no `key=value`."""
     if word.endswith(ROBOT_FILES):
         return explain_robot(word)
+    modes = [option.name for option in options if option.group == "mode"]
     near = get_close_matches(word, modes, n=1)
     hint = f"did you mean mode={near[0]}?" if near else "`brokk --help` says how to begin"
     return f"expected key=value without spaces, got '{word}'; {hint}"

@@ -103,10 +103,6 @@ def main() -> int:
     except SystemExit as left:  # Hydra has said why, as for `--cfg job --package` of no such part.
         return 2 if left.code else 0
     except (FailedJob, Exception) as error:
-        if "brokk_rl.job" in sys.modules:  # Hydra loads it before it makes a folder
-            from brokk_rl.job import SweepFolder
-
-            SweepFolder.drop_if_unused()
         cause = error.args[0] if isinstance(error, FailedJob) else error
         message = explain(cause)
         if isinstance(cause, SweepError) and cause.args[1] == os.getpid():

@@ -31,12 +31,7 @@ from brokk_rl import distributed, extensions, registry
 from brokk_rl.arguments import parse_words
 from brokk_rl.build import build_mode
 from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.session import (
-    list_missing_folders,
-    read_earlier_job,
-    remove_empty_folders,
-    require_new_folder,
-)
+from brokk_rl.session import read_earlier_job, require_new_folder
 
 log = logging.getLogger(__name__)
 
@@ -173,12 +168,10 @@ def name_job(number: int, overrides: Sequence[str], fixed: Sequence[str]) -> str
 
 
 class SweepFolder(Callback):
-    """Hydra callback that remembers the folders made for a sweep."""
-
-    new: tuple[Path, ...] = ()
+    """Hydra callback that prepares a sweep: names of its folders, and places for its jobs."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Remember missing folders and fixed overrides; Hydra calls this before it makes them.
+        """Remember the fixed overrides; Hydra calls this before the first job.
 
         The jobs, which may run in other processes, find the keys of the fixed overrides where Hydra
         keeps those that no folder name should have.
@@ -191,17 +184,8 @@ class SweepFolder(Callback):
             config.hydra.overrides.hydra.append(
                 f"hydra.job.config.override_dirname.exclude_keys={fixed}"
             )
-        type(self).new = tuple(list_missing_folders(Path(str(config.hydra.sweep.dir))))
         if str(config.hydra.launcher._target_).endswith(".LocalLauncher"):
             offer_places()
-
-    @classmethod
-    def drop_if_unused(cls) -> None:
-        """Remove the folders of a sweep into which no job has written."""
-        if cls.new and {path.name for path in cls.new[0].glob("*")} == {"multirun.yaml"}:
-            (cls.new[0] / "multirun.yaml").unlink()
-        remove_empty_folders(cls.new)
-        cls.new = ()
 
 
 def offer_places() -> None:

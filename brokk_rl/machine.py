@@ -106,22 +106,19 @@ class Joint:
         return "rad" if self.kind == "hinge" else "m"
 
     def check(self) -> None:
-        if self.lower.value >= self.upper.value:
-            raise ConfigError(
-                f"joint {self.name}: expected upper above lower, got {self.upper.value} and {self.lower.value}"
-            )
-        if self.max_speed.value <= 0.0:
-            raise ConfigError(
-                f"joint {self.name}: expected max_speed above 0, got {self.max_speed.value}"
-            )
-        if not self.lower.value <= self.home <= self.upper.value:
-            raise ConfigError(
-                f"joint {self.name}: home {self.home} lies outside [{self.lower.value}, {self.upper.value}]"
-            )
-        if self.command == "torque" and (self.max_force is None or self.max_force.value <= 0):
-            raise ConfigError(
-                f"joint {self.name}: command: torque needs max_force, the force or torque at full command, above 0"
-            )
+        lower, upper = self.lower.value, self.upper.value
+        speed = self.max_speed.value
+        fault = ""
+        if lower >= upper:
+            fault = f"expected upper above lower, got {upper} and {lower}"
+        elif speed <= 0.0:
+            fault = f"expected max_speed above 0, got {speed}"
+        elif not lower <= self.home <= upper:
+            fault = f"home {self.home} lies outside [{lower}, {upper}]"
+        elif self.command == "torque" and (self.max_force is None or self.max_force.value <= 0):
+            fault = "command: torque needs max_force, the force or torque at full command, above 0"
+        if fault:
+            raise ConfigError(f"joint {self.name}: {fault}")
 
 
 @spec

@@ -85,9 +85,8 @@ def _run_check(check: Callable[[], DoctorFinding]) -> DoctorFinding:
     try:
         return check()
     except ModuleNotFoundError as error:
-        extra = extras.find_extra(str(error.name), __name__)
-        advice = f"pip install '{extras.DISTRIBUTION}[{extra}]'" if extra else "make setup"
-        return DoctorFinding("warn", f"{error.name} is not installed", advice)
+        text = extras.explain_missing_module(str(error.name), "this check")
+        return DoctorFinding("warn", text or f"{error.name} is not installed", "make setup")
     # A failure inside another package must not hide the rest of the report.
     except Exception as error:
         return DoctorFinding("warn", f"cannot tell: {type(error).__name__}: {error}")

@@ -276,24 +276,16 @@ class PlayPage:
     def _show_figures(self) -> None:
         """Show status and levers as they are."""
         session = self._session
-        num_worlds, finished = session.loop.num_envs, sum(session.endings.values())
-        parts = [
-            "**paused**" if session.paused else f"**{session.measure_rate():.2f} × real time**"
-        ]
-        parts.append("1 world" if num_worlds == 1 else f"{num_worlds} worlds")
-        if num_worlds > self._num_drawn:
-            parts[-1] += f" ({self._num_drawn} drawn)"
-        if session.note:
-            parts.append(session.note)
-        episode = f"Episode {session.episode_s:.1f} s · "
-        if finished:
-            endings = ", ".join(f"{name} {count}" for name, count in session.endings.items())
-            title = session.loop.task.figures[SUCCESS].title
-            episode += f"{title}: {session.successes} of {finished} ({endings})"
-        else:
-            episode += "no episode finished"
+        pace = "paused" if session.paused else f"{session.measure_rate():.2f} × real time"
+        worlds = f"worlds: {session.loop.num_envs}, drawn: {self._num_drawn}"
+        finished = sum(session.endings.values())
+        endings = ", ".join(f"{name} {count}" for name, count in session.endings.items())
+        title = session.loop.task.figures[SUCCESS].title
+        results = f"{title}: {session.successes} of {finished} {endings and f'({endings})'}"
+        lines = [f"**{pace}** · {worlds}", session.note]
+        lines.append(f"Episode {session.episode_s:.1f} s · {results}")
         # viser sends a browser only what differs
-        self._status.content = f"{' · '.join(parts)}\n\n{episode}"
+        self._status.content = "\n\n".join(filter(None, lines))
         for lever, value in zip(self._levers, session.levers, strict=True):
             lever.value = round(float(value), 2)
         self._driver.value = session.driver

@@ -93,7 +93,7 @@ def test_a_sweep_takes_files_beside_options(
     for job in (0, 1):  # each was composed, and refused for its size alone
         (message,) = (one for one in caplog.messages if one.startswith(f"job {job} failed"))
         assert "num_envs[0]: expected a number greater than or equal to 1, got 0" in message
-    assert not (tmp_path / "sweep").exists()
+    assert [path.name for path in (tmp_path / "sweep").iterdir()] == ["multirun.yaml"]
 
 
 IDEAL = "_target_: actuators.models.lag.Ideal\n"
