@@ -156,9 +156,7 @@ class PlayPage:
     def _build_touch(self) -> None:
         gui, session = self._server.gui, self._session
         if session.can_move_target:
-            gui.add_markdown("Drag the arrows at the target to move it.")
-            free = gui.add_button("Draw the target again at each reset")
-            free.on_click(lambda _: self._ask(session.free_target))
+            gui.add_markdown("Drag the arrows at the target; it stays there until **Reset**.")
         if not session.can_push:
             gui.add_markdown("*The arm can be pushed with `sim=native`.*")
             return

@@ -300,8 +300,11 @@ class PlaySession:
         return self._person.levers.numpy().copy()
 
     def reset(self, world: int | None = None) -> None:
-        """Begin a new episode in a world, or in all, with the next step."""
+        """Begin a new episode in a world, or in all, with the next step; its target is drawn."""
         rows = slice(None) if world is None else world
+        for one in list(self._pins):
+            if world in (None, one):
+                del self._pins[one]
         self._restarted[rows] = True
         self.loop.task.state[STEPS][rows] = float(self.loop.task.max_episode_steps)
         if self.paused:
@@ -317,7 +320,9 @@ class PlaySession:
         self._push_n[self.selected] = force, round(PUSH_S / self.machine.period_s)
 
     def move_target(self, position_m: np.ndarray) -> np.ndarray:
-        """Put the selected world's target, and the block with it, elsewhere; it stays there.
+        """Put the selected world's target, and the block with it, elsewhere.
+
+        It stays there until `reset`.
 
         Args:
             position_m: Wanted place in the base frame, `(3,)`.
@@ -336,10 +341,6 @@ class PlaySession:
         self._pins[self.selected] = place
         self._put_target(self.selected, place)
         return position
-
-    def free_target(self) -> None:
-        """Let the selected world draw its target again, from its next episode on."""
-        self._pins.pop(self.selected, None)
 
     def advance(self, elapsed_s: float) -> int:
         """Simulate as much as `elapsed_s` of the wall clock ask for; return the control steps."""
