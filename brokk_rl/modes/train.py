@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 
 TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 """Files of the run folder that a tracker gets at the end."""
+DESCRIBED = ("commit", "choices", "fingerprint")
+"""Fields of `session.json` that a tracker shows, beside the whole configuration."""
 
 
 @spec
@@ -88,7 +90,9 @@ class Train(SimulatedPlant):
                 if is_first:
                     write_json(folder / CONTRACT, self._describe_policy(loop))
                     step = runner.current_learning_iteration
-                    run = (read_record(folder) or {}) | {"config": describe_spec(self)}
+                    record = read_record(folder) or {}
+                    run = {name: record.get(name) for name in DESCRIBED}
+                    run["config"] = describe_spec(self)
                     tracker = self.tracking.open(folder, run, step)
                     runner.logger.writer = stack.enter_context(contextlib.closing(tracker))
                 runner.run()
