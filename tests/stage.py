@@ -57,7 +57,7 @@ class Air:
         self._stage = stage
         self.inbox: deque[CanFrame] = deque()
         self.sent: list[CanFrame] = []
-        self.broken = self.echo = False
+        self.broken = False
         self.interface, self.channel = "virtual", "air"
 
     def open(self, frame_ids: Any) -> Air:
@@ -82,8 +82,6 @@ class Air:
             raise LinkError("bus: cannot send")
         self.sent.append(frame)
         self._stage.bridge.carry(frame, to_gateway=True)
-        if self.echo:
-            self.inbox.append(frame)
 
     def close(self) -> None: ...
 
@@ -138,7 +136,7 @@ class Bridge:
         self.echo_s: dict[str, float] = {}
         self.half, self.second_remote, self.begun_ms = "", False, self._stage.ms
         self.foreign: dict[str, float] | None = None
-        self.remote_every_ms, self.foreign_every_ms, self.remote_offset = 20, 20, 0
+        self.remote_offset = 0
         self.alter: dict[str, Callable[[dict[str, float]], None]] = {}
         self.lose = Counter[str]()
         self.held_s, self.inserted, self.replayed = 0.0, dict[str, bytes](), False
@@ -190,11 +188,11 @@ class Bridge:
             for to_gateway in (True, False):
                 if self.replayed:
                     self._arrive(frame, to_gateway)
-        if self.second_remote and stage.ms % self.remote_every_ms == 7:
+        if self.second_remote and stage.ms % 20 == 7:
             counter = stage.twin._remote._counter + self.remote_offset
             self._arrive(self._remote.build_frame(counter % 16), to_gateway=True)
             self._arrive(self._remote.build_frame(counter % 16), to_gateway=False)
-        if self.foreign is not None and stage.ms % self.foreign_every_ms == 9:
+        if self.foreign is not None and stage.ms % 20 == 9:
             self._foreign_counter += 1
             description, command = self._remote._description, "ValveCmd"
             values = self.foreign | {"Stamp": stage.now_s}
@@ -371,7 +369,7 @@ class Stage:
         self._times += 1
         # To and fro: no joint comes to its end, no policy to its goal.
         side = 1 - 2 * (self._times % 2)
-        self.air.broken, self.air.echo, self.request_s = False, False, 0.05
+        self.air.broken, self.request_s = False, 0.05
         self.bridge.clear()
         self.supervised, self.meddle = True, None
         self.arm()
