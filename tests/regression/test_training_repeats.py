@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 import training as runs
-from composed import option
 
 from brokk_rl.machine import Machine
 from brokk_rl.rl.settings import Teacher
@@ -96,21 +95,3 @@ def test_another_start_of_the_pool_is_not_another_run(machine: Machine, tmp_path
     torch.manual_seed(2)
     second = runs.plant(machine).build(torch.device("cpu"), 4, 32, 5).starts
     assert same(first, second)
-
-
-@pytest.mark.slow
-def test_with_physics_and_the_learned_actuator_too(machine: Machine, tmp_path: Path) -> None:
-    native = replace(option("sim", "native"), num_threads=2)
-    ends = {}
-    for name, budgets in {"whole": (6,), "parts": (3, 6)}.items():
-        for iterations in budgets:
-            training = runs.small(max_env_steps=iterations * ITERATION)
-            torch.manual_seed(0)
-            plant = replace(runs.plant(machine, sim=native), actuator=option("actuator", "mlp"))
-            loop = plant.build(torch.device("cpu"), 16, 64, 0)
-            runner = runs.make(machine, tmp_path / name, training, loop)
-            if iterations == 6 and len(budgets) == 2:
-                runner.load(str(tmp_path / name / "model_3.pt"))
-            runner.run()
-            ends[name] = runs.weights(runner)
-    assert same(ends["whole"], ends["parts"])

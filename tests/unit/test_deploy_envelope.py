@@ -23,7 +23,7 @@ from brokk_rl.sim import shapes
 from brokk_rl.sim.shapes import describe_shapes
 from deploy import guard_setup
 from deploy.checks.envelope import Envelope, measure_segment_to_box
-from deploy.checks.shapes import LinkCapsule, MachineShapes, read_machine_shapes
+from deploy.checks.shapes import MachineShapes, read_machine_shapes
 from deploy.kernel.limits import EnvelopeLimits, Numbers, StayOutBox
 from deploy.kernel.under_way import CommandsUnderWay
 
@@ -37,7 +37,6 @@ MJCF = Path(brokk_rl.sim.__file__).parent / "assets" / "brokk170.xml"
 BODIES = ("undercarriage", *(f"{name}_link" for name in MACHINE.joint_names))
 WALL = StayOutBox(lower_m=(1.0, 1.4, 0.2), upper_m=(4.0, 1.6, 2.5))
 HOME = np.array(MACHINE.home)
-ROD = LinkCapsule(2, np.array([-0.5, 0.0, 0.0]), np.array([0.7, 0.0, 0.0]), 0.05)
 STILL = (0.0,) * 5
 DT_S = 0.025
 SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
@@ -234,71 +233,6 @@ def test_distance_of_a_segment_to_a_box_is_the_least_of_all_its_points() -> None
     inside = expected == 0.0
     depth = (half[inside] - np.abs(points[:, inside])).min(-1).max(0)
     assert inside.sum() > 50 and found[inside] == pytest.approx(-depth.clip(0.0), abs=2e-3)
-
-
-def test_worked_distances() -> None:
-    half = np.array([1.0, 1.0, 1.0])
-    for begin, end, expected in (
-        ((3.0, 0.0, 0.0), (5.0, 0.0, 0.0), 2.0),  # beside it, pointing away
-        ((5.0, 0.0, 0.0), (3.0, 0.0, 0.0), 2.0),  # pointing at it
-        ((-5.0, 0.0, 3.0), (5.0, 0.0, 3.0), 2.0),  # passing above
-        ((0.0, 4.0, 2.0), (0.0, 2.0, 4.0), 4.0 / math.sqrt(2)),  # around an edge
-        ((-5.0, 0.0, 0.0), (5.0, 0.0, 0.0), -1.0),  # through it
-        ((-0.5, 0.2, 0.8), (5.0, 0.2, 0.8), -0.2),  # into it, below its upper side
-        ((0.5, 3.0, 0.0), (1.5, 2.8, 0.0), 1.9 / math.sqrt(1.04)),  # foot of the edge's normal
-    ):
-        (found,) = measure_segment_to_box(np.array([begin]), np.array([end]), half)
-        assert found == pytest.approx(expected)
-
-
-def build_lone_rod(**change: object) -> tuple[Envelope, np.ndarray, np.ndarray]:
-    """An envelope of one rod of 1.2 m on the third link, and its ends in the base frame at home."""
-    limits = replace(LIMITS, ground_m=None, **change)
-    model = read_spec().compile()
-    data = mujoco.MjData(model)
-    data.qpos[:5] = HOME
-    mujoco.mj_kinematics(model, data)
-    link = data.body("q3_link")
-    ends_m = [link.xpos + link.xmat.reshape(3, 3) @ end for end in (ROD.begin_m, ROD.end_m)]
-    return make_envelope(limits, MachineShapes((ROD,), ())), ends_m[0], ends_m[1]
-
-
-def test_what_lies_below_the_ground_touches_it() -> None:
-    envelope, begin_m, end_m = build_lone_rod()
-    above_m = min(begin_m[2], end_m[2]) + 1.0
-    rod = make_envelope(replace(LIMITS, ground_m=above_m), MachineShapes((ROD,), ()))
-    assert measure_clearance(rod, HOME[None])[0] == pytest.approx(-1.05)
-    below_m = min(begin_m[2], end_m[2]) - 1.0
-    rod = make_envelope(replace(LIMITS, ground_m=below_m), MachineShapes((ROD,), ()))
-    assert measure_clearance(rod, HOME[None])[0] == pytest.approx(0.95)
-    assert np.isinf(measure_clearance(envelope, HOME[None])).all()
-
-
-def test_the_way_to_rest_is_looked_at_and_nothing_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
-    envelope, face, rest = build_envelope(), (2.0, 0.0, 1.0), HOME + 0.4
-    tips_m, step_m, asked = np.zeros((5, 3)), np.array([0.25, 0.0, 0.0]), []
-
-    def locate_tip(q: np.ndarray) -> np.ndarray:
-        asked.append(q)
-        # Half a metre of motion within the reaction time: far too fast.
-        return np.concatenate([tips_m, tips_m - step_m, tips_m + step_m])
-
-    monkeypatch.setattr(envelope, "locate_tip", locate_tip)
-
-    def is_slow(heights_m: list[float], aside_m: list[float]) -> bool:
-        tips_m[:] = np.array(face)
-        tips_m[:, 1] += aside_m
-        tips_m[:, 2] += heights_m
-        return envelope._find_slowdown(np.ones(5), HOME, rest, [face]) < 1.0
-
-    far_m = LIMITS.face_radius_m + 1.0
-    assert is_slow([0.5, -0.5, -0.5, -0.5, -0.5], [0.0] * 5)
-    # It passes the surface elsewhere; then it is below it, and goes on there.
-    assert not is_slow([0.5, -0.5, -0.5, -0.5, -0.5], [0.0, far_m, 0.0, 0.0, 0.0])
-    assert not is_slow([0.5] * 5, [0.0] * 5)
-    way = asked[0][:5]
-    assert way[0] == pytest.approx(HOME) and way[-1] == pytest.approx(rest)
-    assert np.diff(way, axis=0) == pytest.approx(0.1)
 
 
 def test_a_command_that_leads_nowhere_is_not_withheld() -> None:

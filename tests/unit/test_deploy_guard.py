@@ -126,20 +126,6 @@ def test_arming_alone_moves_nothing_and_neither_does_a_dead_man_held_from_the_st
     assert decision.trip is GuardTrip.NOT_ARMED
 
 
-def test_the_way_to_the_valves_is_release_then_press() -> None:
-    hand = Hand().active()
-    expected = (GuardState.ACTIVE, (0.05, 0.0, -0.05), GuardTrip.NONE, GuardTrip.NONE)
-    assert hand.decide(u=(0.05, 0.0, -0.05)) == GuardDecision(*expected)
-
-
-def test_the_first_cycle_with_the_dead_man_pressed_still_sends_zero() -> None:
-    hand = Hand()
-    hand.decide(RELEASED)
-    hand.decide(RELEASED)
-    decision = hand.decide(WELL, (0.5, 0.0, 0.0))
-    assert decision.state is GuardState.ACTIVE and decision.u == STILL
-
-
 def test_a_released_dead_man_is_zero_in_the_same_cycle_and_may_be_pressed_again() -> None:
     hand = Hand().active()
     hand.decide(u=(0.1, 0.0, 0.0))
@@ -474,7 +460,6 @@ def test_the_exclusive_joint_moves_alone() -> None:
 
 
 numbers = st.one_of(st.floats(-1.5, 1.5), st.sampled_from([0.0, math.nan, math.inf, -math.inf]))
-ages = st.one_of(st.floats(0.0, 0.3), st.just(math.inf))
 cycles = st.fixed_dictionaries(
     {
         "dt": st.floats(0.0, 0.25),
@@ -634,11 +619,3 @@ def test_what_lies_exactly_on_a_limit_of_time_or_reach_is_allowed() -> None:
     assert watch.accept(0, 0.0, 0.0)
     assert watch.accept(0, 0.25, 0.5)
     assert not watch.accept(0, 0.25, 0.7501)
-
-
-def test_positions_are_plausible_until_as_many_jumps_as_it_takes() -> None:
-    watch = PlausibilityFilter(LIMITS, BODY)
-    for _ in range(LIMITS.num_jumps):
-        assert watch.plausible
-        watch.accept(1, 0.0, 9.0)
-    assert not watch.plausible

@@ -84,14 +84,6 @@ def test_two_errors_within_fifty_messages_are_too_many_and_two_further_apart_are
         assert one.trust is trust
 
 
-def test_three_repetitions_within_fifty_messages_are_too_many() -> None:
-    for apart, trust in ((48, INVALID), (49, VALID)):
-        one = Listener()
-        one.hear([0, 1, 1, 1, *range(2, 2 + apart - 1)])
-        one.hear([apart])
-        assert one.trust is trust, "the last of them is the third"
-
-
 def test_what_became_invalid_needs_twenty_five_good_messages_in_a_row() -> None:
     one = Listener()
     one.hear([0, 1, None, None, *range(2, 26)])
@@ -181,14 +173,6 @@ def test_more_messages_than_the_cycle_time_allows_are_a_second_sender() -> None:
     assert one.trust is VALID, "a flood leaves no debt that would outlast it"
 
 
-def test_messages_that_waited_while_the_receiver_stood_still_are_no_second_sender() -> None:
-    one = Listener()
-    one.hear(range(10))
-    one.now_s += 0.2
-    waited = [one.channel.take(k % 16, one.now_s % WRAP_S, one.now_s) for k in range(10, 21)]
-    assert waited == [GOOD] * 11
-
-
 def test_a_sender_may_be_a_tenth_faster_than_its_cycle_time_and_no_more() -> None:
     for factor, faults in ((0.92, 0), (0.85, 1)):
         one = Listener()
@@ -229,17 +213,6 @@ def test_clocks_of_two_crystals_seem_to_have_no_delay_for_hours(rate: float) -> 
 def test_a_delay_that_grows_by_a_millisecond_a_second_is_seen_and_not_forgotten() -> None:
     # of 1 ms/s a tenth could be the crystals
     assert hear_clock(GatewayClock(), 200.0, 0.0, 1.0 - 1e-3) == pytest.approx(0.18, abs=1e-3)
-
-
-def test_a_constant_delay_is_still_seen_after_half_an_hour() -> None:
-    clock = GatewayClock()
-    hear_clock(clock, 10.0, 0.0)
-    for k in range(18_000):
-        now_s = 1010.0 + k / 10
-        stamp_s = (now_s - 0.5) % CLOCK_WRAP_S
-        clock.learn(stamp_s, CLOCK_WRAP_S, now_s)
-    # the crystals could have drifted 180 ms apart meanwhile
-    assert now_s - clock.find_sent_s(stamp_s, CLOCK_WRAP_S, now_s) == pytest.approx(0.32, abs=2e-3)
 
 
 def test_the_shortest_transit_counts_as_none_and_stamps_of_the_future_as_unknown() -> None:

@@ -176,15 +176,6 @@ def test_a_checkpoint_with_a_part_spoiled_or_missing_is_refused(
         loading(machine, checkpoint)
 
 
-def test_a_checkpoint_of_another_machine_names_what_differs(
-    checkpoint: Path, machine: Machine
-) -> None:
-    assert machine.tool_m is not None
-    longer = replace(machine, tool_m=(replace(machine.tool_m[0], value=1.3), *machine.tool_m[1:]))
-    with pytest.raises(CheckpointError, match="made for another machine: geometry differ"):
-        loading(longer, checkpoint)
-
-
 def test_a_checkpoint_of_another_network_or_number_of_environments_is_refused(
     checkpoint: Path, machine: Machine
 ) -> None:

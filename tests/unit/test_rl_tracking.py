@@ -73,6 +73,13 @@ SMALL = (
 )  # fmt: skip
 
 
+FIELDS = {
+    "episodes", "success_strict", "success_paper", "time_to_insert_s", "lateral_error_m", "peak_force_n", "valve_travel",
+    "terminations", "seed", "actuator", "policy",
+}  # fmt: skip
+"""Fields of `evaluation.json` that tools outside the project read."""
+
+
 @pytest.fixture
 def run(brokk: Callable[..., Any], tmp_path: Path) -> Callable:
     def train(*words: str) -> Path:
@@ -87,6 +94,7 @@ def test_tensorboard_gets_parts_reward_terms_and_the_evaluation(run: Callable[..
     folder = run("tracking=tensorboard")
     events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0}).Reload()
     evaluation = json.loads((folder / "evaluation.json").read_text())
+    assert evaluation.keys() >= FIELDS and list(evaluation["policies"]) == ["trained", "classical"]
     (last,) = events.Scalars("evaluation/classical/valve_travel")
     assert last.value == pytest.approx(evaluation["policies"]["classical"]["valve_travel"])
     assert {"config/text_summary", "commit/text_summary"} <= set(events.Tags()["tensors"])

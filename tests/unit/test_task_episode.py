@@ -297,15 +297,6 @@ def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> Non
     assert reason == "start_in_contact"
 
 
-def test_contact_later_in_the_episode_goes_on(machine: Machine) -> None:
-    stage = Stage(machine)
-    assert not stage.step().terminated.item()
-    stage.world.contact_force_n.fill_(500.0)
-    touched = stage.step()
-    assert not touched.terminated.item() and touched.reason.item() == -1
-    assert touched.reward.item() != 0.0
-
-
 @pytest.mark.parametrize("joint", range(5))
 def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine: Machine) -> None:
     stage = Stage(machine)
