@@ -73,24 +73,6 @@ def test_before_anybody_speaks_nothing_flows() -> None:
     assert Around().is_still(GatewayState.STOPPED)
 
 
-def test_three_idle_commands_are_wanted_before_any_other() -> None:
-    for idle, state in ((3, GatewayState.IDLE), (4, GatewayState.PC)):
-        around = Around()
-        around.go(0.2, "ValveCmd")
-        around.command["CommandMode"] = 0
-        # the first makes a new channel known, and is not used
-        around.go(0.02 * idle)
-        around.command["CommandMode"] = 1
-        around.go(0.02)
-        assert around.flow()[2] is state
-
-
-def test_without_idle_commands_first_nothing_flows() -> None:
-    around = Around()
-    around.go(1.0)
-    assert around.is_still(GatewayState.IDLE)
-
-
 @pytest.mark.parametrize("cause", ["silence", "estop", "levers", "remote", "corrupt"])
 @pytest.mark.parametrize(("idle", "state"), [(2, GatewayState.IDLE), (3, GatewayState.PC)])
 def test_after_every_interruption_three_idle_commands_are_wanted_anew(
@@ -147,15 +129,6 @@ def test_a_gateway_of_a_bus_without_stamps_knows_no_delay(tmp_path: Path) -> Non
     assert around.gateway.round_trip_s == 0.0
 
 
-def test_idle_commands_stop_and_commands_may_follow_at_once(around: Around) -> None:
-    around.command["CommandMode"] = 0
-    around.go(0.02)
-    assert around.is_still(GatewayState.IDLE)
-    around.command["CommandMode"] = 1
-    around.go(0.02)
-    assert around.flow()[1] == PC
-
-
 def test_a_released_dead_man_stops(around: Around) -> None:
     around.remote["DeadMan"] = 0
     around.go(0.02)
@@ -173,13 +146,6 @@ def test_commands_that_stay_away_stop_and_want_idle_frames_again(around: Around)
     around.get_going()
 
 
-def test_a_silence_that_nobody_looked_at_wants_idle_frames_too(around: Around) -> None:
-    around.now_s += 0.08
-    around.send("LeverState")
-    around.send("ValveCmd", skip=4)
-    assert around.is_still(GatewayState.IDLE)
-
-
 def test_a_remote_that_stays_away_or_is_off_stops_and_wants_idle_frames_again(
     around: Around,
 ) -> None:
@@ -195,14 +161,6 @@ def test_a_remote_that_stays_away_or_is_off_stops_and_wants_idle_frames_again(
     around.get_going()
     around.send("LeverState", RemoteOn=0)
     assert around.is_still(GatewayState.STOPPED)
-
-
-def test_an_emergency_stop_stops_and_wants_idle_frames_again(around: Around) -> None:
-    around.gateway.estop = True
-    assert around.is_still(GatewayState.STOPPED)
-    around.gateway.estop = False
-    assert around.is_still(GatewayState.IDLE)
-    around.get_going()
 
 
 @pytest.mark.parametrize("deflection", [0.5, -0.5])
@@ -271,24 +229,6 @@ def test_messages_with_an_old_stamp_are_refused(
         around.go(0.1)
         assert (around.flow()[1] == PC) == is_moving
         assert is_moving or around.is_still(state)
-
-
-def test_late_copies_of_commands_never_move_anything(around: Around) -> None:
-    frames: list[tuple[float, CanFrame]] = []
-    for k in range(60):
-        around.now_s += 0.02
-        around.send("LeverState")
-        around.counters["ValveCmd"] += 1
-        values = around.command | {"Stamp": around.now_s}
-        data = BUS.encode("ValveCmd", values, around.counters["ValveCmd"])
-        frame = CanFrame(BUS.command.frame_id, data)
-        frames.append((around.now_s, frame))
-        if k < 30:
-            around.gateway.take(frame, around.now_s)
-        if k >= 13:  # 260 ms late
-            around.gateway.take(frames[k - 13][1], around.now_s + 0.001)
-        if k > 14:
-            assert around.flow()[1] == NOBODY
 
 
 def test_the_way_there_and_back_is_measured_on_commands(around: Around) -> None:

@@ -93,18 +93,6 @@ def test_a_sensor_at_the_end_of_its_range_is_found_and_a_joint_at_its_stop_is_no
     assert "saturated sensor" not in examine(replace(sound, q=shifted))
 
 
-def test_lost_frames_and_broken_rules_are_one_remark_each(
-    sound: Recording, examine: Examine
-) -> None:
-    q, u = sound.q.copy(), sound.u.copy()
-    for row in range(100, 4000, 97):
-        q[row] = q[row - 1]
-    u[400:420, 1] = 0.5
-    found = examine(replace(sound, q=q, u=u))
-    assert found["lost frames"].count > 10 and found["exclusive joint"].joint == "q2"
-    assert found["exclusive joint"].from_s == pytest.approx(20.0)
-
-
 def test_the_gravest_comes_first_and_all_of_it_is_plain(sound: Recording, machine: Machine) -> None:
     slow = replace(recording(machine, np.abs(sound.u[:, 3]) > 0), t_s=sound.t_s * 1.004)
     remarks = examine_recordings([slow], machine)

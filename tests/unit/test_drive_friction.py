@@ -142,29 +142,3 @@ def test_a_diagnosis_names_what_a_drive_lacks(
     simulator = option("actuator", "force", **known)
     answer = api.diagnose(api.RecordingSet(logs, arm), tmp_path, simulator=simulator).answer
     assert effect in {one.effect for one in answer.selected}
-
-
-def test_a_motor_by_its_duty_is_a_force_with_the_back_emf_as_viscous_friction() -> None:
-    """Twelve volts through a duty; MuJoCo has back EMF, gear and rotor by an element of its own."""
-    supply_v, ohm, constant, gear, rotor = 12.0, 2.0, 0.02, 100.0, 2e-6
-    element = f'<dcmotor joint="arm" gear="{gear}" resistance="{ohm}" motorconst="{constant}"/>'
-    plant = pendulum.build_model(damping=0.05, drive=element)
-    plant.dof_frictionloss[0] = 0.1
-    plant.dof_armature[0] += rotor * gear**2
-    machine = pendulum.make_pendulum(constant * gear * supply_v / ohm)
-    numbers = {
-        "mass_kg": pendulum.INERTIA + rotor * gear**2, "coulomb_n": 0.1, "dead_time_s": 0.0,
-        "viscous_n_s_m": 0.05 + (constant * gear) ** 2 / ohm,
-        "offset_n": pendulum.WEIGHT_NM, "pose_cos_n": pendulum.WEIGHT_NM,
-    }  # fmt: skip
-    model = replace(option("actuator", "force"), **numbers).build(machine, 1, CPU)
-    u = 0.2 + 0.4 * np.sin(np.arange(300) / 15.0)
-    found = run_drive(model, machine, u, -0.4)
-    data, expected = mujoco.MjData(plant), []
-    data.qpos[0] = -0.4
-    for duty in u:
-        data.ctrl[0] = duty * supply_v
-        mujoco.mj_step(plant, data, 5)
-        expected.append(float(data.qpos[0]))
-    assert np.ptp(expected) > 0.5 and np.abs(expected).max() < 1.4, "within the travel"
-    np.testing.assert_allclose(found, expected, atol=0.01)

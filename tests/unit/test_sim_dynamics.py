@@ -148,28 +148,6 @@ def _motion(machine, steps, push):
 
 
 @pytest.mark.slow
-def test_five_seconds_of_motion_and_contact_agree_with_the_native_world(machine):
-    worlds = [spec.build(machine, "cpu") for spec in (NATIVE, WARP)]
-    largest, pressed, felt = torch.zeros(3, NUM_WARP_WORLDS)
-    for increment in _motion(machine, steps=100, push=0.004):
-        for world in worlds:
-            world.step(increment)
-        native, warp = worlds
-        largest = torch.maximum(largest, (native.q - warp.q).abs().amax(1))
-        pressed = torch.maximum(pressed, native.contact_force_n)
-        felt = torch.maximum(felt, warp.contact_force_n)
-        untouched = pressed == 0.0
-        assert (largest[untouched] < 1e-5).all()
-    assert (pressed > 1_000).sum() >= 3
-    assert not any(world.faults.any() for world in worlds)
-    # contact amplifies rounding: a stop that is met edge on may be passed on either side, so not
-    # every world must agree
-    alike = largest < 5e-3
-    assert alike.sum() >= NUM_WARP_WORLDS - 1
-    torch.testing.assert_close(felt[alike], pressed[alike], rtol=1e-2, atol=1.0)
-
-
-@pytest.mark.slow
 def test_a_control_step_is_that_of_mujoco_warp(machine):
     """From the same state, in the air and pressed onto the ground."""
     ours, whole = WARP.build(machine, "cpu"), WARP.build(machine, "cpu")
