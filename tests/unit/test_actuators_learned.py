@@ -106,21 +106,6 @@ def test_the_shipped_machine_at_rest_stays_at_rest(machine: Machine) -> None:
         assert (history.q[:, -1] - q).abs().max() < 0.002, f"command {level}"
 
 
-def test_the_shipped_model_reaches_a_target_and_stays(machine: Machine) -> None:
-    model = option("actuator", "mlp").build(machine, 1, CPU)
-    home = torch.as_tensor(machine.home, dtype=torch.float32)[None]
-    target = home + torch.tensor([[0.5, 0.0, 0.4, -0.4, 0.5]])
-    history = rest(machine)
-    error = []
-    for _ in range(600):
-        gap = target - history.q[:, -1]
-        push = (1.5 * gap).clamp(-0.6, 0.6) + 0.12 * gap.sign() * (gap.abs() > 0.01)
-        history.push_u(push)
-        history.push_q(model.step(history))
-        error.append(gap.abs().max().item())
-    assert max(error[-100:]) < 0.03
-
-
 def test_a_missing_checkpoint_names_what_ships(machine: Machine) -> None:
     with pytest.raises(CheckpointError, match=r"nowhere\..*brokk170\..*mode=identify"):
         load_networks("nowhere.safetensors", machine)

@@ -262,21 +262,6 @@ def test_disarming_sends_zero_a_few_times_and_then_nothing(loop: Loop) -> None:
     assert loop.sent == []
 
 
-def test_a_stop_is_stronger_than_any_arming_before_it_and_no_stronger_than_one_after_it(
-    loop: Loop,
-) -> None:
-    loop.armed_s = loop.now_s - 1.0
-    loop.stop_s = loop.now_s
-    loop.cycle()
-    assert loop.state is GuardState.SILENT and not any(loop.logic.decision.u)  # type: ignore[union-attr]
-    loop.go(0.5)
-    assert loop.state is GuardState.SILENT
-    loop.armed_s = loop.now_s
-    loop.cycle()
-    assert loop.state is GuardState.LATCHED
-    loop.get_active()
-
-
 @pytest.mark.parametrize(
     ("controls", "stopped_s", "armed"),
     [
@@ -304,14 +289,6 @@ def test_a_stop_that_was_read_once_is_not_taken_back_by_an_earlier_one_or_by_non
         loop.stop_s = stop_s
         loop.go(0.3)
         assert loop.state is GuardState.SILENT
-
-
-def test_without_switches_nothing_is_ever_sent() -> None:
-    loop = Loop()
-    loop.sender.go(0.3)
-    inputs = BusInputs(None, None, RequestedCommand(loop.now_s, U), None)
-    assert loop.logic.decide(loop.now_s, True, inputs, 0) == []
-    assert loop.state is GuardState.SILENT and loop.logic.end(loop.now_s, 0) == []
 
 
 def test_a_loop_that_never_commands_sends_nothing_whatever_it_is_asked() -> None:
@@ -451,20 +428,6 @@ def test_the_observer_hears_where_the_chisel_may_touch_the_borehole() -> None:
         assert probe.may_touch is may_touch
 
 
-def test_the_first_period_of_the_observer_has_the_mean_of_its_own_messages() -> None:
-    probe = Probe()
-    probe.due = False
-    loop = Loop(observer=probe)  # type: ignore[arg-type]
-    loop.follows = False
-    loop.sender.values["Flow_q1"] = 0.2
-    loop.go(0.1)
-    probe.due = True
-    loop.decide()
-    (_, _, u) = probe.seen[0]
-    assert loop.logic.receiver.flow_number > 2
-    assert u[0] == pytest.approx(0.2, abs=0.005)
-
-
 def test_an_observed_fault_latches_with_its_joint_and_a_released_dead_man_clears_it() -> None:
     probe = Probe()
     loop = Loop(observer=probe).get_active()  # type: ignore[arg-type]
@@ -550,23 +513,6 @@ def test_the_envelope_knows_the_faces_and_withholds() -> None:
     assert wall.faces == ((center_m, (2.2, 0.4, 0.8)), True)
     assert loop.state is GuardState.ACTIVE and loop.trip is GuardTrip.ENVELOPE
     assert loop.commands()[-1][1]["Command_q1"] == 0.0
-
-
-@pytest.mark.parametrize("commands", [True, False])
-@pytest.mark.parametrize("estop", [True, False])
-def test_a_flow_that_nobody_asked_for_is_said_in_every_mode(commands: bool, estop: bool) -> None:
-    loop = Loop(commands)
-    loop.sender.values |= {"DeadMan": 0, "FlowSource": 0, "EStop": float(estop)}
-    loop.go(0.5)
-    loop.follows = False
-    assert loop.logic.receiver.found == NOTHING_OBSERVED
-    for source in (0, 1, 2):
-        loop.sender.values |= {"Flow_q3": 0.3, "FlowSource": source}
-        loop.go(0.06)
-        assert loop.logic.receiver.found == Observation(GuardTrip.FLOW_UNASKED, 2)
-        loop.sender.values["Flow_q3"] = 0.0
-        loop.go(0.3)
-        assert loop.logic.receiver.found == NOTHING_OBSERVED
 
 
 def test_the_flow_of_levers_is_theirs() -> None:

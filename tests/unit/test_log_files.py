@@ -28,14 +28,6 @@ def write_lists(path: Path) -> None:
     path.write_text("\n".join(["t,both", *rows]) + "\n")
 
 
-def write_iso(path: Path) -> None:
-    signals = make_signals()
-    base = np.datetime64("2026-03-01T23:59:59", "ns")
-    times = [str(base + np.timedelta64(round(t * 1e9), "ns")) for t in signals["t"].tolist()]
-    rows = [f"{t}Z,{u!r},{q!r}" for t, u, q in zip(times, signals["u"].tolist(), signals["q"].tolist(), strict=True)]  # fmt: skip
-    path.write_text("\n".join(["t,u,q", *rows]) + "\n")
-
-
 def write_kind(path: Path) -> ColumnMap:
     """Writes the signals as the ending of `path` says, by the library of that format."""
     signals = make_signals()
@@ -48,14 +40,12 @@ def write_kind(path: Path) -> ColumnMap:
     elif path.stem == "lists":
         write_lists(path)
         return make_map("both[0]", "both[1]")
-    elif path.stem == "iso":
-        write_iso(path)
     else:
         write_csv(path, signals)
     return make_map()
 
 
-@pytest.mark.parametrize("name", ["a.csv", "lists.csv", "iso.csv", "a.parquet", "a.npz", "a.mat"])
+@pytest.mark.parametrize("name", ["a.csv", "lists.csv", "a.parquet", "a.npz", "a.mat"])
 def test_every_kind_of_file_gives_the_same_recording(
     tmp_path: Path, carriage: Machine, name: str
 ) -> None:

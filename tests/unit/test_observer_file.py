@@ -131,11 +131,3 @@ def test_thresholds_of_a_simulator_or_of_another_machine_count_for_nothing_on_a_
             assert build_observer(limits, MACHINE, interface, commands) is None
             assert reason in caplog.text and "mode=observe" in caplog.text
     assert read_observer_content(replace(GUARD, observer=None), MACHINE, "socketcan", True) is None
-
-
-def test_a_loop_that_would_command_a_machine_by_a_simulators_thresholds_does_not_start(
-    brokk: Callable[..., Any],
-) -> None:
-    done = brokk("mode=deploy", "deploy=auto", "target=given", "session.out=run")
-    assert done.code == 2 and "recordings of this machine by brokk mode=observe" in done.err
-    assert not Path("run/processes.json").exists()

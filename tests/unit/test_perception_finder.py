@@ -27,15 +27,6 @@ def finder_with(masks: Masks) -> StagedFinder:
     return replace(option("perception", "plane_conic"), segmenter=segmenter).build()
 
 
-def test_a_hole_is_found_from_picture_and_depth_alone() -> None:
-    frame, masks, _ = drawn(noise=0.001)
-    found = finder_with(masks).find(frame)
-    assert len(found.holes) == 1
-    assert found.holes[0].center_m == pytest.approx(CENTER, abs=1e-3)
-    assert float(found.holes[0].axis @ AXIS) > np.cos(np.radians(0.3))
-    assert {"segment", "ellipse", "pose", "total"} <= set(found.ms)
-
-
 def test_the_base_frame_is_where_the_camera_is_said_to_be() -> None:
     frame, masks, _ = drawn()
     moved = np.eye(4)
