@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import shutil
 import threading
@@ -15,6 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
@@ -85,15 +88,37 @@ def lever(
     return np.array([left_theta, left_psi, right_theta, right_psi])
 
 
+def talk(
+    port: int, path: str, said: list[str], origin: str | None = "own", host: str | None = None
+) -> Any:
+    """Says `said` on a WebSocket; returns the answers, or the refusal."""
+
+    async def run() -> Any:
+        headers = {"Host": host} if host else {}
+        try:
+            own = f"http://localhost:{port}" if origin == "own" else origin
+            async with connect(
+                f"ws://localhost:{port}{path}", origin=own, additional_headers=headers, proxy=None
+            ) as socket:  # type: ignore[arg-type]
+                answers = []
+                for text in said:
+                    await socket.send(text)
+                    answers.append(json.loads(await asyncio.wait_for(socket.recv(), 5)))
+                return answers
+        except InvalidStatus as error:
+            return error.response.status_code
+        except ConnectionClosed as error:
+            return error.rcvd.reason if error.rcvd else "closed"
+
+    return asyncio.run(run())
+
+
 class Scripted:
     """A feed that shows `now` and remembers requests."""
 
     def __init__(self, now: PageState = SHOWN) -> None:
         self.now, self.picture, self.confirms = now, None, True
         self.requests: list[OperatorRequest] = []
-
-    def read_advice_number(self) -> int | None:
-        return self.now.advice.number if self.now.advice else None
 
     def read_state(self) -> PageState:
         return self.now

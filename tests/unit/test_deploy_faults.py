@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import itertools
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -116,47 +115,6 @@ def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero(
     assert mode != "listen" or not stage.air.sent
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_the_operators_lever_always_wins(stages: dict[str, Stage], mode: str) -> None:
-    stage = stages[mode]
-    stage.get_going()
-    stage.fault("lever")
-    stage.go(0.1)
-    state = stage.view.state
-    assert stage.twin._flow[3] > 0.4 and state is not None and not any(state.sent)
-    assert state.guard.name == ("SILENT" if mode == "listen" else "LATCHED")
-
-
-@pytest.mark.parametrize(
-    ("mode", "seconds"),
-    [("collect", 0.3), ("auto", 5.0), ("collect", 70.0)],  # a turn of the stamps and some
-)
-def test_a_process_that_stood_still_moves_nothing_when_it_wakes_up(
-    stages: dict[str, Stage], mode: str, seconds: float
-) -> None:
-    stage = stages[mode]
-    stage.get_going()
-    begun_ms = stage.ms
-    stage.pause(seconds)
-    # the gateway waits for nobody
-    assert stage.stopped_ms is not None and (stage.stopped_ms - begun_ms) / 1e3 <= 0.1
-    stage.go(0.5)
-    state = stage.view.state
-    assert not stage.moves and state is not None and state.guard.name in ("LATCHED", "READY")
-
-
-@pytest.mark.parametrize(("mode", "hours"), [("listen", 1.0), ("auto", 1.0), ("collect", -1.0)])
-def test_a_wall_clock_that_is_moved_by_an_hour_changes_nothing(
-    stages: dict[str, Stage], mode: str, hours: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = stages[mode]
-    stage.get_going()
-    now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() + 3600.0 * hours)
-    stage.go(0.5)
-    assert stage.moves if mode != "listen" else stage.advised
-
-
 def test_a_full_disk_ends_the_log_says_so_and_leaves_what_was_written(
     machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,25 +183,4 @@ def test_a_delay_that_was_always_there_is_measured_and_nothing_moves(
     state = stage.view.state
     assert state is not None and state.round_trip_s >= 0.2
     assert state.trip.value == "way to the gateway and back unknown or too long"
-    stage.close()
-
-
-@pytest.mark.parametrize("pressed", [True, False])
-def test_memory_that_cannot_be_read_takes_no_stop_back_and_hides_no_surface(
-    machine: Machine, tmp_path: Path, pressed: bool
-) -> None:
-    stage = Stage(machine, "collect", tmp_path)
-    stage.get_going()
-    if pressed:
-        stage.stop()
-        stage.go(0.1)
-    slot = stage.memory.page if pressed else stage.memory.target
-    # All of both records, behind the number of the newest.
-    slot.memory.bytes[8:] = bytes(one ^ 0x5A for one in slot.memory.bytes[8:])
-    assert stage.stops_within_s(0.3) <= 0.011
-    stage.fault("deadman_released")
-    stage.go(0.2)
-    stage.fault("none")
-    stage.go(1.0)
-    assert not stage.moves, stage.view
     stage.close()

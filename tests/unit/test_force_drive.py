@@ -11,7 +11,6 @@ import pytest
 import torch
 from composed import option
 from pendulum import run_drive
-from scipy.integrate import solve_ivp
 
 from actuators.contracts import FitTask
 from actuators.recordings.log_signals import Signal
@@ -31,22 +30,6 @@ TRUE = {"mass_kg": 60.0, "viscous_n_s_m": 120.0, "coulomb_n": 15.0, "offset_n": 
 def drive() -> Machine:
     """A carriage that is commanded by a force."""
     return option("machine", "emps")
-
-
-def test_a_mass_follows_its_differential_equation(drive: Machine) -> None:
-    model = replace(option("actuator", "force"), dead_time_s=0.0, **TRUE).build(drive, 1, CPU)
-    u = np.full(260, 0.2)
-    found = run_drive(model, drive, u, 0.0)
-    force = 0.2 * drive.max_force[0] - TRUE["offset_n"] - TRUE["coulomb_n"]
-
-    def solve(t_s: float, y: np.ndarray) -> list[float]:
-        return [y[1], (force - TRUE["viscous_n_s_m"] * y[1]) / TRUE["mass_kg"]]
-
-    t_s = drive.period_s * np.arange(1, 261)
-    solved: Any = solve_ivp(solve, (0.0, t_s[-1]), [0.0, 0.0], t_eval=t_s, max_step=1e-3)
-    inside = solved.y[0] < drive.upper[0]
-    np.testing.assert_allclose(found[inside], solved.y[0][inside], atol=2e-3)
-    assert found[-1] == pytest.approx(drive.upper[0])
 
 
 def test_friction_holds_a_joint_and_brings_it_to_rest(drive: Machine) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import TOKEN, served, until
+from browser import TOKEN, served, talk, until
 from composed import option
 from desk import DBC
-from websockets.asyncio.client import connect
 
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
@@ -168,28 +166,12 @@ def test_marks_stand_where_something_happened(feed: ReplayFeed) -> None:
 
 
 def test_a_recording_takes_no_requests_to_a_machine(feed: ReplayFeed) -> None:
-    async def ask(port: int) -> list[Any]:
-        host = f"localhost:{port}"
-        async with connect(f"ws://{host}/control", origin=f"http://{host}", proxy=None) as one:  # type: ignore[arg-type]
-            await one.send(json.dumps({"token": TOKEN}))
-            await one.recv()
-            answers = []
-            for word in (
-                "start ",
-                "stop ",
-                "record on",
-                "seek 2.5",
-                "seek -1",
-                "play off",
-                "play nan",
-            ):
-                kind, value = word.split(" ")
-                await one.send(json.dumps({"kind": kind, "value": value}))
-                answers.append(json.loads(await one.recv()))
-            return answers
-
+    said = [json.dumps({"token": TOKEN})]
+    words = ("start ", "stop ", "record on", "seek 2.5", "seek -1", "play off", "play nan")
+    for kind, value in (word.split(" ") for word in words):
+        said.append(json.dumps({"kind": kind, "value": value}))
     with served(feed) as port:
-        answers = asyncio.run(ask(port))
+        answers = talk(port, "/control", said)[1:]
     refused = [one.get("refused", "") for one in answers]
     assert refused == ["replay", "replay", "replay", "", "malformed", "", "malformed"]
     assert feed.position_s == pytest.approx(2.5)

@@ -7,37 +7,12 @@ import json
 import time
 from typing import Any
 
-from browser import TOKEN, Scripted, served
+from browser import TOKEN, Scripted, served, talk
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed
 
 from deploy.page.connections import UNPROVEN, WATCHING
 from deploy.page.protocol import PageState
-
-
-def talk(
-    port: int, path: str, said: list[str], origin: str | None = "own", host: str | None = None
-) -> Any:
-    """Says `said` on a WebSocket; returns the answers, or the refusal."""
-
-    async def run() -> Any:
-        headers = {"Host": host} if host else {}
-        try:
-            own = f"http://localhost:{port}" if origin == "own" else origin
-            async with connect(
-                f"ws://localhost:{port}{path}", origin=own, additional_headers=headers, proxy=None
-            ) as socket:  # type: ignore[arg-type]
-                answers = []
-                for text in said:
-                    await socket.send(text)
-                    answers.append(json.loads(await asyncio.wait_for(socket.recv(), 5)))
-                return answers
-        except InvalidStatus as error:
-            return error.response.status_code
-        except ConnectionClosed as error:
-            return error.rcvd.reason if error.rcvd else "closed"
-
-    return asyncio.run(run())
 
 
 def test_strangers_are_refused(feed: Scripted, port: int) -> None:

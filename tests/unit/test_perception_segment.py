@@ -109,15 +109,6 @@ def test_a_block_that_is_not_seen_in_the_whole_is_looked_for_in_parts() -> None:
     assert not empty.block.any() and empty.hole_mask is not None and not empty.hole_mask.any()
 
 
-def test_a_network_in_a_file_says_the_same_in_torch_and_in_onnxruntime(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    network = UNet((4, 8, 8)).eval().requires_grad_(False)
-    header = unet.build_header(network, (64, 32), {"update": 7})
-    unet.write_checkpoint(tmp_path / "a.safetensors", network, header)
-    parity = unet.write_onnx(tmp_path / "a.onnx", network, header, torch.rand(3, 3, 32, 64))
-    assert parity < 1e-5
-
-
 def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -> None:
     rig = option("rig", "zed_2i_720p")
     segmenter = option("perception/segmenter", "onnx").build()
