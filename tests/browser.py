@@ -120,6 +120,9 @@ class Scripted:
         self.now, self.picture, self.confirms = now, None, True
         self.requests: list[OperatorRequest] = []
 
+    def read_advice_number(self) -> int | None:
+        return self.now.advice.number if self.now.advice else None
+
     def read_state(self) -> PageState:
         return self.now
 
