@@ -193,24 +193,6 @@ def test_slow_drift_and_small_errors_of_the_model_pass() -> None:
     assert joints.go(SLOWLY, 4.0) == 4.0
 
 
-def test_the_limit_is_slack_and_share_of_the_way() -> None:
-    for gain, is_fault in ((1.0 - SHARE * 0.98, False), (1.0 - 1.5 * SHARE, True)):
-        joints = Joints(1e-4)
-        joints.go((0.5, 0.0, 0.0, 0.0, 0.0), 3.0)
-        joints.gain[0] = gain
-        joints.go((0.5, 0.0, 0.0, 0.0, 0.0), 3.0)
-        assert (joints.fault is not GuardTrip.NONE) is is_fault
-
-
-def test_each_joint_has_a_slack_of_its_own() -> None:
-    for joint, is_fault in ((0, False), (2, True)):
-        joints = Joints([0.2, 0.06, 0.06, 0.06, 0.06])
-        joints.go((0.0,) * 5, 3.0)
-        joints.q[joint] += 0.1 * SPEED[joint]
-        joints.go((0.0,) * 5, PERIOD_S)
-        assert (joints.fault is not GuardTrip.NONE) is is_fault
-
-
 def test_the_newest_window_worked_by_hand() -> None:
     joints, first = Joints([0.2, 0.06, 0.06, 0.06, 0.06]), np.eye(5)[0]
     before = joints.observer.window

@@ -87,17 +87,6 @@ def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
         assert topic in done.out
 
 
-def test_a_mode_has_a_help_of_its_own(brokk: Callable[..., Any]) -> None:
-    done = brokk("mode=identify", "fit=servo", "--help")
-    assert done.code == 0
-    assert "fit=servo" in done.out and "arx" in done.out
-    text = " ".join(done.out.split())
-    assert "identify.recordings=??? glob or list of globs" in text
-    assert "identify.hold_out=6 one part in so many" in text
-    assert "session.seed=0" in text and " fit." in text, "values of groups too"
-    assert "perception/segmenter" not in text, "only what the mode uses"
-
-
 @pytest.mark.parametrize("name", ["train", "export", "deploy", "study"])
 def test_every_value_of_a_mode_is_listed(name: str, brokk: Callable[..., Any]) -> None:
     done = brokk(f"mode={name}", "--help")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,24 +58,6 @@ def test_the_cause_weighs_all_stages(
     summary = why_answer.write_summary(result)
     assert said in summary
     assert ("lag on q3" in summary) == (cause != "code")
-
-
-def test_next_steps_are_commands_with_their_paths(tmp_path: Path) -> None:
-    ((_, command),) = why_answer.list_changes(make_result(tmp_path, 0.5))
-    assert "policy=runs/policy" in command
-    assert f"@{tmp_path}/diagnosis/effects.yaml" in command
-    own = replace(make_result(tmp_path, 0.5), simulator="my.xml")
-    ((_, command),) = why_answer.list_changes(own)
-    assert "mode=change_simulator" in command
-    assert "simulator=my.xml" in command
-
-
-def test_a_diagnosis_without_an_answer_asks_for_recordings(tmp_path: Path) -> None:
-    result = replace(make_result(tmp_path, None), diagnosis=None)
-    assert result.title == ("No cause found, but not all could be judged", "warn")
-    ((text, command),) = why_answer.list_records(result)
-    assert "a minute or more in two files" in text
-    assert "mode=collect" in command
 
 
 @pytest.mark.parametrize(
