@@ -21,7 +21,7 @@ from deploy.bringup import JointResponse, _StateChecks, describe_joint, find_pus
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.kernel.protection import MessageFault
-from deploy.twin.rehearsal import RehearsalBench
+from deploy.twin.rehearsal import RehearsalBench, ScriptedPerson
 from deploy.twin.remote import RadioRemote
 
 T_S = np.arange(0, 40, 0.01)
@@ -146,6 +146,39 @@ def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
         values = description.decode(remote._layout, remote.build_frame().data)
         assert not isinstance(values, MessageFault)
         assert values["Stamp"] == pytest.approx(stamp_s, abs=0.01)
+
+
+def sample_person(fails: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A round of the scripted person: commands, dead-man and emergency stop every 20 ms."""
+    person = ScriptedPerson(option("machine", "brokk170"), fails, 1.0, 43210)
+    times = np.arange(0.0, person.round_s, 0.02)
+    held = [[person.holds(name, t_s) for t_s in times] for name in ("dead-man", "e-stop")]
+    return np.array([person.command(t_s) for t_s in times]), *map(np.array, held)
+
+
+def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
+    commands, deadman, estop = sample_person(None)
+    assert (commands.max(0) > 0.5).all() and (commands.min(0) < -0.5).all()
+    # Upwards first: positive commands lower the arm, and home is near the ground.
+    assert (commands[np.argmax(commands != 0, axis=0), range(5)] < 0).all()
+    # Each joint moves alone, and nothing moves while a switch is pressed.
+    moves = commands != 0
+    assert (moves.sum(1) <= 1).all()
+    assert deadman.any() and estop.any() and not (deadman | estop)[moves.any(1)].any()
+    # At rest for a second before each motion, as long as the slowest answer.
+    begins = np.flatnonzero(moves.any(1)[1:] & ~moves.any(1)[:-1]) + 1
+    for begin in begins:
+        assert not moves[begin - 50 : begin].any()
+    machine = option("machine", "brokk170")
+    person = ScriptedPerson(machine, None, 1.0, 43210)
+    assert not person.command(-1.0).any() and not person.holds("dead-man", -person.round_s + 0.5)
+    remote = RadioRemote(BusDescription(DBC, machine), machine)
+    person.move(remote, 2.2 + 1.2)
+    assert min(remote.levers) == pytest.approx(-0.6) and not remote.button_right
+    person.move(remote, 2.2 + 4.8 + 1.2)
+    assert remote.button_right and sum(one != 0 for one in remote.levers) == 1
+    person.move(remote, 0.5)
+    assert remote.deadman and not any(remote.levers)
 
 
 def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:
