@@ -38,7 +38,7 @@ def describe_exam(
         title=f"Sealed exam: {title}",
         conditions=f"{conditions} Baseline: one name always.",
         commands=(
-            f"{begin} exam_protocol=sealed exam.mix.num_cases={num_cases} session.seed=<random> exam.workers=2 session.out={{out}}/exam",
+            f"{begin} exam_protocol=sealed exam.mix.num_cases={num_cases} session.seed=<random, 1000 or more> exam.workers=2 session.out={{out}}/exam",
             f"{begin} exam_candidate={candidate} exam.do=run exam.folder={{out}}/exam session.out={{out}}/answers exam.workers=2",
             f"{begin} fit@exam.fit={fit} exam.do=score exam.folder={{out}}/exam +exam.answers.diagnosis={{out}}/answers session.out={{out}}/marks",
         ),
