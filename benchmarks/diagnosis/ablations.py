@@ -1,7 +1,7 @@
 """Ablations of the diagnosis: cases with known causes, answered with one ingredient switched off.
 
     python benchmarks/diagnosis/ablations.py <out.json> <exam> [<exam> …] --workers 32
-    python benchmarks/diagnosis/ablations.py <out.json> <exam> --without scatter ageing
+    python benchmarks/diagnosis/ablations.py <out.json> <exam> --without whitening ageing
 
 An exam is a folder that `brokk mode=exam` made, with its labels; names count strictly. What is switched
 off, and how, stands in `ingredients.yaml`, with other values of the constants of the decision. These are
@@ -41,8 +41,6 @@ NO_PROOF = "gates of the proof, and the decision alone"
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "no ageing": lambda model, numbers: np.zeros(len(model.fitted)),
     "no price": lambda table, _, name: np.full((1, (table.names == name).sum()), -np.inf),
-    "plain covariance": lambda base, slopes, columns: base.covariance,
-    "one motion": lambda side, flow: np.zeros(side.num_samples, dtype=int),
 }
 
 

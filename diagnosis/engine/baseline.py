@@ -71,19 +71,6 @@ class JointBaseline:
     frame_variance: np.ndarray
     error: np.ndarray
 
-    def add_scatter(self, slopes: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the covariance of the fitted numbers where the reference scatters, `(F, F)`.
-
-        The fit takes increments for independent, so what is common to those of a motion leaves an error of its own
-        in the numbers. On the fields of 23 machines of three makes their 110 unchanged joints are likelier by 169 nats.
-
-        Args:
-            slopes: Slopes of the increments over the fitted numbers, `(F, N)`.
-            columns: Scatter of the reference, columns of standard deviation 1, `(K, N)`.
-        """
-        error = self.covariance @ (slopes @ columns.T) / max(self.spread, LEAST_SPREAD)
-        return self.covariance + error @ error.T
-
 
 def build_simulation(
     side: Side, joint: int, numbers: np.ndarray, measure: IncrementMeasure, places: np.ndarray

@@ -31,7 +31,7 @@ JOINT_NATS = 6.0
 """Cost of each joint of an effect; for its size and its form."""
 SHOWN_NATS = 1e3
 """A coarse sensor or a late clock shows by itself and comes before all that is simulated."""
-COMMON = ("thermal_drift", "dead_time")
+COMMON = ("dead_time",)
 """Effects that have one size on all joints, or one on each."""
 
 

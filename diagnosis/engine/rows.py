@@ -73,5 +73,5 @@ def mirror_sizes(sizes: Sequence[float]) -> list[float]:
     return [sign * size for size in sizes for sign in (-1.0, 1.0)]
 
 
-SHARED = frozenset({"flow_sharing", "pump_lag"})
-"""Rows with one size for all joints."""
+SHARED = frozenset({"flow_sharing", "pump_lag", "thermal_drift"})
+"""Rows with one size for all joints: they have one pump and one oil."""

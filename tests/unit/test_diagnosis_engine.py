@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from brokk_rl.machine import Machine
 from diagnosis import answer, case, effect_library, effects_file
 from diagnosis.closure import Gate, RivalError
 from diagnosis.engine import decide
-from diagnosis.engine.baseline import JointBaseline, multiply_plain
+from diagnosis.engine.baseline import multiply_plain
 from diagnosis.engine.descent import Prior, descend
 from diagnosis.engine.evidence import LOSS_LIMIT, JointRow
 from diagnosis.engine.rows import Row
@@ -160,20 +159,15 @@ def test_a_joint_that_a_common_cause_makes_worse_stays_as_it_was() -> None:
     assert set(found.rows) == {1}
 
 
+def test_what_one_joint_alone_shows_is_no_heat_of_the_oil() -> None:
+    row = Row("thermal_drift", (("thermal_share", "add", 0.2), ("thermal_s", "add", 90.0)))
+    for other_nats, told in ((0.0, False), (60.0, True)):
+        rows = {0: JointRow(row, 90.0, 0.0), 1: JointRow(row, other_nats, 0.0)}
+        assert decide.add_up("thermal_drift", rows).shows_on_several == told
+
+
 def test_a_descent_goes_on_where_long_steps_gain_nothing() -> None:
     """From 3 a step of Gauss and Newton down an arc tangent ends beyond -5, and so does one half as long."""
     wide = np.array([1e6])
     prior = Prior(0.0 * wide, wide, np.array([1e-6]), -wide, wide)
     assert abs(descend(np.arctan, np.zeros(1), multiply_plain, np.array([3.0]), prior, 30)) < 1e-6
-
-
-def test_numbers_are_as_unsure_as_fits_to_machines_that_scatter() -> None:
-    generator, spread = np.random.default_rng(3), 0.5
-    slopes, columns = generator.normal(size=(2, 3, 60))
-    scatter = generator.normal(size=(20_000, 3)) @ columns
-    errors = np.sqrt(spread) * generator.normal(size=scatter.shape) + scatter
-    normal = slopes @ slopes.T
-    fitted = np.linalg.solve(normal, slopes @ errors.T)
-    base: Any = SimpleNamespace(covariance=spread * np.linalg.inv(normal), spread=spread)
-    told = JointBaseline.add_scatter(base, slopes, columns)
-    assert told == pytest.approx(np.cov(fitted), rel=0.03, abs=0.01 * np.trace(told))

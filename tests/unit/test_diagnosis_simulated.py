@@ -30,7 +30,7 @@ from diagnosis.engine.coverage import find_covered, measure_uncovered
 from diagnosis.engine.decide import Decider
 from diagnosis.engine.joint_model import Course
 from diagnosis.engine.measure import Motion, fit_variance
-from diagnosis.engine.nuisance import Projection, estimate_nuisance
+from diagnosis.engine.nuisance import Projection
 from diagnosis.engine.rows import Row
 from diagnosis.engine.side import Side, measure_full_loads, stack_side
 from diagnosis.engine.valve import VALVE
@@ -199,22 +199,6 @@ def test_numbers_without_a_part_are_no_step_too_far(
     monkeypatch.setattr(baseline, "linearise", flatten)
     for one, spread in zip(fit_reference(side), told, strict=True):
         assert one.spread == pytest.approx(spread, rel=0.25)
-
-
-def test_motions_that_start_late_or_run_unlike_each_other_are_known(two_joints: Machine) -> None:
-    """In 40 motions one joint starts up to 0.1 s late each time; the other runs 5 % faster or slower each time."""
-    generator = np.random.default_rng(5)
-    u, late = np.zeros((2, 2440, 2))
-    for begin in 20 + 60 * np.arange(40):
-        u[begin : begin + 30] = generator.choice([0.6, -0.9])
-        late[begin + generator.integers(3) : begin + 30] = u[begin]
-    numbers, side = VALVE.list_values("mean"), make_side(two_joints, u)
-    steps = np.diff(side.simulate(1, numbers)[0].astype(float), prepend=0.0)
-    unlike = np.cumsum(steps * np.repeat(generator.choice([0.95, 1.05], 41), 60)[: len(steps)])
-    side.q = np.stack([make_side(two_joints, late).simulate(0, numbers)[0], unlike], 1)
-    sizes = [estimate_nuisance(side, j, base).sizes for j, base in enumerate(fit_reference(side))]
-    assert 0.02 <= sizes[0][3] <= 0.07 and sizes[0][2] <= 0.02
-    assert 0.04 <= sizes[1][2] <= 0.07 and sizes[1][3] <= 0.01
 
 
 def test_the_nuisance_is_a_covariance() -> None:
