@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import re
 import sys
@@ -91,13 +92,17 @@ def _explain_interpolation(error: InterpolationResolutionError) -> str:
     key = error.full_key or "a value"
     reason = str(error).splitlines()[0]
     taken = re.search(r"key '(\w+)\.(\w+)' not found", reason)
-    if taken and (options := registry.list_options(taken[1])):
-        group, name = taken.groups()
-        offered = [one.name for one in options if f"\n{name}:" in one.path.read_text()]
-        return (
-            f"{key}: expected {group}=… with a value '{name}', but the chosen option has none; "
-            f"{_list_options(group, '', offered)}"
-        )
+    for override in parse_words(sys.argv[1:]):
+        if taken and override.key_or_group == taken[1]:
+            group, name = taken.groups()
+            offered = []
+            for option in registry.list_options(group):
+                if re.search(rf"^{name}:", option.path.read_text(), re.MULTILINE):
+                    offered.append(option.name)
+            return (
+                f"{key}: expected {group}=… with a value '{name}', but {override.input_line} has "
+                f"none; {_list_options(group, '', offered)}"
+            )
     return f"{key}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
 
 
@@ -155,7 +160,11 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
             "that stand in the file"
         )
     source = f"{where} changes" if where and where != "config" else "you gave"
-    return f"{source} '{key}', but {_explain_absence(compose_choices(), key)}"
+    # The mode itself may not compose; the message is then shorter.
+    with contextlib.suppress(Exception):
+        cfg = compose_choices()
+        return f"{source} '{key}', but {_explain_absence(cfg, key)}"
+    return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --help` lists what it has"
 
 
 def _list_options(group: str, name: str, offered: Sequence[str]) -> str:

@@ -232,6 +232,12 @@ def _insert_behaviour(
         for node in _list_rivals(cfg):
             if node[TARGET] == CLASSICAL and own_values:
                 node.task = after | own_values
+        if before.get("advice") and not after.get("advice"):
+            log.warning(
+                "the policy in %s was trained without a person at the levers and proposes as if it moved "
+                "them itself; the classical controller beside it knows of the person",
+                stored.name,
+            )
     return said
 
 

@@ -24,7 +24,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase
 from diagnosis.effect_library import DetectedEffect, EffectType
-from diagnosis.engine.decide import JOINT_NATS, LEAST_NATS
+from diagnosis.engine.decide import DIRECT_NATS, JOINT_NATS
 from diagnosis.engine.sizes import SIGMAS
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
@@ -77,7 +77,7 @@ def is_tracked(recordings: Sequence[Recording], machine: Machine) -> bool:
 def find_geometry_errors(case: GapCase, kinds: Sequence[EffectType]) -> list[DetectedEffect]:
     """Return the errors of geometry and encoders that the measured tool points show.
 
-    With less than half of `LEAST_NATS` for a name four of 139 practice cases named geometry falsely beside a true name.
+    With less than half of `DIRECT_NATS` for a name four of 139 practice cases named geometry falsely beside a true name.
     """
     machine = case.machine
     if not is_tracked(case.field, machine):
@@ -90,7 +90,7 @@ def find_geometry_errors(case: GapCase, kinds: Sequence[EffectType]) -> list[Det
         for some in combinations(points.errors, count):
             num_names = len({error[0].kind for error in some})
             gains[some] = points.measure_gain(some)
-            worth[some] = gains[some] - JOINT_NATS * count - LEAST_NATS * num_names
+            worth[some] = gains[some] - JOINT_NATS * count - DIRECT_NATS * num_names
     named = max(worth, key=worth.__getitem__)
     sizes = points.refine(named)
     named = tuple(error for error in named if _is_large(error, sizes))

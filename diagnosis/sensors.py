@@ -17,7 +17,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType
-from diagnosis.engine.decide import JOINT_NATS, LEAST_NATS
+from diagnosis.engine.decide import DIRECT_NATS, JOINT_NATS
 from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.side import stack_side
 from diagnosis.engine.sizes import SIGMAS, get_form_error
@@ -80,7 +80,7 @@ def find_sensor_noise(case: GapCase, kind: EffectType) -> DetectedEffect | None:
     for j in np.flatnonzero(mask).tolist():
         # The steps of a coarse sensor scatter as well.
         mask[j] = find_lattice(*sides, j) == 0.0
-    worth = float((gain[mask] - JOINT_NATS).sum()) - LEAST_NATS
+    worth = float((gain[mask] - JOINT_NATS).sum()) - DIRECT_NATS
     if worth <= 0.0:
         return None
     parameters = {}

@@ -136,7 +136,7 @@ VALUES = {
     "mode=diagnose": "give either case=<folder with reference/ and field/>, or field=<glob>",
     "mode=diagnose diagnosis.case=nowhere": "diagnosis.case=nowhere: there is no such folder",
     "mode=export": "policy has no default and must be given",
-    "mode=why log=x policy=classical": "policy_path: expected policy=… with a value 'path', but the chosen option has none",
+    "mode=why log=x policy=classical": "policy_path: expected policy=… with a value 'path', but policy=classical has none",
     "mode=evaluate policy.folder=runs/x": "'policy' has no 'folder'",
     "policy@rivals.b=classical": "add it by a plus: +policy@rivals.b=<option>",
     "policy=shipped task.depth_m=0.1": "task.depth_m=0.1 was asked for, the policy has 0.14",

@@ -285,7 +285,7 @@ def test_histories_and_recordings_hold_what_was_given(machine: Machine) -> None:
     torch.testing.assert_close(loop.task.episode["valve_travel"], travel)
 
 
-def test_the_controller_beside_an_unadvised_policy_keeps_its_advice() -> None:
+def test_the_controller_beside_an_unadvised_policy_keeps_its_advice(caplog: Any) -> None:
     task = describe_spec(option("task", "borehole_insertion"))
     advice = {"delay_s": 0.3, "lag_s": 0.1, "dead_zone": 0.0, "joints_at_once": 2}
     advice |= {"hold_s": 0.65, "settle_s": 0.5}
@@ -296,3 +296,4 @@ def test_the_controller_beside_an_unadvised_policy_keeps_its_advice() -> None:
     _insert_behaviour(cfg, stored.task, set(), stored)
     assert cfg.task.advice is None
     assert cfg.rivals.classical.task.advice == advice
+    assert "without a person" in caplog.text
