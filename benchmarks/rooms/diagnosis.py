@@ -51,17 +51,17 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "26 simulated machines, answered once. A person drives 15 fields. On 66 opened cases, which chose its last change: 17/23, 4/13, 0/10. The version before: 8/14, 3/8, 1/6 of 40 of them; 6/9, 4/5, 0/4 of 26 others.",
+        "26 machines, answered once. A person drives 15 fields. On 66 opened cases, which chose its last change: 17/23, 4/13, 0/10. Before: 8/14, 3/8, 1/6 of 40 of them; 6/9, 4/5, 0/4 of 26 others.",
         "exam_plants=valves exam_recording=operators", 26, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "14 simulated cranes, answered once. A person drives 8 fields. The version before: 6/8, 0/5, 0/4 of 24 others.",
+        "14 cranes, answered once. A person drives 8 fields. Before: 6/8, 0/5, 0/4 of 24 others.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 14, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "12 simulated arms, answered once. The version before: 7/7, 1/4, 0/3 of 20 others.",
+        "12 arms, answered once. Before: 7/7, 1/4, 0/3 of 20 others.",
         "machine=so101 exam_plants=servos exam_mix=servos", 12, "servo_diagnosis", "servo",
     ),
     Measurement(
