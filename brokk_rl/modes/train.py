@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import pandas as pd
@@ -14,7 +14,13 @@ from brokk_rl import distributed
 from brokk_rl.build import describe_spec
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.modes.evaluate import evaluate_policies
-from brokk_rl.policy_folder import CONTRACT, describe_policy, find_resumed, write_policy
+from brokk_rl.policy_folder import (
+    CONTRACT,
+    describe_policy,
+    find_resumed,
+    list_checkpoints,
+    write_policy,
+)
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import PROGRESS, Tracking, draw_curves
@@ -29,8 +35,6 @@ log = logging.getLogger(__name__)
 
 TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 """Files of the run folder that a tracker gets at the end."""
-DESCRIBED = ("commit", "choices", "fingerprint")
-"""Fields of `session.json` that a tracker shows, beside the whole configuration."""
 
 
 @spec
@@ -84,16 +88,13 @@ class Train(SimulatedPlant):
         _log_setup(loop, group)
         self.session.seed_all()  # capturing has drawn random numbers
         with contextlib.ExitStack() as stack:
-            with group:
+            with self._explain_interruption(), group:
                 runner = TrainingRunner(loop, self.rl, folder, group)
                 self._begin(runner)
                 if is_first:
                     write_json(folder / CONTRACT, self._describe_policy(loop))
                     step = runner.current_learning_iteration
-                    record = read_record(folder) or {}
-                    run = {name: record.get(name) for name in DESCRIBED}
-                    run["config"] = describe_spec(self)
-                    tracker = self.tracking.open(folder, run, step)
+                    tracker = self.tracking.open(folder, self._describe_run(), step)
                     runner.logger.writer = stack.enter_context(contextlib.closing(tracker))
                 runner.run()
             if not is_first:
@@ -118,6 +119,30 @@ class Train(SimulatedPlant):
             (self.session.folder / PROGRESS).unlink(missing_ok=True)
         if self.policy is not None:
             load_initial_weights(runner.alg.actor, self.policy.path, self.machine)
+
+    @contextlib.contextmanager
+    def _explain_interruption(self) -> Iterator[None]:
+        """Say after Ctrl-C which checkpoint remains, and the command that goes on."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            folder = self.session.folder
+            if found := list_checkpoints(folder):
+                text = "%s remains; go on with: brokk mode=train policy=%s session.out=%s"
+                log.warning(text, found[-1], folder, folder)
+            else:
+                log.warning("no checkpoint was written yet: begin again, in another folder")
+            raise
+
+    def _describe_run(self) -> dict[str, Any]:
+        """Return what a tracker shows of the run: commit, chosen options and whole configuration."""
+        record = read_record(self.session.folder) or {}
+        return {
+            "commit": record.get("commit") or "unknown",
+            "choices": record.get("choices", {}),
+            "fingerprint": self.machine.fingerprint(),
+            "config": describe_spec(self),
+        }
 
     def _describe_policy(self, loop: ControlLoop) -> dict[str, Any]:
         """Return the contract of the policy that is trained; see `brokk_rl.policy_folder`."""
