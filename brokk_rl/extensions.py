@@ -28,8 +28,8 @@ from brokk_rl.plain_files import read_plain_file
 
 MOST_BYTES = 1 << 20
 """Size beyond which a file holds no option."""
-MOST_ALIASES = 20
-"""YAML aliases in a file: aliases of aliases grow beyond all bounds when they are written out."""
+MOST_VALUES = 20_000
+"""Values of a file with its aliases written out: the largest that the commands write has some hundred."""
 EVERYWHERE = "_global_"
 """Package of options that may change any part of the configuration, such as experiments."""
 
@@ -172,9 +172,8 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
         raise ConfigError(f"{where}: expected a YAML file; {explain_robot(name)}")
     try:
         text = read_plain_file(Path(name).expanduser(), MOST_BYTES).decode()
-        events = yaml.parse(text, Loader=yaml.SafeLoader)
-        if sum(isinstance(event, yaml.AliasEvent) for event in events) > MOST_ALIASES:
-            raise ValueError(f"expected at most {MOST_ALIASES} aliases")
+        if _count_values(yaml.compose(text, Loader=yaml.SafeLoader), {}) > MOST_VALUES:
+            raise ValueError(f"expected at most {MOST_VALUES} values, aliases written out")
         loaded = OmegaConf.create(text)
     except (OSError, yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
@@ -189,7 +188,8 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
         node["mjcf"] = str(beside.resolve())
     packages = {one.target or one.name: one.place for one in registry.list_options(group)}
     package = _find_package(where, group, text, node, packages)
-    targets, module = registry.list_targets(), _name_module(node.get("_target_"))
+    targets = registry.list_targets()
+    module = str(node.get("_target_")).rpartition(".")[0]
     for place, target in registry.iterate_leaves(node):
         if place[-1] != "_target_":
             continue
@@ -197,7 +197,7 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
         itself = package != EVERYWHERE and len(place) == (1 if "_target_" in node else 2)
         known = packages.keys() if itself else targets
         # a part's class lies beside that of the option, and its annotation names it
-        is_part = not itself and _name_module(target) == module
+        is_part = not itself and str(target).rpartition(".")[0] == module
         if target not in known and not is_part:
             kind = f"no {group}" if itself else "nothing of ours"
             raise ConfigError(
@@ -205,12 +205,23 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
             )
     from brokk_rl.build import drop_targets  # the command composes without it
 
-    plain = drop_targets(node, targets)
-    return {str(key): value for key, value in plain.items()}, package
+    return {str(key): value for key, value in drop_targets(node, targets).items()}, package
 
 
-def _name_module(target: object) -> str:
-    return str(target).rpartition(".")[0]
+def _count_values(node: yaml.Node | None, counted: dict[int, int]) -> int:
+    """Return the values of a YAML node with its aliases written out, too many for one that contains itself.
+
+    Args:
+        node: The node; aliases are the same object again.
+        counted: Values of the nodes that were counted, by identity.
+    """
+    if id(node) not in counted:
+        counted[id(node)] = MOST_VALUES + 1
+        parts = node.value if isinstance(node, yaml.CollectionNode) else []
+        if isinstance(node, yaml.MappingNode):
+            parts = [part for pair in parts for part in pair]
+        counted[id(node)] = 1 + sum(_count_values(part, counted) for part in parts)
+    return counted[id(node)]
 
 
 def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:

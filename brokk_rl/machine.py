@@ -107,12 +107,11 @@ class Joint:
 
     def check(self) -> None:
         lower, upper = self.lower.value, self.upper.value
-        speed = self.max_speed.value
         fault = ""
         if lower >= upper:
             fault = f"expected upper above lower, got {upper} and {lower}"
-        elif speed <= 0.0:
-            fault = f"expected max_speed above 0, got {speed}"
+        elif self.max_speed.value <= 0.0:
+            fault = f"expected max_speed above 0, got {self.max_speed.value}"
         elif not lower <= self.home <= upper:
             fault = f"home {self.home} lies outside [{lower}, {upper}]"
         elif self.command == "torque" and (self.max_force is None or self.max_force.value <= 0):

@@ -35,6 +35,8 @@ log = logging.getLogger(__name__)
 
 TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 """Files of the run folder that a tracker gets at the end."""
+DESCRIBED = ("commit", "choices", "fingerprint")
+"""Fields of `session.json` that a tracker shows, beside the whole configuration."""
 
 
 @spec
@@ -94,7 +96,10 @@ class Train(SimulatedPlant):
                 if is_first:
                     write_json(folder / CONTRACT, self._describe_policy(loop))
                     step = runner.current_learning_iteration
-                    tracker = self.tracking.open(folder, self._describe_run(), step)
+                    record = read_record(folder) or {}
+                    run = {name: record.get(name) for name in DESCRIBED}
+                    run["config"] = describe_spec(self)
+                    tracker = self.tracking.open(folder, run, step)
                     runner.logger.writer = stack.enter_context(contextlib.closing(tracker))
                 runner.run()
             if not is_first:
@@ -133,16 +138,6 @@ class Train(SimulatedPlant):
             else:
                 log.warning("no checkpoint was written yet: begin again, in another folder")
             raise
-
-    def _describe_run(self) -> dict[str, Any]:
-        """Return what a tracker shows of the run: commit, chosen options and whole configuration."""
-        record = read_record(self.session.folder) or {}
-        return {
-            "commit": record.get("commit") or "unknown",
-            "choices": record.get("choices", {}),
-            "fingerprint": self.machine.fingerprint(),
-            "config": describe_spec(self),
-        }
 
     def _describe_policy(self, loop: ControlLoop) -> dict[str, Any]:
         """Return the contract of the policy that is trained; see `brokk_rl.policy_folder`."""
