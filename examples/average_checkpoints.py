@@ -25,7 +25,7 @@ from brokk_rl.rl.policy import PlainActor, observe_once, restore_actor
 CPU = torch.device("cpu")
 
 
-def average(states):
+def average_networks(states):
     """Return the mean of networks by name, in double precision on the way."""
     mean = {}
     for name, value in states[0].items():
@@ -45,7 +45,7 @@ def export_mean(run, out):
     machine, task = build_node(values["machine"], "machine"), build_node(values["task"], "task")
     process = task.build(machine, 1, CPU)
     groups = observe_once(process, machine, CPU)
-    content = newest | {"weights": average(states)}
+    content = newest | {"weights": average_networks(states)}
     actor = restore_actor(
         content, str(run), machine, describe_task(task), groups, process.num_actions
     )

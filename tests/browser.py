@@ -91,7 +91,7 @@ def lever(
 def talk(
     port: int, path: str, said: list[str], origin: str | None = "own", host: str | None = None
 ) -> Any:
-    """Says `said` on a WebSocket; returns the answers, or the refusal."""
+    """Send a message over a WebSocket; return the answers, or the refusal."""
 
     async def run() -> Any:
         headers = {"Host": host} if host else {}

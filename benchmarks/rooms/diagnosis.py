@@ -67,9 +67,9 @@ MEASUREMENTS = (
     Measurement(
         name="ablations",
         title="What other constants of the decision decide",
-        conditions="The sealed exam of machines with valves, after it was answered, without the gates of the proof. The baseline is the first row.",
+        conditions="66 machines with valves of two opened exams, which chose 40 nats, the first row; without the gates of the proof.",
         commands=(
-            "python benchmarks/diagnosis/ablations.py {out}/ablations.json <the sealed exam> --without 'gates of the proof, and the decision alone'",
+            "python benchmarks/diagnosis/ablations.py {out}/ablations.json <two opened exams> --without 'gates of the proof, and the decision alone'",
         ),
         code=CODE,
         read=lambda folder: load_json(folder / "ablations.json")["rows"],

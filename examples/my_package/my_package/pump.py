@@ -57,7 +57,7 @@ class Pump(EffectSpec):
             load = load - value["bearing"] * now.moved.sign() * weight
         load = load.clamp(min=0.0)  # a falling weight drives no pump
         pressure = self._balance(value, opening, load)
-        flow = torch.where(is_on_pump, _pass(pressure - load, value), 1.0)
+        flow = torch.where(is_on_pump, _compute_flow(pressure - load, value), 1.0)
         return now.moved * (flow - 1.0), {}
 
     def _balance(
@@ -73,12 +73,12 @@ class Pump(EffectSpec):
         centre = left.square().prod(1, keepdim=True) * (stroke > 0.0)
         pressure = torch.full_like(centre, 0.5)
         for i in range(HALVINGS):
-            taken = (asked * _pass(pressure - load, value)).sum(1, keepdim=True)
+            taken = (asked * _compute_flow(pressure - load, value)).sum(1, keepdim=True)
             taken = taken + centre * (pressure / IDLE_PRESSURE).sqrt()
             pressure = pressure + torch.where(taken < 1.0, 0.25, -0.25) * 0.5**i
         return pressure
 
 
-def _pass(across: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
+def _compute_flow(across: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
     """Return the flow of valves over their nominal one, for the pressure across them."""
     return (across / value["margin"]).clamp(min=0.0).minimum(value["surplus"]).sqrt()
