@@ -86,8 +86,8 @@ MEASUREMENTS = (
     Measurement(
         name="unidentified_machine",
         title="A policy for machines that nobody identified",
-        conditions="One training from nothing on four GPUs, one seed, episodes of 40 s: 11,010 million steps in 576 s, of a budget of 610 s; the machine was lost before its end. The policy is the mean of the eight checkpoints that were kept, from 467 s on, its only candidate. On one GPU the same numbers had 0.87 of the last episodes succeed (six trainings of several variants, none better), here 0.95. "
-        "Failures of earlier policies on these circuits, to which nothing was fitted, suggested its effects. It moves up to three levers. Baseline: the controller without filter, same starts.",
+        conditions="One training from nothing on four GPUs, one seed: 11,010 million steps in 576 s; the machine was lost before its end at 610 s. The policy is the mean of the eight kept checkpoints, its only candidate. 0.95 of the last episodes succeeded; on one GPU, in six trainings, at most 0.87. "
+        "Failures of earlier policies on these circuits suggested its effects. It moves up to three levers. Baseline: the controller without filter, same starts.",
         commands=tuple(
             command
             for follower, episode_s in TRIALS
