@@ -54,6 +54,7 @@ def repeat_number(count: int, number: JointNumber) -> list[JointNumber]:
 COMMAND_NAMES = (
     "slope_time_s",
     "command_lag_s",
+    "filling_s",
     "pilot_lag_s",
     "log_closing_ratio",
     "closing_lag_s",
@@ -95,7 +96,7 @@ class JointModel:
         numbers: Those of `COMMAND_NAMES` first.
         rows: Effects of the library in each form and size.
         outside_rows: Causes outside the library.
-        plain_forms: Numbers of the rows that are effects of the registry as they stand.
+        own_forms: Numbers of the rows that no effect of the registry has in this form.
         lags: Numbers that delay the motion behind a command, and by how much of their value.
         courses: Laws by which commands are held.
         late: Numbers that are known better once all joints are fitted, with the values before.
@@ -109,7 +110,7 @@ class JointModel:
     numbers: tuple[JointNumber, ...]
     rows: tuple[Row, ...]
     outside_rows: tuple[Row, ...]
-    plain_forms: frozenset[tuple[str, ...]]
+    own_forms: frozenset[tuple[str, ...]]
     lags: Mapping[str, float]
     courses: tuple[Course, ...]
     late: Mapping[str, float]

@@ -64,12 +64,17 @@ def simulate_spool(
     closing = _approach(step_s, closing_s)
     second = _approach(step_s, numbers[d, Place.SPOOL_LAG_S])
     lagging = _approach(step_s, numbers[d, Place.COMMAND_LAG_S])
+    # Of an orifice that fills a chamber in 2 T the mean delay is two thirds of T.
+    filling = zero
+    if numbers[d, Place.FILLING_S] > zero:
+        filling = step_s / (wp.float64(1.5) * numbers[d, Place.FILLING_S])
     slope = wp.float64(1e9)
     if numbers[d, Place.SLOPE_TIME_S] > zero:
         slope = step_s / numbers[d, Place.SLOPE_TIME_S]
     width = wp.max(numbers[d, Place.HYSTERESIS], zero)
     limited = zero
     lagged = zero
+    filled = zero
     pilot = zero
     follower = zero
     held = zero
@@ -81,16 +86,22 @@ def simulate_spool(
             # A target was there before the recording.
             limited = command * wp.float64(1 - integrates)
             lagged = limited
+            filled = limited
             pilot = limited
             follower = limited
             held = limited
         for i in range(substeps):
             limited += wp.clamp(command - limited, -slope, slope)
             lagged += lagging * (limited - lagged)
+            behind = lagged - filled
+            if filling > zero:
+                most = filling * wp.sqrt(wp.abs(behind))
+                behind = wp.clamp(behind, -most, most)
+            filled += behind
             rate = opening
-            if wp.abs(lagged) < wp.abs(pilot):
+            if wp.abs(filled) < wp.abs(pilot):
                 rate = closing
-            pilot += rate * (lagged - pilot)
+            pilot += rate * (filled - pilot)
             follower += second * (pilot - follower)
             held = wp.clamp(held, follower - width, follower + width)
             spool[d, k * substeps + i] = wp.float32(held)

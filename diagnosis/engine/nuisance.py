@@ -103,7 +103,7 @@ class JointNuisance:
         """Return the likeliest ageing of the fitted numbers, `(F,)`, from increments of the error, `(N,)`."""
         scaled = residual / np.sqrt(projection.spread)
         shares = projection.inverse @ (projection.columns @ scaled)
-        return shares[: len(self.mix)] @ self.mix
+        return shares @ self.mix
 
 
 def count_part(base: JointBaseline, part: int) -> float:

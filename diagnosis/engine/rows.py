@@ -56,7 +56,7 @@ class Row:
 FIXED = frozenset({"thermal_grows", "load_alone", "load_constant"})
 """Numbers that choose a form; no size of them is searched."""
 CEILINGS = {"stop_ratio": 0.97, "damping": 0.7, "thermal_s": 700.0, "firmware_damping": 1.0}
-FLOORS = {"thermal_s": 30.0}
+FLOORS = {"thermal_s": 10.0}
 
 
 def _limit(name: str, value: float) -> float:

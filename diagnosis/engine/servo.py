@@ -15,6 +15,7 @@ from diagnosis.engine.rows import Row, mirror_sizes, spread_sizes
 NUMBERS = (
     JointNumber("slope_time_s"),
     JointNumber("command_lag_s"),
+    JointNumber("filling_s"),
     JointNumber("pilot_lag_s", 0.005, 0.02, 0.002, 0.0015, 0.0, 0.5),
     JointNumber("log_closing_ratio"),
     JointNumber("closing_lag_s"),
@@ -89,21 +90,7 @@ SERVO = JointModel(
     numbers=NUMBERS,
     rows=tuple(_list_effect_rows()),
     outside_rows=tuple(_list_outside_rows()),
-    plain_forms=frozenset(
-        {
-            ("delay_s",),
-            ("command_lag_s",),
-            ("command_lag_s", "pilot_lag_s"),
-            ("damping_ratio",),
-            ("slope_time_s",),
-            ("dry",),
-            ("hysteresis",),
-            ("sag",),
-            ("sag_load",),
-            ("sag", "sag_pose_1"),
-            ("shortage", "firmware_damping"),
-        }
-    ),
+    own_forms=frozenset({("damping_ratio", "firmware_damping")}),
     lags={"pilot_lag_s": 1.0, "command_lag_s": 1.0, "response_s": 2.0},  # damped critically
     late={"dry": 0.0, "static_ratio": 0.0, "load_dry": 0.0},
     courses=(

@@ -93,7 +93,7 @@ def fit_rows(finding: EffectFinding, joints: Sequence[FieldJoint]) -> dict[int, 
 
 def is_plain(row: Row, model: JointModel) -> bool:
     """Return whether a row has a form of the registry."""
-    return tuple(name for name, _, _ in row.changes) in model.plain_forms
+    return tuple(name for name, _, _ in row.changes) not in model.own_forms
 
 
 def is_possible(row: Row, joint: FieldJoint) -> bool:

@@ -124,16 +124,16 @@ def test_a_cause_is_named_or_unknown_by_what_it_earns() -> None:
 
 
 def test_a_further_effect_earns_enough_beside_those_before_it() -> None:
-    first = weigh(lag={1: 100.0, 2: 50.0}, creep={1: 90.0})
+    first = weigh(lag={1: 400.0, 2: 50.0}, creep={1: 90.0})
     cases = [
         # on other joints it earns what any effect has to earn
         ({0: 40.0}, [{0: 40.0}]), ({0: 39.9}, []),
-        # where one before it earns more it does not count; other joints keep what they earn
+        # where one before it earns four times as much it does not count; other joints keep what they earn
         ({1: 100.0}, [{1: 100.0}]), ({1: 99.9}, []), ({0: 40.0, 1: 99.9}, [{0: 40.0}]), ({1: 40.0, 2: 50.0}, [{2: 50.0}]),
     ]  # fmt: skip
     for nets, expected in cases:
         # jitter earns more, and shows on joints of the first alone
-        tables = iter([weigh(jitter={1: 99.0, 2: 49.0, 0: 9.0}, creep=nets), weigh()])
+        tables = iter([weigh(jitter={1: 99.0, 2: 12.0, 0: 9.0}, creep=nets), weigh()])
         found = decide.select(first, lambda _, tables=tables: next(tables))
         assert [dict(one.nets) for one in found[1:]] == expected
     # what shows by itself is not named again
