@@ -51,18 +51,18 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "26 machines, answered once. A person drives 15 fields. On 66 opened cases, which chose its last change: 17/23, 4/13, 0/10. Before: 8/14, 3/8, 1/6 of 40 of them; 6/9, 4/5, 0/4 of 26 others.",
-        "exam_plants=valves exam_recording=operators", 26, "diagnosis", "valve",
+        "40 machines, answered once. A person drives 20 fields. Its rows have the lag of these machines. On 66 opened cases: 18/23, 5/13, 0/10. Before: 21/28, 9/16, 0/12 of 80 others.",
+        "exam_plants=valves exam_recording=operators", 40, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "14 cranes, answered once. A person drives 8 fields. Before: 6/8, 0/5, 0/4 of 24 others.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 14, "diagnosis", "valve",
+        "20 cranes, answered once. A person drives 11 fields. Before: 8/14, 3/8, 0/6 of 40 others.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 20, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "12 arms, answered once. Before: 7/7, 1/4, 0/3 of 20 others.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 12, "servo_diagnosis", "servo",
+        "16 arms, answered once. Before: 10/10, 2/6, 0/5 of 30 others.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 16, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
