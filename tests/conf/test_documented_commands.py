@@ -27,20 +27,15 @@ BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.M | re.S)
 INLINE = re.compile(r"`((?:\.venv/bin/)?brokk [^`]+)`")
 NOT_COMPOSED = {
     "session.seed=<random, 1000 or more>": "a rule for a number instead of one",
-    "effect.<name>.<number>=<size>": "a pattern for any number of any effect",
     "-sc install=": "completion of a shell composes nothing",
-    "mode=<mode>": "any mode",
-    "mode=X": "any mode",
     " $R ": "words that stand once, above several commands",
     "group=option": "any group",
     "hydra/launcher=": "Hydra warns of the launcher's schema; brokk silences that",
-    "mine.terms:": "a function that the reader writes",
     "search=": "its sweeper comes with the extra `optuna`",
 }
 """Parts of commands that stand for something that does not compose, and the reason."""
 WITHOUT_VALUES = {
     "mode=identify fit=valve …": "the values before the dots stand in the line above it",
-    "mode=diagnose …": "the values before the dots stand in the block above it",
     "diagnosis.case=": "the folder is the reader's",
     "subject.model=arm.urdf": "the file is the reader's",
     '"$': "a variable of the shell holds a value that must be given",

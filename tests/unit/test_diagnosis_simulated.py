@@ -132,6 +132,14 @@ def test_a_late_joint_is_that_of_scipy(two_joints: Machine, numbers: Any, system
     assert np.abs(path - expected[::fine, ...].ravel()).max() < 0.02
 
 
+@pytest.mark.parametrize("level", [1.0, 0.25])
+def test_an_orifice_delays_by_the_root_of_the_command(two_joints: Machine, level: float) -> None:
+    """Of p' = sqrt(u - p) / T after a step of u the mean delay is 2 T / 3 sqrt(u)."""
+    side = make_side(two_joints, np.repeat([[0.0, 0.0], [level, level]], [20, 80], 0))
+    paths = side.simulate(0, np.stack([pure_numbers(), pure_numbers(filling_s=0.4)]))
+    assert (paths[0, -1] - paths[1, -1]) / level == pytest.approx(0.4 * level**0.5, abs=0.02)
+
+
 def test_a_delay_acts_by_each_part_of_a_step(two_joints: Machine) -> None:
     """At a steady speed v, each further 5 ms cost 5 ms v; a step of the simulation lasts 25 ms."""
     side = make_side(two_joints, np.repeat([[0.0, 0.0], [0.6, 0.6]], [20, 80], 0))
