@@ -2,7 +2,7 @@
 
     python benchmarks/run.py list                          # names, where they run, and how long
     python benchmarks/run.py measure shipped_policy        # runs the commands, writes benchmarks/results/shipped_policy.json
-    python benchmarks/run.py take five_seeds <folder>      # reads a folder that the commands left on another computer
+    python benchmarks/run.py take exam_valves <folder>     # reads a folder that the commands left on another computer
     python benchmarks/run.py page                          # renders docs/results.md
 
 A result holds commands, machine, commit, and a hash of the code that was measured. The page says

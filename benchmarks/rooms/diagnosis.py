@@ -51,7 +51,7 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "40 machines, answered once. A person drives 20 fields. Its rows have the lag of these machines. On 66 opened cases: 18/23, 5/13, 0/10. Before: 21/28, 9/16, 0/12 of 80 others.",
+        "40 machines, answered once. A person drives 20 fields. The diagnosis has their equation of lag. On 66 opened cases: 18/23, 5/13, 0/10. Before: 21/28, 9/16, 0/12 of 80 others.",
         "exam_plants=valves exam_recording=operators", 40, "diagnosis", "valve",
     ),
     describe_exam(

@@ -86,7 +86,7 @@ MEASUREMENTS = (
     Measurement(
         name="unidentified_machine",
         title="A policy for machines that nobody identified",
-        conditions="One training from nothing on four GPUs, one seed: 11,010 million steps in 576 s; the machine was lost before its end at 610 s. The policy is the mean of the eight kept checkpoints, its only candidate. 0.95 of the last episodes succeeded; on one GPU, in seven trainings, four of 610 s, at most 0.87. "
+        conditions="One training from nothing on four GPUs, one seed: 11,010 million steps in 576 s; the machine was lost before 610 s. The policy is the mean of the eight kept checkpoints, its only candidate. 0.95 of the last episodes succeeded; on one GPU, in seven trainings, four of 610 s, at most 0.87. "
         "Failures of earlier policies on these circuits suggested its effects. It moves up to three levers. Baseline: the controller without filter, same starts.",
         commands=tuple(
             command

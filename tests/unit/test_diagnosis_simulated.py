@@ -134,7 +134,7 @@ def test_a_late_joint_is_that_of_scipy(two_joints: Machine, numbers: Any, system
 
 @pytest.mark.parametrize("level", [1.0, 0.25])
 def test_an_orifice_delays_by_the_root_of_the_command(two_joints: Machine, level: float) -> None:
-    """Of p' = sqrt(u - p) / T after a step of u the mean delay is 2 T / 3 sqrt(u)."""
+    """A chamber with p' = sqrt(u - p) / T follows a step to u with a mean delay of 2/3 T sqrt(u)."""
     side = make_side(two_joints, np.repeat([[0.0, 0.0], [level, level]], [20, 80], 0))
     paths = side.simulate(0, np.stack([pure_numbers(), pure_numbers(filling_s=0.4)]))
     assert (paths[0, -1] - paths[1, -1]) / level == pytest.approx(0.4 * level**0.5, abs=0.02)
