@@ -24,7 +24,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase
 from diagnosis.effect_library import DetectedEffect, EffectType
-from diagnosis.engine.decide import DIRECT_NATS, JOINT_NATS
+from diagnosis.engine.decide import DIRECT_NATS, NUMBER_NATS
 from diagnosis.engine.sizes import SIGMAS
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
@@ -90,7 +90,7 @@ def find_geometry_errors(case: GapCase, kinds: Sequence[EffectType]) -> list[Det
         for some in combinations(points.errors, count):
             num_names = len({error[0].kind for error in some})
             gains[some] = points.measure_gain(some)
-            worth[some] = gains[some] - JOINT_NATS * count - DIRECT_NATS * num_names
+            worth[some] = gains[some] - NUMBER_NATS * count - DIRECT_NATS * num_names
     named = max(worth, key=worth.__getitem__)
     sizes = points.refine(named)
     named = tuple(error for error in named if _is_large(error, sizes))

@@ -17,7 +17,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType
-from diagnosis.engine.decide import DIRECT_NATS, JOINT_NATS
+from diagnosis.engine.decide import DIRECT_NATS, NUMBER_NATS
 from diagnosis.engine.direct import find_lattice
 from diagnosis.engine.side import stack_side
 from diagnosis.engine.sizes import SIGMAS, get_form_error
@@ -75,12 +75,12 @@ def find_sensor_noise(case: GapCase, kind: EffectType) -> DetectedEffect | None:
     gain = _compute_likelihood(seen, noisy, variance)
     gain = gain - _compute_likelihood(seen, plain, _compute_variance(plain, plain))
     gain = np.minimum(gain, MAX_GAIN)
-    mask = (gain > JOINT_NATS) & (sizes >= MIN_ADDED_SCATTER * estimate_sensor_noise(reference))
+    mask = (gain > NUMBER_NATS) & (sizes >= MIN_ADDED_SCATTER * estimate_sensor_noise(reference))
     sides = stack_side(case.field, machine), stack_side(case.reference, machine)
     for j in np.flatnonzero(mask).tolist():
         # The steps of a coarse sensor scatter as well.
         mask[j] = find_lattice(*sides, j) == 0.0
-    worth = float((gain[mask] - JOINT_NATS).sum()) - DIRECT_NATS
+    worth = float((gain[mask] - NUMBER_NATS).sum()) - DIRECT_NATS
     if worth <= 0.0:
         return None
     parameters = {}
@@ -92,8 +92,7 @@ def find_sensor_noise(case: GapCase, kind: EffectType) -> DetectedEffect | None:
         size = float(sizes[j])
         parameters[machine.joint_names[j]] = Estimate(size, (size / factor, size * factor))
     (name,) = kind.fitted
-    earned = float(gain[mask].sum())
-    return DetectedEffect(kind, mask, {name: parameters}, worth, earned)
+    return DetectedEffect(kind, mask, {name: parameters}, worth, float(gain[mask].sum()))
 
 
 def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:

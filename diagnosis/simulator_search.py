@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.effect_library import EffectType, EffectValues, list_shared_effects
-from diagnosis.engine.decide import JOINT_NATS
+from diagnosis.engine.decide import NUMBER_NATS
 from diagnosis.grown_effects import GrownEffect, list_candidates
 from diagnosis.simulator_runs import EffectSimulator, FreeRunLikelihood
 
@@ -106,7 +106,7 @@ class SimulatorSearch:
         for reference in self._views[1:]:
             # What a candidate earns where the simulator was fitted is no finding.
             gains = gains - np.maximum(reference.weigh_candidates(kind, candidates), 0.0)
-        costs = JOINT_NATS * _count_moved(kind, candidates)
+        costs = NUMBER_NATS * _count_moved(kind, candidates)
         if kind.name in self.shared or not _is_per_joint(kind):
             best = np.full(gains.shape[1], (gains.sum(1) - costs).argmax())
             joints = np.ones(gains.shape[1], dtype=bool)
@@ -124,7 +124,7 @@ class SimulatorSearch:
     def _weigh(self, effects: Sequence[GrownEffect]) -> float:
         """Return the log likelihood with effects, less the price of their numbers, nats."""
         nats = float(self.whole.weigh(effects).sum())
-        return nats - JOINT_NATS * sum(one.count_numbers() for one in effects)
+        return nats - NUMBER_NATS * sum(one.count_numbers() for one in effects)
 
     def fit(
         self, effects: Sequence[GrownEffect], used: np.ndarray | None = None, rounds: int = ROUNDS

@@ -102,13 +102,13 @@ def weigh(**nets: dict[int, float]) -> decide.EvidenceTable:
 def test_a_cause_is_named_or_unknown_by_what_it_earns() -> None:
     lag = {1: 50.0}
     cases = [
-        (weigh(lag={1: 40.0}), 0.0, "effects"), (weigh(lag={1: 39.9}), 0.0, "none"),
+        (weigh(lag={1: 32.0}), 0.0, "effects"), (weigh(lag={1: 31.9}), 0.0, "none"),
         # a row outside the library, or flexible columns, explain so much more
-        (weigh(slip={1: 90.0}, lag=lag), 0.0, "effects"), (weigh(slip={1: 90.1}, lag=lag), 0.0, "unknown"),
-        (weigh(lag=lag), 90.0, "effects"), (weigh(lag=lag), 90.1, "unknown"),
+        (weigh(slip={1: 82.0}, lag=lag), 0.0, "effects"), (weigh(slip={1: 82.1}, lag=lag), 0.0, "unknown"),
+        (weigh(lag=lag), 82.0, "effects"), (weigh(lag=lag), 82.1, "unknown"),
         # a cause of the whole machine that one joint alone shows is none
-        (weigh(jitter={0: 75.0, 1: 40.0}), 50.1, "effects"), (weigh(jitter={0: 75.1, 1: 39.9}), 40.1, "unknown"),
-        (weigh(jitter={0: 39.0, 1: 39.9}), 0.0, "none"), (weigh(jitter={0: 40.0}), 0.0, "effects"),
+        (weigh(jitter={0: 75.0, 1: 32.0}), 50.1, "effects"), (weigh(jitter={0: 75.1, 1: 31.9}), 32.1, "unknown"),
+        (weigh(jitter={0: 31.0, 1: 31.9}), 0.0, "none"), (weigh(jitter={0: 32.0}), 0.0, "effects"),
     ]  # fmt: skip
     for table, generic, expected in cases:
         assert decide.is_unknown(table, generic, is_coarse=False) == (expected == "unknown")
@@ -127,9 +127,9 @@ def test_a_further_effect_earns_enough_beside_those_before_it() -> None:
     first = weigh(lag={1: 400.0, 2: 50.0}, creep={1: 90.0})
     cases = [
         # on other joints it earns what any effect has to earn
-        ({0: 40.0}, [{0: 40.0}]), ({0: 39.9}, []),
+        ({0: 32.0}, [{0: 32.0}]), ({0: 31.9}, []),
         # where one before it earns four times as much it does not count; other joints keep what they earn
-        ({1: 100.0}, [{1: 100.0}]), ({1: 99.9}, []), ({0: 40.0, 1: 99.9}, [{0: 40.0}]), ({1: 40.0, 2: 50.0}, [{2: 50.0}]),
+        ({1: 100.0}, [{1: 100.0}]), ({1: 99.9}, []), ({0: 32.0, 1: 99.9}, [{0: 32.0}]), ({1: 40.0, 2: 50.0}, [{2: 50.0}]),
     ]  # fmt: skip
     for nets, expected in cases:
         # jitter earns more, and shows on joints of the first alone
@@ -142,10 +142,10 @@ def test_a_further_effect_earns_enough_beside_those_before_it() -> None:
 
 def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:
     row = Row("lag", (("command_lag_s", "add", 0.2),))
-    lag = {0: JointRow(row, 50.0, 0.0), 1: JointRow(row, 30.0, 0.0), 2: JointRow(row, 5.0, 0.0)}
+    lag = {0: JointRow(row, 50.0, 0.0), 1: JointRow(row, 30.0, 0.0), 2: JointRow(row, 12.0, 0.0)}
     backlash = {0: JointRow(row, 49.0, 0.0), 1: JointRow(row, 40.0, 6.0)}
     table = {"lag": lag, "backlash": backlash, "hysteresis": {0: JointRow(row, 99.0, 0.0)}}
-    # each pays 6 nats for a joint; backlash pays 6 more on the second one
+    # each pays 12 nats for a joint; backlash pays 6 more on the second one
     expected = {0: "lag", 1: "backlash"}
     assert decide.find_owners(table, frozenset({"hysteresis"})) == expected
 
