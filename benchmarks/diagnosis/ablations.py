@@ -31,7 +31,7 @@ from rich.progress import track
 from brokk_rl import extensions
 from diagnosis.case import load_case
 from diagnosis.effect_library import load_effects
-from diagnosis.engine.decide import Decider, Decision, EffectFinding, EvidenceTable
+from diagnosis.engine import decide
 from diagnosis.reference_diagnosis import ReferenceDiagnosis
 from exam.dataset import open_labels
 
@@ -44,10 +44,10 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-class ManyDecisions(Decider):
+class ManyDecisions(decide.Decider):
     """A decider that is asked with each value of each constant of the decision."""
 
-    def decide(self) -> Decision:
+    def decide(self) -> decide.Decision:
         """Raise `LookupError` with a decision for each."""
         found = {NO_PROOF: super().decide()}
         for name, values in INGREDIENTS[NO_PROOF].items():
@@ -56,10 +56,10 @@ class ManyDecisions(Decider):
                     found[f"{name.split('.')[-1]} {value:g}"] = super().decide()
         raise LookupError(found)
 
-    def weigh(self, there: Sequence[EffectFinding]) -> EvidenceTable:
-        """Return what everything earns beside effects, which no constant changes."""
+    def weigh(self, there: Sequence[decide.EffectFinding]) -> decide.EvidenceTable:
+        """Return what everything earns beside effects, which only the cost of a joint changes."""
         known = self.__dict__.setdefault("known", {})
-        key = tuple((one.effect, one.joints) for one in there)
+        key = (decide.JOINT_NATS, *((one.effect, one.joints) for one in there))
         known[key] = known.get(key) or super().weigh(there)
         return known[key]
 
