@@ -67,7 +67,7 @@ MEASUREMENTS = (
     Measurement(
         name="ablations",
         title="What other constants of the decision decide",
-        conditions="48 machines with valves, among those that chose 32 nats and 12 a joint, the first row; without the gates of the proof.",
+        conditions="48 machines, among those that chose the first row; without gates of the proof.",
         commands=(
             "python benchmarks/diagnosis/ablations.py {out}/ablations.json <an exam: exam_plants=valves exam_recording=operators session.seed=33 exam.mix.num_cases=48> --without 'gates of the proof, and the decision alone'",
         ),
