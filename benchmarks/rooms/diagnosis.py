@@ -67,7 +67,7 @@ MEASUREMENTS = (
     Measurement(
         name="ablations",
         title="What other constants of the decision decide",
-        conditions="48 machines, among those that chose the first row; without gates of the proof.",
+        conditions="48 practice machines; with them the first row, which ships, was chosen; without gates of the proof.",
         commands=(
             "python benchmarks/diagnosis/ablations.py {out}/ablations.json <an exam: exam_plants=valves exam_recording=operators session.seed=33 exam.mix.num_cases=48> --without 'gates of the proof, and the decision alone'",
         ),

@@ -24,9 +24,9 @@ from diagnosis.engine.side import Side
 LEAST_NATS = 32.0
 """Least gain of an effect, a further one or a cause outside the library, beyond what is explained without it.
 
-Of 107 practice cases of three makes, whose causes act on the motion, it names 30 of 37 single effects first. It calls 18 of 25
-outside causes unknown and gives none of them a name. One of 30 unchanged or faint machines is accused. With 40 nats, and 6
-for a joint, it names 27, calls 17 unknown and gives one a name; with 32 and 6 it names 29, and three of them have a name.
+Of 107 practice cases of three makes, whose causes act on the motion, the first step names 30 of 37 single effects. It calls
+18 of 25 outside causes unknown, gives none of them a name, and accuses one of 30 unchanged or faint machines. With 40 nats, and
+6 for a joint, these are 27, 17, one and one; with 32 and 6 they are 29, 17, three and two.
 """
 DIRECT_NATS = 24.0
 """The same for what tool points or the scatter of samples show."""
@@ -40,8 +40,8 @@ NUMBER_NATS = 6.0
 RIVAL_SHARE = 0.25
 """Least gain of a further effect on a joint, over the largest of those before it there.
 
-Of further effects with 40 nats on 280 practice machines that earn less than an earlier one on each of their joints, true
-ones have 0.08, 0.12, 0.28, 0.29, 0.56 and 0.87 of it, wrong ones 0.004 to 0.24 (seventeen), 0.65 and 0.8.
+Of further effects with 40 nats on 280 practice machines, when a joint cost 6, that earn less than an earlier one on each of
+their joints, true ones have 0.08, 0.12, 0.28, 0.29, 0.56 and 0.87 of it, wrong ones 0.004 to 0.24 (seventeen), 0.65 and 0.8.
 """
 SHOWN_NATS = 1e3
 """A coarse sensor or a late clock shows by itself and comes before all that is simulated."""
