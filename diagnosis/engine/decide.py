@@ -220,8 +220,8 @@ class Decider:
         hold = find_hold(joints, self.evidence.bases)
         if hold is None:
             return None
-        nets = dict(enumerate(share_cost(hold.gains, JOINT_NATS - hold.prior)))
-        return EffectFinding(hold.course.effect, nets, hold=hold, is_common=True)
+        nets = dict(enumerate(share_cost(hold.gains, JOINT_NATS + hold.cost)))
+        return EffectFinding(hold.law.effect, nets, hold=hold, is_common=True)
 
     def _find_coarse(self) -> list[int]:
         """Return the joints with a coarse sensor on the field; their steps enter the scale."""

@@ -1,13 +1,10 @@
 """Commands that were held: lost frames and jitter, as a hidden delay common to all joints.
 
-Viterbi's algorithm finds the likeliest course of the delay. The commands are replaced by those that
-were in force, and judged by the same measure as every other row, less the prior of the course.
-Axes: `T` samples, `K` delays, `M` laws.
+A hidden Markov model gives the mean course of the delay under each law. The commands are replaced by
+those in force under it, and judged by the same measure as every other row. A course costs the
+information that it has beyond its law.
+Axes: `T` samples, `K` delays.
 """
-
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
-# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
-# The kernel is compiled by Warp; a type checker reads it as ordinary Python.
 
 from __future__ import annotations
 
@@ -15,15 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import warp as wp
 from scipy.ndimage import uniform_filter1d
 
 from diagnosis.engine.baseline import JointBaseline
 from diagnosis.engine.evidence import FieldJoint
-from diagnosis.engine.joint_model import Course
+from diagnosis.engine.hold_laws import HoldLaw, LossLaw
 from diagnosis.engine.measure import Scale, measure_motion
 from diagnosis.engine.nuisance import compute_gain
-from diagnosis.engine.side import DEVICE, Side
+from diagnosis.engine.side import Side
 
 LONGEST_S = 0.9
 LONGEST_TARGET_S = 0.2
@@ -33,17 +29,16 @@ SLOW_S = 0.5
 PULSE_S = 0.6
 """Time after which a servo has answered."""
 PULSE_UNITS = 0.01
+LAW_ROUNDS = 8
+"""Rounds in which the law of lost frames is fitted."""
 TARGET_ROUNDS = 2
 """Rounds in which the course is sought again beside what it explains already."""
 MAX_SQUARE = 16.0
 LATENT_UNITS_S = 0.004
 """Speed that no joint shows: its step is below the noise of the encoder."""
-TEMPER = 0.5
-"""Power of the likelihood under which a course is sought; the samples depend on each other. Of seven opened cases of three
-makes three earn 127 to 216 nats less with 1.0, of 50 to 744, and four 25 to 411 more, of 69 to 4,433."""
-LAW_TEMPER = 0.1
-"""The same for the choice between lost frames and jitter: of 14 opened cases of four makes it tells 13, as 0.05 does; 0.2
-tells 11, and 0.5 nine."""
+POWERS = (0.1, 0.25, 0.5, 1.0)
+"""Powers of the likelihood under which courses are weighed: the samples depend on each other, by how much is not known."""
+LEAST_CHANCE = np.finfo(float).tiny
 IMPOSSIBLE = -1e9
 """Log chance of what cannot be."""
 
@@ -53,159 +48,78 @@ class HeldCourse:
     """A found course.
 
     Attributes:
-        course: Its model.
+        law: Its law.
+        power: Power of the likelihood under which it was found.
         delays: Additional delay of each sample of the field, in samples, `(T,)`.
         gains: What it earns on each joint of the field, nats.
-        prior: Log prior of the course, nats, 0 at most.
+        cost: Information in the course beyond its law, nats, 0 at least.
         weights: Share of each sample in what is seen of the delays, `(T,)`.
     """
 
-    course: Course
+    law: HoldLaw
+    power: float
     delays: np.ndarray
     gains: tuple[float, ...]
-    prior: float
+    cost: float
     weights: np.ndarray
 
-
-@wp.kernel(enable_backward=False)
-def find_course(
-    likelihood: wp.array2d[wp.float64],
-    law: wp.array2d[wp.float64],
-    score: wp.array2d[wp.float64],
-    back: wp.array2d[wp.int32],
-    course: wp.array[wp.int32],
-):
-    """Find the likeliest course by Viterbi's algorithm, `(T,)`."""
-    samples = likelihood.shape[0]
-    delays = likelihood.shape[1]
-    for k in range(samples):
-        for d in range(delays):
-            best = score[0, 0] + law[0, d]
-            source = wp.int32(0)
-            for before in range(1, delays):
-                tried = score[0, before] + law[before, d]
-                if tried > best:
-                    best = tried
-                    source = before
-            score[1, d] = best + likelihood[k, d]
-            back[k, d] = source
-        for d in range(delays):
-            score[0, d] = score[1, d]
-    state = wp.int32(0)
-    for d in range(1, delays):
-        if score[0, d] > score[0, state]:
-            state = d
-    for i in range(samples):
-        k = samples - 1 - i
-        course[k] = state
-        state = back[k, state]
-
-
-def build_law(course: Course, num_delays: int) -> np.ndarray:
-    """Return the log chance that a delay (first axis) is followed by another one (second), `(K, K)`."""
-    stays = np.full(num_delays, course.lasts)
-    stays[0] = 1.0 - course.begins
-    steps = np.arange(num_delays)
-    if course.is_loss:
-        chance = np.zeros((num_delays, num_delays))
-        chance[steps[1:], 0] = 1.0 - course.lasts
-        chance[steps[1:-1], steps[2:]] = course.lasts
-        chance[0, :2] = (1.0 - course.begins, course.begins)
-    else:
-        # No frame overtakes another: a delay grows by one sample a sample at most.
-        in_order = (steps <= steps[:, None] + course.parts) & (steps != steps[:, None])
-        chance = (1.0 - stays[:, None]) * in_order / in_order.sum(1, keepdims=True)
-        np.fill_diagonal(chance, stays)
-    return np.where(chance > 0.0, np.log(np.maximum(chance, 1e-300)), IMPOSSIBLE)
+    @property
+    def net(self) -> float:
+        """What it earns on all joints less its cost, nats."""
+        return sum(self.gains) - self.cost
 
 
 @dataclass(frozen=True)
-class _Law:
-    """A law with the log likelihoods `(T, K)` that it is held against, its log chances `(K, K)` and its evidence, nats.
+class MeanCourse:
+    """The course of the delay to be expected under a law.
 
-    The evidence is that of all courses together, against no delay, under `TEMPER` and under `LAW_TEMPER`.
+    Attributes:
+        delays: Its delays, in steps of the law, `(T,)`.
+        counts: Expected number of samples with each delay, `(K,)`.
+        evidence: Log evidence of the law over all courses, against no delay, nats.
+        cost: Information that the commands give about the course beyond its law, nats, 0 at least.
     """
 
-    course: Course
-    bank: np.ndarray
-    chances: np.ndarray
-    evidence: np.ndarray
+    delays: np.ndarray
+    counts: np.ndarray
+    evidence: float
+    cost: float
 
 
-def _list_laws(
-    side: Side, bases: Sequence[JointBaseline], numbers: Sequence[np.ndarray]
-) -> list[_Law]:
-    """Return all laws with their evidence on a side."""
-    found = []
-    for parts in sorted({course.parts for course in side.model.courses}):
-        courses = [course for course in side.model.courses if course.parts == parts]
-        bank = _build_bank(side, bases, numbers, parts)
-        chances = [build_law(course, bank.shape[1]) for course in courses]
-        every = weigh_laws(bank, chances, (TEMPER, LAW_TEMPER))
-        for course, law, evidence in zip(courses, chances, every, strict=True):
-            found.append(_Law(course, bank, law, evidence))
-    return found
+def average_courses(
+    bank: np.ndarray, chances: np.ndarray, powers: Sequence[float]
+) -> list[MeanCourse]:
+    """Return the mean of all courses under a law at each power of the likelihood.
 
-
-def _follow_law(
-    side: Side, bases: Sequence[JointBaseline], numbers: Sequence[np.ndarray], law: _Law
-) -> tuple[np.ndarray, float]:
-    """Return the likeliest course, in samples, `(T,)`, and its log prior.
-
-    The prior is what the evidence leaves of the likelihood: that of one course alone, and what it
-    shares with all others that are nearly the same. It never adds to what the course itself earns:
-    a crane whose frames came in time would have 130 nats for nothing.
-    """
-    states = follow_courses(law.bank, law.chances)
-    likelihood = law.bank[np.arange(side.num_samples), states] - law.bank[:, 0]
-    prior = min(float(law.evidence[0] - TEMPER * likelihood.sum()), 0.0)
-    delays = states / law.course.parts
-    for _ in range(0 if side.model.integrates else TARGET_ROUNDS):
-        bank = _build_target_bank(side, bases, numbers, law.course.parts, delays)
-        delays = follow_courses(bank, law.chances) / law.course.parts
-    return delays, prior
-
-
-def weigh_laws(
-    bank: np.ndarray, laws: Sequence[np.ndarray], tempers: Sequence[float]
-) -> np.ndarray:
-    """Return the log evidence of each law over all courses, against no delay, `(M, tempers)`.
-
-    It is the forward pass of a hidden Markov model. Jitter has many courses that are nearly as likely as its
-    likeliest one, and lost frames have few, so that the likeliest courses alone do not tell the two apart.
+    This is the forward and backward pass of a hidden Markov model. A single course is likely by chance where
+    the commands say little. The mean of all stays there at what the law lets expect, and costs nothing.
 
     Args:
         bank: Log likelihood of each delay at each sample, `(T, K)`; no delay but 0 is possible at the first one.
-        laws: Log chance that a delay (first axis) is followed by another one (second), `(K, K)` each.
-        tempers: Powers of the likelihood.
+        chances: Chance that a delay (first axis) is followed by another one (second), `(K, K)`.
+        powers: Powers of the likelihood.
     """
-    chances = np.exp(np.array(laws))[:, None]
-    likelihood = np.multiply.outer(tempers, bank - bank[:, :1])
+    likelihood = (bank - bank[:, :1])[:, None] * np.array(powers)[:, None]
     highest = likelihood.max(2)
-    factors = np.exp(likelihood - highest[..., None]).transpose(1, 0, 2)[:, :, None]
-    state = np.repeat(factors[None, 0], len(laws), 0)
-    evidence = np.repeat(highest.sum(1)[None], len(laws), 0)
-    for factor in factors[1:]:
-        state = (state @ chances) * factor
-        total = np.maximum(state.sum(3, keepdims=True), np.finfo(float).tiny)
-        state /= total
-        evidence += np.log(total[..., 0, 0])
-    return evidence
-
-
-def follow_courses(bank: np.ndarray, law: np.ndarray) -> np.ndarray:
-    """Return the likeliest states `(T,)` of a law `(K, K)` from log likelihoods `(T, K)` to the power of `TEMPER`."""
-    num_samples, num_delays = bank.shape
-    with wp.ScopedDevice(DEVICE):
-        found = wp.zeros(num_samples, dtype=wp.int32)
-        inputs = [
-            wp.array(TEMPER * bank, dtype=wp.float64),
-            wp.array(law, dtype=wp.float64),
-            wp.zeros((2, num_delays), dtype=wp.float64),
-            wp.empty((num_samples, num_delays), dtype=wp.int32),
-        ]
-        wp.launch(find_course, dim=1, inputs=inputs, outputs=[found])
-    return found.numpy()
+    factors = np.exp(likelihood - highest[:, :, None])
+    evidence = highest.sum(0)
+    posterior = np.zeros_like(factors)
+    posterior[0, :, 0] = 1.0
+    for k in range(1, len(bank)):
+        state = (posterior[k - 1] @ chances) * factors[k]
+        total = np.maximum(state.sum(1), LEAST_CHANCE)
+        posterior[k] = state / total[:, None]
+        evidence += np.log(total)
+    later = np.ones_like(factors[0])
+    for k in reversed(range(len(bank))):
+        posterior[k] *= later
+        posterior[k] /= np.maximum(posterior[k].sum(1, keepdims=True), LEAST_CHANCE)
+        later = (factors[k] * later) @ chances.T
+        later /= np.maximum(later.max(1, keepdims=True), LEAST_CHANCE)
+    delays = posterior @ np.arange(bank.shape[1])
+    costs = (posterior * likelihood).sum((0, 2)) - evidence
+    each = zip(delays.T, posterior.sum(0), evidence.tolist(), costs.tolist(), strict=True)
+    return [MeanCourse(*one) for one in each]
 
 
 def _build_bank(
@@ -334,9 +248,12 @@ def _weigh_samples(side: Side) -> np.ndarray:
     return squares / max(float(squares.sum()), 1e-12)
 
 
-def _weigh_course(joints: Sequence[FieldJoint], delays: np.ndarray) -> tuple[float, ...]:
-    """Return what a course earns on each joint in the measure of all rows, nats."""
+def _weigh_course(
+    joints: Sequence[FieldJoint], law: HoldLaw, power: float, course: MeanCourse
+) -> HeldCourse:
+    """Return a course with what it earns on each joint in the measure of all rows."""
     side = joints[0].side
+    delays = course.delays / law.parts
     held = hold_commands(side, delays)
     gains = []
     for joint in joints:
@@ -345,22 +262,59 @@ def _weigh_course(joints: Sequence[FieldJoint], delays: np.ndarray) -> tuple[flo
         count = joint.count * (1.0 if side.model.integrates else joint.measure.interval)
         squares = joint.projection.measure_squares(left)
         gains.append(float(compute_gain(squares, joint.squares, count)[0]))
-    return tuple(gains)
+    weights = _weigh_samples(side)
+    return HeldCourse(law, power, delays, tuple(gains), course.cost, weights)
 
 
 def find_hold(joints: Sequence[FieldJoint], bases: Sequence[JointBaseline]) -> HeldCourse | None:
-    """Return the best course of the effect with the likeliest law, where it earns anything."""
+    """Return the course that earns most, where one earns anything: that of the likeliest law at one of the powers."""
     side = joints[0].side
     numbers = [joint.numbers for joint in joints]
-    laws = _list_laws(side, bases, numbers)
-    effect = max(laws, key=lambda law: law.evidence[-1]).course.effect
-    best, most = None, 0.0
-    for law in laws:
-        if law.course.effect != effect:
-            continue
-        delays, prior = _follow_law(side, bases, numbers, law)
-        gains = _weigh_course(joints, delays)
-        if sum(gains) + prior > most:
-            most = sum(gains) + prior
-            best = HeldCourse(law.course, delays, gains, prior, _weigh_samples(side))
+    likeliest: list[tuple[HoldLaw, MeanCourse]] = []
+    for parts in sorted({law.parts for law in side.model.hold_laws}):
+        bank = _build_bank(side, bases, numbers, parts)
+        for law in side.model.hold_laws:
+            if law.parts != parts:
+                continue
+            chances = law.list_chances(bank.shape[1], side.period_s)
+            each = [(law, course) for course in average_courses(bank, chances, POWERS)]
+            pairs = zip(likeliest or each, each, strict=True)
+            likeliest = [max(pair, key=lambda one: one[1].evidence) for pair in pairs]
+    best: HeldCourse | None = None
+    for power, (law, course) in zip(POWERS, likeliest, strict=True):
+        if course.evidence > 0.0:
+            hold = _weigh_course(joints, law, power, course)
+            if hold.net > (best.net if best else 0.0):
+                best = hold
+    if best is None:
+        return None
+    if not side.model.integrates:
+        for _ in range(TARGET_ROUNDS):
+            best = max(best, _seek_again(joints, bases, best), key=lambda hold: hold.net)
+    if isinstance(best.law, LossLaw):
+        bank = _build_bank(side, bases, numbers, best.law.parts)
+        best = replace(best, law=fit_loss_law(bank, best.law, side.period_s))
     return best
+
+
+def fit_loss_law(bank: np.ndarray, law: LossLaw, period_s: float) -> LossLaw:
+    """Return the law that makes the commands likeliest, by expectation maximisation from `law` on (Baum 1970).
+
+    A frame that is lost between equal commands leaves no trace, and counts as the law lets expect.
+    """
+    for _ in range(LAW_ROUNDS):
+        (course,) = average_courses(bank, law.list_chances(bank.shape[1], period_s), [1.0])
+        law = LossLaw.count(course.counts)
+    return law
+
+
+def _seek_again(
+    joints: Sequence[FieldJoint], bases: Sequence[JointBaseline], hold: HeldCourse
+) -> HeldCourse:
+    """Return the course of targets under the same law, sought beside what `hold` explains already."""
+    side = joints[0].side
+    numbers = [joint.numbers for joint in joints]
+    bank = _build_target_bank(side, bases, numbers, hold.law.parts, hold.delays)
+    chances = hold.law.list_chances(bank.shape[1], side.period_s)
+    (course,) = average_courses(bank, chances, [hold.power])
+    return _weigh_course(joints, hold.law, hold.power, course)

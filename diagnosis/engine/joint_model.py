@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from diagnosis.engine.descent import Prior
+from diagnosis.engine.hold_laws import HoldLaw
 from diagnosis.engine.rows import Row
 
 
@@ -65,30 +66,6 @@ COMMAND_NAMES = (
 
 
 @dataclass(frozen=True)
-class Course:
-    """Law by which a delay comes and goes.
-
-    Attributes:
-        effect: `frame_loss`: it grows with each lost frame and ends at once; `delay_jitter`: it
-            jumps.
-        begins: Chance a sample that a delay begins.
-        lasts: Chance a sample that it goes on.
-        parts: Into how many steps a sample is divided; a frame that comes late by a part of it leaves
-            the mean of two targets.
-    """
-
-    effect: str
-    begins: float
-    lasts: float
-    parts: int = 1
-
-    @property
-    def is_loss(self) -> bool:
-        """True for frames that are lost."""
-        return self.effect == "frame_loss"
-
-
-@dataclass(frozen=True)
 class JointModel:
     """Numbers of a kind of joint, and how its recordings are read.
 
@@ -98,7 +75,7 @@ class JointModel:
         outside_rows: Causes outside the library.
         own_forms: Numbers of the rows that no effect of the registry has in this form.
         lags: Numbers that delay the motion behind a command, and by how much of their value.
-        courses: Laws by which commands are held.
+        hold_laws: Laws by which commands are held.
         late: Numbers that are known better once all joints are fitted, with the values before.
         substep_s: Longest step of the simulation.
         interval_s: Time of an increment of the measure.
@@ -112,7 +89,7 @@ class JointModel:
     outside_rows: tuple[Row, ...]
     own_forms: frozenset[tuple[str, ...]]
     lags: Mapping[str, float]
-    courses: tuple[Course, ...]
+    hold_laws: tuple[HoldLaw, ...]
     late: Mapping[str, float]
     substep_s: float
     interval_s: float

@@ -9,7 +9,8 @@ friction .05 Nm).
 
 from __future__ import annotations
 
-from diagnosis.engine.joint_model import Course, JointModel, JointNumber, list_places, repeat_number
+from diagnosis.engine.hold_laws import JitterLaw, LossLaw
+from diagnosis.engine.joint_model import JointModel, JointNumber, list_places, repeat_number
 from diagnosis.engine.rows import Row, mirror_sizes, spread_sizes
 
 NUMBERS = (
@@ -93,12 +94,14 @@ SERVO = JointModel(
     own_forms=frozenset({("damping_ratio", "firmware_damping")}),
     lags={"pilot_lag_s": 1.0, "command_lag_s": 1.0, "response_s": 2.0},  # damped critically
     late={"dry": 0.0, "static_ratio": 0.0, "load_dry": 0.0},
-    courses=(
-        Course("frame_loss", 0.03, 0.1),
-        Course("frame_loss", 0.12, 0.2),
-        Course("frame_loss", 0.05, 0.7),
-        Course("delay_jitter", 0.4, 0.5, 2),
-        Course("delay_jitter", 0.7, 0.3, 2),
+    hold_laws=(
+        LossLaw(0.03, 0.1),
+        LossLaw(0.12, 0.2),
+        LossLaw(0.05, 0.7),
+        JitterLaw(0.015, 2),
+        JitterLaw(0.03, 2),
+        JitterLaw(0.06, 2),
+        JitterLaw(0.12, 2),
     ),
     substep_s=0.005,
     interval_s=0.1,

@@ -9,7 +9,8 @@ by 30, 56, 52 and -106 nats with 0.35, 0.5, 0.7 and 1.4 times what it was.
 
 from __future__ import annotations
 
-from diagnosis.engine.joint_model import Course, JointModel, JointNumber, list_places, repeat_number
+from diagnosis.engine.hold_laws import JitterLaw, LossLaw
+from diagnosis.engine.joint_model import JointModel, JointNumber, list_places, repeat_number
 from diagnosis.engine.rows import Row, mirror_sizes, spread_sizes
 
 NUMBERS = (
@@ -190,13 +191,14 @@ VALVE = JointModel(
     # The ringing delays by its damping over pi: that of 0.6 of the critical one.
     lags=dict.fromkeys(LAGS, 1.0) | {"ringing_s": 0.2},
     late={"pump_load": 0.0},
-    courses=(
-        Course("frame_loss", 0.01, 0.6),
-        Course("frame_loss", 0.04, 0.85),
-        Course("frame_loss", 0.02, 0.94),
-        Course("delay_jitter", 0.02, 0.9),
-        Course("delay_jitter", 0.1, 0.9),
-        Course("delay_jitter", 0.3, 0.6),
+    hold_laws=(
+        LossLaw(0.01, 0.6),
+        LossLaw(0.04, 0.85),
+        LossLaw(0.02, 0.94),
+        JitterLaw(0.045),
+        JitterLaw(0.09),
+        JitterLaw(0.18),
+        JitterLaw(0.36),
     ),
     substep_s=0.025,  # half a period of the reference machine's 20 Hz
     interval_s=0.25,  # chosen by hand: of 0.1, 0.25 and 0.5 s each named 9 of 12 small effects
