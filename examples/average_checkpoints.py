@@ -1,8 +1,11 @@
 """Export the mean of the actors of all checkpoints that a training kept, as a policy folder.
 
     python examples/average_checkpoints.py runs/trained runs/mean
+    python examples/average_checkpoints.py runs/trained runs/mean 1.08
 
-The golden answers are those of the mean to observations that the training recorded, computed here.
+A third number multiplies the output layer. A command just below the dead band of a valve then
+moves it, as the exploration noise did while the policy learned. The golden answers are those of the
+mean to observations that the training recorded, computed here.
 """
 
 import sys
@@ -34,7 +37,15 @@ def average_networks(states):
     return mean
 
 
-def export_mean(run, out):
+def multiply_output(weights, gain):
+    """Return a network whose last layer is `gain` times as large."""
+    last = list(weights)[-1].removesuffix(".bias")
+    return {
+        name: gain * value if name.startswith(last) else value for name, value in weights.items()
+    }
+
+
+def export_mean(run, out, gain=1.0):
     """Write the policy folder `out` of the run folder `run`."""
     paths = list_checkpoints(run)
     states, newest = [], {}
@@ -45,7 +56,8 @@ def export_mean(run, out):
     machine, task = build_node(values["machine"], "machine"), build_node(values["task"], "task")
     process = task.build(machine, 1, CPU)
     groups = observe_once(process, machine, CPU)
-    content = newest | {"weights": average_networks(states)}
+    weights = multiply_output(average_networks(states), gain)
+    content = newest | {"weights": weights}
     actor = restore_actor(
         content, str(run), machine, describe_task(task), groups, process.num_actions
     )
@@ -54,6 +66,7 @@ def export_mean(run, out):
         contract.pop(name, None)
     contract["trained"] |= newest["book"]
     contract["trained"]["mean_of_iterations"] = [int(path.stem[6:]) for path in paths]
+    contract["trained"]["output_gain"] = gain
     observations = newest["answers"][0]
     with torch.no_grad():
         commands = process.deployable(PlainActor(actor).eval())(observations.float())
@@ -63,4 +76,4 @@ def export_mean(run, out):
 
 
 if __name__ == "__main__":
-    export_mean(Path(sys.argv[1]), Path(sys.argv[2]))
+    export_mean(Path(sys.argv[1]), Path(sys.argv[2]), *map(float, sys.argv[3:]))
