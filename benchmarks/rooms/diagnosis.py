@@ -51,17 +51,17 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "40 machines, answered once. A person drives 23 fields. The diagnosis has their equation of lag. Before: 31/42, 12/24, 0/18 of 120 others.",
+        "40 machines, answered once. A person drives 17 fields. The diagnosis has their equation of lag. Before: 41/56, 16/32, 1/24 of 160 others.",
         "exam_plants=valves exam_recording=operators", 40, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "20 cranes, answered once. A person drives 10 fields. Before: 12/21, 4/12, 1/9 of 60 others.",
+        "20 cranes, answered once. A person drives 9 fields. Before: 16/28, 5/16, 1/12 of 80 others.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 20, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "16 arms, answered once. Before: 16/16, 5/9, 0/7 of 46 others.",
+        "16 arms, answered once. Before: 22/22, 7/12, 0/9 of 62 others.",
         "machine=so101 exam_plants=servos exam_mix=servos", 16, "servo_diagnosis", "servo",
     ),
     Measurement(
