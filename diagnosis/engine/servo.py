@@ -98,6 +98,7 @@ SERVO = JointModel(
         LossLaw(0.03, 0.1),
         LossLaw(0.12, 0.2),
         LossLaw(0.05, 0.7),
+        # Each longest delay is twice the one before: the evidence tells the nearest one.
         JitterLaw(0.015, 2),
         JitterLaw(0.03, 2),
         JitterLaw(0.06, 2),

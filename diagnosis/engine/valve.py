@@ -195,6 +195,7 @@ VALVE = JointModel(
         LossLaw(0.01, 0.6),
         LossLaw(0.04, 0.85),
         LossLaw(0.02, 0.94),
+        # Each longest delay is twice the one before: the evidence tells the nearest one.
         JitterLaw(0.045),
         JitterLaw(0.09),
         JitterLaw(0.18),
