@@ -228,8 +228,7 @@ def test_the_nuisance_is_a_covariance() -> None:
 def test_the_variance_of_increments_is_that_of_what_was_drawn() -> None:
     generator = np.random.default_rng(4)
     motion = Motion(*generator.uniform(0.0, 2.0, (2, 40_000)))
-    drawn = np.array([0.4, 0.0, 0.5, 0.0, 0.2])
-    expected = motion.stack() @ drawn
+    expected = motion.stack() @ np.array([0.4, 0.0, 0.5, 0.0, 0.2])
     increments = generator.normal(0.0, np.sqrt(expected))
     found = fit_variance(increments, motion, np.ones(len(increments), bool))
     assert motion.stack() @ found == pytest.approx(expected, rel=0.1)
@@ -251,7 +250,11 @@ JITTER = ((5, 23, 0, 0), (5, 10, 13, 0), (5, 10, 10, 3), (5, 10, 10, 3))
 
 @pytest.mark.parametrize(
     ("law", "expected"),
-    [(LossLaw(0.03, 0.73), np.array(LOSS)), (JitterLaw(0.14), np.array(JITTER) / 28.0)],
+    [
+        (LossLaw(0.03, 0.73), np.array(LOSS)),
+        (JitterLaw(0.14), np.array(JITTER) / 28.0),
+        (JitterLaw(0.07, 2), np.array(JITTER)[[1, 2, 2, 2]] / 28.0),
+    ],
 )
 def test_delays_follow_each_other_by_their_law(law: HoldLaw, expected: np.ndarray) -> None:
     np.testing.assert_allclose(law.list_chances(4, 0.05), expected, atol=1e-12)
@@ -283,13 +286,14 @@ def test_losses_are_fitted_where_a_third_of_the_samples_tells_them(machine: Mach
         delays.append(delays[-1] + 1 if chance < 0.03 + 0.7 * (delays[-1] > 0) else 0)
     bank = np.where(np.arange(30) == np.array(delays)[:, None], 0.0, -8.0)
     bank[generator.uniform(size=len(delays)) > 1 / 3] = 0.0
-    bank[0, 1:] = -1e9
-    law = holds.fit_loss_law(bank, LossLaw(0.04, 0.85), 0.05)
+    law = holds.fit_loss_law(bank, LossLaw(0.1, 0.4), 0.05)
     assert law.probability == pytest.approx(0.1, abs=0.01)
     assert law.persistence == pytest.approx(0.7, abs=0.03)
     held = holds.HeldCourse(law, 1.0, np.array(delays), (1.0,), 0.0, np.array([0.01] * 100))
     (kind,) = effect_library.load_effects(machine, ("frame_loss",))
     assert sizes.describe_numbers(kind, {}, held, machine)["persistence"]["q1"].ci95[1] == 1.0
+    late = replace(held, law=JitterLaw(0.1), delays=np.full(100, 1.6))
+    assert sizes.describe_hold(late, machine)["jitter_s"][0] == pytest.approx(2.0 * 1.6 * 0.05)
 
 
 def test_an_unchanged_machine_has_no_effect(two_joints: Machine) -> None:
