@@ -76,4 +76,5 @@ def export_mean(run, out, gain=1.0):
 
 
 if __name__ == "__main__":
-    export_mean(Path(sys.argv[1]), Path(sys.argv[2]), *map(float, sys.argv[3:]))
+    output_gain = float(sys.argv[3]) if len(sys.argv) > 3 else 1.0
+    export_mean(Path(sys.argv[1]), Path(sys.argv[2]), output_gain)

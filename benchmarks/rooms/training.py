@@ -68,7 +68,7 @@ MEASUREMENTS = (
     Measurement(
         name="shipped_policy",
         title="The policy that ships",
-        conditions="The shipped policy and the classical controller (baseline) from the same random starts, one seed, MuJoCo C. An episode lasts 20 s. Boreholes, their errors, dead time and effects are random. It learned from nothing on `flat`, on two H200 in 5,119 million steps; its output times 1.08, which 768 other starts chose.",
+        conditions="The shipped policy and the classical controller (baseline) from the same random starts, one seed, MuJoCo C. An episode lasts 20 s. Boreholes, their errors, dead time and effects are random. The policy learned from nothing on `flat`, two H200, 5,119 million steps; a gain of 1.08 at its output was chosen on 768 other starts.",
         commands=evaluate_each("actuator", PLANTS),
         code=SHIPPED_CODE,
         read=lambda folder: read_evaluations(folder, "plant"),

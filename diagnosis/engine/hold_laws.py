@@ -38,7 +38,7 @@ class LossLaw:
 
     @property
     def persistence(self) -> float:
-        """How losses hang together, as `actuators.effects.timing.FrameLoss` counts it."""
+        """Rise of the chance of a loss after a lost frame, as in `FrameLoss`; 0 where each is lost by itself."""
         return max(self.lasts - self.begins, 0.0)
 
     @property

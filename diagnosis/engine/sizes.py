@@ -47,7 +47,7 @@ FORM_ERRORS = {
     "thermal_drift": 0.17,
     "torque_limit": 0.33,
 }
-"""The same by effect: 196 numbers of 400 practice cases of four makes. With a make left out of the choice, the
+"""The same by effect: 196 numbers of practice and opened cases of four makes. With a make left out of the choice, the
 90 % intervals hold 167 of its numbers; benchmarks/results/size_errors has them all."""
 SIGMAS = 1.96
 

@@ -245,7 +245,7 @@ def test_dependence_on_weight_is_told_per_yield_force(
 
 LOSS = ((0.97, 0.03, 0, 0), (0.27, 0, 0.73, 0), (0.27, 0, 0, 0.73), (0.27, 0, 0, 0))
 JITTER = ((5, 23, 0, 0), (5, 10, 13, 0), (5, 10, 10, 3), (5, 10, 10, 3))
-"""Of 28 frames that come late by up to 2.8 samples, 5 come within half a sample; a delay grows by one at most."""
+"""Chances times 28: delays are uniform up to 2.8 samples, rounded to whole ones, and grow by one sample at most."""
 
 
 @pytest.mark.parametrize(
