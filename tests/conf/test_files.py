@@ -128,11 +128,6 @@ def test_a_file_that_does_more_than_name_values_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["given.yaml"]
 
 
-def test_a_file_without_an_end_is_refused(brokk: Callable[..., Any]) -> None:
-    done = brokk("mode=train", "machine=@/dev/zero")
-    assert done.code == 2 and "expected a plain file" in done.err
-
-
 def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Callable[..., Any]) -> None:
     cfg = composed(brokk, "mode=identify", "identify.recordings=@home/*.parquet", "session.out=x")
     assert cfg["identify"]["recordings"] == "@home/*.parquet"

@@ -141,6 +141,14 @@ VALUES = {
     "policy@rivals.b=classical": "add it by a plus: +policy@rivals.b=<option>",
     "policy=shipped task.depth_m=0.1": "task.depth_m=0.1 was asked for, the policy has 0.14",
     "mode=evaluate task=goal_pose": "for task=borehole_insertion, but task=goal_pose was asked for",
+    "mode=collect excitation=[levels,hold]": "there is no excitation=hold",
+    "mode=collect collect.guards.max_command=2": "max_command: expected a number less than or equal to 1, got 2",
+    "mode=study study.do=simulate": "needs simulated operators; ground=twin",
+    "mode=study study.do=run": "needs study.folder=<folder>",
+    "mode=study study.do=erase study.folder=there": "needs study.participant=<participant>",
+    "mode=study study.do=plan study.design.primary=time": "did you mean 'time_s'",
+    "mode=study study.do=report study.folder=nowhere": "holds no study",
+    "mode=train machine=@/dev/zero": "expected a plain file",
 }  # fmt: skip
 """Words of a command whose number or word nothing can use, and a part of its message."""
 WRONG |= {tuple(words.split()): (told,) for words, told in VALUES.items()}
@@ -159,6 +167,21 @@ AFTER_TORCH = {
 }
 """The same for what can be known only after the import of torch: a class of one's own, and values
 of several parts."""
+LATE_VALUES = {
+    "mode=collect excitation=[holds,ramps] collect.run_minutes=0.2 collect.file_minutes=0.2": "excitation=holds",
+    "preset=bench bench=twin deploy.policy=nowhere": "policy nowhere: policy.json is missing",
+    "preset=bench bench=guided deploy.policy=nowhere": "policy nowhere: policy.json is missing",
+    "preset=bench camera=pictures perception/source@source=folder source.folder=nowhere": "nowhere: no such folder); give a folder",
+    "mode=train_perception training.frames=empty": "mode=render",
+    "mode=train_perception training.frames=x training.size_px=[100,48]": "multiples of 32",
+    "mode=why log=nowhere/*.parquet policy=tasks:policies/borehole_insertion": "no recording matches nowhere",
+    "mode=why log=nowhere/*.parquet policy=nowhere/x": "nowhere/x: expected a run folder",
+    "mode=why log=x policy=tasks:policies/borehole_insertion simulator=mlpp": "did you mean 'mlp'?",
+    "mode=why log=x policy=tasks:policies/borehole_insertion simulator=nowhere.xml": "there is no such file",
+    "mode=why log=x policy=tasks:policies/borehole_insertion simulator=nowhere:step": "simulator=nowhere:step",
+}  # fmt: skip
+"""As `VALUES`, after the import of torch."""
+AFTER_TORCH |= {tuple(words.split()): (told,) for words, told in LATE_VALUES.items()}
 
 
 @pytest.fixture(scope="module")

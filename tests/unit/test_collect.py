@@ -107,28 +107,6 @@ def test_actuator_and_effects_are_chosen_as_everywhere(
     assert file.extra["oil_c"].shape == (file.num_samples,) and 0.0 < file.extra["oil_c"][0] < 60.0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (("excitation=[levels,hold]",), ("there is no excitation=hold",)),
-        (
-            ("excitation=[holds,ramps]", "collect.run_minutes=0.2", "collect.file_minutes=0.2"),
-            ("excitation=holds", "run_minutes"),
-        ),
-        (("collect.guards.max_command=2",), ("max_command: expected", "equal to 1, got 2")),
-    ],
-    ids=str,
-)
-def test_what_makes_no_sense_is_refused_and_leaves_nothing(
-    arguments: tuple[str, ...], told: tuple[str, ...], brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    done = brokk("mode=collect", "collect.num_runs=1", *arguments)
-    assert done.code == 2
-    for part in told:
-        assert part in done.err
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
-
-
 class Fails(NominalLink):
     """Fails, or is interrupted, after 20 s."""
 

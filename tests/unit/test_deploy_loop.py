@@ -410,21 +410,3 @@ def test_the_machines_computer_needs_no_torch_no_simulator_and_no_trainer() -> N
     code = f"import sys, {modules}; print([m for m in ('torch', 'warp', 'mujoco', 'rsl_rl') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-
-
-@pytest.mark.parametrize("bench", ["twin", "guided"])
-def test_a_bench_is_built_whole_before_its_policy_is_read(
-    brokk: Callable[..., Any], bench: str
-) -> None:
-    done = brokk("preset=bench", f"bench={bench}", "deploy.policy=nowhere", "session.out=run")
-    assert done.code == 2 and "policy nowhere: policy.json is missing" in done.err
-
-
-def test_a_camera_without_frames_is_refused_before_any_process_starts(
-    brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    words = ("camera=pictures", "perception/source@source=folder", "source.folder=nowhere")
-    done = brokk("preset=bench", *words, "session.out=run")
-    assert done.code == 2 and not (tmp_path / "run/processes.json").exists()
-    assert "expected frames" in done.err and "nowhere: no such folder" in done.err
-    assert "source.folder=" in done.err

@@ -94,14 +94,6 @@ def test_a_stopped_training_leaves_the_best_network_to_go_on_with(
     assert done.code == 0, done.err
 
 
-def test_folders_without_masks_are_refused(brokk: Callable[..., Any], tmp_path: Path) -> None:
-    done = brokk("mode=train_perception", f"training.frames={tmp_path}", "session.out=run")
-    assert done.code == 2 and "mode=render" in done.err and not Path("run").exists()
-    odd = ("training.frames=x", "training.size_px=[100,48]")
-    done = brokk("mode=train_perception", *odd, "session.out=run")
-    assert done.code == 2 and "multiples of 32" in done.err
-
-
 def test_each_picture_is_changed_its_own_way_and_the_mask_is_not() -> None:
     change = Augmentation(
         probability=1.0, brightness=(0.6, 1.4), contrast=(0.5, 1.6), gamma=(0.6, 1.7),

@@ -119,23 +119,6 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
     assert erased.code == 0 and not list(run.rglob("P02*"))
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["study.do=simulate"], "needs simulated operators; ground=twin"),
-        (["study.do=run"], "needs study.folder=<folder>"),
-        (["study.do=erase", "study.folder=there"], "needs study.participant=<participant>"),
-        (["study.do=plan", "study.design.primary=time"], "did you mean 'time_s'"),
-        (["study.do=report", "study.folder=nowhere"], "holds no study"),
-    ],
-)
-def test_what_a_step_lacks_is_said(
-    words: list[str], message: str, brokk: Callable[..., Any]
-) -> None:
-    done = brokk("mode=study", *words)
-    assert done.code == 2 and message in done.err
-
-
 GROUND = option("ground", "twin")
 START = np.array([0.1, -0.95, 0.55, 1.15, 0.6])
 RIM_M = np.array([2.6, 0.3, 0.75])

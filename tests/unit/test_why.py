@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -58,27 +57,6 @@ def test_the_cause_weighs_all_stages(
     summary = why_answer.write_summary(result)
     assert said in summary
     assert ("lag on q3" in summary) == (cause != "code")
-
-
-@pytest.mark.parametrize(
-    ("changed", "expected"),
-    [
-        (["log=nowhere/*.parquet"], "no recording matches nowhere"),
-        (["policy=nowhere/x"], "nowhere/x: expected a run folder"),
-        (["simulator=mlpp"], "did you mean 'mlp'?"),
-        (["simulator=nowhere.xml"], "there is no such file"),
-        (["simulator=nowhere:step"], "simulator=nowhere:step"),
-    ],
-)
-def test_inputs_are_refused_before_the_first_stage(
-    brokk: Callable[..., Any], changed: list[str], expected: str
-) -> None:
-    command = {"log": "log=nowhere/*.parquet", "policy": "policy=tasks:policies/borehole_insertion"}
-    command |= {word.partition("=")[0]: word for word in changed}
-    done = brokk("mode=why", *command.values(), "session.out=out")
-    assert done.code == 2
-    assert expected in done.err
-    assert not Path("out/doctor").exists()
 
 
 def test_the_interval_of_a_difference_is_newcombe_s() -> None:
