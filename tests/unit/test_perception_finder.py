@@ -220,12 +220,3 @@ def test_ellipses_of_a_picture_need_no_depth(folder: Path, brokk: Callable) -> N
     assert min(away_px) < 2.0 and frame["holes"] == []
     refused = brokk(*command, "perception=truth", "session.out=no")
     assert refused.code == 2 and "expected perception=plane_conic" in refused.err
-
-
-def test_a_finder_that_only_finds_holes_is_enough(folder: Path, brokk: Callable) -> None:
-    done = brokk("mode=perceive", f"perceive.input={folder}", "perception=truth", "session.out=out")
-    assert done.code == 0, done.err
-    frames = json.loads(Path("out/holes.json").read_text())["frames"]
-    assert [len(frame["holes"]) for frame in (frames[0], frames[2])] == [1, 1]
-    assert frames[0]["holes"][0]["center_m"] == [2.6, 0.0, 0.4]
-    assert Path("out/overlays/00000.png").exists()
