@@ -19,20 +19,6 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 
 BEGIN_NS = 1_700_000_000_000_000_000
-JOINT_STATE = """std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
 
 
 def make_topic_map(command: str, position: str, time: str = "log_time") -> Any:
@@ -86,29 +72,7 @@ def write_protobuf(path: Path) -> Any:
     return make_topic_map("joints[slide].value", "joints[slide].value")
 
 
-def make_joint_state(time_ns: int, value: float, turned: bool) -> dict[str, Any]:
-    names, values = ["jaw", "slide"], [9.0, value]
-    if turned:  # a driver may change the order of its joints
-        names, values = names[::-1], values[::-1]
-    stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
-    header = {"stamp": stamp, "frame_id": ""}
-    return {"header": header, "name": names, "position": values, "velocity": [], "effort": []}
-
-
-def write_ros2(path: Path) -> Any:
-    mcap_ros2 = pytest.importorskip("mcap_ros2.writer")
-    with path.open("wb") as file:
-        writer = mcap_ros2.Writer(file)
-        schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
-        for number, (time_ns, *values) in enumerate(list_rows()):
-            for topic, value in zip(("/command", "/state"), values, strict=True):
-                content = make_joint_state(time_ns, value, number % 7 == 3)
-                writer.write_message(topic, schema, content, time_ns, time_ns)
-        writer.finish()
-    return make_topic_map("position[slide]", "position[slide]")
-
-
-def write_bag(path: Path, storage: str) -> Any:
+def write_bag(path: Path, storage: str, stamped: bool = True) -> Any:
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     from rosbags.typesys import Stores, get_typestore
 
@@ -118,14 +82,25 @@ def write_bag(path: Path, storage: str) -> Any:
     with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as writer:
         topics = ("/command", "/state")
         connections = [writer.add_connection(topic, kind.__msgtype__, typestore=store) for topic in topics]  # fmt: skip
-        for time_ns, *values in list_rows():
+        for number, (time_ns, *values) in enumerate(list_rows()):
+            side = -1 if number % 7 == 3 else 1  # a driver may change the order of its joints
             for connection, value in zip(connections, values, strict=True):
                 stamp = types["builtin_interfaces/msg/Time"](time_ns // 10**9, time_ns % 10**9)
                 header = types["std_msgs/msg/Header"](stamp, "")
-                message = kind(header, ["slide"], np.array([value]), np.empty(0), np.empty(0))
+                names, places = ["jaw", "slide"][::side], np.array([9.0, value])[::side]
+                message = kind(header, names, places.copy(), np.empty(0), np.empty(0))
                 data = store.serialize_cdr(message, kind.__msgtype__)
                 writer.write(connection, time_ns, data)
-    return make_topic_map("position[slide]", "position[slide]", "header.stamp")
+    time = "header.stamp" if stamped else "log_time"
+    return make_topic_map("position[slide]", "position[slide]", time)
+
+
+def write_ros2(path: Path) -> Any:
+    """Writes the file of a bag alone, as a recorder without bags does."""
+    reader = write_bag(path.with_name("bag"), "MCAP", stamped=False)
+    (file,) = path.with_name("bag").glob("*.mcap")
+    file.rename(path)
+    return reader
 
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
