@@ -98,7 +98,6 @@ def test_numbers_of_the_configuration_are_explained() -> None:
         (rules.doors, "deploy.kernel.guard", "import torch"),
         (rules.vague_names, "brokk_rl.rl.utils", ""),
         (rules.docstrings, "brokk_rl.a", '"""A."""\nclass B:\n    """B."""\n    def c(self): pass'),
-        (rules.docstrings, "brokk_rl.a", "x = 1"),
         (rules.units, "brokk_rl.a", "tilt_deg: float = 1.0"),
         (rules.units, "brokk_rl.a", "def f(n_envs): pass"),
         (rules.verb_names, "brokk_rl.a", "def distance(a): pass"),
