@@ -17,7 +17,6 @@ import json
 
 import torch
 
-from brokk_rl.contracts.vision import FrameDetections
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 
@@ -33,31 +32,11 @@ class Sticky:
 
 
 @spec
-class Wave:
-    """Wave with the tool."""
-
-    def build(self, machine, num_envs, device):
-        return self
-
-
-@spec
-class Dowser:
-    """Finds nothing, ever."""
-
-    def build(self):
-        return self
-
-    def find(self, frame):
-        return FrameDetections(holes=[])
-
-
-@spec
 class Show:
     """Writes what it was given."""
 
     session: Session
     actuator: object
-    task: object
     perception: object
     fails: str
 
@@ -66,7 +45,7 @@ class Show:
             raise RuntimeError("our own fault")
         if self.fails == "by hand":
             raise KeyboardInterrupt
-        names = [type(part).__name__ for part in (self.actuator, self.task, self.perception)]
+        names = [type(part).__name__ for part in (self.actuator, self.perception)]
         (self.session.folder / "seen.json").write_text(json.dumps(names))
         return float("nan") if self.fails == "to learn" else self.actuator.share
 '''
@@ -74,8 +53,7 @@ MODE = """# @package _global_
 defaults:
   - /session@session
   - /actuator: sticky
-  - /task: wave
-  - /perception: dowser
+  - /perception: truth
   - _self_
 run: mine.parts.Show
 fails: not
@@ -89,8 +67,6 @@ def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
     options = {
         "parts.py": PARTS,
         "conf/actuator/sticky.yaml": "_target_: mine.parts.Sticky\nshare: 0.25\n",
-        "conf/task/wave.yaml": "_target_: mine.parts.Wave\n",
-        "conf/perception/dowser.yaml": "_target_: mine.parts.Dowser\n",
         "conf/mode/show.yaml": MODE,
     }
     install_package(folder, "mine", options, monkeypatch)
@@ -99,9 +75,7 @@ def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 
 def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
     assert brokk("mode=show", "actuator=sticky", "session.out=run").code == 0
-    assert (tmp_path / "run" / "seen.json").read_text() == '["Sticky", "Wave", "Dowser"]'
-    assert brokk("mode=show", "perception=truth", "session.out=ours").code == 0
-    assert (tmp_path / "ours" / "seen.json").read_text() == '["Sticky", "Wave", "TruthPerception"]'
+    assert (tmp_path / "run" / "seen.json").read_text() == '["Sticky", "TruthPerception"]'
 
 
 def test_an_option_that_two_packages_offer_is_chosen_by_its_file(
@@ -168,14 +142,6 @@ def test_the_name_of_a_job_can_be_typed() -> None:
     overrides = ["effect=[@found/effects.yaml,lag]", "fit@baselines.lag=lag", "mode=train"]
     assert name_job(7, overrides, ["mode"]) == "7_effect-effects-lag_lag-lag"
     assert len(name_job(0, [f"a.b={'x' * 300}"], [])) == 120
-
-
-def test_the_jobs_of_a_sweep_go_on_when_one_fails(
-    mine: Path, brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    assert brokk("-m", "mode=show", "session.seed=x,4", "session.out=sweep").code == 2
-    left = sorted(path.name for path in (tmp_path / "sweep").iterdir())
-    assert left == ["1_seed-4", "multirun.yaml"]
 
 
 def test_resolved_runs_again_in_a_new_folder(
