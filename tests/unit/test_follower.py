@@ -67,14 +67,6 @@ def test_a_perfect_person_changes_no_bit(machine: Machine) -> None:
     assert torch.equal(follow(machine, proposed), proposed)
 
 
-def test_the_delay_is_exact_to_the_fraction_of_a_period(machine: Machine) -> None:
-    steps = [0.8] * 3 + [0.0] * 9
-    assert q1(machine, steps, delay_s=0.3) == pytest.approx([0.0] * 6 + [0.8] * 3 + [0.0] * 3)
-    # 0.22 s are 4.4 periods: of the fifth period 0.6 have the new command
-    expected = [0.0] * 4 + [0.48, 0.8, 0.8, 0.32] + [0.0] * 4
-    assert q1(machine, steps, delay_s=0.22) == pytest.approx(expected, abs=1e-6)
-
-
 def test_delay_and_lag_together_are_those_of_continuous_time(machine: Machine) -> None:
     """Against a simulation of hand and display in steps of 0.1 ms."""
     generator = torch.Generator().manual_seed(3)

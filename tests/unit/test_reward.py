@@ -227,14 +227,6 @@ def test_numpy_and_torch_say_the_same_and_decoding_inverts_it(
     np.testing.assert_allclose(vector, by_torch.numpy(), rtol=0, atol=1e-6)
 
 
-def test_a_wanted_pitch_is_one_more_number_behind_those_of_the_paper(machine: Machine) -> None:
-    values = make_values(machine, 1) | {"pitch_rad": np.array([1.75], np.float32)}
-    with_pitch, paper = (make_encoder(machine, one).encode(values) for one in (WITH_PITCH, SCALING))
-    assert with_pitch.shape == (1, 134)
-    np.testing.assert_array_equal(with_pitch[:, :133], paper)
-    assert with_pitch[0, 133] == pytest.approx(1.0)  # (1.75 - 1.4) / 0.35
-
-
 def test_the_contract_tells_size_order_and_scale_and_gives_the_encoder_back(
     machine: Machine,
 ) -> None:
