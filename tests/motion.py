@@ -39,6 +39,32 @@ def rest(machine: Machine, at: Any = None, num: int = 1) -> History:
     return history
 
 
+def build_nominal_tables(machine: Machine, dead_time_s: float) -> dict[str, Any]:
+    """Returns the tables of a valve that is the nominal machine: a dead time, then speed times command."""
+    none, line = [0.0] * machine.num_joints, [[0.0, 1.0]] * machine.num_joints
+    tables = {"dead_time_s": [dead_time_s] * machine.num_joints}
+    tables |= dict.fromkeys(("demand", "play", "spool_s", "speed_s"), none)
+    return tables | {"knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line, "pose": None}
+
+
+def step_through(model: Any, u: torch.Tensor, q: torch.Tensor, size: int) -> torch.Tensor:
+    """Returns positions `(T, N, J)` like `q`, from `size` on those of a model that is stepped."""
+    q = q.clone()
+    for k in range(size, len(q)):
+        past = slice(k - size, k)
+        q[k] = model.step(History(q=q[past].transpose(0, 1), u=u[past].transpose(0, 1)))
+    return q
+
+
+def run_planned(model: Any, u: torch.Tensor, q: torch.Tensor, size: int) -> torch.Tensor:
+    """Returns the same of a planned run."""
+    q, run = q.clone(), model.plan_run(u, size)
+    assert run is not None, "it was to be planned"
+    for k in range(size, len(q)):
+        q[k] = run.step(k, q)
+    return q
+
+
 @torch.no_grad()
 def roll(
     model: Any, machine: Machine, u: torch.Tensor, at: Any = None, moving: bool = False

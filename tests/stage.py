@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from composed import option
 from desk import build_twin
+from motion import build_nominal_tables
 
 from actuators.excite.player import NominalMachine
 from brokk_rl.errors import LinkError
@@ -222,14 +223,17 @@ class Bridge:
 
 def write_nominal_observer(machine: Machine, folder: Path) -> Path:
     """Writes the file of an observer that expects the nominal machine: dead time, speed times command."""
-    ones = [1.0] * machine.num_joints
-    none, line = [0.0] * machine.num_joints, [[0.0, 1.0]] * machine.num_joints
-    model = {"dead_time_s": [machine.dead_time_s] * machine.num_joints}
-    model |= dict.fromkeys(("demand", "play", "spool_s", "speed_s"), none)
-    model |= {"knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line, "pose": None}
     content = {"schema": 2, "machine": machine.name, "fingerprint": machine.fingerprint()}
-    content |= {"sources": ["nominal machine"], "model": model}
-    thresholds = {"window_s": 1.0, "share": 0.25, "slack_s": [0.06 for _ in ones], "minutes": 0.0}
+    content |= {
+        "sources": ["nominal machine"],
+        "model": build_nominal_tables(machine, machine.dead_time_s),
+    }
+    thresholds = {
+        "window_s": 1.0,
+        "share": 0.25,
+        "slack_s": [0.06] * machine.num_joints,
+        "minutes": 0.0,
+    }
     path = folder / "nominal_observer.json"
     path.write_text(json.dumps(content | {"thresholds": thresholds}))
     return path

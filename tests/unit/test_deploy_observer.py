@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from motion import build_nominal_tables
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -25,16 +26,6 @@ SHIPPED = Path(__file__).parents[2] / "deploy" / "observers" / "brokk170.json"
 SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
 PERIOD_S = MACHINE.period_s
 HOME = np.array(MACHINE.home)
-
-
-def build_tables(**change: Any) -> dict[str, Any]:
-    """Tables of a plain machine: a dead time of 0.2 s, speed times command."""
-    ones = [1.0] * 5
-    none = [0.0] * 5
-    tables: dict[str, Any] = dict.fromkeys(("play", "spool_s", "speed_s"), none)
-    tables["dead_time_s"] = [0.2] * 5
-    tables |= {"demand": none, "knots": [0.0, 1.0], "curve_extend": [[0.0, one] for one in ones]}
-    return tables | {"curve_retract": [[0.0, one] for one in ones], "pose": None} | change
 
 
 def draw_commands(count: int, seed: int) -> np.ndarray:
@@ -107,7 +98,7 @@ class Joints:
     def __init__(self, slack_s: float | list[float] = SLACK_S, **change: Any):
         slacks_s = slack_s if isinstance(slack_s, list) else [slack_s] * 5
         thresholds = {"window_s": 1.0, "share": SHARE, "slack_s": slacks_s, "minutes": 60.0}
-        content = {"model": build_tables(**change)}
+        content = {"model": build_nominal_tables(MACHINE, dead_time_s=0.2) | change}
         self.observer = Observer(content | {"thresholds": thresholds}, MACHINE)
         self.q, self.now_s, self.waiting = HOME.copy(), 20.0, [np.zeros(5)] * 4
         self.offset, self.drift, self.gain = np.zeros(5), np.zeros(5), np.ones(5)

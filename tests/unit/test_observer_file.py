@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
-from motion import make_recording
+from motion import build_nominal_tables, make_recording
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.record import Recording, write_recording
@@ -24,12 +24,7 @@ SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
 SETTINGS = ThresholdSettings(window_s=1.0, share=0.25, least_slack_s=0.06, margin=1.5)
 
 
-def build_content() -> dict[str, Any]:
-    """A model with a dead time of 0.2 s, speed times command."""
-    line, none = [[0.0, 1.0]] * 5, [0.0] * 5
-    model = {"dead_time_s": [0.2] * 5, "play": none, "spool_s": none, "speed_s": none}
-    model |= {"demand": none, "knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line}
-    return {"model": model | {"pose": None}}
+CONTENT = {"model": build_nominal_tables(MACHINE, dead_time_s=0.2)}
 
 
 def record(jump_rad: float, source: str = "machine: socketcan can0, excitation: sine") -> Recording:
@@ -46,15 +41,15 @@ def record(jump_rad: float, source: str = "machine: socketcan can0, excitation: 
 
 
 def test_slack_is_the_largest_difference_in_the_recordings_times_the_margin() -> None:
-    found = find_thresholds(SETTINGS, build_content(), MACHINE, [record(0.1)])
+    found = find_thresholds(SETTINGS, CONTENT, MACHINE, [record(0.1)])
     least, second_s = [0.06] * 3, 1.5 * 0.1 / SPEED[1]
     assert found["slack_s"] == pytest.approx([0.06, second_s, *least], abs=1e-3)
     assert (found["window_s"], found["share"], found["minutes"]) == (1.0, 0.25, 1.0)
 
 
 def test_thresholds_raise_no_alarm_where_they_come_from_and_one_beyond() -> None:
-    content = build_content()
-    content["thresholds"] = find_thresholds(SETTINGS, content, MACHINE, [record(0.1)])
+    thresholds = find_thresholds(SETTINGS, CONTENT, MACHINE, [record(0.1)])
+    content = CONTENT | {"thresholds": thresholds}
     for jump_rad, number in ((0.1, 0), (0.149, 0), (0.151, 1)):
         counts = count_alarms(content, MACHINE, [record(jump_rad)])
         assert counts.faults.total() == number, jump_rad
@@ -100,7 +95,7 @@ def test_whose_recordings_these_are(source: str, is_real: bool) -> None:
 
 def write_file(path: Path, machine: Any, *sources: str) -> Any:
     """The limits of a guard whose observer has a file of `machine` from `sources`."""
-    content = build_content() | {"schema": 2, "machine": machine.name, "sources": list(sources)}
+    content = CONTENT | {"schema": 2, "machine": machine.name, "sources": list(sources)}
     content["fingerprint"] = machine.fingerprint()
     slack_s = [0.06, 0.07, 0.08, 0.09, 0.1]
     content["thresholds"] = {"window_s": 1.0, "share": 0.25, "slack_s": slack_s, "minutes": 30.0}

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from motion import run_planned, step_through
 
 from actuators.effects.effect import EffectSpec
 from actuators.models.joint_weight import build_joint_weight
-from brokk_rl.history import History
 from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
 
@@ -73,22 +73,6 @@ def draw_motion(machine: Machine) -> tuple[torch.Tensor, torch.Tensor]:
     # One environment begins just before its stops, so that it runs into them.
     q[:size, 0] += torch.as_tensor(machine.upper, dtype=torch.float32) - q[size - 1, 0] - 1e-4
     return u, q
-
-
-def step_through(model: Any, u: torch.Tensor, q: torch.Tensor, size: int) -> torch.Tensor:
-    q = q.clone()
-    for k in range(size, len(q)):
-        past = slice(k - size, k)
-        q[k] = model.step(History(q=q[past].transpose(0, 1), u=u[past].transpose(0, 1)))
-    return q
-
-
-def run_planned(model: Any, u: torch.Tensor, q: torch.Tensor, size: int) -> torch.Tensor:
-    q, run = q.clone(), model.plan_run(u, size)
-    assert run is not None, "it was to be planned"
-    for k in range(size, len(q)):
-        q[k] = run.step(k, q)
-    return q
 
 
 def compare(base: str, effects: list[tuple[str, float]], machine: Machine) -> None:

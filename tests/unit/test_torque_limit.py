@@ -11,11 +11,11 @@ import pytest
 import torch
 from arm import make_machine, run_servo
 from composed import option
+from motion import run_planned, step_through
 from scipy.integrate import solve_ivp
 
 from actuators.models.servo import Servo
 from brokk_rl.commands import read_targets
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 from diagnosis import api
@@ -127,17 +127,9 @@ def test_a_planned_run_moves_as_its_steps_do(arm: Machine) -> None:
         return model
 
     q = torch.zeros(len(u) + 1, num_envs, 2)
-    stepped, planned = q.clone(), q.clone()
     with torch.inference_mode():
-        model = build()
-        for k in range(size, len(q)):
-            past = slice(k - size, k)
-            history = History(q=stepped[past].transpose(0, 1), u=u[past].transpose(0, 1))
-            stepped[k] = model.step(history)
-        plan = build().plan_run(u, size, planned)
-        assert plan is not None
-        for k in range(size, len(q)):
-            planned[k] = plan.step(k, planned)
+        stepped = step_through(build(), u, q, size)
+        planned = run_planned(build(), u, q, size)
     assert (stepped - planned).abs().max() < 1e-5
     free, limited = stepped[:, 0], stepped[:, 3]
     assert (free - limited).abs().max() > 0.05
