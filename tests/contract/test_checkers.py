@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -79,21 +78,25 @@ def test_a_broken_actuator_is_found(name: str, method: Any, message: str, machin
 NOWHERE = torch.zeros(4, dtype=torch.bool)
 
 
-def overriding(**methods: Callable[..., Any]) -> Any:
-    """Returns the shipped task with some methods of its process replaced; each gets the original as its first argument."""
+def overriding(**parts: Any) -> Any:
+    """Returns the shipped task with parts of its process replaced; a method gets the original as its first argument."""
 
     def build(machine: Machine, num_envs: int, device: torch.device) -> Any:
         process = option("task", "borehole_insertion").build(machine, num_envs, device)
-        for name, method in methods.items():
-            setattr(process, name, partial(method, getattr(process, name)))
+        for name, part in parts.items():
+            new = partial(part, getattr(process, name)) if callable(part) else part
+            setattr(process, name, new)
         return process
 
     return SimpleNamespace(build=build)
 
 
 @pytest.mark.parametrize(
-    ("methods", "message"),
+    ("parts", "message"),
     [
+        ({"reasons": ("time_limit",)}, "expected 'fault'"),
+        ({"state": {}}, "state: expected an entry 'steps'"),
+        ({"episode": {}}, "expected an entry 'success_"),
         ({"command": lambda original, action: action}, "leaves"),
         ({"starts": lambda original, count, seed: original(count, 7)}, "another seed"),
         ({"step": lambda original, *a: replace(original(*a), reward=torch.full((4,), torch.nan))}, "not finite"),
@@ -101,11 +104,9 @@ def overriding(**methods: Callable[..., Any]) -> Any:
         ({"reset": lambda original, mask, start: original(torch.ones_like(mask), start)}, "outside the mask"),
     ],
 )  # fmt: skip
-def test_a_broken_task_is_found(
-    methods: dict[str, Callable[..., Any]], message: str, machine: Machine
-) -> None:
+def test_a_broken_task_is_found(parts: dict[str, Any], message: str, machine: Machine) -> None:
     with pytest.raises(AssertionError, match=message):
-        check_task(overriding(**methods), machine)
+        check_task(overriding(**parts), machine)
 
 
 def finder_of(answer: Any) -> Any:

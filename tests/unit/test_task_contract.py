@@ -99,29 +99,6 @@ def test_the_shipped_tasks_offer_all_that_is_optional(name: str, machine: Machin
     assert option("task", name).build(machine, 1, CPU).offers == OPTIONAL.keys()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda process: setattr(process, "reasons", ("time_limit",)), "expected 'fault'"),
-        (lambda process: process.state.pop("steps"), "state: expected an entry 'steps'"),
-        (lambda process: process.episode.pop("success_strict"), "expected an entry 'success_"),
-    ],
-)
-def test_the_checker_names_what_the_framework_misses(
-    change: Any, message: str, machine: Machine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    task = HoldStill()
-
-    def build(*args: Any) -> HoldStillProcess:
-        process = HoldStillProcess(*args)
-        change(process)
-        return process
-
-    monkeypatch.setattr(task, "build", build)
-    with pytest.raises(AssertionError, match=message):
-        check_task(task, machine)
-
-
 def test_a_task_without_optional_contracts_trains_and_is_not_exported(
     machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
