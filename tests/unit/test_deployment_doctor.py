@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
+import torch
 from arm import make_machine
 from motion import make_recording
-from onnx import TensorProto, helper, numpy_helper
+from torch import nn
 
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, write_recording
+from brokk_rl.rl.export import _write_onnx
 from diagnosis.case import select_rows
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
 from diagnosis.deployment.examination import Deployment, DoctorAnswer
@@ -32,27 +33,12 @@ Loop = Callable[[np.ndarray, int], np.ndarray]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Path:
     """A policy of another maker: a network of two layers with a contract that lists its terms."""
-    place, rng = tmp_path_factory.mktemp("policy"), np.random.default_rng(0)
-    size = sum(number for _, number in TERMS)
-    weights = {
-        "w1": rng.normal(0.0, 0.4, (size, 24)), "b1": rng.normal(0.0, 0.2, 24),
-        "w2": rng.normal(0.0, 0.3, (24, 5)), "b2": rng.normal(0.0, 0.1, 5),
-    }  # fmt: skip
-    nodes = [
-        helper.make_node("Gemm", ["observation", "w1", "b1"], ["h"]),
-        helper.make_node("Tanh", ["h"], ["a"]),
-        helper.make_node("Gemm", ["a", "w2", "b2"], ["o"]),
-        helper.make_node("Tanh", ["o"], ["command"]),
-    ]
-    floats = TensorProto.FLOAT
-    graph = helper.make_graph(
-        nodes, "policy",
-        [helper.make_tensor_value_info("observation", floats, ["B", size])],
-        [helper.make_tensor_value_info("command", floats, ["B", 5])],
-        [numpy_helper.from_array(value.astype(np.float32), name) for name, value in weights.items()],
-    )  # fmt: skip
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    onnx.save(model, place / "policy.onnx")
+    place, size = tmp_path_factory.mktemp("policy"), sum(number for _, number in TERMS)
+    layers = [nn.Linear(size, 24), nn.Tanh(), nn.Linear(24, 5), nn.Tanh()]
+    network, rng = nn.Sequential(*layers), torch.Generator().manual_seed(0)
+    for weights, std in zip(network.parameters(), (0.4, 0.2, 0.3, 0.1), strict=True):
+        nn.init.normal_(weights, std=std, generator=rng)
+    _write_onnx(network, torch.zeros(1, size), place / "policy.onnx")
     names = machine.joint_names
     terms = [
         {"name": "target", "columns": ["target_x_m", "target_y_m", "target_z_m"], "mean": [2.5, 0, 0.7], "std": 0.5},
