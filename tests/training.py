@@ -94,6 +94,12 @@ def weights(runner: TrainingRunner) -> dict[str, torch.Tensor]:
     }
 
 
+def take_state(loop: ControlLoop) -> dict[str, torch.Tensor]:
+    """Returns all tensors of a loop by name, with those of its world."""
+    state = loop.state_dict()
+    return state["tensors"] | {f"world.{name}": value for name, value in state["world"].items()}
+
+
 def progress(folder: Path) -> list[dict[str, str]]:
     """Returns the rows of `progress.csv` without the columns that tell the time."""
     with (folder / "progress.csv").open(newline="") as file:

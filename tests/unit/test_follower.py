@@ -242,11 +242,6 @@ def loop_with(machine: Machine, follower: Any) -> ControlLoop:
     return runs.plant(machine, task, follower=follower).build(CPU, 8, 64, 5)
 
 
-def state_of(loop: ControlLoop) -> dict[str, torch.Tensor]:
-    state = loop.state_dict()
-    return state["tensors"] | {f"world.{name}": value for name, value in state["world"].items()}
-
-
 def test_a_loop_behind_a_perfect_person_is_the_loop_without_one(machine: Machine) -> None:
     loops = [loop_with(machine, follower) for follower in (option("follower", "none"), person())]
     actions = 2 * torch.randn(30, 8, 5)
@@ -254,7 +249,7 @@ def test_a_loop_behind_a_perfect_person_is_the_loop_without_one(machine: Machine
         torch.manual_seed(1)
         for action in actions:
             loop.step(action)
-    alone, behind = (state_of(loop) for loop in loops)
+    alone, behind = (runs.take_state(loop) for loop in loops)
     assert all(torch.equal(value, behind[name]) for name, value in alone.items())
 
 

@@ -191,8 +191,7 @@ def test_a_gate_drops_the_blocks_that_it_does_not_see() -> None:
 
 def write_ros_log(path: Path, pictures: list[tuple[np.ndarray, np.ndarray]], bent: float) -> None:
     """Writes raw grey pairs with their `camera_info` as a bag of ROS 1, or as MCAP."""
-    import mcap.writer
-    from rosbags.rosbag1 import Writer
+    from rosbags import rosbag1, rosbag2
     from rosbags.typesys import Stores, get_typestore
 
     is_bag = path.suffix == ".bag"
@@ -225,25 +224,21 @@ def write_ros_log(path: Path, pictures: list[tuple[np.ndarray, np.ndarray]], ben
             )  # fmt: skip
             messages.append((f"/cam/{side}/camera_info", "sensor_msgs/msg/CameraInfo", info))
             messages.append((f"/cam/{side}/image_raw", kind, image))
-    if is_bag:
-        with Writer(path) as bag:
-            topics: dict[str, Any] = {}
-            for number, (topic, kind, message) in enumerate(messages):
-                if topic not in topics:
-                    topics[topic] = bag.add_connection(topic, kind, typestore=store)
-                bag.write(topics[topic], number, store.serialize_ros1(message, kind))
-        return
-    with path.open("wb") as file:
-        writer = mcap.writer.Writer(file)
-        writer.start()
-        channels: dict[str, int] = {}
+    serialize = store.serialize_ros1 if is_bag else store.serialize_cdr
+    place = path if is_bag else path.with_suffix("")
+    mcap = rosbag2.StoragePlugin.MCAP
+    with (
+        rosbag1.Writer(place)
+        if is_bag
+        else rosbag2.Writer(place, version=9, storage_plugin=mcap) as bag
+    ):
+        topics: dict[str, Any] = {}
         for number, (topic, kind, message) in enumerate(messages):
-            if topic not in channels:
-                schema = writer.register_schema(kind, "ros2msg", b"")
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            data = bytes(store.serialize_cdr(message, kind))
-            writer.add_message(channels[topic], number, data, number)
-        writer.finish()
+            if topic not in topics:
+                topics[topic] = bag.add_connection(topic, kind, typestore=store)
+            bag.write(topics[topic], number, serialize(message, kind))
+    for file in place.glob("*.mcap"):
+        file.rename(path)
 
 
 @pytest.mark.parametrize("ending", ["bag", "mcap"])

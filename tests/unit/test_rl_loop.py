@@ -33,22 +33,17 @@ def make(machine: Machine, num_envs: int = 8, **changes: Any) -> ControlLoop:
     return runs.plant(machine, task).build(CPU, num_envs, 64, 5)
 
 
-def snapshot(loop: ControlLoop) -> dict[str, torch.Tensor]:
-    state = loop.state_dict()
-    return state["tensors"] | {f"world.{name}": value for name, value in state["world"].items()}
-
-
 def test_only_finished_environments_begin_anew(machine: Machine) -> None:
     loop = make(machine)
     for _ in range(3):
         loop.step(torch.zeros(8, 5))
     last = loop.max_episode_length - 1
     loop.episode_length_buf = torch.where(torch.arange(8) < 2, last, loop.episode_length_buf)
-    before = snapshot(loop)
+    before = runs.take_state(loop)
     _, _, done, extras = loop.step(torch.zeros(8, 5))
     assert done.tolist() == [True, True, *[False] * 6]
     assert extras["time_outs"].tolist() == done.tolist()
-    after = snapshot(loop)
+    after = runs.take_state(loop)
     assert (after["task.steps"][:2] == 0).all() and (after["task.steps"][2:] == 4).all()
     assert (after["episode.length"][:2] == 0).all() and (after["episode.length"][2:] == 4).all()
     is_new = (after["task.start.target_m"] != before["task.start.target_m"]).any(1)
@@ -72,10 +67,10 @@ def test_a_failure_is_no_time_out(machine: Machine) -> None:
 def test_asking_twice_gives_the_same_observation(machine: Machine) -> None:
     loop = make(machine)
     loop.step(torch.randn(8, 5))
-    state, random = snapshot(loop), torch.get_rng_state()
+    state, random = runs.take_state(loop), torch.get_rng_state()
     assert (loop.get_observations() == loop.get_observations()).all()
     assert torch.equal(random, torch.get_rng_state())
-    assert all(torch.equal(value, state[name]) for name, value in snapshot(loop).items())
+    assert all(torch.equal(value, state[name]) for name, value in runs.take_state(loop).items())
 
 
 def test_what_was_handed_out_does_not_change_later(machine: Machine) -> None:
