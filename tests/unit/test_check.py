@@ -182,13 +182,10 @@ BALL = '<geom size="0.1"/>'
         ('<sdf version="1.6"/>', "expected a URDF"),
         (edit('velocity="0.5"', 'velocity="${max}"'), "xacro arm.urdf|xacro model.urdf"),
         (edit('<link name="base"/>', '<link name="base"/><x:if xmlns:x="http://ros.org/wiki/xacro"/>'), "xacro"),
-        (edit('xyz="0 0 0.3"', 'xyz="0 0 a"'), "bad format in attribute 'xyz'"),
         (edit('<child link="beam"/>', '<child link="bean"/>'), "joint parent or child missing\nElement 'joint', line"),
         (edit('xyz="0 0 0.3"', 'xyz="0 0 nan"'), "is not finite"),
         (edit('<mass value="40"/>', '<mass value="-40"/>'), "link 'mast'.*mass of -40"),
         (edit(INERTIA, INERTIA.replace('"1"', '"-1"')), "link 'mast' has a principal inertia"),
-        (edit('type="prismatic"', 'type="linear"'), "invalid joint type"),
-        (edit('child link="tool0"', 'child link="lamp"'), "multiple parents"),
         (SCENE.format(f"<body><freejoint/>{BALL}</body>", ""), "neither a hinge"),
         (SCENE.format("", ""), "no joint that moves"),
         (
@@ -233,7 +230,6 @@ LOOP = '<equality><connect body1="slide_link" body2="a_link" anchor="0 0 0"/></e
     ("text", "choices", "joints", "told"),
     [
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {}, ARM, "left_finger, right_finger: not part"),
-        (SCENE.format(nest(*ARM, inside=nest("jaw")), ""), {"chain": ("c",)}, ARM, "jaw: not part"),
         (SCENE.format(nest(*ARM, inside=FINGERS), ""), {"chain": ("b",)}, ("a", "b"), "c, left_finger, right_finger: not part"),
         (SCENE.format(nest(*ARM), ""), {"chain": ("a_link", "c_link")}, ("b", "c"), "a: not part"),
         (SCENE.format(nest(*ARM), ""), {"chain": ("b", "c")}, ("b", "c"), "a: not part"),

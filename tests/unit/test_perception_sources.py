@@ -113,7 +113,6 @@ BREACHES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no depth": (lambda f: (f / "00000.depth.npy").unlink(), r"00000: no depth; expected 00000.depth.npy"),
     "truncated colour": (lambda f: cut(f / "00000.color.png", 0.6), r"00000.color.png: truncated, damaged or no picture"),
     "damaged colour": (lambda f: flip(f / "00000.color.png"), r"00000.color.png: truncated, damaged or no picture"),
-    "no picture": (lambda f: (f / "00000.color.png").write_text("hello"), r"00000.color.png: truncated, damaged or no picture"),
     "truncated depth": (lambda f: cut(f / "00000.depth.npy", 0.5), r"00000.depth.npy: truncated"),
     "16 bit colour": (lambda f: save(f / "00000.color.png", np.zeros((*SIZE, 3), np.uint16)), r"uint16, expected 8 bits"),
     "8 bit depth": (lambda f: save(f / "00000.depth.png", np.full(SIZE, 9, np.uint8)), r"00000.depth.png: uint8, expected 16 bits"),
