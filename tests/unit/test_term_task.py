@@ -178,14 +178,6 @@ def test_success_needs_its_share_of_the_steps_that_count(machine: Machine, asked
     assert early.process.episode["held_share"].item() == 0.0, "before after_s"
 
 
-def test_success_may_end_the_episode(machine: Machine, asked: float) -> None:
-    ends = {"success": SUCCESS, "time_limit": TIME}
-    stage = Stage(machine, termination=ends)
-    reasons = [int(stage.turn(asked).reason) for _ in range(6)]
-    assert stage.process.reasons == ("success", "fault", "time_limit")
-    assert reasons == [-1, -1, -1, -1, -1, 0], "four of the counted steps"
-
-
 def test_the_reward_is_the_weighted_sum(machine: Machine, asked: float) -> None:
     stage = Stage(machine)
     assert stage.turn(asked + 0.3).reward.item() == pytest.approx(2.0 * -0.3, abs=1e-4)
