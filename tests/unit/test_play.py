@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import training as runs
 from composed import option
 
 from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
-from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import ClassicalPolicy
 
 NUM = 2
@@ -22,15 +22,10 @@ PERIOD_S = 0.05
 def made() -> Callable[..., PlaySession]:
     """Makes sessions of two quiet machines, on which the classical controller drives."""
     task = option("task", "borehole_insertion")
-    config = SimulatedPlant(
-        machine=option("machine", "brokk170"),
-        sim=option("sim", "native"),
-        task=replace(task, noise=replace(task.noise, filter="mean")),
-        actuator=option("actuator", "ideal"),
-        effect={"library": option("effect", "library")},
-        event={},
-        follower=option("follower", "none"),
-    )
+    task = replace(task, noise=replace(task.noise, filter="mean"))
+    plant = runs.plant(option("machine", "brokk170"), task, option("sim", "native"))
+    library = {"library": option("effect", "library")}
+    config = replace(plant, actuator=option("actuator", "ideal"), effect=library)
 
     def make(neutral: bool = True) -> PlaySession:
         torch.manual_seed(0)

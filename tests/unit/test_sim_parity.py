@@ -1,6 +1,7 @@
 """A simulator that leaves out a part of an MJCF is seen by its motion, or refused by name."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
@@ -90,18 +91,13 @@ class Spoiled:
     def __init__(self, machine: Machine, fault: str) -> None:
         self._world, self._fault = NATIVE.build(machine, "cpu"), fault
         self.num_worlds, self.device = NUM_WORLDS, torch.device("cpu")
-        self.faults = self._world.faults
 
-    @property
-    def q(self) -> torch.Tensor:
-        return self._world.q
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
 
     @property
     def contact_force_n(self) -> torch.Tensor:
         return self._world.contact_force_n * (0.9 if self._fault == "force" else 1.0)
-
-    def reset(self, *state: torch.Tensor) -> None:
-        self._world.reset(*state)
 
     def step(self, increment: torch.Tensor) -> None:
         self._world.step(increment * (1.02 if self._fault == "motion" else 1.0))
