@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
+from composed import option
 
 from brokk_rl.commands import read_targets
 from brokk_rl.history import History
-from brokk_rl.machine import Dimension, Joint, Machine
+from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 
 ARM = """
@@ -39,36 +41,13 @@ NOISE_RAD = 2e-4
 
 def make_machine(*names: str) -> Machine:
     """Returns a machine of position servos at 50 Hz, known by its joints."""
-
-    def number(value: float) -> Dimension:
-        return Dimension(value=value, source="test", confidence="high")
-
-    joints = tuple(
-        Joint(
-            name=name,
-            part=None,
-            kind="hinge",
-            lower=number(-1.5),
-            upper=number(1.5),
-            home=0.0,
-            max_speed=number(3.0),
-            body=None,
-            command="position",
-        )
-        for name in names
-    )
-    return Machine(
-        name="two_links",
-        title="two links",
-        mjcf=None,
-        period_s=0.02,
-        dead_time_s=0.0,
-        num_history=26,
-        joints=joints,
-        tool_m=None,
-        exclusive=(),
-        levers=(),
-    )
+    servos = option("machine", "so101")
+    joint = servos.joints[0]
+    ends = {"lower": replace(joint.lower, value=-1.5), "upper": replace(joint.upper, value=1.5)}
+    joint = replace(joint, **ends, home=0.0, max_speed=replace(joint.max_speed, value=3.0))
+    joints = tuple(replace(joint, name=name) for name in names)
+    timing = {"period_s": 0.02, "dead_time_s": 0.0, "num_history": 26}
+    return replace(servos, name="two_links", title="two links", joints=joints, **timing)
 
 
 def draw_targets(generator: np.random.Generator, count: int, joints: int) -> np.ndarray:

@@ -25,23 +25,12 @@ def make_carriage() -> Machine:
 def make_map(
     command: str = "u", position: str = "q", time: str = "t", full_minus: float | None = -1.0
 ) -> ColumnMap:
-    return ColumnMap(
-        delimiter=",",
-        decimal=".",
-        time=Column(column=time, scale=1.0, offset=0.0),
-        joints={
-            "carriage": JointColumns(
-                command=CommandColumn(
-                    column=command, neutral=0.0, full_plus=1.0, full_minus=full_minus
-                ),
-                position=Column(column=position, scale=1.0, offset=0.0),
-            )
-        },
-        optional={},
-        overrun=0.0,
-        longest_gap_s=0.1,
-        shortest_s=0.5,
-    )
+    ends = {"neutral": 0.0, "full_plus": 1.0, "full_minus": full_minus}
+    place = Column(column=position, scale=1.0, offset=0.0)
+    joint = JointColumns(command=CommandColumn(column=command, **ends), position=place)
+    reader = replace(option("import", "mini_excavator"), joints={"carriage": joint}, overrun=0.0)
+    clock = Column(column=time, scale=1.0, offset=0.0)
+    return replace(reader, time=clock, longest_gap_s=0.1, shortest_s=0.5)
 
 
 def make_signals() -> dict[str, np.ndarray]:
