@@ -26,7 +26,7 @@ from deploy.bus.description import BusDescription
 from deploy.kernel.bus_process import BusProcessConfig
 from deploy.kernel.limits import GuardLimits
 from deploy.kernel.protection import MessageFault
-from deploy.page.loop_feed import PageProcessConfig
+from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.settings import LINK
 from deploy.runtime.operator_state import OperatorControls, RequestedCommand
 from deploy.runtime.process import ChildProcess
@@ -79,6 +79,14 @@ def build_twin(bus: CanBus, **changes: Any) -> Twin:
     """Returns the twin of a gateway that plays its remote and holds the dead-man, with `changes`."""
     usual = {"dbc": DBC, "remote": True, "deadman": True, "again_s": None, "fault_port": None}
     return Twin(wire=bus, seconds=None, realtime=False, **usual | changes)
+
+
+def build_feed(memory: LoopMemory, folder: Path, *camera: float) -> LoopFeed:
+    """Returns the page's feed of a loop of the default machine; `camera` as in its configuration."""
+    parts = (option("page", "local"), option("machine", "brokk170"), option("guidance", "machine"))
+    session = Session(out=str(folder), seed=1, device="cpu")
+    guard = option("guard", "default")
+    return LoopFeed(PageProcessConfig(*parts, session, guard, 600.0, *camera), memory)
 
 
 class Stop(NamedTuple):

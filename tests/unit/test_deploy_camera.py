@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from block import TARGETS, seen_at, take_frame
 from composed import option
+from desk import build_feed
 
 from brokk_rl.contracts.vision import CameraView, FrameDetections, HolePose
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.extensions import load_part
-from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.page.loop_feed import UNNAMED, LoopFeed, PageProcessConfig
+from deploy.page.loop_feed import UNNAMED, LoopFeed
 from deploy.page.protocol import OperatorRequest
 from deploy.page.scene import locate_borehole
 from deploy.recorder import capture_reader
@@ -37,10 +37,11 @@ from deploy.runtime.target import (
     GivenTarget,
     TargetPosition,
     TargetSelector,
+    locate_hole,
+    read_holes,
 )
 
 MACHINE = option("machine", "brokk170")
-OPTIONS = (option("page", "local"), MACHINE, option("guidance", "machine"))
 FRAME = take_frame((640, 360), 0, 12.0)
 PIXELS = 640 * 360
 
@@ -114,7 +115,7 @@ def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
     show(exchange, pose(2.21, 0.4), pose(2.62, 0.01))
     aim.refresh()
     assert aimed(exchange) == [2.62, 0.01, 0.75], "the same borehole, as the camera sees it"
-    aim.choose(eyes_place(exchange, 0))
+    aim.choose(locate_hole(read_holes(exchange.holes)[0]))
     show(exchange, pose(2.2, 0.4))
     aim.refresh()
     assert aimed(exchange) == [2.2, 0.4, 0.75]
@@ -124,12 +125,6 @@ def test_who_spoke_last_says_which_borehole_it_is_and_the_camera_keeps_it_fresh(
     path.write_text("[")
     with pytest.raises(ConfigError, match="center_in_base_m"):
         aim.refresh()
-
-
-def eyes_place(exchange: LoopMemory, row: int) -> Any:
-    from deploy.runtime.target import locate_hole, read_holes
-
-    return locate_hole(read_holes(exchange.holes)[row])
 
 
 def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(
@@ -156,9 +151,7 @@ def test_a_given_borehole_never_grows_old_and_a_seen_one_is_the_surest(
 
 @pytest.fixture
 def feed(exchange: LoopMemory, tmp_path: Path) -> LoopFeed:
-    session = Session(out=str(tmp_path), seed=1, device="cpu")
-    config = PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0, 1.0)
-    return LoopFeed(config, exchange)
+    return build_feed(exchange, tmp_path, 1.0)
 
 
 def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
+from desk import build_feed
 
 from brokk_rl.errors import LinkError
-from brokk_rl.session import Session
 from deploy.guidance import LeverPositions
 from deploy.kernel.guard import GuardState
-from deploy.page.loop_feed import LoopFeed, PageProcessConfig
+from deploy.page.loop_feed import LoopFeed
 from deploy.page.protocol import OperatorRequest
 from deploy.recorder.capture import CaptureConfig
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
@@ -28,7 +28,6 @@ from deploy.runtime.shm_layout import TEXT, LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
-OPTIONS = (option("page", "local"), MACHINE, option("guidance", "machine"))
 FULL_RAD = 0.35
 
 
@@ -41,8 +40,7 @@ def memory() -> Iterator[LoopMemory]:
 
 @pytest.fixture
 def feed(memory: LoopMemory, tmp_path: Path) -> LoopFeed:
-    session = Session(out=str(tmp_path), seed=1, device="cpu")
-    return LoopFeed(PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0), memory)
+    return build_feed(memory, tmp_path)
 
 
 def say(memory: LoopMemory, **changes: Any) -> None:
@@ -221,9 +219,7 @@ def test_a_start_that_was_asked_for_before_a_stop_does_not_undo_it(
 
 def test_a_loop_that_sends_nothing_has_nothing_to_confirm(tmp_path: Path) -> None:
     memory = LoopMemory(MACHINE.num_joints, commands=False)
-    session = Session(out=str(tmp_path), seed=1, device="cpu")
-    config = PageProcessConfig(*OPTIONS, session, option("guard", "default"), 600.0)
-    feed = LoopFeed(config, memory)
+    feed = build_feed(memory, tmp_path)
     assert feed.submit(OperatorRequest("stop", "")) and feed.confirms_stop()
     memory.close()
 
