@@ -101,12 +101,6 @@ def test_the_folder_of_a_killed_training_names_the_command_that_goes_on(tmp_path
         require_new_folder(tmp_path)
 
 
-def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(StorageError, match=r"session\.out"):
-        require_new_folder(tmp_path / "file" / "run")
-
-
 def test_a_file_is_written_whole_or_not_at_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
