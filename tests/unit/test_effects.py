@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,19 +26,14 @@ link_length base_tilt clock_offset extrinsics
 """.split()  # noqa: SIM905
 
 
-@cache
-def shipped(group: str, name: str) -> Any:
-    return option(group, name)
-
-
 def effect(name: str, **changes: Any) -> Any:
     """Returns an effect at its typical size with some fields changed."""
-    spec = shipped("effect", name)
+    spec = option("effect", name)
     return replace(spec, **{key: number.typical for key, number in spec.numbers.items()} | changes)
 
 
 def neutral(name: str) -> Any:
-    numbers = shipped("effect", name).numbers
+    numbers = option("effect", name).numbers
     return effect(
         name, **{key: number.none for key, number in numbers.items() if number.none is not None}
     )
@@ -53,7 +47,7 @@ def places(model: Any, q: torch.Tensor) -> torch.Tensor:
 
 def wrap(machine: Machine, *specs: Any, actuator: str = "ideal", num: int = 1) -> Any:
     """Returns an actuator model with effects around it, the first one nearest to it."""
-    model = shipped("actuator", actuator).build(machine, num, CPU)
+    model = option("actuator", actuator).build(machine, num, CPU)
     for spec in specs:
         model = spec.wrap(model, machine, num, CPU)
     return model
@@ -61,7 +55,7 @@ def wrap(machine: Machine, *specs: Any, actuator: str = "ideal", num: int = 1) -
 
 @pytest.mark.parametrize("name", FIXED)
 def test_an_effect_says_what_a_diagnosis_must_know(name: str, machine: Machine) -> None:
-    spec = shipped("effect", name)
+    spec = option("effect", name)
     assert isinstance(spec, EffectSpec)
     assert spec.name() == name
     assert any(number.none is not None for number in spec.numbers.values())
@@ -122,7 +116,7 @@ def test_only_the_named_joints_have_it(name: str, machine: Machine) -> None:
 def test_ranges_are_drawn_anew_at_each_reset_for_each_environment(
     name: str, machine: Machine
 ) -> None:
-    spec = shipped("effect", name)
+    spec = option("effect", name)
     ranges = {}
     for key, number in spec.numbers.items():
         if number.is_on(machine):
@@ -171,7 +165,7 @@ def test_what_makes_no_sense_is_refused(
 
 def test_all_effects_together_make_an_actuator_model(machine: Machine) -> None:
     names = [name for name in FIXED if name not in ("sensor_noise", "quantisation")]
-    specs = [shipped("effect", name) for name in names]
+    specs = [option("effect", name) for name in names]
     model = wrap(machine, *specs, actuator="lag", num=NUM_ENVS)
     check_actuator_model(model, machine, CPU)
     assert model.sides == {"command", "speed", "joints", "measurement", "kinematics"}
@@ -180,14 +174,14 @@ def test_all_effects_together_make_an_actuator_model(machine: Machine) -> None:
 @pytest.mark.parametrize("name", [*FIXED, "library"])
 def test_a_run_goes_on_exactly_from_its_state(name: str, machine: Machine) -> None:
     torch.manual_seed(0)
-    model = wrap(machine, shipped("effect", name), actuator="lag", num=2)
+    model = wrap(machine, option("effect", name), actuator="lag", num=2)
     u = draw_commands(machine, 30, 2)
     roll(model, machine, u)
     model.measure(u[0])
     kept = {key: value.clone() for key, value in model.state.items()}
     on, seen = roll(model, machine, u), model.measure(u[0])
     torch.manual_seed(1)
-    other = wrap(machine, shipped("effect", name), actuator="lag", num=2)
+    other = wrap(machine, option("effect", name), actuator="lag", num=2)
     for key, value in other.state.items():
         value.copy_(kept[key])
     assert torch.equal(roll(other, machine, u), on)
@@ -233,9 +227,9 @@ def test_actuators_and_effects_can_be_captured_in_a_cuda_graph(
     home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).expand(num, 5)
 
     def run(captured: bool) -> torch.Tensor:
-        model = shipped("actuator", actuator).build(machine, num, device)
+        model = option("actuator", actuator).build(machine, num, device)
         for name in those:
-            model = shipped("effect", name).wrap(model, machine, num, device)
+            model = option("effect", name).wrap(model, machine, num, device)
         assert isinstance(model, EffectChain)
         shape = (num, machine.num_history, machine.num_joints)
         history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))

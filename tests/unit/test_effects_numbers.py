@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import motion
@@ -47,13 +46,8 @@ class Glide(Probe):
         return history.q[:, -1] + 0.5 * (went + history.u[:, -1] * self._step)
 
 
-@cache
-def shipped(group: str, name: str) -> Any:
-    return option(group, name)
-
-
 def wrapped(name: str, machine: Machine, num: int = 1, inner: Any = None, **numbers: Any) -> Any:
-    return replace(shipped("effect", name), **numbers).wrap(
+    return replace(option("effect", name), **numbers).wrap(
         inner or Probe(machine), machine, num, CPU
     )
 
@@ -117,7 +111,7 @@ def test_the_joint_moves_by_so_much_of_full_speed(
 def build_late_model(machine: Machine) -> Any:
     """Returns a joint that follows its command after 0.55 s."""
     sharp = {"dead_band_extend": 0.0, "dead_band_retract": 0.0, "time_constant_s": 0.0}
-    return replace(shipped("actuator", "lag"), dead_time_s=0.55, **sharp).build(machine, 1, CPU)
+    return replace(option("actuator", "lag"), dead_time_s=0.55, **sharp).build(machine, 1, CPU)
 
 
 def test_dead_time_adds_to_that_of_the_model_beyond_the_history(machine: Machine) -> None:
@@ -261,7 +255,7 @@ def test_no_effect_goes_through_a_stop(machine: Machine) -> None:
         ("lag", {"time_constant_s": 1.0}),
         ("compliance", {"ringing_s": 0.5}),
     ):
-        inner = shipped("actuator", "ideal").build(machine, 1, CPU)
+        inner = option("actuator", "ideal").build(machine, 1, CPU)
         model = wrapped(name, machine, inner=inner, **numbers)
         path = roll(model, machine, [1.0] * 20 + [0.0] * 20, at=near)
         assert path[:, 0, 0].max() <= machine.upper[0] + 1e-6
@@ -297,8 +291,8 @@ def test_bias_and_scale_are_taken_back_by_truth(machine: Machine) -> None:
 
 
 def affected(actuator: str, **effects: Any) -> ActuatorWithEffects:
-    specs = {name: replace(shipped("effect", name), **numbers) for name, numbers in effects.items()}
-    return ActuatorWithEffects(actuator=shipped("actuator", actuator), effects=specs)
+    specs = {name: replace(option("effect", name), **numbers) for name, numbers in effects.items()}
+    return ActuatorWithEffects(actuator=option("actuator", actuator), effects=specs)
 
 
 def test_a_free_run_with_sensors_stays_in_measured_positions(machine: Machine) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +18,6 @@ from brokk_rl.session import Session
 from perception.render.drilled_block import Chip, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.ray_tracer import Light, Pinhole, Tracer
-from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import SceneSampler, compute_hidden_share, sample_rim
 from perception.render.solids import Box, Material, PlaneSolid, SolidPose, build_frame
 from perception.render.stereo_camera import (
@@ -60,16 +58,11 @@ def rig() -> StereoRig:
     return replace(option("rig", "zed_2i_1080p"), width=480, height=270, focal_px=264.0)
 
 
-@lru_cache
-def kind(name: str) -> SceneRanges:
-    return option("scene", name)
-
-
 def studio(
     name: str, rig: StereoRig, depth: Literal["matched", "exact", "none"] = "exact"
 ) -> FrameRenderer:
-    stereo: Any = load_part("stereo")
-    return FrameRenderer(rig=rig, scene=kind(name), stereo=stereo, depth=depth, pair=True)
+    parts: Any = {"scene": option("scene", name), "stereo": load_part("stereo")}
+    return FrameRenderer(rig=rig, **parts, depth=depth, pair=True)
 
 
 def test_a_wall_that_fills_the_picture_is_drawn_though_no_edge_crosses_it() -> None:
@@ -236,7 +229,8 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(
 def test_the_hidden_part_of_a_rim_is_what_the_arm_covers_in_the_picture(rig: StereoRig) -> None:
     chance = np.random.default_rng(7)
     large = replace(rig, width=640, height=360, focal_px=352.0)
-    near = replace(kind("hidden"), sight=replace(kind("hidden").sight, distance_m=(0.8, 0.8)))
+    hidden = option("scene", "hidden")
+    near = replace(hidden, sight=replace(hidden.sight, distance_m=(0.8, 0.8)))
     for _ in range(2):
         scene = SceneSampler(near, large, chance).compose()
         shot = studio("hidden", large).shot(scene, chance)
