@@ -147,6 +147,7 @@ def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: 
         ("def step(state, command): raise KeyError('arm')", "failed with KeyError: 'arm'"),
         ("calls = []\ndef step(state, command):\n    calls.append(1)\n    return state + len(calls)", "two answers to one state"),
         ("def step(state, command) return state", "cannot be imported.*SyntaxError.*mend it"),
+        ("import nothing_here\nstep = 1", "nothing_here.*mend it"),
         ("def move(state, command): return state", "has no function 'step'"),
         ("def step(state, command): return state\nstart = lambda q, v: q", "expected a state of 2 numbers or more"),
         ("def step(state, command): return state\nstart = lambda q: q", r"start\(position, speed\) failed"),
