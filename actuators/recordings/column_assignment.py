@@ -130,7 +130,7 @@ class ColumnTable:
         signal = self.signals.read(full_name)
         _, column = self._run.places.get(full_name, (signal.table, full_name))
         unit = self._run.tables[signal.table].units.get(column)
-        return ColumnEntry(read_column_name(signal.table, column, unit), signal)
+        return ColumnEntry(**vars(signal), name=read_column_name(signal.table, column, unit))
 
     def _unwrap(
         self, commands: Entries, positions: Entries, names: Sequence[str]

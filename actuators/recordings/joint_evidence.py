@@ -57,29 +57,17 @@ REST_SPEED = 0.02
 """Part of the top speed below which a joint counts as at rest."""
 
 
-@dataclass(frozen=True)
-class ColumnEntry:
-    """A column with its name read, and its signal.
+@dataclass(frozen=True, kw_only=True)
+class ColumnEntry(Signal):
+    """The signal of a column with its name read; the text is its full name.
 
     Attributes:
         name: Its name as words.
-        signal: Its numbers on their clock; the text is its full name.
-        wrap: Wraps that were taken out of them.
+        wrap: Wraps that were taken out of its numbers.
     """
 
     name: ColumnName
-    signal: Signal
     wrap: Wrap | None = None
-
-    @property
-    def text(self) -> str:
-        """Its full name."""
-        return self.signal.text
-
-    @property
-    def values(self) -> np.ndarray:
-        """Its numbers, `(T,)`."""
-        return self.signal.values
 
     @property
     def is_changing(self) -> bool:
@@ -95,8 +83,7 @@ class ColumnEntry:
         """Return it without its wraps."""
         if wrap is None:
             return self
-        values = unwrap(self.values, wrap.modulus)
-        return replace(self, signal=replace(self.signal, values=values), wrap=wrap)
+        return replace(self, values=unwrap(self.values, wrap.modulus), wrap=wrap)
 
 
 Entries = Sequence[ColumnEntry]
@@ -300,13 +287,13 @@ class JointGuess:
 
     def _check_steps(self, slope: float, rest: float) -> None:
         """Add the evidence of steps that no machine makes."""
-        q, t_s = self.q.values, self.q.signal.t_s
+        q, t_s = self.q.values, self.q.t_s
         if self.q.wrap is None and (wrap := find_wrap(q)) is not None:
             self.evidence.append((f"{wrap.explain()}, and is taken as it is", -6.0))
             return
         cause = np.zeros(len(q))
         if self.kind == "position":
-            cause = slope * self.u.signal.interpolate(t_s) + rest
+            cause = slope * self.u.interpolate(t_s) + rest
         spikes, jumps = find_spikes(q), find_jumps(t_s, q, cause)
         if len(spikes):
             is_mixed = len(spikes) > SPIKE_SHARE * len(q)
@@ -403,7 +390,7 @@ class Correlations:
 
     def __init__(self, run: LogRun, commands: Entries, positions: Entries) -> None:
         self.commands = commands
-        signals = [one.signal for one in (*commands, *positions)]
+        signals = [*commands, *positions]
         begin_s = max(float(one.t_s[0]) for one in signals)
         end_s = min(float(one.t_s[-1]) for one in signals)
         if end_s <= begin_s:

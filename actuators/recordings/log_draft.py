@@ -171,7 +171,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         for joint in sample.joints:
             best[joint.name] = max(best.get(joint.name, joint), joint, key=JointGuess.rank)
     joints = [*best.values()]
-    used = {one.u.signal.table for one in joints} | {one.q.signal.table for one in joints}
+    used = {one.u.table for one in joints} | {one.q.table for one in joints}
     times = {table: time for table, time in clocks.items() if table in used}
     survey = LogSurvey()
     for path in paths:
