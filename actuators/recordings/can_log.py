@@ -8,7 +8,7 @@ message are missing in the rows of the others.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from datetime import datetime
 from functools import partial
 from io import StringIO
@@ -45,7 +45,7 @@ class CanLog(MessageLog):
     def __init__(self, path: Path, dbc: str, channel: int | str | None = None) -> None:
         super().__init__(path)
         self._channel = None if channel is None else str(channel)
-        self._messages = {}
+        self._messages, self.units = {}, {}
         file = str(registry.resolve_package_path(dbc))
         try:
             database: Any = cantools.database.load_file(file, strict=False)
@@ -54,6 +54,8 @@ class CanLog(MessageLog):
         for message in database.messages:
             kind = EXTENDED if message.is_extended_frame else 0
             self._messages[message.frame_id | kind] = message
+            stated = {signal.name: signal.unit for signal in message.signals if signal.unit}
+            self.units[message.name] = stated
 
     def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the signals of the messages of the DBC; refuse a log that has none."""
@@ -65,10 +67,6 @@ class CanLog(MessageLog):
             listed = ", ".join(ids) or "none"
             self.refuse(f"no message of the DBC is in this log; its identifiers are {listed}")
         return tables
-
-    def _list_units(self, table: str) -> Mapping[str, str]:
-        (message,) = [one for one in self._messages.values() if one.name == table]
-        return {signal.name: signal.unit for signal in message.signals if signal.unit}
 
     def _open(self) -> Any:
         if self.path.suffix.lower() in (".log", ".txt"):

@@ -60,14 +60,12 @@ class MessageLog(LogFile):
 
     clock = "log_time"
     """Column of the time since the first message, s."""
+    units: Mapping[str, Mapping[str, str]] = {}
+    """Units that the log states, by table and column."""
 
     @abstractmethod
     def _iterate(self) -> Iterator[LoggedMessage]:
         """Yield the messages in the order of the log."""
-
-    def _list_units(self, table: str) -> Mapping[str, str]:
-        """Return the units that the log states for the columns of a table."""
-        return {}
 
     def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the numbers of each topic."""
@@ -85,7 +83,7 @@ class MessageLog(LogFile):
             # several programs may send to one topic
             order = np.argsort(known[self.clock], kind="stable")
             several = {name: np.array(values)[order] for name, values in known.items()}
-            tables[table] = Table(several, self._list_units(table), self.clock, is_sparse=True)
+            tables[table] = Table(several, self.units.get(table, {}), self.clock, is_sparse=True)
         return tables
 
     def _read_messages(self, most: int | None) -> Iterator[tuple[str, Numbers]]:
