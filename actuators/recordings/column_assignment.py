@@ -56,7 +56,8 @@ class ColumnTable:
         self._given = given
         self.times = times = guess_times(run, given)
         self._run = run = replace(run, tables={name: run.tables[name] for name in times})
-        self.signals = RunSignals(run, lambda name: times[name].choice, True, 1.0, quiet=True)
+        clocks = {name: time.choice for name, time in times.items()}
+        self.signals = RunSignals(run, clocks, True, 1.0, quiet=True)
         self.remarks: list[str] = []
         self.joints = self._find() if given.joints is None else self._take(given.joints)
         u, q = [one.u for one in self.joints], [one.q for one in self.joints]

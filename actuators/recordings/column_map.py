@@ -17,21 +17,20 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn, put_near
+from actuators.recordings.clocks import AlignedTime, Column, RowTime, put_near
 from actuators.recordings.guess import Damaged
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import TICK_TOLERANCE, RunSignals, Signal, locate
 from brokk_rl import record
-from brokk_rl.errors import ConfigError, RecordingError, list_choices
+from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.spec import NonNegative, NonZero, Positive, spec
+from brokk_rl.spec import NonNegative, Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +74,7 @@ class CommandColumn:
 
 
 @spec
-class TargetColumn:
+class TargetColumn(Column):
     """A column of target positions, for a servo that follows targets.
 
     On a machine whose joints are commanded by position the target is the command; -1 and 1 are the
@@ -91,17 +90,8 @@ class TargetColumn:
         wraps: As of a `Column`.
     """
 
-    column: str
-    scale: NonZero
     full_speed: Positive | None
     offset: float = 0.0  # maps from before this field have none
-    wraps: float | None = None
-
-    def command(self, values: np.ndarray, t_s: np.ndarray) -> np.ndarray:
-        """Return the speed in force from each sample to the next, 0 at the last; same shape."""
-        assert self.full_speed is not None, "checked against the machine"
-        speed = np.diff(self.scale * values) / np.diff(t_s)
-        return np.append(speed, 0.0) / self.full_speed
 
 
 @spec
@@ -175,10 +165,11 @@ class ColumnMap:
                 )
         signs = (self.delimiter, self.decimal)
         opened = open_log(path, signs, self.dbc, self.damaged, self.channel)
-        find_time = partial(self.find_time, where=path)
         found = []
         for run in opened.read_runs(None):
-            signals = RunSignals(run, find_time, opened.keep_whole, self.longest_gap_s)
+            time = self.time
+            times = time if isinstance(time, dict) else dict.fromkeys(run.tables, time)
+            signals = RunSignals(run, times, opened.keep_whole, self.longest_gap_s)
             found += self._read_run(signals, machine)
         if not found:
             raise RecordingError(
@@ -187,25 +178,11 @@ class ColumnMap:
             )
         return found
 
-    def find_time(self, table: str, where: object) -> TimeColumn:
-        """Return the time of a table.
-
-        Raises:
-            RecordingError: The map has none.
-        """
-        if not isinstance(self.time, dict):
-            return self.time
-        if table not in self.time:
-            raise RecordingError(
-                f"{where}: the map has no time for table '{table}'; {list_choices(table, self.time)}"
-            )
-        return self.time[table]
-
     def _read_run(self, signals: RunSignals, machine: Machine) -> list[Recording]:
         """Return the pieces of a run, resampled to the rate of the machine."""
         commands, positions, optional = [], [], {}
         for j, name in enumerate(machine.joint_names):
-            middle = (machine.upper[j] + machine.lower[j]) / 2.0
+            middle = float(machine.upper[j] + machine.lower[j]) / 2.0
             positions.append(read_column(signals, self.joints[name].position, middle))
             commands.append(self._read_command(signals, positions[j], machine, j))
         for name, column in self.optional.items():
@@ -248,19 +225,16 @@ class ColumnMap:
             signal = signals.read(column.column)
             u = column.command(signal.values)
         else:
-            signal = signals.read(column.column, wraps=column.wraps)
-            if column.wraps:
-                following = (position.interpolate(signal.t_s) - column.offset) / column.scale
-                values = put_near(signal.values, float(np.median(following)), column.wraps)
-                signal = replace(signal, values=values)
+            signal = read_column(signals, column, position)
             if column.full_speed is None:
                 low, high = machine.lower[j], machine.upper[j]
-                target = column.scale * signal.values + column.offset
+                target = signal.values
                 u = (target - (high + low) / 2.0) / ((high - low) / 2.0)
-            else:
-                u = column.command(signal.values, signal.t_s)
+            else:  # the speed in force from each sample to the next
+                speed = np.diff(signal.values) / np.diff(signal.t_s)
                 # a gap between pieces is no motion of the target
-                u[:-1][np.diff(signal.t_s) > self.longest_gap_s] = 0.0
+                speed[np.diff(signal.t_s) > self.longest_gap_s] = 0.0
+                u = np.append(speed, 0.0) / column.full_speed
         is_beyond = ~(np.abs(u) <= 1.0 + self.overrun)
         if not is_beyond.any():
             return replace(signal, values=np.clip(u, -1.0, 1.0))
@@ -280,18 +254,20 @@ class ColumnMap:
 
 
 def read_column(
-    signals: RunSignals, column: Column, middle: float | None, empty: bool = False
+    signals: RunSignals, column: Column, near: Signal | float | None, empty: bool = False
 ) -> Signal:
     """Return a column in the unit of the recording.
 
     Args:
         signals: Signals of the run.
         column: The column.
-        middle: Middle of the travel, next to which an unwrapped angle is put; `None` for no joint.
+        near: Middle of the travel, or position that it follows, next to which an unwrapped angle is put; `None` for
+            no joint.
         empty: Accept missing numbers.
     """
     signal = signals.read(column.column, empty, column.wraps)
     values = signal.values
-    if column.wraps is not None and middle is not None:
-        values = put_near(values, (middle - column.offset) / column.scale, column.wraps)
+    if column.wraps is not None and near is not None:
+        place = np.median(near.interpolate(signal.t_s)) if isinstance(near, Signal) else near
+        values = put_near(values, (float(place) - column.offset) / column.scale, column.wraps)
     return replace(signal, values=column.scale * values + column.offset)

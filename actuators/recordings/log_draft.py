@@ -311,8 +311,9 @@ class LogSurvey:
         Raises:
             RecordingError: It is damaged, or lacks a column that the first one has.
         """
+        clocks = {table: time.choice for table, time in times.items()}
         for run in opened.read_runs(None):
-            signals = RunSignals(run, lambda table: times[table].choice, opened.keep_whole, 1.0)
+            signals = RunSignals(run, clocks, opened.keep_whole, 1.0)
             read = []
             for joint in joints:
                 position = signals.read(joint.q.text, wraps=joint.q.modulus)

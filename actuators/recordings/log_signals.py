@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
@@ -69,21 +69,24 @@ class RunSignals:
 
     Attributes:
         run: The run.
-        find_time: Returns the clock of a table by its name.
+        times: Clocks of its tables.
         skip: Leave rows out that lack a number or whose time does not increase.
         gap_s: Time at which a log is split; parts between which a clock was set back lie further apart.
         quiet: Leave out without a warning.
     """
 
     run: LogRun
-    find_time: Callable[[str], TimeColumn]
+    times: Mapping[str, TimeColumn]
     skip: bool
     gap_s: float
     quiet: bool = False
 
     def _read_times(self, name: str, table: Table) -> np.ndarray:
         """Return the times of a table, `(T,)` s; NaN for rows that are left out."""
-        time = self.find_time(name)
+        if name not in self.times:
+            choices = list_choices(name, self.times)
+            self.run.refuse(f"the map has no time for table '{name}'; {choices}")
+        time = self.times[name]
         num_rows = len(next(iter(table.columns.values())))
         if num_rows < 2:
             self.run.refuse(f"table '{name}' has {num_rows} rows; a log has at least 2")
