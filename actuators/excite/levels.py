@@ -28,8 +28,6 @@ class Levels(PoseProgram):
             travel, is driven the other way.
     """
 
-    share: Positive
-    pose_s: float
     turn_s: Positive
     exclusive_share: float
     shortest_s: Positive
@@ -37,7 +35,6 @@ class Levels(PoseProgram):
     zero_share: Share
     small_share: Share
     small_level: float
-    stop_margin: float
 
     def check(self) -> None:
         if self.zero_share + self.small_share > 1.0:

@@ -15,10 +15,16 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import Positive, spec
 
 
+@spec
 class Motif:
-    """Base of the motifs: each program once per pose, in random order, while time is left."""
+    """Base of the motifs: each program once per pose, in random order, while time is left.
 
-    share: float
+    Attributes:
+        share: Part of the time, relative to the others of the plan.
+        stop_margin: As in `levels`.
+    """
+
+    share: Positive
     stop_margin: float
 
     def programs(self, machine: Machine, generator: Generator) -> list[Program]:
@@ -69,11 +75,9 @@ class Ramps(Motif):
         stop_margin: As in `levels`.
     """
 
-    share: Positive
     slopes_per_s: Annotated[tuple[Positive, ...], MinLen(1)]
     highest: float
     reach: float
-    stop_margin: float
 
     def programs(self, machine: Machine, generator: Generator) -> list[Program]:
         """Return a ramp to one side, to the other and back, per joint and slope.
@@ -103,9 +107,7 @@ class Holds(Motif):
         stop_margin: As in `levels`.
     """
 
-    share: Positive
     hold_s: float
-    stop_margin: float
 
     def programs(self, machine: Machine, generator: Generator) -> list[Program]:
         """Return one hold: the way to each pose does the rest."""
@@ -126,12 +128,10 @@ class Reversals(Motif):
         stop_margin: As in `levels`.
     """
 
-    share: Positive
     levels: tuple[float, ...]
     holds_s: tuple[float, ...]
     num_cycles: int
     pause_s: float
-    stop_margin: float
 
     def programs(self, machine: Machine, generator: Generator) -> list[Program]:
         """Return all reversals of a joint in one program."""

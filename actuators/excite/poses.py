@@ -12,6 +12,7 @@ from numpy.random import Generator
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.kinematics import Gravity
 from brokk_rl.machine import Machine
+from brokk_rl.spec import Positive, spec
 
 Program = tuple[str, np.ndarray]
 """Name and commands, `(T, J)`."""
@@ -55,15 +56,18 @@ def move_joint(name: str, machine: Machine, joint: int, commands: np.ndarray) ->
     return f"{name}_{machine.joint_names[joint]}", u
 
 
+@spec
 class PoseProgram:
     """Base of excitations that fill the time from poses of opposite load.
 
     Attributes:
+        share: Part of the time, relative to the others of the plan.
         pose_s: Time after which another start pose is taken, about.
         stop_margin: Distance kept from the stops, as a part of each joint's travel.
     """
 
-    pose_s: float
+    share: Positive
+    pose_s: Positive
     stop_margin: float
 
     def program(self, machine: Machine, steps: int, generator: Generator) -> np.ndarray:

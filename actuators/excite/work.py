@@ -31,8 +31,6 @@ class Work(PoseProgram):
         stop_margin: As in `levels`.
     """
 
-    share: Positive
-    pose_s: Positive
     joints_at_once: Count
     stroke_s: PositiveRange
     level: CommandRange
@@ -41,7 +39,6 @@ class Work(PoseProgram):
     correction_s: PositiveRange
     correction_level: CommandRange
     pause_s: PositiveRange
-    stop_margin: float
 
     def program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands of so many control periods, `(T, J)`."""
