@@ -62,8 +62,6 @@ class TableLog(LogFile):
             dates = frame.select_dtypes(["datetime", "datetimetz"]).columns
             index = {name: "timestamp" for name in dates if name.startswith(INDEX)}
             columns = convert_frame(frame.rename(columns=index), ".", self._labels)
-        except FileNotFoundError as error:
-            self.refuse("no such log", error)
         except TABLE_ERRORS as error:
             self.refuse(f"cannot be read as {kind} ({error})", error)
         return {"": Table(columns)}
@@ -112,30 +110,27 @@ class LeRobotLog(LogFile):
 class ArrayLog(LogFile):
     """Named arrays as a log: those of one length are a table, each structure with a time another one."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        is_matlab = path.suffix.lower() == ".mat"
-        tables = self._read_matlab() if is_matlab else self._read_npz()
-        self._tables: dict[str, dict[str, np.ndarray]] = {}
-        for table, arrays in tables.items():
+    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
+        """Return the real vectors of the most frequent length, and columns of such matrices."""
+        is_matlab = self.path.suffix.lower() == ".mat"
+        found = self._read_matlab() if is_matlab else self._read_npz()
+        tables = {}
+        for table, arrays in found.items():
             sizes = Counter(size for values in arrays.values() for size in {*values.shape})
             length = max(sizes, key=lambda size: (sizes[size], size), default=0)
             columns: dict[str, np.ndarray] = {}
             for name, values in arrays.items():
                 is_turned = len(values) != length and values.shape[-1] == length
                 plain = values.T if is_turned else values
-                if len(plain) == length and plain.ndim == 1:
-                    columns[name] = plain.astype(float)
-                elif len(plain) == length and plain.shape[1] <= MOST_COLUMNS:
-                    for item, column in enumerate(plain.T.astype(float)):
+                if len(plain) != length or (plain.ndim > 1 and plain.shape[1] > MOST_COLUMNS):
+                    continue
+                rows = plain[:max_rows].astype(float)
+                if rows.ndim == 1:
+                    columns[name] = rows
+                else:
+                    for item, column in enumerate(rows.T):
                         columns[f"{name}[{item}]"] = column
-            self._tables[table] = columns
-
-    def read_tables(self, max_rows: int | None) -> dict[str, Table]:
-        """Return the real vectors of the most frequent length, and columns of such matrices."""
-        tables = {}
-        for table, columns in self._tables.items():
-            tables[table] = Table({name: values[:max_rows] for name, values in columns.items()})
+            tables[table] = Table(columns)
         return tables
 
     def _read_npz(self) -> dict[str, dict[str, np.ndarray]]:
