@@ -161,10 +161,7 @@ def make_draft(paths: Sequence[Path], name: str, given: GivenColumns) -> Draft:
         opened = open_log(path, None, given.dbc, given.damaged, given.channel)
         if isinstance(opened, TextLog):
             signs = opened.signs
-        run = next(opened.read_runs(SAMPLED_ROWS), None)
-        if run is None:
-            raise RecordingError(f"{path}: no row")
-        sample = ColumnTable(run, given)
+        sample = ColumnTable(next(opened.read_runs(SAMPLED_ROWS)), given)
         for table, time in sample.times.items():
             clocks.setdefault(table, time)
         remarks |= dict.fromkeys(sample.remarks)
