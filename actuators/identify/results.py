@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -322,10 +323,7 @@ class FittedModel:
 
 def list_recordings(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
     """Return the recordings of all runs."""
-    found = []
-    for recordings in part.values():
-        found.extend(recordings)
-    return found
+    return list(chain.from_iterable(part.values()))
 
 
 def _restore(path: Path, key: str) -> FittedModel:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from actuators.recordings.signal_checks import LONGEST_LAG_S, find_jumps, find_spikes, find_wrap
 from actuators.recordings.split import COMMANDED
@@ -139,7 +140,7 @@ class _RecordingScan:
         self._is_moving = np.abs(self._v) > STILL * machine.max_speed
         self._lead = round((machine.dead_time_s + SETTLE_S) / self._period_s)
         least = HELD_TARGET if machine.interface == "position" else COMMANDED
-        self._idle = np.stack([find_held(np.abs(u) < least, self._lead) for u in self._u.T], 1)
+        self._idle = find_held(np.abs(self._u) < least, self._lead)
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
         self._step = np.array([estimate_step(q) for q in self._q.T])
         grain = np.fmax(np.nan_to_num(self._step), np.nan_to_num(self._noise))
@@ -354,11 +355,10 @@ class _RecordingScan:
 
 
 def find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
-    """Return where `condition`, `(T,)`, has held for more than `num_rows` rows on end."""
-    held = np.zeros(len(condition), dtype=bool)
-    for row, count in find_stretches(condition):
-        held[row + num_rows : row + count] = True
-    return held
+    """Return where `condition`, `(T, …)`, has held for more than `num_rows` rows on end."""
+    # the filter lies on the rows before
+    size, origin = num_rows + 1, num_rows // 2
+    return minimum_filter1d(condition, size, axis=0, mode="constant", origin=origin)
 
 
 def estimate_step(q: np.ndarray) -> float:
