@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from actuators.recordings.guess import Evidence, GivenColumns, Guess, advise
-from actuators.recordings.log_tables import LogRun, Table
+from actuators.recordings.log_tables import LogRun, Table, parse_expression
 from actuators.recordings.name_evidence import TIME_UNITS, WORDS, read_words, split_unit
 from actuators.recordings.signal_checks import find_wrap
 from brokk_rl.errors import list_choices
@@ -48,9 +48,16 @@ class Column:
     offset: float
     wraps: float | None = None  # maps from before this field have none
 
+    def compute(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return its numbers, `(T,)` in the unit of the recording, from columns of one clock."""
+        values = columns.get(self.column)
+        if values is None:
+            values = parse_expression(self.column).evaluate(columns)
+        return self.scale * unwrap(np.asarray(values, dtype=float), self.wraps) + self.offset
+
 
 @spec
-class AlignedTime:
+class AlignedTime(Column):
     """A clock that is tied to another one of the same table by a straight line.
 
     Samples carry the time of the sensor's own clock, whose zero and drift are unknown, and that of
@@ -60,12 +67,12 @@ class AlignedTime:
     Attributes:
         column: Time of the sensor's clock.
         scale: Seconds for one of it.
+        offset: As of a `Column`; the line takes it out again.
         anchor: Time of the recorder's clock, to s.
     """
 
-    column: str
-    scale: float
     anchor: Column
+    offset: float = 0.0
 
     def align(self, stamp_s: np.ndarray, anchor_s: np.ndarray) -> np.ndarray:
         """Return times of the recorder's clock without the scatter of the transport, `(T,)` s."""

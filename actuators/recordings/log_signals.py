@@ -92,11 +92,7 @@ class RunSignals:
             self.run.refuse(f"table '{name}' has {num_rows} rows; a log has at least 2")
         if isinstance(time, clocks.RowTime):
             return np.arange(num_rows) / time.rate_hz
-        t_s = _compute_column(table.columns, time.column)
-        if isinstance(time, clocks.Column):
-            t_s = time.scale * unwrap(t_s, time.wraps) + time.offset
-        else:
-            t_s = time.scale * t_s
+        t_s = time.compute(table.columns)
         known = np.isfinite(t_s)
         if not known.all() and not self.skip:
             self._refuse_cell(table, known, time.column, time.column)
@@ -117,8 +113,7 @@ class RunSignals:
             t_s = np.where(later, t_s, np.nan)
         if isinstance(time, clocks.AlignedTime):
             kept = np.isfinite(t_s)
-            anchor = _compute_column(table.columns, time.anchor.column)
-            anchor_s = time.anchor.scale * anchor + time.anchor.offset
+            anchor_s = time.anchor.compute(table.columns)
             t_s[kept] = time.align(t_s[kept], anchor_s[kept])
         return t_s
 
@@ -201,12 +196,6 @@ class RunSignals:
         cell = table.show_cell(row, column) if column in table.columns else "the value"
         place = f"{table.locate(row)}, column '{name}'"
         self.run.refuse(f"{place}: {cell} is not a number; {advise('damaged')}")
-
-
-def _compute_column(columns: Mapping[str, np.ndarray], text: str) -> np.ndarray:
-    if text in columns:
-        return np.asarray(columns[text], dtype=float)
-    return parse_expression(text).evaluate(columns)
 
 
 def locate(run: LogRun, signal: Signal, row: int, column: str) -> str:
