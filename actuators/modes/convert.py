@@ -7,7 +7,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
-from actuators.recordings.log_files import find_logs, name_log
+from actuators.recordings.log_files import find_logs
+from actuators.recordings.log_tables import name_log
 from actuators.recordings.recording_checks import examine_recordings, tabulate_remarks
 from brokk_rl import record
 from brokk_rl.console_table import print_table, print_text

@@ -21,7 +21,7 @@ import pyarrow.dataset as ds
 from scipy import io as matlab
 
 from actuators.recordings.cells import Labels, convert_frame
-from actuators.recordings.log_tables import LogFile, LogRun, Table
+from actuators.recordings.log_tables import LogFile, LogRun, Table, name_log
 from brokk_rl.errors import RecordingError
 
 EPISODE = "episode_index"
@@ -103,7 +103,7 @@ class LeRobotLog(LogFile):
             for begin, end in pairwise(edges):
                 number = int(numbers[begin])
                 part = {name: values[begin:end] for name, values in columns.items()}
-                name = f"{self.path.resolve().name}_{number:06d}"
+                name = f"{name_log(self.path)}_{number:06d}"
                 yield LogRun(name, f"{file.path}, episode {number}", {"": Table(part)})
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from actuators.recordings.array_log import FORMATS
 from actuators.recordings.guess import FOREIGN, Damaged, advise
-from actuators.recordings.log_tables import LogFile
+from actuators.recordings.log_tables import LogFile, name_log
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError
 
@@ -136,11 +136,6 @@ def find_logs(patterns: str | Sequence[str]) -> list[Path]:
         if (other := by_name.setdefault(name_log(path), path)) is not path:
             raise RecordingError(f"{other} and {path} would become the same recording; rename one")
     return found
-
-
-def name_log(path: Path) -> str:
-    """Return the first part of the names of a log's recordings."""
-    return path.resolve().name if path.is_dir() else path.stem
 
 
 def _expand_log(path: Path) -> list[Path]:

@@ -100,6 +100,11 @@ def warn_once(text: str) -> None:
     log.warning("%s", text)
 
 
+def name_log(path: Path) -> str:
+    """Return the first part of the names of a log's recordings."""
+    return path.resolve().name if path.is_dir() else path.stem
+
+
 class LogFile:
     """A log, which is read whole."""
 
@@ -133,8 +138,7 @@ class LogFile:
         Raises:
             RecordingError: The log is damaged; names the place.
         """
-        name = self.path.resolve().name if self.path.is_dir() else self.path.stem
-        yield LogRun(name, str(self.path), self.read_tables(max_rows))
+        yield LogRun(name_log(self.path), str(self.path), self.read_tables(max_rows))
 
     def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the tables of a log that is one run; see `read_runs`."""
