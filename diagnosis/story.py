@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import subprocess
@@ -22,6 +23,8 @@ HANDED_ON_FOLDER = "given"
 FOLDER_PLACEHOLDER = "{folder}"
 DEVICE = "device"
 """Key of `session` that every stage takes although it is no group."""
+EVALUATION = "evaluation"
+"""A node that is no group: a stage takes its values one by one."""
 
 
 @spec
@@ -31,7 +34,7 @@ class StoryStage:
     Attributes:
         title: Its purpose in words.
         command: Arguments of `brokk`; `{folder}` stands for the run folder of the story.
-        takes: Groups and `device` that it takes from the story.
+        takes: Groups, `evaluation` and `device` that it takes from the story.
         links: Links made before it, both ends below the run folder: path and target.
         needs: A file below the run folder without whose content the story ends before this stage;
             `null`: nothing.
@@ -96,11 +99,17 @@ def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) ->
         path.unlink(missing_ok=True)
         path.symlink_to(folder / target)
     words = [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
-    for group in stage.takes:
-        if group != DEVICE:
-            words.append(f"{group}=@{folder / HANDED_ON_FOLDER / group}.yaml")
-    words += [f"session.device={session.device}"] if DEVICE in stage.takes else []
-    words += [f"session.out={folder / name}"]
+    for taken in stage.takes:
+        given = folder / HANDED_ON_FOLDER / f"{taken}.yaml"
+        if taken == DEVICE:
+            words.append(f"session.device={session.device}")
+        elif taken == EVALUATION:
+            values = yaml.safe_load(given.read_text())
+            del values["_target_"]
+            words += [f"{taken}.{key}={json.dumps(one)}" for key, one in values.items()]
+        else:
+            words.append(f"{taken}=@{given}")
+    words.append(f"session.out={folder / name}")
     # The command sets this for Hydra; a stage that inherited it would print a traceback of user errors.
     env = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
     with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words], env=env) as process:

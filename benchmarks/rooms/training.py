@@ -18,7 +18,8 @@ POLICY_CODE = (
     "actuators/effects", "actuators/weights", "conf/task", "conf/machine", "conf/actuator", "conf/effect",
 )  # fmt: skip
 SHIPPED_CODE = (*POLICY_CODE, "tasks/policies/borehole_insertion")
-TRAINING_CODE = (*POLICY_CODE, "brokk_rl/rl", "conf/rl", "conf/preset", "conf/experiment")
+STORY_CODE = (*POLICY_CODE, "brokk_rl/rl", "conf/rl", "conf/preset", "conf/experiment")
+TRAINING_CODE = (*STORY_CODE, ":(exclude)conf/experiment/gap_loop.yaml")  # no training of its own
 
 
 def evaluate_each(
@@ -177,12 +178,10 @@ MEASUREMENTS = (
         name="gap_loop",
         title="Diagnose, retrain, close the gap",
         conditions="Boom and stick of the simulated machine extend at half their speed. The diagnosis does not know it, and named `asymmetry` on both and nothing else. "
-        "`before` is the old policy, `after` the retrained one; 50 s a training, 512 episodes.",
-        commands=(
-            "brokk experiment=gap_loop preset=gpu rl.budget.max_seconds=50 evaluation.episodes=512 session.out={out}/story",
-        ),
-        code=(*TRAINING_CODE, "diagnosis"),
+        "`before` learned without what was found, `trained` with it; one seed, 290 s from nothing each, beside other work, 256 episodes. Baseline: the classical controller.",
+        commands=("brokk experiment=gap_loop session.out={out}/story",),
+        code=(*STORY_CODE, "diagnosis"),
         read=read_story,
-        where="one GPU of 80 GB, 10 min",
+        where="two cores, 20 min",
     ),
 )

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from conftest import Done
 
+from brokk_rl import extensions
 from diagnosis import story
 
 
@@ -57,7 +58,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Played:
 def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
     played: Played, brokk: Callable[..., Done], tmp_path: Path
 ) -> None:
-    changes = ("session.device=cpu", "rl.budget.max_seconds=7", "sim.native.num_worlds=3")
+    changes = ("session.device=cpu", "rl.budget.max_seconds=7", "sim.num_worlds=3")
     done = brokk("experiment=gap_loop", "session.out=story", *changes)
     assert done.code == 0, done.err
     folder = tmp_path / "story"
@@ -68,10 +69,22 @@ def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
     assert f"rl=@{folder}/given/rl.yaml" in training
     assert "session.device=cpu" in training
     assert yaml.safe_load((folder / "given/rl.yaml").read_text())["budget"]["max_seconds"] == 7
-    assert yaml.safe_load((folder / "given/sim.yaml").read_text())["native"]["num_worlds"] == 3
+    assert yaml.safe_load((folder / "given/sim.yaml").read_text())["num_worlds"] == 3
     told = {name for name, words in played.commands.items() if "withheld" in " ".join(words)}
     assert told == {"changed", "field", "on_machine"}
     assert (folder / "case/field").readlink() == folder / "field/recordings"
+
+
+@pytest.mark.parametrize("stage", ["policy", "on_machine"])
+def test_a_stage_composes_with_what_it_takes(
+    played: Played, brokk: Callable[..., Done], stage: str
+) -> None:
+    done = brokk("experiment=gap_loop", "session.out=story", "evaluation.episodes=5")
+    assert done.code == 0, done.err
+    # Actuators and policies that earlier stages leave are not there.
+    left = ("actuator=@", "policy=", "+policy@")
+    words = [word for word in played.commands[stage] if not word.startswith(left)]
+    assert extensions.load_mode(*words).evaluation.episodes == 5
 
 
 def test_a_failed_stage_ends_the_story(played: Played, brokk: Callable[..., Done]) -> None:
