@@ -21,8 +21,6 @@ log = logging.getLogger(__name__)
 HANDED_ON_FOLDER = "given"
 """Folder with the files that stages take from the story."""
 FOLDER_PLACEHOLDER = "{folder}"
-DEVICE = "device"
-"""Key of `session` that every stage takes although it is no group."""
 EVALUATION = "evaluation"
 """A node that is no group: a stage takes its values one by one."""
 
@@ -34,7 +32,7 @@ class StoryStage:
     Attributes:
         title: Its purpose in words.
         command: Arguments of `brokk`; `{folder}` stands for the run folder of the story.
-        takes: Groups, `evaluation` and `device` that it takes from the story.
+        takes: Groups and `evaluation` that it takes from the story.
         links: Links made before it, both ends below the run folder: path and target.
         needs: A file below the run folder without whose content the story ends before this stage;
             `null`: nothing.
@@ -51,9 +49,9 @@ def check_stages(stages: Mapping[str, StoryStage], groups: Sequence[str]) -> Non
     """Refuse stages that take another group than the story has, one of `groups`."""
     for stage in stages.values():
         for name in stage.takes:
-            if name not in (*groups, DEVICE):
+            if name not in groups:
                 raise ConfigError(
-                    f"a stage takes '{name}', which the story does not have; {list_choices(name, (*groups, DEVICE))}"
+                    f"a stage takes '{name}', which the story does not have; {list_choices(name, groups)}"
                 )
 
 
@@ -77,7 +75,7 @@ def write_groups(
 
 
 def run_story(session: Session, stages: Mapping[str, StoryStage]) -> None:
-    """Run the stages one after another, in folder and on device of the session.
+    """Run the stages one after another, in the folder of the session.
 
     Raises:
         BrokkError: a stage failed.
@@ -101,9 +99,7 @@ def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) ->
     words = [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
     for taken in stage.takes:
         given = folder / HANDED_ON_FOLDER / f"{taken}.yaml"
-        if taken == DEVICE:
-            words.append(f"session.device={session.device}")
-        elif taken == EVALUATION:
+        if taken == EVALUATION:
             values = yaml.safe_load(given.read_text())
             del values["_target_"]
             words += [f"{taken}.{key}={json.dumps(one)}" for key, one in values.items()]
