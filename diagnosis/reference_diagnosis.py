@@ -296,9 +296,8 @@ def list_alike(
         how = "an outside measurement of the angle (inclinometer, laser) at two positions"
         return ("encoder_scale",), how
     if name == "dead_time" and len(joints) == case.machine.num_joints and "clock_offset" in known:
-        return (
-            "clock_offset",
-        ), "one clock for commands and positions, or a pulse that both record"
+        how = "one clock for commands and positions, or a pulse that both record"
+        return ("clock_offset",), how
     return (), None
 
 

@@ -40,8 +40,6 @@ With 0 a name is added on 13 of them.
 """
 SHOWN_NATS = 1e3
 """A coarse sensor or a late clock shows by itself and comes before all that is simulated."""
-COMMON = ("dead_time",)
-"""Effects that have one size on all joints, or one on each."""
 
 
 @dataclass(frozen=True)
@@ -190,9 +188,8 @@ class Decider:
             if not is_outside and effect not in SHARED:
                 rows = {j: row for j, row in rows.items() if owners.get(j) == effect}
             found.append(add_up(effect, rows, is_outside))
-        for effect in COMMON:
-            if effect in table:
-                found.append(add_up(f"{effect}_all", evidence.weigh_common(effect, joints)))
+        # A dead time has one size on each joint, or one on all.
+        found.append(add_up("dead_time_all", evidence.weigh_common("dead_time", joints)))
         held = self._find_held(joints) if joints[0].side is evidence.field else None
         late = max([one.nats for one in found if one.name == "dead_time"], default=0.0)
         if held is not None and held.nats >= late + LEAST_NATS:

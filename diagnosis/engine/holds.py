@@ -274,15 +274,15 @@ def find_hold(joints: Sequence[FieldJoint], bases: Sequence[JointBaseline]) -> H
     side = joints[0].side
     numbers = [joint.numbers for joint in joints]
     likeliest: list[tuple[HoldLaw, MeanCourse]] = []
-    for parts in sorted({law.parts for law in side.model.hold_laws}):
-        bank = _build_bank(side, bases, numbers, parts)
-        for law in side.model.hold_laws:
-            if law.parts != parts:
-                continue
-            chances = law.list_chances(bank.shape[1], side.period_s)
-            each = [(law, course) for course in average_courses(bank, chances, POWERS)]
-            pairs = zip(likeliest or each, each, strict=True)
-            likeliest = [max(pair, key=lambda one: one[1].evidence) for pair in pairs]
+    banks: dict[int, np.ndarray] = {}
+    for law in side.model.hold_laws:
+        if law.parts not in banks:
+            banks[law.parts] = _build_bank(side, bases, numbers, law.parts)
+        bank = banks[law.parts]
+        chances = law.list_chances(bank.shape[1], side.period_s)
+        each = [(law, course) for course in average_courses(bank, chances, POWERS)]
+        pairs = zip(likeliest or each, each, strict=True)
+        likeliest = [max(pair, key=lambda one: one[1].evidence) for pair in pairs]
     best: HeldCourse | None = None
     for power, (law, course) in zip(POWERS, likeliest, strict=True):
         if course.evidence > 0.0:
@@ -295,8 +295,8 @@ def find_hold(joints: Sequence[FieldJoint], bases: Sequence[JointBaseline]) -> H
         for _ in range(TARGET_ROUNDS):
             best = max(best, _seek_again(joints, bases, best), key=lambda hold: hold.net)
     if isinstance(best.law, LossLaw):
-        bank = _build_bank(side, bases, numbers, best.law.parts)
-        best = replace(best, law=fit_loss_law(bank, best.law, side.period_s))
+        law = fit_loss_law(banks[best.law.parts], best.law, side.period_s)
+        best = replace(best, law=law)
     return best
 
 
