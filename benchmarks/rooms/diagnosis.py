@@ -51,18 +51,18 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "40 machines, answered once. A person drives 17 fields. The diagnosis has their equation of lag. Before: 41/56, 16/32, 1/24 of 160 others.",
-        "exam_plants=valves exam_recording=operators", 40, "diagnosis", "valve",
+        "32 machines, answered once. A person drives NN fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others.",
+        "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "20 cranes, answered once. A person drives 9 fields. Before: 16/28, 5/16, 1/12 of 80 others.",
-        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 20, "diagnosis", "valve",
+        "16 cranes, answered once. A person drives NN fields. Before: 21/35, 7/20, 1/15 of 100 others.",
+        "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 16, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "16 arms, answered once. Before: 22/22, 7/12, 0/9 of 62 others.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 16, "servo_diagnosis", "servo",
+        "12 arms, answered once. Before: 28/28, 9/15, 0/11 of 78 others.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 12, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
