@@ -205,10 +205,7 @@ class ReferenceDiagnosis(Diagnosis):
         decision = decider.decide()
         tell("sizes and proof", 0.8)
         known = {kind.name for kind in self.kinds} - {one.kind.name for one in detected}
-        findings = []
-        for one in decision.named if decision.verdict == "effects" else ():
-            if self.name(one) in known:
-                findings.append(one)
+        findings = [one for one in decision.named if self.name(one) in known]
         prove = partial(EngineProof, case, decider, generator=self.generator)
         proof = prove(findings=findings)
         # A false further effect may spoil the free runs with the true first one.

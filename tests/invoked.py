@@ -30,7 +30,7 @@ def refuse_all(commands: Sequence[tuple[str, ...]], desk: Path) -> dict[tuple[st
     """Runs commands that are to be refused in `desk`, whose modules can be imported."""
     paths = os.pathsep.join((str(Path(__file__).parents[1]), str(desk)))
     done = subprocess.run(
-        [sys.executable, __file__],
+        [sys.executable, "-B", __file__],
         input=json.dumps(commands),
         capture_output=True,
         text=True,

@@ -27,10 +27,6 @@ LEAST_SPREAD = 1e-3
 """Least mean square of the error of increments, so that a simulated reference has a covariance."""
 NUM_PARTS = 4
 """Parts of the reference that are left out in turn."""
-FIT_ROUNDS = (2, 2, 4)
-"""Most rounds of the three fits. With 4, 4 and 10 left-out parts of five machines (23 joints) are likelier by 329 nats in 590,000,
-and those of a tabletop arm by 537 in 279,000. 48 practice machines with valves are decided as often rightly by either, in 14 and
-19 s; 20 cranes are decided alike."""
 STEP_SHARES = np.array([1.0, 0.5, 0.25, 0.0])
 """Shares of a step towards the numbers without a part that are tried. Left-out parts are likelier so than by whole steps:
 those of these machines by 1,966 nats, and those of four tabletop arms (20 joints) by 28,400."""
@@ -120,7 +116,7 @@ def fit_numbers(
     prior = model.prior.select(is_free)
     found = numbers.copy()
     found[places] = descend(
-        simulate, target, multiply_plain, numbers[places], prior, FIT_ROUNDS[stage]
+        simulate, target, multiply_plain, numbers[places], prior, model.fit_rounds[stage]
     )
     return found
 

@@ -80,6 +80,7 @@ class JointModel:
         substep_s: Longest step of the simulation.
         interval_s: Time of an increment of the measure.
         settling_s: At the beginning of a recording the commands before it are unknown.
+        fit_rounds: Most rounds of the three fits to the reference.
         integrates: A command is a speed: errors of the speed add up. Otherwise it is a target, and the
             level of the error says something too.
     """
@@ -94,6 +95,7 @@ class JointModel:
     substep_s: float
     interval_s: float
     settling_s: float
+    fit_rounds: tuple[int, int, int]
     integrates: bool
     names: tuple[str, ...] = field(init=False)
     place: dict[str, int] = field(init=False)
