@@ -67,7 +67,7 @@ MEASUREMENTS = (
     Measurement(
         name="ablations",
         title="What the ingredients of the diagnosis decide",
-        conditions="48 practice machines, not seen before. Constants of the decision are tried without gates of the proof. Fits in 2, 2 and 4 rounds, and sizes searched where a joint pays, ship since. The time on the computer ended it before prices, columns and sensors.",
+        conditions="48 practice machines, not seen before. Constants of the decision are tried without gates of the proof. `rounds of the fits` in 2, 2 and 4, and `sizes searched where a joint pays`, ship since. Stopped before prices, columns and sensors.",
         commands=(
             "python benchmarks/diagnosis/ablations.py {out}/ablations.json <an exam: exam_plants=valves exam_recording=operators session.seed=71 exam.mix.num_cases=48>",
         ),
