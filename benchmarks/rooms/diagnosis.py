@@ -51,23 +51,23 @@ def describe_exam(
 MEASUREMENTS = (
     describe_exam(
         "valves", "machines with valves",
-        "32 machines, answered once. A person drives NN fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others.",
+        "32 machines, answered once. A person drives 18 fields. The diagnosis has their equation of lag. Before: 54/70, 18/40, 1/30 of 200 others.",
         "exam_plants=valves exam_recording=operators", 32, "diagnosis", "valve",
     ),
     describe_exam(
         "circuits", "cranes on three hydraulic circuits",
-        "16 cranes, answered once. A person drives NN fields. Before: 21/35, 7/20, 1/15 of 100 others.",
+        "16 cranes, answered once. A person drives 7 fields. Before: 21/35, 7/20, 1/15 of 100 others.",
         "machine=crane exam_plants=circuits exam_mix=circuits exam_recording=operators", 16, "diagnosis", "valve",
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "12 arms, answered once. Before: 28/28, 9/15, 0/11 of 78 others.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 12, "servo_diagnosis", "servo",
+        "16 arms, answered once. Before: 22/22, 7/12, 0/9 of 62 others.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 16, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",
         title="What the ingredients of the diagnosis decide",
-        conditions="48 practice machines, not seen before. Constants of the decision are tried without gates of the proof. `rounds of the fits` in 2, 2 and 4, and `sizes searched where a joint pays`, ship since. Stopped before prices, columns and sensors.",
+        conditions="48 practice machines. Constants are tried without gates of the proof. `rounds of the fits` in 2, 2 and 4 ship since.",
         commands=(
             "python benchmarks/diagnosis/ablations.py {out}/ablations.json <an exam: exam_plants=valves exam_recording=operators session.seed=71 exam.mix.num_cases=48>",
         ),
