@@ -54,8 +54,7 @@ class CanLog(MessageLog):
         for message in database.messages:
             kind = EXTENDED if message.is_extended_frame else 0
             self._messages[message.frame_id | kind] = message
-            stated = {signal.name: signal.unit for signal in message.signals if signal.unit}
-            self.units[message.name] = stated
+            self.units[message.name] = {one.name: one.unit for one in message.signals if one.unit}
 
     def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the signals of the messages of the DBC; refuse a log that has none."""

@@ -106,13 +106,16 @@ def name_log(path: Path) -> str:
 
 
 class LogFile:
-    """A log, which is read whole."""
+    """A log, which is read whole.
 
-    keep_whole = False
-    """True leaves damaged parts out with a warning; False refuses a log with damage."""
+    Attributes:
+        path: The log.
+        keep_whole: Damaged parts are left out with a warning; otherwise a log with damage is refused.
+    """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, keep_whole: bool = False) -> None:
         self.path = path
+        self.keep_whole = keep_whole
 
     def refuse(self, text: str, error: Exception | None = None) -> NoReturn:
         """Raise a `RecordingError` that names the log; `error`: what a library raised."""

@@ -37,13 +37,17 @@ COMMA_ADVICE = "; if the comma is both delimiter and decimal sign, export with a
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
 
+Signs = tuple[str, str] | None
+"""Delimiter and decimal sign of a text file, where they are known."""
+
+
 class CsvFolderLog(LogFile):
     """A folder with the CSV files of one run, each on its clock."""
 
     def read_tables(self, max_rows: int | None) -> dict[str, Table]:
         """Return the rows of each file."""
-        files = sorted(self.path.glob("*.csv"))
-        return {path.stem: TextLog(path).read_tables(max_rows)[""] for path in files}
+        logs = [TextLog(path, None, self.keep_whole) for path in sorted(self.path.glob("*.csv"))]
+        return {one.path.stem: one.read_tables(max_rows)[""] for one in logs}
 
 
 class TextLog(LogFile):
@@ -52,6 +56,7 @@ class TextLog(LogFile):
     Args:
         path: The file.
         signs: Its delimiter and decimal sign; `None` to tell them.
+        keep_whole: As of a `LogFile`.
 
     Attributes:
         signs: Delimiter between the cells of a line, a space for any white space, and decimal sign.
@@ -60,8 +65,8 @@ class TextLog(LogFile):
         RecordingError: The file cannot be read, has no rows of numbers, or its header does not fit them.
     """
 
-    def __init__(self, path: Path, signs: tuple[str, str] | None = None) -> None:
-        super().__init__(path)
+    def __init__(self, path: Path, signs: Signs = None, keep_whole: bool = False) -> None:
+        super().__init__(path, keep_whole)
         head, self._encoding = self._read_head()
         # Excel writes the delimiter into a line of its own; quotes hold 0,5 between commas
         stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
