@@ -170,7 +170,6 @@ of several parts."""
 LATE_VALUES = {
     "mode=collect excitation=[holds,ramps] collect.run_minutes=0.2 collect.file_minutes=0.2": "excitation=holds",
     "preset=bench bench=twin deploy.policy=nowhere": "policy nowhere: policy.json is missing",
-    "preset=bench bench=guided deploy.policy=nowhere": "policy nowhere: policy.json is missing",
     "preset=bench camera=pictures perception/source@source=folder source.folder=nowhere": "nowhere: no such folder); give a folder",
     "mode=train_perception training.frames=empty": "mode=render",
     "mode=train_perception training.frames=x training.size_px=[100,48]": "multiples of 32",
@@ -178,7 +177,6 @@ LATE_VALUES = {
     "mode=why log=nowhere/*.parquet policy=nowhere/x": "nowhere/x: expected a run folder",
     "mode=why log=x policy=tasks:policies/borehole_insertion simulator=mlpp": "did you mean 'mlp'?",
     "mode=why log=x policy=tasks:policies/borehole_insertion simulator=nowhere.xml": "there is no such file",
-    "mode=why log=x policy=tasks:policies/borehole_insertion simulator=nowhere:step": "simulator=nowhere:step",
 }  # fmt: skip
 """As `VALUES`, after the import of torch."""
 AFTER_TORCH |= {tuple(words.split()): (told,) for words, told in LATE_VALUES.items()}

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -138,6 +139,19 @@ def test_a_further_effect_earns_enough_beside_those_before_it() -> None:
         assert [dict(one.nets) for one in found[1:]] == expected
     # what shows by itself is not named again
     assert decide.select(first, lambda _: weigh(), known=[first.found[0]]) == []
+
+
+@pytest.mark.parametrize(("nats", "told"), [(131.9, False), (132.0, True)])
+def test_held_commands_earn_enough_beyond_a_dead_time(nats: float, told: bool) -> None:
+    # 100 nats are left of the dead time when it has paid for a joint
+    late = {0: JointRow(Row("dead_time", (("delay_s", "add", 0.1),)), 112.0, 0.0)}
+    given = {"field": None, "weigh_rows": lambda _: {}, "weigh_common": lambda *_: late}
+    decider: Any = object.__new__(decide.Decider)
+    decider.evidence = SimpleNamespace(**given)
+    decider.outside = frozenset()
+    decider._view = lambda _: [SimpleNamespace(side=None)]
+    decider._find_held = lambda _: decide.EffectFinding("delay_jitter", {0: nats})
+    assert (len(decider.weigh(()).found) == 2) is told
 
 
 def test_a_joint_counts_for_the_effect_that_earns_most_on_it() -> None:

@@ -233,6 +233,17 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path, carriage: Machine) -> 
     check(recording)
 
 
+def test_a_damaged_line_in_a_folder_of_csv_files_is_left_out_where_asked(tmp_path: Path) -> None:
+    rows = [f"{0.05 * k},{k}" for k in range(100)]
+    (tmp_path / "goals.csv").write_text("\n".join(["t_s,goal", *rows, ""]))
+    lines = ["t_s,q", *rows[:50], "2.5,1,7", *rows[50:], ""]
+    (tmp_path / "states.csv").write_text("\n".join(lines))
+    with pytest.raises(RecordingError, match=r"states.csv: line 52 .*log.damaged=skip"):
+        next(open_log(tmp_path).read_runs(None))
+    (run,) = open_log(tmp_path, damaged="skip").read_runs(None)
+    assert run.tables["states"].columns["q"].tolist() == list(range(100))
+
+
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="expected a folder with the CSV files"):
         open_log(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
@@ -14,7 +15,7 @@ from brokk_rl import extensions
 from diagnosis import story
 
 
-class Played:
+class Played(AbstractContextManager[Any]):
     """Stands in for the processes of the stages: notes the commands."""
 
     def __init__(self) -> None:
@@ -33,17 +34,11 @@ class Played:
             (place / "effects.yaml").write_text(self.found)
         return self
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *exc: Any) -> None:
         pass
 
     def wait(self) -> int:
         return self.code
-
-    def terminate(self) -> None:
-        pass
 
 
 @pytest.fixture
