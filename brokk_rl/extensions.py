@@ -6,6 +6,7 @@ that name, so lists, sweeps and launchers treat it as any other option. Importin
 effect; the command calls `register_options`.
 """
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -172,7 +173,10 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
         raise ConfigError(f"{where}: expected a YAML file; {explain_robot(name)}")
     try:
         text = read_plain_file(Path(name).expanduser(), MOST_BYTES).decode()
-        if _count_values(yaml.compose(text, Loader=yaml.SafeLoader), {}) > MOST_VALUES:
+        # aliases are written out one by one, so that a file of millions is refused soon
+        plain = yaml.load(text, Loader=yaml.BaseLoader)
+        values = itertools.islice(registry.iterate_leaves(plain), MOST_VALUES + 1)
+        if sum(1 for _ in values) > MOST_VALUES:
             raise ValueError(f"expected at most {MOST_VALUES} values, aliases written out")
         loaded = OmegaConf.create(text)
     except (OSError, yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError) as error:
@@ -206,22 +210,6 @@ def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     from brokk_rl.build import drop_targets  # the command composes without it
 
     return {str(key): value for key, value in drop_targets(node, targets).items()}, package
-
-
-def _count_values(node: yaml.Node | None, counted: dict[int, int]) -> int:
-    """Return the values of a YAML node with its aliases written out, too many for one that contains itself.
-
-    Args:
-        node: The node; aliases are the same object again.
-        counted: Values of the nodes that were counted, by identity.
-    """
-    if id(node) not in counted:
-        counted[id(node)] = MOST_VALUES + 1
-        parts = node.value if isinstance(node, yaml.CollectionNode) else []
-        if isinstance(node, yaml.MappingNode):
-            parts = [part for pair in parts for part in pair]
-        counted[id(node)] = 1 + sum(_count_values(part, counted) for part in parts)
-    return counted[id(node)]
 
 
 def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:

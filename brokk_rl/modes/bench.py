@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from dataclasses import replace
-from statistics import median
 from typing import Any, ClassVar
 
 import torch
+from torch.utils.benchmark import Timer, timer
 
 from brokk_rl.console_table import print_table
 from brokk_rl.rl.execution import capture_graph
@@ -22,8 +21,6 @@ from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
-CALLS = 10
-"""Calls between two looks at the clock."""
 RATES = {
     "physics_env_steps_per_s": "physics /s",
     "env_steps_per_s": "control step /s",
@@ -96,39 +93,27 @@ class Benchmark(SimulatedPlant):
         # processes of one computer share its cores and power: measure at the same time
         group.wait()
         rest = loop.world.state_dict()
-        rates = {"physics_env_steps_per_s": num / self._time_call(physics, device)}
+        rates = {"physics_env_steps_per_s": num / self._time_call(physics)}
         loop.world.load_state_dict(rest)
-        rates["env_steps_per_s"] = num / self._time_call(lambda: loop.step(action), device)
-        rates["train_env_steps_per_s"] = num / self._time_training(loop, device, group)
+        rates["env_steps_per_s"] = num / self._time_call(lambda: loop.step(action))
+        rates["train_env_steps_per_s"] = num / self._time_training(loop, group)
         return {"num_envs": num, **rates, "graph": loop.graph_active}
 
-    def _time_training(
-        self, loop: ControlLoop, device: torch.device, group: TrainingGroup
-    ) -> float:
+    def _time_training(self, loop: ControlLoop, group: TrainingGroup) -> float:
         """Return the seconds of a control step of all environments in training."""
         num_steps = int(self.rl.runner["num_steps_per_env"])
         training = replace(self.rl, max_fault_rate=1.0)
         runner = TrainingRunner(loop, training, self.session.folder, group)
         runner.learn(1)
-        _wait(device)
         group.wait()
-        start = time.perf_counter()
+        start_s = timer()  # it waits for the GPU
         runner.learn(self.bench.iterations)
-        _wait(device)
-        return (time.perf_counter() - start) / (self.bench.iterations * num_steps)
+        return (timer() - start_s) / (self.bench.iterations * num_steps)
 
-    def _time_call(self, step: Callable[[], object], device: torch.device) -> float:
-        """Return the seconds of one call, the median over at least `bench.seconds`."""
-        spent: list[float] = []
-        while sum(spent) < self.bench.seconds:
-            step()  # finds what it needs in the caches
-            _wait(device)
-            start = time.perf_counter()
-            for _ in range(CALLS):
-                step()
-            _wait(device)
-            spent.append(time.perf_counter() - start)
-        return median(spent) / CALLS
+    def _time_call(self, step: Callable[[], object]) -> float:
+        """Return the seconds of one call, the median over `bench.seconds`."""
+        timer = Timer("step()", globals={"step": step}, num_threads=torch.get_num_threads())
+        return timer.blocked_autorange(min_run_time=self.bench.seconds).median
 
 
 def _name_device(device: torch.device) -> str:
@@ -144,11 +129,6 @@ def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
     per_rank = [{name: row[name] for name in RATES} for row in rows]
     total = {name: sum(rates[name] for rates in per_rank) for name in RATES}
     return rows[0] | total | {"ranks": len(rows), "per_rank": per_rank}
-
-
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def _print_rows(rows: list[dict[str, Any]]) -> None:
