@@ -9,7 +9,7 @@ import logging
 import math
 import queue
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -22,7 +22,7 @@ from mjviser.conversions import merge_geoms
 from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.errors import BrokkError
 from brokk_rl.machine import Machine
-from brokk_rl.play.session import KEY_STEP, PERSON, PlaySession, PlayState
+from brokk_rl.play.session import KEY_STEP, PERSON, PlaySession
 from brokk_rl.play.settings import SPEEDS
 from brokk_rl.plot import BLUE, ORANGE, OTHERS
 from brokk_rl.sim.posed_scene import PosedScene
@@ -186,9 +186,9 @@ class PlayPage:
             return
         gui.add_markdown("0 is none, 1 is typical of a machine that has the effect.")
         size = 0.0 if session.starts_neutral else 1.0
-        for dial in session.dials.values():
+        for name, dial in session.dials.items():
             slider = gui.add_slider(
-                f"{dial.effect}: {dial.number}",
+                name,
                 dial.low,
                 dial.high,
                 0.1,
@@ -206,21 +206,23 @@ class PlayPage:
             pairs = zip(names, colors, strict=True)
             colored = [f'<b style="color: {color}">{name}</b>' for name, color in pairs]
             gui.add_html(f"<div style='padding: 0 1em'>Joints: {', '.join(colored)}</div>")
-            given = [uplot.Series(stroke=color, width=1.6) for color in colors]
-            proposed = [uplot.Series(stroke=color, dash=(4, 4)) for color in colors]
-            self._commands = self._plot(
-                "Commands in force; dashed: proposed", [*given, *proposed], (-1.05, 1.05)
-            )
-            beside, above = (uplot.Series(stroke=color, width=1.6) for color in COLORS[:2])
-            self._error = self._plot("Tip from target / cm: beside, above", [beside, above])
-            force = uplot.Series(stroke=COLORS[2], width=1.6)
-            self._force = self._plot("Contact force / kN", [force])
+            title = "Commands in force; dashed: proposed"
+            self._commands = self._plot(title, colors, dashed=colors, bounds=(-1.05, 1.05))
+            self._error = self._plot("Tip from target / cm: beside, above", COLORS[:2])
+            self._force = self._plot("Contact force / kN", COLORS[2:3])
         panel.dock_left()
         panel.set_width(380)
 
     def _plot(
-        self, title: str, lines: Sequence[uplot.Series], bounds: tuple[float, float] | None = None
+        self,
+        title: str,
+        colors: Sequence[str],
+        dashed: Sequence[str] = (),
+        bounds: tuple[float, float] | None = None,
     ) -> viser.GuiUplotHandle:
+        """Return a plot over time with a line of each colour, and dashed ones after them."""
+        lines = [uplot.Series(stroke=color, width=1.6) for color in colors]
+        lines += [uplot.Series(stroke=color, dash=(4, 4)) for color in dashed]
         scales = {"x": uplot.Scale(time=False)}
         if bounds:
             scales["y"] = uplot.Scale(range=bounds)
@@ -327,7 +329,7 @@ class SceneView:
         model.geom_rgba[self._posed.block_geoms, 3] = 1.0
         self._set_up_stage()
         self._marks = {}
-        for name, color in (("target", TRUE), ("estimate", SEEN)):
+        for name, color in (("target_m", TRUE), ("estimate_m", SEEN)):
             self._marks[name] = server.scene.add_point_cloud(
                 f"/{name}",
                 self._offsets.astype(np.float32),
@@ -343,21 +345,20 @@ class SceneView:
                 "/hole", scale=0.55, disable_rotations=True, depth_test=False, opacity=0.85
             )
 
-    def draw(self, state: PlayState, selected: int) -> None:
+    def draw(self, state: Mapping[str, np.ndarray], selected: int) -> None:
         """Show a state; the handle is at the target of the `selected` world."""
-        places, turns = self._posed.locate_bodies(state.q[: self._num_worlds])
+        places, turns = self._posed.locate_bodies(state["q"][: self._num_worlds])
         self._machines.update_from_arrays(places + self._offsets[:, None], turns)
-        for name, points in (("target", state.target_m), ("estimate", state.estimate_m)):
-            mark = self._marks[name]
-            mark.visible = points is not None
-            if points is not None:
-                mark.points = (points[: self._num_worlds] + self._offsets).astype(np.float32)
-        if state.scene is not None:
-            for world, scene in enumerate(state.scene[: self._num_worlds]):
-                self._draw_block(world, scene)
-        if self.handle is not None and state.target_m is not None and not self.is_dragged:
+        for name, mark in self._marks.items():
+            mark.visible = name in state
+            if name in state:
+                points = state[name][: self._num_worlds] + self._offsets
+                mark.points = points.astype(np.float32)
+        for world, scene in enumerate(state.get("scene", ())[: self._num_worlds]):
+            self._draw_block(world, scene)
+        if self.handle is not None and not self.is_dragged:
             offset = self._offsets[min(selected, self._num_worlds - 1)]
-            self.handle.position = tuple(state.target_m[selected] + offset)
+            self.handle.position = tuple(state["target_m"][selected] + offset)
 
     def read_handle(self, world: int) -> np.ndarray:
         """Return the place of the handle in the base frame of a world, `(3,)`."""
@@ -379,18 +380,16 @@ class SceneView:
 
     def _draw_block(self, world: int, scene: np.ndarray) -> None:
         """Put the block of a world in its place; its shape is sent anew only where it differs."""
-        before, handle = self._blocks.get(world, (None, None))
-        if before is not None and np.array_equal(before, scene):
-            return
-        if handle is None or before is None or not np.array_equal(before[4:], scene[4:]):
+        shape, handle = self._blocks.get(world, ((), None))
+        if handle is None or not np.array_equal(shape, scene[4:]):
             self._posed.set_scene(scene)
             mesh = merge_geoms(self._posed.model, self._posed.block_geoms)
             handle = self._server.scene.add_mesh_trimesh(f"/block/{world}", mesh)
+            self._blocks[world] = scene[4:].copy(), handle
         x, y, rim_z, yaw = scene[:4]
         handle.position = tuple(np.array([x, y, rim_z]) + self._offsets[world])
         handle.wxyz = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
         handle.visible = math.hypot(x, y) < FAR_M
-        self._blocks[world] = scene.copy(), handle
 
 
 def place_worlds(num_worlds: int) -> np.ndarray:

@@ -33,30 +33,14 @@ DISTANCE_M, HEIGHT_M = (1.6, 4.6), (0.0, 1.6)
 """Where a target may be put: distance from the slew axis and height. Chosen by hand: a block that
 is nearer would stand in the undercarriage, and the arm of a Brokk 170 reaches 5.2 m."""
 SHOWN_STATE = {"scene": "start.scene", "target_m": "start.target_m", "estimate_m": "estimate_m"}
-"""State of the task, where it has it, that is drawn."""
+"""What is drawn of the task's state, where it has it: scenes `(N, S)`, see `brokk_rl.sim.scene`, true
+targets in the base frame, `(N, 3)`, and targets as the policy sees them, likewise."""
 KEY_STEP = 0.25
 """Stroke by which one press of a key moves a lever. Chosen by hand: four presses to full speed."""
 PUSH_S = 0.5
 """Time for which a push lasts, s. Chosen by hand."""
 LARGEST_EFFECT = 3.0
 """Largest size of an effect, in typical sizes. Chosen by hand: three times what a machine has."""
-
-
-@dataclass(frozen=True)
-class PlayState:
-    """Drawn state of the simulated machines; `N` worlds, `J` joints.
-
-    Attributes:
-        q: Joint positions, `(N, J)`, rad or m.
-        scene: Scenes, `(N, S)`; see `brokk_rl.sim.scene`; `None` where the task does not tell.
-        target_m: True targets in the base frame, `(N, 3)`; `None` where the task has none.
-        estimate_m: Targets as the policy sees them, likewise.
-    """
-
-    q: np.ndarray
-    scene: np.ndarray | None
-    target_m: np.ndarray | None
-    estimate_m: np.ndarray | None
 
 
 class PersonAtLevers(FollowerModel):
@@ -79,7 +63,7 @@ class PersonAtLevers(FollowerModel):
         self._is_exclusive = torch.as_tensor(machine.is_exclusive)
         self.env: int | None = None
         self.levers = torch.zeros(machine.num_joints)
-        self.proposed: torch.Tensor | None = None
+        self.proposed = torch.zeros(machine.num_joints)
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
@@ -111,8 +95,6 @@ class EffectDial:
     """One number of an effect: 0 is none of it, 1 the typical size on a machine that has it.
 
     Attributes:
-        effect: Name of the effect.
-        number: Name of the number, with its unit.
         low: Smallest size, in typical sizes.
         high: Largest size.
         typical: Number at size 1 on each joint, `(J,)` or `(1,)`.
@@ -121,19 +103,12 @@ class EffectDial:
         key: Name of the number there.
     """
 
-    effect: str
-    number: str
     low: float
     high: float
     typical: torch.Tensor
     none: torch.Tensor
     parameters: dict[str, torch.Tensor]
     key: str
-
-    @property
-    def label(self) -> str:
-        """Name of the dial."""
-        return f"{self.effect}.{self.number}"
 
     def turn(self, size: float) -> None:
         """Give all machines the effect in `size`, limited to what makes sense."""
@@ -144,42 +119,38 @@ class EffectDial:
         self.parameters[self.key] = value.to(before).expand_as(before).clone()
 
 
-def list_dials(model: ActuatorModel, machine: Machine) -> list[EffectDial]:
-    """Return a dial for each number of each effect around an actuator model.
+def list_dials(model: ActuatorModel, machine: Machine) -> dict[str, EffectDial]:
+    """Return a dial for each number of each effect around an actuator model, by `effect.number`.
 
     Numbers that only shape an effect, such as its time constant, have none.
     """
-    found = []
+    found = {}
     layer: Any = model
     while layer is not None:
-        if hasattr(layer, "effects") and hasattr(layer, "parameters"):
-            for name, effect in layer.effects.items():
-                for key, number in effect.numbers.items():
-                    if number.none is None or not number.is_on(machine):
-                        continue
-                    dial = _make_dial(layer, name, effect.name(), key, number, machine)
+        for name, effect in getattr(layer, "effects", {}).items():
+            for key, number in effect.numbers.items():
+                if number.none is not None and number.is_on(machine):
+                    place = f"{name}.{key}" if name else key
+                    dial = _make_dial(number, machine, layer.parameters, place)
                     if dial.low < dial.high:
-                        found.append(dial)
+                        found[f"{effect.name()}.{key}"] = dial
         layer = getattr(layer, "inner", None)
     return found
 
 
 def _make_dial(
-    chain: Any, prefix: str, effect: str, key: str, number: Any, machine: Machine
+    number: Any, machine: Machine, parameters: dict[str, torch.Tensor], key: str
 ) -> EffectDial:
-    """Return the dial of one number; `prefix` is the name of its effect in the chain."""
     none, typical = (number.scale_to(machine, value) for value in (number.none, number.typical))
     ends = (np.array(number.limit_on(machine)) - none) / (typical - none)
     low, high = max(-LARGEST_EFFECT, ends.min(0).max()), min(LARGEST_EFFECT, ends.max(0).min())
     return EffectDial(
-        effect=effect,
-        number=key,
         low=math.ceil(low * 10 - 1e-6) / 10,
         high=math.floor(high * 10 + 1e-6) / 10,
         typical=torch.as_tensor(typical, dtype=torch.float32),
         none=torch.as_tensor(none, dtype=torch.float32),
-        parameters=chain.parameters,
-        key=f"{prefix}.{key}" if prefix else key,
+        parameters=parameters,
+        key=key,
     )
 
 
@@ -207,9 +178,8 @@ class PlaySession:
         self._kinematics = Kinematics(loop.machine, loop.device)
         self._person = PersonAtLevers(loop.follower, loop.machine)
         loop.follower = self._person
-        self.dials: dict[str, EffectDial] = {}
-        for dial in list_dials(loop.actuator, loop.machine):
-            self.dials[dial.label] = dial
+        self.dials = list_dials(loop.actuator, loop.machine)
+        for dial in self.dials.values():
             if neutral:
                 dial.turn(0.0)
         self.starts_neutral = neutral
@@ -218,9 +188,10 @@ class PlaySession:
         self.note = ""
         self._acting = self.driver
         self._owed_s, self._steps = 0.0, 0
-        self._pins: dict[int, torch.Tensor] = {}
+        self._pinned_m = torch.full((loop.num_envs, 3), torch.nan, device=loop.device)
         self._restarted = torch.zeros(loop.num_envs, dtype=torch.bool, device=loop.device)
-        self._push_n: dict[int, tuple[torch.Tensor, int]] = {}
+        self._push_n = torch.zeros(loop.num_envs, 3, device=loop.device)
+        self._push_steps = torch.zeros(loop.num_envs, device=loop.device)
         self._trace: deque[dict[str, np.ndarray]] = deque(
             maxlen=round(TRACE_S / loop.machine.period_s)
         )
@@ -302,9 +273,7 @@ class PlaySession:
     def reset(self, world: int | None = None) -> None:
         """Begin a new episode in a world, or in all, with the next step; its target is drawn."""
         rows = slice(None) if world is None else world
-        for one in list(self._pins):
-            if world in (None, one):
-                del self._pins[one]
+        self._pinned_m[rows] = torch.nan
         self._restarted[rows] = True
         self.loop.task.state[STEPS][rows] = float(self.loop.task.max_episode_steps)
         if self.paused:
@@ -316,8 +285,8 @@ class PlaySession:
         Args:
             force_n: Force in the base frame, `(3,)`, N.
         """
-        force = torch.as_tensor(force_n, dtype=torch.float32, device=self.loop.device)
-        self._push_n[self.selected] = force, round(PUSH_S / self.machine.period_s)
+        self._push_n[self.selected] = torch.as_tensor(force_n, dtype=torch.float32)
+        self._push_steps[self.selected] = round(PUSH_S / self.machine.period_s)
 
     def move_target(self, position_m: np.ndarray) -> np.ndarray:
         """Put the selected world's target, and the block with it, elsewhere.
@@ -337,9 +306,9 @@ class PlaySession:
         distance = max(float(np.hypot(*position[:2])), 1e-6)
         position[:2] *= np.clip(distance, *DISTANCE_M) / distance
         position[2] = np.clip(position[2], *HEIGHT_M)
-        place = torch.as_tensor(position, dtype=torch.float32, device=self.loop.device)
-        self._pins[self.selected] = place
-        self._put_target(self.selected, place)
+        self._pinned_m[self.selected] = torch.as_tensor(position, dtype=torch.float32)
+        everywhere = torch.arange(self.loop.num_envs, device=self.loop.device)
+        self._put_targets(everywhere == self.selected)
         return position
 
     def advance(self, elapsed_s: float) -> int:
@@ -360,7 +329,8 @@ class PlaySession:
     def step(self) -> None:
         """Simulate one control period."""
         loop, task = self.loop, self.loop.task
-        self._apply_pushes()
+        if self.can_push:
+            self._apply_pushes()
         if self._person.env is not None and not self._restarted[self._person.env]:
             # a person has the time that it takes
             task.state[STEPS][self._person.env].clamp_(max=float(task.max_episode_steps - 2))
@@ -370,17 +340,17 @@ class PlaySession:
         self._steps += 1
         self._record()
         self._count_endings()
-        for world, place in self._pins.items():
-            if loop.done[world]:
-                self._put_target(world, place)
+        is_drawn_anew = loop.done & self._pinned_m.isfinite().all(1)
+        if is_drawn_anew.any():
+            self._put_targets(is_drawn_anew)
 
-    def read(self) -> PlayState:
-        """Return the state to draw."""
-        state = self.loop.task.state
-        drawn = {}
-        for field, name in SHOWN_STATE.items():
-            drawn[field] = _to_numpy(state[name]) if name in state else None
-        return PlayState(q=_to_numpy(self.loop.world.q), **drawn)
+    def read(self) -> dict[str, np.ndarray]:
+        """Return the state to draw: joint positions `q`, `(N, J)`, and what `SHOWN_STATE` names."""
+        state = {"q": _to_numpy(self.loop.world.q)}
+        for name, entry in SHOWN_STATE.items():
+            if entry in self.loop.task.state:
+                state[name] = _to_numpy(self.loop.task.state[entry])
+        return state
 
     def read_traces(self) -> dict[str, np.ndarray]:
         """Return the last seconds of the selected world by name, oldest first; empty before any.
@@ -395,26 +365,19 @@ class PlaySession:
         return traces
 
     def _apply_pushes(self) -> None:
-        """Write the loads of running pushes, and take those of finished ones away."""
+        """Load the joints of the arms that are being pushed, and no others."""
         world: Any = self.loop.world
-        for index, (force, left) in list(self._push_n.items()):
-            if left == 0:
-                world.joint_load[index] = 0.0
-                del self._push_n[index]
-                continue
-            tip = self._kinematics.jacobian(world.q[index : index + 1]).tip[0]
-            world.joint_load[index] = tip.T @ force
-            self._push_n[index] = force, left - 1
+        force_n = self._push_n * (self._push_steps > 0)[:, None]
+        tip = self._kinematics.jacobian(world.q).tip
+        world.joint_load.copy_((force_n[:, None] @ tip)[:, 0])
+        self._push_steps -= 1
 
-    def _put_target(self, world: int, place: torch.Tensor) -> None:
-        """Move target and block of a world to `place`, `(3,)`."""
+    def _put_targets(self, mask: torch.Tensor) -> None:
+        """Move targets and blocks of the worlds of `mask`, `(N,)` bool, to where they were put."""
         task = self.loop.task
-        mask = torch.zeros(self.loop.num_envs, dtype=torch.bool, device=self.loop.device)
-        mask[world] = True
-        task.move_target(mask, place - self.loop.task.state["start.target_m"])
-        scene = self.loop.task.state["start.scene"]
-        if float(scene[world, :2].norm()) < FAR_M:
-            self.loop.world.place(mask, scene)
+        task.move_target(mask, self._pinned_m - task.state["start.target_m"])
+        scene = task.state["start.scene"]
+        self.loop.world.place(mask & (scene[:, :2].norm(dim=1) < FAR_M), scene)
 
     def _record(self) -> None:
         """Add the step that was just simulated to the traces."""
@@ -424,13 +387,11 @@ class PlaySession:
         error = tip - target if target is not None else torch.full_like(tip, torch.nan)
         # a finished world has its next target already; NaN leaves a gap in the line
         error = torch.where(loop.done[:, None], torch.nan, error)
-        proposed = self._person.proposed
-        assert proposed is not None
         seconds = np.full(loop.num_envs, self.t_s)
         self._trace.append(
             {
                 "t_s": seconds,
-                "proposed": _to_numpy(proposed),
+                "proposed": _to_numpy(self._person.proposed),
                 "given": _to_numpy(loop.end_u),
                 "lateral_m": _to_numpy(error[:, :2].norm(dim=1)),
                 "height_m": _to_numpy(error[:, 2]),

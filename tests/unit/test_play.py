@@ -73,8 +73,8 @@ def test_a_reset_begins_one_episode_anew_and_is_no_ending(made: Callable) -> Non
     session.reset(1)
     session.step()
     state = session.read()
-    assert np.abs(state.q[0] - before.q[0]).max() < 0.05
-    assert np.abs(state.scene[1] - before.scene[1]).max() > 0.05
+    assert np.abs(state["q"][0] - before["q"][0]).max() < 0.05
+    assert np.abs(state["scene"][1] - before["scene"][1]).max() > 0.05
     assert not session.endings
     session.select_world(1)
     assert session.episode_s < 2 * PERIOD_S
@@ -84,23 +84,23 @@ def test_a_target_that_is_moved_takes_block_estimate_and_arm_with_it(made: Calla
     session = made()
     run(session, 20)
     before = session.read()
-    place = before.target_m[0] + np.array([0.0, 0.25, 0.05])
+    place = before["target_m"][0] + np.array([0.0, 0.25, 0.05])
     session.move_target(place)
     state = session.read()
-    np.testing.assert_allclose(state.target_m[0], place, atol=1e-5)
-    np.testing.assert_allclose(state.scene[0, :3], place, atol=1e-5)
+    np.testing.assert_allclose(state["target_m"][0], place, atol=1e-5)
+    np.testing.assert_allclose(state["scene"][0, :3], place, atol=1e-5)
     # the machine believes the old error of the new place, and stands where it stood
-    error = before.estimate_m - before.target_m
-    np.testing.assert_allclose(state.estimate_m - state.target_m, error, atol=1e-5)
-    np.testing.assert_array_equal(state.q, before.q)
-    np.testing.assert_array_equal(state.target_m[1], before.target_m[1])
+    error = before["estimate_m"] - before["target_m"]
+    np.testing.assert_allclose(state["estimate_m"] - state["target_m"], error, atol=1e-5)
+    np.testing.assert_array_equal(state["q"], before["q"])
+    np.testing.assert_array_equal(state["target_m"][1], before["target_m"][1])
     block = session.loop.world._views["mocap_pos"][0, 0].numpy()
     np.testing.assert_allclose(block, place, atol=1e-5)
     run(session, 1)
     # One more noisy sample in the mean of 22.
-    np.testing.assert_allclose(session.read().estimate_m[0] - place, error[0], atol=5e-3)
+    np.testing.assert_allclose(session.read()["estimate_m"][0] - place, error[0], atol=5e-3)
     run(session, 400)
-    np.testing.assert_allclose(session.read().target_m[0], place, atol=1e-5)
+    np.testing.assert_allclose(session.read()["target_m"][0], place, atol=1e-5)
     assert session.successes >= 1, "the arm went to the new place"
 
 
@@ -110,7 +110,7 @@ def test_a_target_stays_out_of_the_machine_and_is_drawn_again_by_a_reset(made: C
     assert np.hypot(*moved_m[:2]) == pytest.approx(DISTANCE_M[0])
     session.reset()
     session.step()
-    assert np.hypot(*session.read().target_m[0, :2]) > DISTANCE_M[0] + 0.1
+    assert np.hypot(*session.read()["target_m"][0, :2]) > DISTANCE_M[0] + 0.1
 
 
 def test_a_push_moves_the_tip_its_own_way_and_ends(made: Callable) -> None:
@@ -133,13 +133,13 @@ def test_a_push_moves_the_tip_its_own_way_and_ends(made: Callable) -> None:
 def test_a_person_drives_one_machine_and_the_policy_the_other(made: Callable) -> None:
     session = made()
     session.choose_driver(PERSON)
-    before = session.read().q
+    before = session.read()["q"]
     session.nudge_lever(2, 0.5)
     session.nudge_lever(2, 0.75)  # to the end of the stroke
     session.put_lever(0, 0.5)
     session.put_lever(0, 0.0)
     run(session, 30)
-    traces, after = session.read_traces(), session.read().q
+    traces, after = session.read_traces(), session.read()["q"]
     np.testing.assert_array_equal(traces["given"][-1], [0, 0, 1, 0, 0])
     assert np.abs(traces["proposed"][-1]).max() > 0, "the policy's proposal is shown"
     assert after[0, 2] - before[0, 2] > 0.1
