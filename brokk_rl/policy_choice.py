@@ -153,11 +153,8 @@ def _take_over(cfg: DictConfig) -> DictConfig:
         cfg = _choose_option(cfg, own, given, stored)
     if "machine" in cfg:
         brought = _insert_plant(cfg, stored, given)
-    if "task" in cfg and (changes := _insert_behaviour(cfg, own, given, stored)):
-        brought.append(f"{len(changes)} value{'s' if len(changes) > 1 else ''} of its task")
-        named = _list_named()
-        if yielding := [text for key, text in changes.items() if _is_given(key, named)]:
-            log.warning("the experiment yields to its policy: %s", "; ".join(yielding))
+    if "task" in cfg:
+        brought += _insert_behaviour(cfg, own, given, stored)
     if brought:
         log.info("the policy in %s brings %s", stored.name, " and ".join(brought))
     return cfg
@@ -207,8 +204,8 @@ def _insert_plant(cfg: DictConfig, stored: StoredPolicy, given: set[str]) -> lis
 
 def _insert_behaviour(
     cfg: DictConfig, own: TaskDescription, given: set[str], stored: StoredPolicy
-) -> dict[str, str]:
-    """Put the behaviour of the policy into the task; return what changed, in words, by key.
+) -> list[str]:
+    """Put the behaviour of the policy into the task; return the values that it changed.
 
     The classical controller as a rival keeps the numbers that were composed, and what it knows of a
     person: a policy may rest on those of an earlier version, which are no honest opponent.
@@ -216,11 +213,14 @@ def _insert_behaviour(
     before: Any = OmegaConf.to_container(cfg.task, resolve=True)
     after = own.apply_to(before)
     changes = dict(list_differences(drop_targets(before), drop_targets(after), "task"))
-    said = {
-        key: f"{key}={format_value(here)} was asked for, the policy has {format_value(there)}"
-        for key, (here, there) in changes.items()
-    }
-    if refused := [text for key, text in said.items() if _is_given(key, given)]:
+    refused, brought = [], []
+    for key, (here, there) in changes.items():
+        brought.append(f"{key}={format_value(there)}")
+        if _is_given(key, given):
+            refused.append(
+                f"{key}={format_value(here)} was asked for, the policy has {format_value(there)}"
+            )
+    if refused:
         raise ConfigError(
             f"the policy in {stored.name} acts by the task that it was trained in: "
             f"{'; '.join(refused)}. Leave these out, and the policy's own values are taken; or "
@@ -238,7 +238,7 @@ def _insert_behaviour(
                 "them itself; the classical controller beside it knows of the person",
                 stored.name,
             )
-    return said
+    return brought
 
 
 def _insert_task(cfg: DictConfig, node: DictConfig) -> None:
@@ -262,15 +262,6 @@ def _list_given() -> set[str]:
         else:
             given.add(key)
     return given
-
-
-def _list_named() -> set[str]:
-    """Return the keys of the values in the file of the chosen experiment; none where none is chosen."""
-    chosen = HydraConfig.get().runtime.choices.get("experiment") or ""
-    files = {one.name: one.path for one in registry.list_options("experiment")}
-    path = Path(chosen[1:]).expanduser() if chosen.startswith("@") else files.get(chosen)
-    node = OmegaConf.to_container(OmegaConf.load(path)) if path else None
-    return {".".join(place) for place, _ in registry.iterate_leaves(node)}
 
 
 def _is_given(key: str, given: set[str]) -> bool:

@@ -209,22 +209,6 @@ class CameraView:
     std_m: float
     std_before_m: float
 
-    def explain(self) -> str:
-        """Return where the camera looks and why, in a sentence or two."""
-        if self.is_moving:
-            return (
-                f"Camera moves ({self.name}, {self.travel_s:.1f} s): from here the hole would be "
-                f"seen for {self.seen_before_s:.1f} of the next {self.horizon_s:.0f} s, from there "
-                f"for {self.seen_s:.1f} s. Expected {1000 * self.std_m:.1f} mm instead of "
-                f"{1000 * self.std_before_m:.1f} mm."
-            )
-        if self.seen_s > 0:
-            return (
-                f"Camera stays ({self.name}): the hole will be seen for {self.seen_s:.1f} of the "
-                f"next {self.horizon_s:.0f} s."
-            )
-        return f"Camera stays ({self.name}): no view would see the hole."
-
 
 class BoreholeFinder(Protocol):
     """Finds boreholes in frames, as `mode=perceive` and the camera process call it."""
