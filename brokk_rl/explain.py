@@ -95,13 +95,9 @@ def _explain_interpolation(error: InterpolationResolutionError) -> str:
     for override in parse_words(sys.argv[1:]):
         if taken and override.key_or_group == taken[1]:
             group, name = taken.groups()
-            offered = []
-            for option in registry.list_options(group):
-                if re.search(rf"^{name}:", option.path.read_text(), re.MULTILINE):
-                    offered.append(option.name)
             return (
                 f"{key}: expected {group}=… with a value '{name}', but {override.input_line} has "
-                f"none; {_list_options(group, '', offered)}"
+                f"none; brokk mode=list list.group={group} lists the others"
             )
     return f"{key}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
 

@@ -11,11 +11,10 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from datetime import datetime
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from brokk_rl.errors import StorageError
@@ -30,7 +29,10 @@ BASE = Path(__file__).parent
 def render_page(template: Path, values: Mapping[str, Any]) -> str:
     """Return a page by a template that extends `report.html.jinja`; `values` has its `title`."""
     made = f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"
-    return _load_template(template).render(**values, made=made)
+    environment = Environment(
+        loader=FileSystemLoader([template.parent, BASE]), autoescape=True, undefined=StrictUndefined
+    )
+    return environment.get_template(template.name).render(**values, made=made)
 
 
 def embed_picture(source: Figure | Path) -> str:
@@ -47,12 +49,3 @@ def embed_picture(source: Figure | Path) -> str:
     except OSError as error:
         raise StorageError(f"cannot read picture {source}: {error.strerror or error}") from error
     return f"data:image/png;base64,{base64.b64encode(data).decode()}"
-
-
-@cache
-def _load_template(path: Path) -> Template:
-    folders = [path.parent, BASE]
-    environment = Environment(
-        loader=FileSystemLoader(folders), autoescape=True, undefined=StrictUndefined
-    )
-    return environment.get_template(path.name)

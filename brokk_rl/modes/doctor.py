@@ -17,9 +17,13 @@ from brokk_rl import extras
 from brokk_rl.console_table import print_table
 from brokk_rl.session import read_output
 from brokk_rl.sim import probe
-from brokk_rl.spec import NonNegative, spec
+from brokk_rl.spec import spec
 
 COLORS = {"ok": "green", "warn": "yellow", "fail": "red"}
+RUNS = Path("runs")
+"""Folder into which runs are written unless a command names another."""
+MIN_FREE_GIB = 5.0
+"""Free disk space below which it warns. Chosen by hand: checkpoints of some trainings."""
 
 
 class DoctorFinding(NamedTuple):
@@ -37,23 +41,8 @@ class DoctorFinding(NamedTuple):
 
 
 @spec
-class DoctorLimits:
-    """Folder and limits of the checks.
-
-    Attributes:
-        folder: Folder in which runs will be written.
-        min_free_gib: Free disk space below which it warns.
-    """
-
-    folder: str
-    min_free_gib: NonNegative
-
-
-@spec
 class Doctor:
     """Report which parts work on this computer: GPU, CUDA graphs, rendering, disk, packages."""
-
-    doctor: DoctorLimits
 
     def run(self) -> None:
         """Print the report.
@@ -66,7 +55,7 @@ class Doctor:
             "torch": check_torch,
             "Warp": check_warp,
             "rendering": check_rendering,
-            "disk": lambda: check_disk(Path(self.doctor.folder), self.doctor.min_free_gib),
+            "disk": lambda: check_disk(RUNS, MIN_FREE_GIB),
         }
         rows = []
         has_failed = False

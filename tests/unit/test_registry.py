@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 import brokk_rl
 from brokk_rl.help import MAIN_MODES, collect_comments
 from brokk_rl.modes import doctor
-from brokk_rl.modes.doctor import Doctor, DoctorFinding, DoctorLimits
+from brokk_rl.modes.doctor import Doctor, DoctorFinding
 
 
 def test_the_version_needs_no_configuration(brokk: Callable[..., Any]) -> None:
@@ -40,9 +40,6 @@ def test_the_list_can_be_narrowed_to_a_group(brokk: Callable[..., Any]) -> None:
     assert "borehole_insertion" not in done.out
 
 
-LIMITS = DoctorLimits(folder="runs", min_free_gib=0.0)
-
-
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Sets checks; all of them find that everything works, at once."""
@@ -59,7 +56,7 @@ def test_a_check_that_breaks_is_a_warning_and_the_others_go_on(
         raise OSError("no such library")
 
     healthy.setattr(doctor, "check_warp", break_down)
-    Doctor(doctor=LIMITS).run()
+    Doctor().run()
     lines = capsys.readouterr().out.splitlines()
     (broken,) = (line for line in lines if "Warp" in line)
     assert broken.startswith("warn") and "OSError: no such library" in broken
@@ -71,7 +68,7 @@ def test_the_doctor_leaves_with_1_when_something_essential_fails(
 ) -> None:
     healthy.setattr(doctor, "check_packages", lambda: DoctorFinding("fail", "too old"))
     with pytest.raises(SystemExit) as left:
-        Doctor(doctor=LIMITS).run()
+        Doctor().run()
     assert left.value.code == 1
 
 
