@@ -40,13 +40,6 @@ class FailedJob(BaseException):
     """
 
 
-class SweepError(BrokkError):
-    """A job of a sweep failed, and its process, the second argument, has said why."""
-
-    def __str__(self) -> str:
-        return str(self.args[0])
-
-
 def main() -> int:
     """Run the command and return its exit code.
 
@@ -105,8 +98,6 @@ def main() -> int:
     except (FailedJob, Exception) as error:
         cause = error.args[0] if isinstance(error, FailedJob) else error
         message = explain(cause)
-        if isinstance(cause, SweepError) and cause.args[1] == os.getpid():
-            message = "jobs of the sweep failed, for the reasons above"
         if message is None or os.environ.get("BROKK_TRACE") == "1":
             traceback.print_exception(cause)
         # Of several processes the first one reports an error of the configuration for all.
@@ -130,10 +121,10 @@ def run_job(cfg: DictConfig) -> float | None:
         message = explain(error)
         if message is None:
             raise
-        # The other jobs go on. Hydra repeats only the first error, at the end, and an error of
+        # The other jobs go on. Hydra raises the first error again, at the end, and an error of
         # another process comes without its cause.
         log.error("job %s failed: %s", HydraConfig.get().job.num, message)
-        raise SweepError(message, os.getpid()) from error
+        raise BrokkError(message) from error
 
 
 def _is_first_process() -> bool:
