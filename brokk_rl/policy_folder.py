@@ -19,6 +19,7 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
@@ -84,21 +85,14 @@ class TaskDescription:
         Raises:
             CheckpointError: A part is missing, or the fingerprint is that of other values.
         """
-        try:
+        with suppress(KeyError, TypeError, ValueError):
             found = cls(name=str(data["name"]), behaviour=dict(data["behaviour"]))
-            stamp = data["fingerprint"]
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointError(
-                f"{where}: the description of its task is incomplete ({error}); export the policy "
-                "again (mode=export)"
-            ) from error
-        if stamp != found.fingerprint():
-            raise CheckpointError(
-                f"{where}: the description of its task was changed after it was written: its "
-                f"fingerprint is {found.fingerprint()}, the file says {stamp}. Export the policy "
-                "again (mode=export)"
-            )
-        return found
+            if data["fingerprint"] == found.fingerprint():
+                return found
+        raise CheckpointError(
+            f"{where}: the description of its task is incomplete, or was changed after it was "
+            "written, so that its fingerprint is another; export the policy again (mode=export)"
+        )
 
     def apply_to(self, node: Mapping[str, Any]) -> dict[str, Any]:
         """Return the node of a task with the values of this behaviour."""

@@ -85,12 +85,11 @@ class PlayPage:
 
     def update(self) -> None:
         """Carry out the requests of browsers and show the present state."""
-        is_touched = self._follow_requests()
+        self._follow_requests()
         state, now_s = self._session.read(), time.monotonic()
         with self._server.atomic():
             self._scene.draw(state, self._session.selected)
-            is_due = now_s - self._shown_s >= SHOW_S and not self._session.paused
-            if is_touched or is_due:
+            if now_s - self._shown_s >= SHOW_S:
                 self._shown_s = now_s
                 self._show_figures()
                 self._show_traces()
@@ -116,9 +115,8 @@ class PlayPage:
         """Have `request(value)` done whenever a person clicks a button, or one of a group."""
         control.on_click(lambda event: self._ask(request, event.target.value))
 
-    def _follow_requests(self) -> bool:
-        """Do what was asked for; return whether there was anything."""
-        is_touched = not self._requests.empty()
+    def _follow_requests(self) -> None:
+        """Do what was asked for."""
         while not self._requests.empty():
             try:
                 self._requests.get()()
@@ -126,7 +124,6 @@ class PlayPage:
                 log.warning("%s", error)
                 for client in self._server.get_clients().values():
                     client.add_notification("Not done", str(error), color="red")
-        return is_touched
 
     def _build_controls(self) -> None:
         """Build the panel with what a person can do."""
@@ -136,8 +133,8 @@ class PlayPage:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         self._status = gui.add_markdown("")
-        self._driver = gui.add_dropdown("Driver", session.drivers, initial_value=session.driver)
-        self._ask_on_change(self._driver, session.choose_driver)
+        driver = gui.add_dropdown("Driver", session.drivers, initial_value=session.driver)
+        self._ask_on_change(driver, session.choose_driver)
         if session.loop.num_envs > 1:
             world = gui.add_slider("World", 0, session.loop.num_envs - 1, 1, 0)
             self._ask_on_change(world, session.select_world)
@@ -288,7 +285,6 @@ class PlayPage:
         self._status.content = "\n\n".join(filter(None, lines))
         for lever, value in zip(self._levers, session.levers, strict=True):
             lever.value = round(float(value), 2)
-        self._driver.value = session.driver
 
     def _show_traces(self) -> None:
         """Show the last seconds of the selected world."""

