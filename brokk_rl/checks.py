@@ -171,8 +171,8 @@ def _check_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Ten
     check_rows(start, "starts")
     for name, value in start.items():
         assert value.isfinite().all(), f"starts: '{name}' is not finite"
-        assert is_same(value, again[name]), f"starts: '{name}' differs for the same seed"
-    assert not is_same(start["q"], other["q"]), "starts: another seed gives the same arms"
+        check_same(value, again[name], f"starts: '{name}' differs for the same seed")
+    assert not start["q"].equal(other["q"]), "starts: another seed gives the same arms"
     q = start["q"].cpu().numpy()
     inside = (q >= machine.lower) & (q <= machine.upper)
     assert inside.all(), "starts: an arm begins outside its joint limits"
@@ -368,9 +368,9 @@ def check_rows(tensors: Tensors, what: str) -> None:
         assert len(value) == NUM_ENVS, f"{what} '{name}': expected {NUM_ENVS} rows, got {shape}"
 
 
-def check_same(found: Any, expected: Any, text: str) -> None:
+def check_same(found: Any, expected: Any, text: str, tolerance: float = 0.0) -> None:
     """Check that tensors hold the expected numbers; NaN equals NaN. `text` names the promise."""
-    torch.testing.assert_close(found, expected, rtol=0.0, atol=0.0, equal_nan=True, msg=text)
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=tolerance, equal_nan=True, msg=text)
 
 
 def check_in_place(tensors: Tensors, before: Tensors, what: str) -> None:
@@ -397,11 +397,6 @@ def view_tensors(tensors: Tensors) -> dict[str, torch.Tensor]:
 def copy_tensors(tensors: Tensors) -> dict[str, torch.Tensor]:
     """Return copies of all tensors."""
     return {name: value.clone() for name, value in tensors.items()}
-
-
-def is_same(a: torch.Tensor, b: torch.Tensor, tolerance: float = 0.0) -> bool:
-    """Return whether two tensors hold the same numbers; NaN equals NaN."""
-    return bool(torch.allclose(a.float(), b.float(), rtol=0.0, atol=tolerance, equal_nan=True))
 
 
 def check_memory(

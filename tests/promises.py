@@ -11,7 +11,7 @@ from brokk_rl.checks import (
     NUM_ENVS,
     check_in_place,
     check_memory,
-    is_same,
+    check_same,
     isolate_randomness,
     view_tensors,
 )
@@ -134,7 +134,7 @@ def _follow(model: FollowerModel, machine: Machine, alter_first: bool) -> torch.
             proposed[0] = -proposed[0].roll(1)
         kept = proposed.clone()
         found.append(model.step(proposed).clone())
-        assert is_same(proposed, kept), "step: changed the proposal"
+        check_same(proposed, kept, "step: changed the proposal")
     return torch.stack(found)
 
 
@@ -170,22 +170,22 @@ def check_world(
     tolerance = 0.0 if device.type == "cpu" else 1e-5
     world.load_state_dict(stored)
     text = "load_state_dict: the same steps from the same state lead elsewhere"
-    assert is_same(_push_joints(world, steps), first, tolerance), text
+    check_same(_push_joints(world, steps), first, text, tolerance)
     world.load_state_dict(stored)
     altered = steps.clone()
     altered[0] = 0.0
     text = "step: what happens in world 0 changes the others"
-    assert is_same(_push_joints(world, altered)[:, 1:], first[:, 1:], tolerance), text
+    check_same(_push_joints(world, altered)[:, 1:], first[:, 1:], text, tolerance)
     before, some = world.q.clone(), torch.arange(NUM_ENVS, device=device) == 0
     world.reset(some, home, scenes)
-    assert is_same(world.q[1:], before[1:]), "reset: q changed in worlds outside the mask"
+    check_same(world.q[1:], before[1:], "reset: q changed in worlds outside the mask")
     text = "reset: the world of the mask is not where it was put"
     assert torch.allclose(world.q[0], home[0], atol=1e-4), text
     elsewhere = scenes.clone()
     elsewhere[:, 0] += PLACED_M
     before = world.q.clone()
     world.place(some, elsewhere)
-    assert is_same(world.q, before), "place: the arm moved with the block"
+    check_same(world.q, before, "place: the arm moved with the block")
 
 
 def _view_results(world: World, machine: Machine) -> dict[str, torch.Tensor]:

@@ -57,9 +57,6 @@ class Play(SimulatedPlant):
         """
         session, watch = self._build_session()
         page = PlayPage(session, self.play.port)
-        port = page.port
-        log.info("open http://localhost:%d in a browser; end with Ctrl-C", port)
-        log.info("over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", port, port)
         begun_s = last_s = time.monotonic()
         try:
             while self.play.seconds is None or last_s - begun_s < self.play.seconds:

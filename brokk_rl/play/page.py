@@ -77,11 +77,9 @@ class PlayPage:
         self._build_traces()
         self._add_keys()
         self._listen_to_handle()
-
-    @property
-    def port(self) -> int:
-        """Port at which the page is."""
-        return self._server.get_port()
+        at = self._server.get_port()
+        log.info("open http://localhost:%d in a browser; end with Ctrl-C", at)
+        log.info("over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", at, at)
 
     def update(self) -> None:
         """Carry out the requests of browsers and show the present state."""
