@@ -81,13 +81,11 @@ class PersonAtLevers(FollowerModel):
         if self.env is None:
             return given
         given = given.clone()
-        given[self.env] = self.read_command().to(given.device)
-        return given
-
-    def read_command(self) -> torch.Tensor:
-        """Return the person's command, `(J,)`: a lever of an exclusive joint rules out the others."""
+        # a lever of an exclusive joint rules out the others
         positioning = bool(self.levers[self._is_exclusive].any())
-        return self.levers * mask_exclusive_joints(self._is_exclusive, positioning)
+        command = self.levers * mask_exclusive_joints(self._is_exclusive, positioning)
+        given[self.env] = command.to(given.device)
+        return given
 
 
 @dataclass(frozen=True)
@@ -307,8 +305,8 @@ class PlaySession:
         position[:2] *= np.clip(distance, *DISTANCE_M) / distance
         position[2] = np.clip(position[2], *HEIGHT_M)
         self._pinned_m[self.selected] = torch.as_tensor(position, dtype=torch.float32)
-        everywhere = torch.arange(self.loop.num_envs, device=self.loop.device)
-        self._put_targets(everywhere == self.selected)
+        worlds = torch.arange(self.loop.num_envs, device=self.loop.device)
+        self._put_targets(worlds == self.selected)
         return position
 
     def advance(self, elapsed_s: float) -> int:
@@ -375,7 +373,8 @@ class PlaySession:
     def _put_targets(self, mask: torch.Tensor) -> None:
         """Move targets and blocks of the worlds of `mask`, `(N,)` bool, to where they were put."""
         task = self.loop.task
-        task.move_target(mask, self._pinned_m - task.state["start.target_m"])
+        shift_m = self._pinned_m - task.state["start.target_m"]
+        task.move_target(mask, shift_m.nan_to_num())
         scene = task.state["start.scene"]
         self.loop.world.place(mask & (scene[:, :2].norm(dim=1) < FAR_M), scene)
 
