@@ -61,8 +61,8 @@ MEASUREMENTS = (
     ),
     describe_exam(
         "servos", "tabletop arms of position servos",
-        "16 arms, answered once. Before: 22/22, 7/12, 0/9 of 62 others.",
-        "machine=so101 exam_plants=servos exam_mix=servos", 16, "servo_diagnosis", "servo",
+        "24 arms, answered once. Before: 28/28, 9/15, 0/11 of 78 others.",
+        "machine=so101 exam_plants=servos exam_mix=servos", 24, "servo_diagnosis", "servo",
     ),
     Measurement(
         name="ablations",

@@ -44,16 +44,19 @@ def read_comparison(folder: Path) -> Table:
     """Return a row for each group of `mode=compare`: means over seeds with Student's intervals."""
     rows: Table = []
     for group in load_json(folder / "comparison/comparison.json")["groups"]:
-        row = {name: str(value) for name, value in group["variation"].items()}
-        strict, (low, high) = group["success_strict"]["mean"], group["success_strict"]["ci95"]
-        row |= {
+        low, high = group["success_strict_low"], group["success_strict_high"]
+        # The controller meets the same starts beside each seed.
+        interval = f"{low:.3f} to {high:.3f}" if high > low else ""
+        row = {
             "policy": group["policy"],
             "seeds": group["runs"],
-            "strict success": round(strict, 3),
-            "95 %": f"{low:.3f} to {high:.3f}",
-            "median time, s": round(group["time_to_insert_s"]["mean"], 1),
-            "peak force, kN": round(group["peak_force_n"]["mean"] / 1000.0, 1),
-            "valve travel, 1/s": round(group["valve_travel"]["mean"], 1),
+            "strict success": round(group["success_strict"], 3),
+            "95 %": interval,
+            "inserted": round(group["success_reached"], 3),
+            "paper's criterion": round(group["success_paper"], 3),
+            "median time, s": round(group["time_to_insert_s"], 1),
+            "peak force, kN": round(group["peak_force_n"] / 1000.0, 1),
+            "valve travel, 1/s": round(group["valve_travel"], 1),
         }
         rows.append(row)
     return rows
@@ -141,8 +144,8 @@ MEASUREMENTS = (
     Measurement(
         name="paper",
         title="The paper's configuration",
-        conditions="`experiment=paper` is a reading of the paper under which a policy learns, five seeds of 200 million steps. `experiment=paper_literal` "
-        "takes its words as they stand, one seed of 40 million steps. 1,024 episodes each.",
+        conditions="`experiment=paper` is a reading of the paper under which a policy learns, five seeds of 200 million steps, 1,024 episodes each. "
+        "It strikes too hard for a strict success. `experiment=paper_literal` takes its words as they stand: one seed of 40 million steps has 0.000 of each. Baseline: the controller.",
         commands=(
             "brokk -m preset=gpu experiment=paper session.seed=1,2,3,4,5 rl.budget.max_env_steps=200e6 evaluation.video=false session.out={out}/paper",
             "brokk mode=compare compare.runs={out}/paper session.out={out}/comparison",
