@@ -114,8 +114,8 @@ class Diagnosis(ABC):
         told += found.gates
         tell("sizes and proof", 0.9)
         proof, verdict, detected = found.proof, found.verdict, self.detected
-        named = {j for one in proof.findings for j in one.joints}
-        told = accept_named_joints(told, name_joints(sorted(named), machine))
+        named = {one.effect: name_joints(one.joints, machine) for one in proof.findings}
+        told = accept_named_joints(told, named)
         names = {one.kind.name for one in detected} | {self.name(one) for one in proof.findings}
         if geometry.is_tracked(self.case.field, machine) and not names & SCATTERING:
             told.append(gates.judge_scatter(geometry.measure_scatter_growth(self.case, self.kinds)))
@@ -303,18 +303,27 @@ ACCEPTED_FINDINGS = ("does_not_obey", "unlogged_input", "interlock")
 others move, as an interlock does. Of opened cases two with such effects are told so since; two with a stop that
 moved, whose joints stand still for half of the time, stay unknown."""
 
+COARSE_FINDINGS = ("frozen_sensor", "jumps")
+"""Findings about a joint whose coarse sensor repeats its readings, and then changes by a step."""
 
-def accept_named_joints(told: Sequence[Gate], named: Sequence[str]) -> list[Gate]:
-    """Return the gates of the recordings; joints that do not move as commanded may have a named effect.
+
+def accept_named_joints(told: Sequence[Gate], named: Mapping[str, Sequence[str]]) -> list[Gate]:
+    """Return the gates of the recordings; what they find on a joint may have a named effect as its cause.
 
     Whether the effect explains it is told by the proof: the repaired simulator has to beat standing
     still on that joint.
+
+    Args:
+        told: The gates.
+        named: Joints of each named effect.
     """
     found = []
     for gate in told:
-        is_named = any(f", on {name};" in gate.text for name in named)
-        passed = gate.passed or (gate.name in ACCEPTED_FINDINGS and is_named)
-        found.append(replace(gate, passed=passed))
+        causes = named if gate.name in ACCEPTED_FINDINGS else ()
+        if gate.name in COARSE_FINDINGS:
+            causes = {"quantisation"} & named.keys()
+        is_named = any(f", on {name};" in gate.text for cause in causes for name in named[cause])
+        found.append(replace(gate, passed=gate.passed or is_named))
     return found
 
 

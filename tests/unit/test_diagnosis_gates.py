@@ -61,8 +61,22 @@ def test_an_effect_that_is_named_on_a_joint_may_be_what_locks_it(machine: Machin
     field = [recording(machine, np.abs(whole.u[:, 3]) > 0)]
     told = gates.judge_recordings(examine_recordings(field, machine), [], field, [whole], machine)
     assert not by_name(told)["interlock"].passed
-    assert not by_name(accept_named_joints(told, ["q4"]))["interlock"].passed
-    assert by_name(accept_named_joints(told, ["q4", "q3"]))["interlock"].passed
+    assert not by_name(accept_named_joints(told, {"lag": ["q4"]}))["interlock"].passed
+    assert by_name(accept_named_joints(told, {"lag": ["q4"], "creep": ["q3"]}))["interlock"].passed
+
+
+@pytest.mark.parametrize("name", ["frozen sensor", "jumps"])
+@pytest.mark.parametrize(
+    ("named", "passes"),
+    [({"lag": ["q3"]}, False), ({"quantisation": ["q4"]}, False), ({"quantisation": ["q3"]}, True)],
+)
+def test_a_coarse_sensor_repeats_its_readings_and_jumps(
+    name: str, named: dict[str, list[str]], passes: bool, machine: Machine
+) -> None:
+    one = [recording(machine)]
+    told = gates.judge_recordings([remark(name, "q3", 0.4)], [], one, one, machine)
+    found = by_name(accept_named_joints(told, named))
+    assert found[name.replace(" ", "_")].passed is passes
 
 
 def test_limits_that_the_recordings_leave_are_told(machine: Machine) -> None:
