@@ -200,6 +200,7 @@ VALVE = JointModel(
         JitterLaw(0.09),
         JitterLaw(0.18),
         JitterLaw(0.36),
+        JitterLaw(0.72),
     ),
     substep_s=0.025,  # half a period of the reference machine's 20 Hz
     interval_s=0.25,  # chosen by hand: of 0.1, 0.25 and 0.5 s each named 9 of 12 small effects
