@@ -16,6 +16,7 @@ Axes: `T` rows of a log, `H` samples of history (oldest first), `C` columns of a
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from collections.abc import Mapping
@@ -110,6 +111,11 @@ class PolicyContract:
     def size(self) -> int:
         """Length of the observation vector, `O`."""
         return sum(term.size for term in self.terms)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name of each number of the observation vector."""
+        return tuple(itertools.chain.from_iterable(term.list_numbers() for term in self.terms))
 
     @property
     def num_samples(self) -> int:

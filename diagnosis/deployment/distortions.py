@@ -9,18 +9,22 @@ Axes: `T` rows, `R` rows that are asked for, `H` samples (oldest first), `C` col
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm
+from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm, PolicyContract
 from diagnosis.deployment.orders import Order, invert_order, list_orders, match_order
 from diagnosis.deployment.replay import Change
 
-Spoil = Callable[[np.ndarray, float, np.ndarray], np.ndarray]
-"""Makes wrong values of right ones by a number, with the unit of each column, `(C,)`."""
+POINTS = ("log", "signal", "scaled", "vector", "network", "answer", "command")
+"""Points of the way, by the first word of their name; a log begins it."""
+Spoil = Callable[[np.ndarray, float], np.ndarray]
+"""Makes wrong values of right ones by a number."""
 
 
 @dataclass(frozen=True)
@@ -31,24 +35,21 @@ class Place:
         point: See `diagnosis.deployment.replay`.
         columns: Those that are spoiled; `None`: all.
         order: Column that the code takes for each of them; `None`: the right one.
-        unit: Unit of each column of the point in which offsets are tried, `(C,)`.
     """
 
     point: str
     columns: tuple[int, ...] | None = None
     order: Order | None = None
-    unit: np.ndarray | None = None
 
     def change(self, spoil: Spoil, number: float, values: np.ndarray) -> np.ndarray:
         """Return the values of the point with the wrong ones among them."""
         if self.order is not None:
             values = values[..., list(self.order)]
-        unit = np.ones(values.shape[-1]) if self.unit is None else self.unit
         if self.columns is None:
-            return spoil(values, number, unit)
+            return spoil(values, number)
         columns = list(self.columns)
         changed = values.copy()
-        changed[..., columns] = spoil(values[..., columns], number, unit[columns])
+        changed[..., columns] = spoil(values[..., columns], number)
         return changed
 
 
@@ -60,7 +61,8 @@ class Distortion:
         kind: Kind of mistake.
         text: The mistake in words; `{field}` stands for the field, `{value}` for the number.
         spoil: Makes wrong values of right ones.
-        values: Numbers to try; one of no meaning where there is no number.
+        values: Numbers to try; one of no meaning where there is no number. None: rows from shortly before the
+            first departure on.
         parameter: Name of the number, with its unit; empty where it is not told.
         is_continuous: The number is refined between those of `values`.
         field: Where it acts, in words: `q.q3`, `u`, `target.y`, `command.q2`, `observation`.
@@ -81,6 +83,11 @@ class Distortion:
         text = self.text.replace("{field}", field)
         return replace(self, text=text, field=field, places=places)
 
+    def acts_between(self, begin: str, end: str) -> bool:
+        """Return whether it acts behind one point of the way, and at another one or before."""
+        first = min(POINTS.index(place.point.split()[0]) for place in self.places)
+        return POINTS.index(begin) < first <= POINTS.index(end)
+
     def build(self, number: float) -> Change:
         """Return the change of the replay with this number."""
         changes = {}
@@ -89,53 +96,48 @@ class Distortion:
         return changes
 
 
-def keep(values: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
+def keep(values: np.ndarray, number: float) -> np.ndarray:
     """Return right values: only their order is wrong."""
     return values
 
 
-def scale(values: np.ndarray, factor: float, unit: np.ndarray) -> np.ndarray:
+def scale(values: np.ndarray, factor: float) -> np.ndarray:
     """Return values times a factor."""
     return factor * values
 
 
-def flip(values: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
-    """Return values times the sign of each column."""
-    return values * unit
+def shift(values: np.ndarray, offset: float) -> np.ndarray:
+    """Return values with an offset."""
+    return values + offset
 
 
-def shift(values: np.ndarray, offset: float, unit: np.ndarray) -> np.ndarray:
-    """Return values with an offset in the unit of each column."""
-    return values + offset * unit
-
-
-def shift_command(values: np.ndarray, offset: float, unit: np.ndarray) -> np.ndarray:
+def shift_command(values: np.ndarray, offset: float) -> np.ndarray:
     """Return commands with an offset, within full command."""
     return (values + offset).clip(-1.0, 1.0)
 
 
-def clip(values: np.ndarray, bound: float, unit: np.ndarray) -> np.ndarray:
+def clip(values: np.ndarray, bound: float) -> np.ndarray:
     """Return values clipped at plus and minus a bound."""
     return values.clip(-bound, bound)
 
 
-def delay(values: np.ndarray, periods: float, unit: np.ndarray) -> np.ndarray:
+def delay(values: np.ndarray, periods: float) -> np.ndarray:
     """Return values that are whole rows late; the first row stands before. Fewer than 0: early."""
     return values[np.clip(np.arange(len(values)) - int(periods), 0, len(values) - 1)]
 
 
-def freeze(values: np.ndarray, row: float, unit: np.ndarray) -> np.ndarray:
+def freeze(values: np.ndarray, row: float) -> np.ndarray:
     """Return values that stay as they are from a row on."""
     return values[np.minimum(np.arange(len(values)), int(row))]
 
 
-def hold(values: np.ndarray, phase: float, unit: np.ndarray, every: int) -> np.ndarray:
+def hold(values: np.ndarray, phase: float, every: int) -> np.ndarray:
     """Return values that are refreshed only every few rows."""
     rows = np.arange(len(values))
     return values[np.maximum(rows - (rows - int(phase)) % every, 0)]
 
 
-def smooth(values: np.ndarray, weight: float, unit: np.ndarray) -> np.ndarray:
+def smooth(values: np.ndarray, weight: float) -> np.ndarray:
     """Return values behind a first-order low-pass; `weight` is that of the newest value."""
     smoothed = values.copy()
     for row in range(1, len(values)):
@@ -143,27 +145,27 @@ def smooth(values: np.ndarray, weight: float, unit: np.ndarray) -> np.ndarray:
     return smoothed
 
 
-def turn(points: np.ndarray, angle_rad: float, unit: np.ndarray, axis: int) -> np.ndarray:
-    """Return points `(T, 3)` turned about axis 0, 1 or 2."""
-    one, other = (axis + 1) % 3, (axis + 2) % 3
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    turned = points.copy()
-    turned[:, one] = cos * points[:, one] - sin * points[:, other]
-    turned[:, other] = sin * points[:, one] + cos * points[:, other]
-    return turned
+def exchange(points: np.ndarray, number: float, axes: np.ndarray) -> np.ndarray:
+    """Return points `(T, 3)` in a frame with other `axes`, `(3, 3)`."""
+    return points @ axes.T
 
 
-def turn_round(window: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
+def turn(points: np.ndarray, angle_rad: float, axis: str) -> np.ndarray:
+    """Return points `(T, 3)` turned about `x`, `y` or `z`."""
+    return Rotation.from_euler(axis, angle_rad).apply(points)
+
+
+def turn_round(window: np.ndarray, number: float) -> np.ndarray:
     """Return a history `(R, H, C)` with the newest sample first."""
     return window[:, ::-1]
 
 
-def lay_out_by_joint(window: np.ndarray, number: float, unit: np.ndarray) -> np.ndarray:
+def lay_out_by_joint(window: np.ndarray, number: float) -> np.ndarray:
     """Return a history `(R, H, C)` whose numbers stand joint by joint."""
     return window.transpose(0, 2, 1).reshape(window.shape)
 
 
-def fill_early(window: np.ndarray, times: float, unit: np.ndarray) -> np.ndarray:
+def fill_early(window: np.ndarray, times: float) -> np.ndarray:
     """Return a history `(R, H, C)` into which each sample was put several times."""
     samples = window.shape[1]
     return window[:, samples - 1 - np.arange(samples)[::-1] // int(times)]
@@ -195,12 +197,19 @@ ON_SIGNALS = (
     Distortion("scale", "{field} is in thousandths for units", scale, (1000.0,)),
     Distortion("scale", "{field} is in units for thousandths", scale, (0.001,)),
     Distortion("scale", "{field} is in hundredths for units", scale, (100.0,)),
-    Distortion("default_pose", "{value} standard deviations are added to {field}", shift, OFFSETS_STD, "offset_std", True),
+    Distortion("stale", "{field} is stale from row {value} on", freeze, (), "row"),
 )  # fmt: skip
 ON_COMMANDS = (
     *ON_COLUMNS,
     Distortion("clip", "{field} is clipped at ±{value}", clip, LEVELS[:6], "bound", True),
     Distortion("default_pose", "{value} is added to {field}", shift_command, OFFSETS_COMMAND, "offset", True),
+)  # fmt: skip
+CLIPPED = Distortion(
+    "clip", "{field} is clipped at ±{value} after scaling", clip, LEVELS, "bound", True
+)
+ON_SCALED = (Distortion("stale", "{field} is missing: zero after scaling", scale, (0.0,)), CLIPPED)
+OFFSET = Distortion(
+    "default_pose", "{value} standard deviations are added to {field}", shift, OFFSETS_STD, "offset_std", True
 )  # fmt: skip
 EARLY = Distortion("delay", "{field} is a period too new", delay, (-1.0,))
 LATE = Distortion("delay", "{field} is {value} periods old", delay, DELAYS, "periods")
@@ -222,7 +231,7 @@ ALL_FILLED = Distortion(
     "rate", "the history is filled {value} times a period: the loop runs at {value} times its rate", fill_early, (2.0, 3.0)
 )  # fmt: skip
 ALL_LATE = replace(LATE, text="the whole {field} is {value} periods old")
-CLIPPED = Distortion("clip", "the {field} is clipped at ±{value}", clip, LEVELS, "bound", True)
+ALL_CLIPPED = replace(CLIPPED, text="the {field} is clipped at ±{value}")
 
 
 def spread(
@@ -238,64 +247,58 @@ def spread(
             yield row.put(f"{field}.{name}", *single)
 
 
-def list_input_distortions(
-    policy: LoadedPolicy, signals: Mapping[str, np.ndarray], rows: tuple[int, ...]
-) -> list[Distortion]:
-    """Return mistakes between log and observation vector.
+def list_distortions(policy: LoadedPolicy, others: Mapping[str, LoadedPolicy]) -> list[Distortion]:
+    """Return the mistakes that are known, but for orders that only a log tells.
 
     Args:
         policy: The policy.
-        signals: The log's values by term, `(T, C)`.
-        rows: Rows at which something may have begun to be stale.
+        others: Further policies that may have run instead, by folder.
     """
-    found = list[Distortion]()
-    begins = tuple(float(row) for row in rows)
-    stale = Distortion("stale", "{field} is stale from row {value} on", freeze, begins, "row")
+    found = list(_list_frame_mistakes(policy))
     for term in policy.contract.terms:
-        place, names = _watch(term), _name_columns(term)
-        found += spread(ON_SIGNALS, term.name, names, place)
-        found += _list_normalisations(term)
-        for row in ON_ROWS if term.newest >= 0 else (EARLY, *ON_ROWS):
-            found.append(row.put(term.name, place))
-        moves = np.ptp(signals[term.name], axis=0) != 0.0
-        for one in spread([stale], term.name, names, place):
-            # What never changes cannot be seen to be stale.
-            if moves[list(one.places[0].columns or range(len(names)))].any():
-                found.append(one)
-        if term.name != "target" and len(names) > 1:
-            for order in list_orders(names):
-                found += make_orders([term], names, order)
-        if term.samples > 1:
-            found += [row.put(term.name, Place(f"scaled {term.name}")) for row in ON_HISTORIES]
-    return [*found, *_list_shared_mistakes(policy), *_list_vector_mistakes(policy)]
+        found += _list_term_mistakes(term)
+    found += _list_shared_mistakes(policy)
+    found += _list_vector_mistakes(policy)
+    for name, other in others.items():
+        if other.contract.size == policy.contract.size:
+            network = lambda vectors, _, other=other: other.network.answer(vectors)  # noqa: E731
+            row = Distortion("network", f"the network is that of {name}", network)
+            found.append(row.put("network", Place("network")))
+    joints, command = policy.contract.joints, Place("command")
+    found += [_make_command_order(joints, order) for order in list_orders(joints)]
+    found += spread(ON_COMMANDS, "command", joints, command)
+    found += [row.put("command", command) for row in ON_ROWS]
+    return found
 
 
-def _watch(term: ObservationTerm) -> Place:
-    """Return the values of a term as they come in."""
-    return Place(f"signal {term.name}", unit=term.std)
+def _list_term_mistakes(term: ObservationTerm) -> Iterator[Distortion]:
+    """Yield mistakes of one term."""
+    name, names = term.name, name_columns(term)
+    signal, scaled = Place(f"signal {name}"), Place(f"scaled {name}")
+    yield from spread(ON_SIGNALS, name, names, signal)
+    yield from spread([OFFSET], name, names, scaled)
+    for row in (*_list_normalisations(term.mean, term.std), *ON_SCALED):
+        yield row.put(name, scaled)
+    for row in ON_ROWS if term.newest >= 0 else (EARLY, *ON_ROWS):
+        yield row.put(name, signal)
+    if name != "target" and len(names) > 1:
+        for order in list_orders(names):
+            yield from _make_orders([term], names, order)
+    if term.samples > 1:
+        for row in ON_HISTORIES:
+            yield row.put(name, scaled)
 
 
-def _list_normalisations(term: ObservationTerm) -> Iterator[Distortion]:
-    """Yield missing steps of the normalisation; clipped values."""
-    mean, std, place = term.mean, term.std, Place(f"scaled {term.name}")
-    has_mean, has_std = np.abs(mean).max() > 0, np.abs(std - 1.0).max() > 0
-    rows = []
-    if has_mean or has_std:
-        rows.append(Distortion("scale", "{field} is not normalised", lambda x, *_: x * std + mean))
-        missing = "{field} is missing: zero after scaling"
-        rows.append(Distortion("stale", missing, lambda x, *_: np.zeros_like(x)))
-    if has_mean:
-        text = "the mean of {field} is not subtracted"
-        rows.append(Distortion("default_pose", text, lambda x, *_: x + mean / std))
-    if has_std:
-        text = "{field} is not divided by its standard deviation"
-        rows.append(Distortion("scale", text, lambda x, *_: x * std))
-    rows.append(replace(CLIPPED, text="{field} is clipped at ±{value} after scaling"))
-    for row in rows:
-        yield row.put(term.name, place)
+def _list_normalisations(mean: np.ndarray, std: np.ndarray) -> Iterator[Distortion]:
+    """Yield missing steps of the normalisation; a step that is none explains nothing."""
+    yield Distortion("scale", "{field} is not normalised", lambda x, _: x * std + mean)
+    text = "the mean of {field} is not subtracted"
+    yield Distortion("default_pose", text, lambda x, _: x + mean / std)
+    text = "{field} is not divided by its standard deviation"
+    yield Distortion("scale", text, lambda x, _: x * std)
 
 
-def make_orders(
+def _make_orders(
     terms: Sequence[ObservationTerm], names: Sequence[str], order: Order, *after: Place
 ) -> Iterator[Distortion]:
     """Yield the mistake that terms of the observation are in another order.
@@ -314,56 +317,58 @@ def make_orders(
     text = f"{listed} {verb} in another order: {describe_order(names, order)}"
     row = Distortion("order", text, keep)
     field = "joints" if len(terms) > 1 else terms[0].name
-    yield row.put(field, *(replace(_watch(term), order=order) for term in terms), *after)
+    yield row.put(field, *(Place(f"signal {term.name}", order=order) for term in terms), *after)
     if any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms):
         scaled = [Place(f"scaled {term.name}", order=order) for term in terms]
         yield row.put(field, *scaled, *after)
 
 
 def list_matched_orders(
-    policy: LoadedPolicy, signals: Mapping[str, np.ndarray], observed: np.ndarray
+    contract: PolicyContract, point: str, known: np.ndarray, seen: np.ndarray
 ) -> list[Distortion]:
-    """Return the orders of terms that a logged observation vector shows, whatever they are.
+    """Return the orders in which the numbers at a point come out as they were logged, whatever they are.
 
     Args:
-        policy: The policy.
-        signals: The log's values by term, `(T, C)`.
-        observed: The vector as the network got it, `(T, O)`.
+        contract: The policy's contract.
+        point: `vector` or `command`.
+        known: What the contract says, `(T, O)` or `(T, J)`.
+        seen: What was logged.
     """
-    contract, shared = policy.contract, dict[Order, list[ObservationTerm]]()
-    found = list[Distortion]()
+    if point == "command":
+        order = match_order(known, seen)
+        return [] if order is None else [_make_command_order(contract.joints, order)]
+    found, shared = list[Distortion](), dict[Order, list[ObservationTerm]]()
     for term in contract.terms:
         if len(term.columns) < 2:
             continue
-        block = observed[:, contract.term_slices[term.name]]
-        seen = block.reshape(len(observed), term.samples, -1)[:, -1]
-        known = signals[term.name][np.clip(np.arange(len(observed)) + term.newest, 0, None)]
-        names = _name_columns(term)
-        by_scaled = match_order((known - term.mean) / term.std, seen)
-        by_raw = match_order(known, seen * term.std + term.mean)
+        end = contract.term_slices[term.name].stop
+        newest, names = slice(end - len(term.columns), end), name_columns(term)
+        by_scaled = match_order(known[:, newest], seen[:, newest])
+        by_raw = match_order(*(one[:, newest] * term.std + term.mean for one in (known, seen)))
         for order in dict.fromkeys(one for one in (by_scaled, by_raw) if one is not None):
-            found += make_orders([term], names, order)
+            found += _make_orders([term], names, order)
             if names == list(contract.joints):
                 shared.setdefault(order, []).append(term)
     for order, terms in shared.items():
         if len(terms) > 1:
-            found += make_orders(terms, contract.joints, order)
+            found += _make_orders(terms, contract.joints, order)
     return found
 
 
 def _list_shared_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
     """Yield mistakes that several terms share."""
     terms, names = policy.contract.terms, list(policy.contract.joints)
-    by_joint = [term for term in terms if _name_columns(term) == names]
+    by_joint = [term for term in terms if name_columns(term) == names]
     if len(by_joint) < 2:
         return
     for order in list_orders(names):
-        yield from make_orders(by_joint, names, order)
-        yield from make_orders(by_joint, names, order, Place("answer", order=invert_order(order)))
-    yield from spread([SIGN], "joints", names, *map(_watch, by_joint))
+        yield from _make_orders(by_joint, names, order)
+        yield from _make_orders(by_joint, names, order, Place("answer", order=invert_order(order)))
+    yield from spread([SIGN], "joints", names, *(Place(f"signal {term.name}") for term in by_joint))
     long = [Place(f"scaled {term.name}") for term in terms if term.samples > 1]
-    yield ALL_FILLED.put("observation", *long)
-    yield ALL_LATE.put("observation", *map(_watch, terms))
+    if long:
+        yield ALL_FILLED.put("observation", *long)
+    yield ALL_LATE.put("observation", *(Place(f"signal {term.name}") for term in terms))
 
 
 def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
@@ -374,10 +379,10 @@ def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
             places = [np.arange(slices[name].start, slices[name].stop) for name in order]
             row = Distortion("order", f"the terms are in the order {', '.join(order)}", keep)
             yield row.put("observation", Place("vector", order=tuple(np.concatenate(places))))
-    yield CLIPPED.put("observation", Place("vector"))
+    yield ALL_CLIPPED.put("observation", Place("vector"))
 
 
-def list_frame_distortions(policy: LoadedPolicy) -> Iterator[Distortion]:
+def _list_frame_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
     """Yield turned, swapped and shifted frames of the target."""
     terms = {term.name: term for term in policy.contract.terms}
     if "target" not in terms or len(terms["target"].columns) != 3:
@@ -388,46 +393,25 @@ def list_frame_distortions(policy: LoadedPolicy) -> Iterator[Distortion]:
             if order == (0, 1, 2) and sum(sign < 0 for sign in signs) < 2:
                 continue  # no change, or the wrong sign of one axis
             letters = zip(signs, order, strict=True)
-            axes = " ".join(f"{'-' if sign < 0 else '+'}{'xyz'[axis]}" for sign, axis in letters)
-            kind, text = "frame", f"target is in a frame with the axes {axes}"
+            named = " ".join(f"{'-' if sign < 0 else '+'}{'xyz'[axis]}" for sign, axis in letters)
+            kind, text = "frame", f"target is in a frame with the axes {named}"
             if min(signs) > 0:
-                kind, text = "order", f"target has its axes in the order {axes}"
-            row = Distortion(kind, text, flip)
-            yield row.put("target", replace(place, order=order, unit=np.array(signs)))
+                kind, text = "order", f"target has its axes in the order {named}"
+            axes = np.diag(signs) @ np.eye(3)[list(order)]
+            yield Distortion(kind, text, partial(exchange, axes=axes)).put("target", place)
     for axis, letter in enumerate("xyz"):
         text = f"target is in a frame turned by {{value}} rad about {letter}"
-        about = partial(turn, axis=axis)
+        about = partial(turn, axis=letter)
         yield Distortion("frame", text, about, ANGLES_RAD, "angle_rad", True).put("target", place)
         text = f"target is in a frame shifted by {{value}} m along {letter}"
         row = Distortion("frame", text, shift, SHIFTS_M, "shift_m", True)
         yield row.put(f"target.{letter}", replace(place, columns=(axis,)))
 
 
-def make_command_order(names: Sequence[str], order: Order) -> Distortion:
+def _make_command_order(names: Sequence[str], order: Order) -> Distortion:
     """Return the mistake that commands reach the joints in another order."""
     text = "commands reach the joints in another order: " + describe_order(names, order)
     return Distortion("order", text, keep).put("command", Place("command", order=order))
-
-
-def list_command_distortions(policy: LoadedPolicy) -> list[Distortion]:
-    """Return mistakes between network and valve."""
-    names, place = policy.contract.joints, Place("command")
-    found = [make_command_order(names, order) for order in list_orders(names)]
-    found += spread(ON_COMMANDS, "command", names, place)
-    return [*found, *(row.put("command", place) for row in ON_ROWS)]
-
-
-def list_network_distortions(
-    policy: LoadedPolicy, others: Mapping[str, LoadedPolicy]
-) -> list[Distortion]:
-    """Return the mistake of having deployed each of the other policies, where it would run at all."""
-    found = []
-    for name, other in others.items():
-        if other.contract.size == policy.contract.size:
-            network = lambda vectors, *_, other=other: other.network.answer(vectors)  # noqa: E731
-            row = Distortion("network", f"the network is that of {name}", network)
-            found.append(row.put("network", Place("network")))
-    return found
 
 
 def describe_order(names: Sequence[str], order: Order) -> str:
@@ -435,15 +419,7 @@ def describe_order(names: Sequence[str], order: Order) -> str:
     return ", ".join(names[column] for column in order)
 
 
-def _name_columns(term: ObservationTerm) -> list[str]:
-    """Return the names of a term's columns within it: `q3` for `q_q3_rad`."""
-    if term.name == "target":
-        return [column.split("_")[1] for column in term.columns]
-    names = []
-    for column in term.columns:
-        for prefix in (f"{term.name}_", "q_", "u_", "advice_"):
-            column = column.removeprefix(prefix)
-        for unit in ("_rad", "_m"):
-            column = column.removesuffix(unit)
-        names.append(column)
-    return names
+def name_columns(term: ObservationTerm) -> list[str]:
+    """Return the names of a term's columns within it: `q3` for `q_q3_rad`, `x` for `target_x_m`."""
+    around = re.compile(rf"^({re.escape(term.name)}|q|u|advice)_|_(rad|m)$")
+    return [around.sub("", column) for column in term.columns]

@@ -21,17 +21,16 @@ from brokk_rl.record import Recording
 from brokk_rl.session import write_json
 from diagnosis.deployment import distortions
 from diagnosis.deployment.contract import LoadedPolicy, PolicyContract
-from diagnosis.deployment.distortions import MAX_DELAY, Distortion
 from diagnosis.deployment.fault_search import (
     LEAST_ROWS,
     NUM_RANKED,
     FittedDistortion,
+    Predict,
     ReplayStage,
     StageResult,
     judge_stage,
 )
 from diagnosis.deployment.motion_check import MotionEvidence, check_motion
-from diagnosis.deployment.orders import match_order
 from diagnosis.deployment.replay import (
     SPREAD_FACTOR,
     TOLERANCE,
@@ -43,6 +42,14 @@ from diagnosis.deployment.replay import (
 from diagnosis.deployment.training_range import RangeEvidence, compare_with_training
 
 DoctorVerdict = Literal["code", "actuator", "task", "nothing", "cannot_tell"]
+StageName = Literal["observation", "network", "policy", "delivery"]
+WAYS: dict[StageName, tuple[str, str]] = {
+    "observation": ("log", "vector"),
+    "network": ("vector", "command"),
+    "policy": ("log", "command"),
+    "delivery": ("answer", "command"),
+}
+"""First and last point of each part of the way from log to valve."""
 UNLISTED = "unlisted"
 """Kind of a departure that no distortion explains."""
 SCHEMA = 1
@@ -221,33 +228,33 @@ class Deployment:
         self, log: RunLog, is_sent: bool, generator: np.random.Generator
     ) -> Iterator[ReplayStage]:
         """Yield the parts of the way that the log lets one judge."""
-        policy, observed, in_force = self.policy, log.observed, log.in_force
-        contract = policy.contract
-        commanded = log.commanded
-        if commanded is None and is_sent:
-            commanded = in_force
-        replay = PolicyReplay(policy, log, generator)
-        after = distortions.list_command_distortions(policy)
-        networks = distortions.list_network_distortions(policy, self.others)
-        start, joints = contract.num_samples, contract.joints
-        if log.is_complete and observed is not None:
+        contract = self.policy.contract
+        replay = PolicyReplay(self.policy, log, generator)
+        every = distortions.list_distortions(self.policy, self.others)
+
+        def make_stage(
+            name: StageName, predict: Predict, logged: np.ndarray, floor: np.ndarray | float
+        ) -> ReplayStage:
+            begin, end = WAYS[name]
+            some = [one for one in every if one.acts_between(begin, end)]
+            nominal = predict((), np.arange(len(logged)))
+            some += distortions.list_matched_orders(contract, end, nominal, logged)
+            labels = contract.labels if end == "vector" else contract.joints
+            num_start = contract.num_samples if begin == "log" else 0
+            floor = np.broadcast_to(floor, logged.shape)
+            return ReplayStage(name, predict, logged, floor, labels, some, num_start)
+
+        if log.is_complete and log.observed is not None:
             floor = VECTOR_TOLERANCE + SPREAD_FACTOR * replay.spread[0]
-            labels = tuple(name for term in contract.terms for name in term.list_numbers())
-            every = _list_inputs(policy, log, replay.encoded, observed, floor)
-            every += distortions.list_matched_orders(policy, log.signals, observed)
-            yield ReplayStage("observation", replay.encode, observed, floor, labels, every, start)
-        if commanded is not None and (observed is not None or log.is_complete):
-            name, floor, every = "network", np.full(commanded.shape, TOLERANCE), list[Distortion]()
-            if observed is None:
-                name, floor = "policy", floor + SPREAD_FACTOR * replay.spread[1]
-                every = _list_inputs(policy, log, replay.nominal, commanded, floor)
-            every += [*networks, *after, *_match_commands(contract, replay.nominal, commanded)]
-            start = 0 if observed is not None else start
-            yield ReplayStage(name, replay.command, commanded, floor, joints, every, start)
-        if log.commanded is not None and in_force is not None and is_sent:
-            floor = np.full(in_force.shape, TOLERANCE)
-            every = [*after, *_match_commands(contract, log.commanded, in_force)]
-            yield ReplayStage("delivery", replay.deliver, in_force, floor, joints, every, 0)
+            yield make_stage("observation", replay.encode, log.observed, floor)
+        commanded = log.in_force if log.commanded is None and is_sent else log.commanded
+        if commanded is not None and log.observed is not None:
+            yield make_stage("network", replay.command, commanded, TOLERANCE)
+        elif commanded is not None and log.is_complete:
+            floor = TOLERANCE + SPREAD_FACTOR * replay.spread[1]
+            yield make_stage("policy", replay.command, commanded, floor)
+        if log.commanded is not None and log.in_force is not None and is_sent:
+            yield make_stage("delivery", replay.deliver, log.in_force, TOLERANCE)
 
 
 def decide_verdict(
@@ -278,27 +285,6 @@ def decide_verdict(
         return "nothing", f"{code}Motion was not judged: {motion.cannot_tell}."
     moves = "the machine moves as those of the training, as far as could be judged"
     return "nothing", f"{code}The run lies within the training's range, and {moves}."
-
-
-def _list_inputs(
-    policy: LoadedPolicy, log: RunLog, nominal: np.ndarray, logged: np.ndarray, floor: np.ndarray
-) -> list[Distortion]:
-    """Return mistakes before the network; something may be stale from shortly before the first departure on."""
-    start = policy.contract.num_samples
-    with np.errstate(invalid="ignore"):
-        departed = np.flatnonzero((np.abs(nominal - logged) > floor)[start:].any(1))
-    first = start + int(departed[0]) if len(departed) else 0
-    rows = tuple(range(max(0, first - MAX_DELAY), first + 1))
-    frames = distortions.list_frame_distortions(policy)
-    return [*frames, *distortions.list_input_distortions(policy, log.signals, rows)]
-
-
-def _match_commands(
-    contract: PolicyContract, known: np.ndarray, seen: np.ndarray
-) -> list[Distortion]:
-    """Return the order of the joints, whatever it is, in which commands come out as they were logged."""
-    order = match_order(known, seen)
-    return [] if order is None else [distortions.make_command_order(contract.joints, order)]
 
 
 def _describe_findings(result: StageResult, log: RunLog) -> list[Finding]:
@@ -368,8 +354,8 @@ def _check_without_replay(contract: PolicyContract, log: RunLog) -> list[Finding
         text = f"the loop ran at {rate_hz:.4g} Hz, {trained}"
         number = {"rate_hz": rate_hz}
         found.append(Finding("rate", "loop", "policy", text, whole_s, parameters=number))
-    if log.num_observed not in (0, contract.size):
+    if log.observed is not None and log.observed.shape[1] != contract.size:
         stated = f"the contract has {contract.size}: another policy ran"
-        text = f"the network got {log.num_observed} numbers, {stated}"
+        text = f"the network got {log.observed.shape[1]} numbers, {stated}"
         found.append(Finding("network", "observation", "observation", text, whole_s))
     return found

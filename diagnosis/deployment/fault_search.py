@@ -183,7 +183,7 @@ def judge_stage(stage: ReplayStage) -> StageResult:
     named = alike = ranking = ()
     if is_departure(len(departed), len(rows)):
         judged = rows if len(settled) < LEAST_ROWS else settled
-        search = _FaultSearch(stage, residual, judged)
+        search = _FaultSearch(stage, residual, judged, int(departed[0]))
         ranking = search.rank(())
         named, alike = search.choose(ranking)
     return StageResult(stage, len(rows), departed, residual, named, alike, ranking)
@@ -192,8 +192,11 @@ def judge_stage(stage: ReplayStage) -> StageResult:
 class _FaultSearch:
     """Search within one stage, on the rows that are judged."""
 
-    def __init__(self, stage: ReplayStage, residual: np.ndarray, rows: np.ndarray) -> None:
+    def __init__(
+        self, stage: ReplayStage, residual: np.ndarray, rows: np.ndarray, first: int
+    ) -> None:
         self._stage, self._rows = stage, rows
+        self._begins = range(max(0, first - MAX_DELAY), first + 1)
         self._ok = np.asarray((np.abs(residual[rows]) <= stage.floor[rows]).all(1))
         self._loss = _measure_loss(residual[rows])
         departed, others = np.flatnonzero(~self._ok), np.flatnonzero(self._ok)
@@ -204,7 +207,8 @@ class _FaultSearch:
         """Return the mistakes that come nearest, beside those of `given`, best first."""
         screened = []
         for distortion in self._stage.distortions:
-            tried = [self._try(distortion, one, given, self._sample) for one in distortion.values]
+            values = distortion.values or self._begins
+            tried = [self._try(distortion, one, given, self._sample) for one in values]
             screened.append(max(tried, key=_get_gain))
         screened.sort(key=_get_gain, reverse=True)
         refined = [self._refine(one, given) for one in screened[:NUM_SCREENED]]

@@ -11,8 +11,9 @@ columns of a term, `O` numbers of the vector, `J` joints.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -174,9 +175,9 @@ class RunLog:
         missing: Columns that the contract asks for and the log lacks.
         commanded: Command that the policy gave, `(T, J)`; `None` where it was not logged.
         in_force: Command in force, `(T, J)`.
-        observed: Observation vector as the network got it, `(T, O)`; `None` where not logged.
-        num_observed: Numbers of the logged vector; 0 where it was not logged.
+        observed: Observation vector as the network got it, `(T, O)`, or of another length; `None` where not logged.
         is_measured: The command in force is a measured valve feedback, not what was sent.
+        units: Step to which each column was rounded, by name.
     """
 
     recording: Recording
@@ -185,9 +186,8 @@ class RunLog:
     commanded: np.ndarray | None
     in_force: np.ndarray | None
     observed: np.ndarray | None
-    num_observed: int
     is_measured: bool
-    units: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, float]
 
     @property
     def t_s(self) -> np.ndarray:
@@ -218,39 +218,27 @@ def read_run_log(
             columns.setdefault(name, np.full(recording.num_samples, value))
     signals, missing = {}, []
     for term in contract.terms:
-        lacking = [name for name in term.columns if name not in columns]
-        missing += lacking
-        if not lacking:
-            signals[term.name] = _read_term(term, columns)
-    advice = _stack(columns, [name_advice_column(name) for name in contract.joints])
-    in_force = _stack(columns, contract.commands)
-    names = [OBSERVATION_COLUMN.format(number) for number in range(contract.size)]
-    source = recording.metadata.get("source", "")
-    num_observed = 0
-    while OBSERVATION_COLUMN.format(num_observed) in columns:
-        num_observed += 1
+        values = _stack(columns, term.columns)
+        if values is None:
+            missing += [name for name in term.columns if name not in columns]
+        else:
+            # A policy that gave no advice proposed nothing: its history holds zero there.
+            signals[term.name] = np.nan_to_num(values) if term.name == "proposals" else values
+    numbers = map(OBSERVATION_COLUMN.format, itertools.count())
     return RunLog(
         recording=recording,
         signals=signals,
         missing=tuple(missing),
-        commanded=advice,
-        in_force=in_force,
-        observed=_stack(columns, names) if num_observed == contract.size else None,
-        num_observed=num_observed,
-        is_measured=source.startswith(CAPTURED),
+        commanded=_stack(columns, [name_advice_column(name) for name in contract.joints]),
+        in_force=_stack(columns, contract.commands),
+        observed=_stack(columns, [*itertools.takewhile(columns.__contains__, numbers)]),
+        is_measured=recording.metadata.get("source", "").startswith(CAPTURED),
         units={name: measure_resolution(values) for name, values in columns.items()},
     )
 
 
-def _read_term(term: ObservationTerm, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    values = np.stack([columns[name] for name in term.columns], 1)
-    # A policy that gave no advice proposed nothing: its history holds zero there.
-    return np.nan_to_num(values) if term.name == "proposals" else values
-
-
-def _stack(
-    columns: Mapping[str, np.ndarray], names: list[str] | tuple[str, ...]
-) -> np.ndarray | None:
+def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray | None:
+    """Return some columns, `(T, C)`; `None` where one is missing, or none was asked for."""
     if not names or any(name not in columns for name in names):
         return None
     return np.stack([columns[name] for name in names], 1)
