@@ -1,19 +1,19 @@
 """A simulator from outside as an actuator: a function `step(state, command) -> state`, or an MJCF file.
 
 It is run on the recorded commands as it is. Effects act on the commands before it and on the motion
-after it; the motion after it does not come back into it. Roll-outs are kept, since effects on the motion
-ask for the same one again. Axes: `N` rows, `T` samples of a run, `J` joints, `S` numbers of a state.
+after it; the motion after it does not come back into it.
+Axes: `N` rows, `T` samples of a run, `J` joints, `S` numbers of a state.
 """
 
 from __future__ import annotations
 
 import importlib
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,9 +27,6 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
-if TYPE_CHECKING:
-    from diagnosis.mjcf.plant import MjcfPlant  # MuJoCo is not in every installation
-
 SPEED_GAIN = 0.5
 """Share of the difference between measured and simulated motion that corrects the speed in the warm-up.
 Chosen by hand: with 1 the speed has the noise of a difference of positions, with 0 all faults of the
@@ -38,6 +35,9 @@ MIN_WARM_UP = 15
 """Samples before a run that give its speed; a simulator with a memory gets the whole warm-up."""
 TRIAL_TOLERANCE = 1e-9
 """Largest difference between a function called for two states at once and one by one, or twice."""
+ModelChanges = Mapping[str, np.ndarray]
+"""Changes of numbers of a plant by name, `(N, J)` each."""
+NO_CHANGES: ModelChanges = {}
 
 
 def is_named_in(simulator: str) -> bool:
@@ -86,7 +86,7 @@ class OwnSimulator:
         """
         return OwnSimulatorModel(self.load(machine), machine, num_envs, device)
 
-    def load(self, machine: Machine) -> Any:
+    def load(self, machine: Machine) -> Plant:
         """Return the plant, the same one until file or function changes.
 
         Raises:
@@ -120,7 +120,7 @@ class OwnSimulatorModel:
             `actuators.effects.simulator`.
     """
 
-    def __init__(self, plant: Any, machine: Machine, num_envs: int, device: torch.device) -> None:
+    def __init__(self, plant: Plant, machine: Machine, num_envs: int, device: torch.device) -> None:
         if device.type != "cpu":
             raise ConfigError("a simulator of your own runs on the CPU; set session.device=cpu")
         self.plant = plant
@@ -153,7 +153,7 @@ class OwnSimulatorModel:
             state = np.where(fresh[:, None], begun, state)
         # Single precision of the history is no motion.
         moved = np.abs(q - self._seen.numpy()).max(1) > 1e-6
-        corrected = correct_state(self.plant, state, q, self._period_s)
+        corrected = self.plant.correct(state, q, self._period_s)
         state = np.where((moved & ~fresh)[:, None], corrected, state)
         commands = read_commands(history.u[:, -1:].double().numpy(), self._machine)
         state = self.plant.run(state, commands, self._read_changes())[:, 0]
@@ -178,14 +178,24 @@ class OwnSimulatorModel:
             return None
         known = q[:begin].double().numpy()
         commands = read_commands(u.double().numpy(), self._machine)
-        path = _roll_out(
-            self.plant, known, commands, first, self._period_s, self._read_changes() or {}
-        )
+        changes = self._read_changes()
+        first = first if self.plant.has_memory else max(first, begin - MIN_WARM_UP)
+        speed = (known[first - 1] - known[first - 2]) / self._period_s
+        state = self.plant.start(known[first - 1], speed)
+        for k in range(first, begin):
+            state = self.plant.run(state, commands[k - 1][:, None], changes)[:, 0]
+            state = self.plant.correct(state, known[k], self._period_s)
+        states = self.plant.run(state, commands[begin - 1 :].swapaxes(0, 1), changes)
+        ahead = self.plant.read(states)[0].swapaxes(0, 1)
+        if not np.isfinite(ahead).all():
+            raise BrokkError(
+                "the simulator gave NaN or infinity on the recorded commands; run it on one recording by itself"
+            )
+        path = np.concatenate([known, ahead]).astype(np.float32)
         return _RolledRun(torch.as_tensor(path), begin)
 
-    def _read_changes(self) -> dict[str, np.ndarray] | None:
-        found = {name: value.double().numpy() for name, value in self.drive_changes.items()}
-        return found or None
+    def _read_changes(self) -> dict[str, np.ndarray]:
+        return {name: value.double().numpy() for name, value in self.drive_changes.items()}
 
 
 class _RolledRun:
@@ -208,47 +218,61 @@ def read_commands(u: np.ndarray, machine: Machine) -> np.ndarray:
     return u * (machine.max_speed if machine.interface == "speed" else machine.max_force)
 
 
-def correct_state(
-    plant: FunctionPlant | MjcfPlant, state: np.ndarray, q: np.ndarray, period_s: float
-) -> np.ndarray:
-    """Return states moved to measured positions `(N, J)`, their speeds corrected by a share of the way.
+class Plant(ABC):
+    """Motion of all joints under commands, rows independent.
 
-    The simulator is the model of an alpha-beta filter: it knows how fast a step of the command makes a
-    joint, which the last positions alone do not tell.
+    Args:
+        q_at: Places of the positions in a state, `(J,)`.
+        speed_at: Those of the speeds.
     """
-    simulated, speed = plant.read(state)
-    return plant.place(state, q, speed + SPEED_GAIN * (q - simulated) / period_s)
+
+    def __init__(self, q_at: np.ndarray, speed_at: np.ndarray) -> None:
+        self._q_at, self._speed_at = q_at, speed_at
+
+    @property
+    @abstractmethod
+    def has_memory(self) -> bool:
+        """True if a state holds more than positions and speeds."""
+
+    @abstractmethod
+    def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return states at positions and speeds `(N, J)`, `(N, S)`."""
+
+    @abstractmethod
+    def run(
+        self, state: np.ndarray, commands: np.ndarray, changes: ModelChanges = NO_CHANGES
+    ) -> np.ndarray:
+        """Return the states after each control period, `(N, T, S)`.
+
+        Args:
+            state: Where the rows begin, `(N, S)`.
+            commands: Targets (rad, m), speeds (rad/s, m/s) or torques (Nm, N), `(N, T, J)`.
+            changes: Changes of numbers of the plant by name, `(N, J)` each.
+        """
+
+    def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return states moved to positions and speeds `(N, J)`."""
+        state = state.copy()
+        state[:, self._q_at] = q
+        state[:, self._speed_at] = speed
+        return state
+
+    def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and speeds of states, each `(…, J)`."""
+        return state[..., self._q_at], state[..., self._speed_at]
+
+    def correct(self, state: np.ndarray, q: np.ndarray, period_s: float) -> np.ndarray:
+        """Return states moved to measured positions `(N, J)`, their speeds corrected by a share of the way.
+
+        The simulator is the model of an alpha-beta filter: it knows how fast a step of the command makes a
+        joint, which the last positions alone do not tell.
+        """
+        simulated, speed = self.read(state)
+        return self.place(state, q, speed + SPEED_GAIN * (q - simulated) / period_s)
 
 
-def _roll_out(
-    plant: FunctionPlant | MjcfPlant,
-    known: np.ndarray,
-    commands: np.ndarray,
-    first: int,
-    period_s: float,
-    changes: Mapping[str, np.ndarray] = MappingProxyType({}),
-) -> np.ndarray:
-    """Return positions `(T + 1, N, J)` of runs under commands `(T, N, J)`, those in `known` first."""
-    begin = len(known)
-    at = first if plant.has_memory else max(first, begin - MIN_WARM_UP)
-    state = plant.start(known[at - 1], (known[at - 1] - known[at - 2]) / period_s)
-    for k in range(at, begin):
-        state = plant.run(state, commands[k - 1][:, None], changes)[:, 0]
-        state = correct_state(plant, state, known[k], period_s)
-    states = plant.run(state, commands[begin - 1 :].swapaxes(0, 1), changes)
-    paths = plant.read(states)[0]
-    if not np.isfinite(paths).all():
-        raise BrokkError(
-            "the simulator gave NaN or infinity on the recorded commands; run it on one recording by itself"
-        )
-    return np.concatenate([known, paths.swapaxes(0, 1)]).astype(np.float32)
-
-
-class FunctionPlant:
-    """A function `step(state, command) -> state` as a plant: motion of all joints under commands, rows independent.
-
-    Attributes:
-        has_memory: A state holds more than positions and speeds.
+class FunctionPlant(Plant):
+    """A function `step(state, command) -> state` as a plant; it has no numbers that could be changed.
 
     Args:
         step: The function.
@@ -267,14 +291,14 @@ class FunctionPlant:
         machine: Machine,
         name: str,
     ) -> None:
+        places = np.arange(2 * machine.num_joints).reshape(2, -1)
+        super().__init__(*places)
         self._step, self._start, self._name = step, start, name
-        self._num_joints = machine.num_joints
-        self.has_memory = start is not None
         middle = 0.5 * (machine.lower + machine.upper)
         q = np.stack([middle, middle + 0.1 * (machine.upper - machine.lower)])
         state = self.start(q, np.zeros_like(q))
         command = read_commands(np.full_like(q, 0.1), machine)
-        found = [self._call(*one) for one in zip(state, command, strict=True)]
+        found = [self._call_step(*one) for one in zip(state, command, strict=True)]
         for one in found:
             if one.shape != state[0].shape:
                 raise ConfigError(
@@ -286,86 +310,71 @@ class FunctionPlant:
                     f"simulator={name}: step(state, command) returned NaN or infinity in the middle of the travel, "
                     f"at rest: {one}; it has to stay finite there"
                 )
-        again = self._call(state[0], command[0])
-        if not np.allclose(again, found[0], rtol=0, atol=TRIAL_TOLERANCE):
+        again = self._call_step(state[0], command[0])
+        if not _are_same(again, found[0]):
             raise ConfigError(
                 f"simulator={name}: step(state, command) gave two answers to one state and command, {found[0]} and {again}; "
                 "keep what it remembers in the state that start(position, speed) begins, and switch its noise off"
             )
-        one_by_one = np.stack(found)
-        self._is_vectorised = self._agrees_in_rows(state, command, one_by_one)
+        try:
+            is_vectorised = _are_same(self._call_step(state, command), np.stack(found))
+        except ConfigError:
+            is_vectorised = False
+        if not is_vectorised:
+            self._step = np.vectorize(step, otypes=[float], signature="(s),(j)->(s)")
+
+    @property
+    def has_memory(self) -> bool:
+        """True if a state holds more than positions and speeds."""
+        return self._start is not None
 
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return states `(N, S)` at positions and speeds `(N, J)`."""
+        """Return states at positions and speeds `(N, J)`, `(N, S)`."""
         if self._start is None:
             return np.concatenate([q, speed], 1)
-        found = []
+        found, least = [], 2 * q.shape[1]
         for one in zip(q, speed, strict=True):
-            try:
-                state = np.asarray(self._start(*one), dtype=float)
-            except Exception as error:
+            state = self._call(self._start, "start(position, speed)", *one)
+            if state.ndim != 1 or len(state) < least:
                 raise ConfigError(
-                    f"simulator={self._name}: start(position, speed) failed with {type(error).__name__}: {error}; it got "
-                    f"two arrays of {self._num_joints} numbers"
-                ) from error
-            if state.ndim != 1 or len(state) < 2 * self._num_joints:
-                raise ConfigError(
-                    f"simulator={self._name}: expected a state of {2 * self._num_joints} numbers or more from "
+                    f"simulator={self._name}: expected a state of {least} numbers or more from "
                     f"start(position, speed), positions and speeds first, got shape {state.shape}"
                 )
             found.append(state)
         return np.stack(found)
 
-    def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return states moved to positions and speeds."""
-        state, joints = state.copy(), self._num_joints
-        state[:, :joints], state[:, joints : 2 * joints] = q, speed
-        return state
-
-    def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and speeds of states, each `(…, J)`."""
-        joints = self._num_joints
-        return state[..., :joints], state[..., joints : 2 * joints]
-
     def run(
-        self,
-        state: np.ndarray,
-        commands: np.ndarray,
-        changes: Mapping[str, np.ndarray] | None = None,
+        self, state: np.ndarray, commands: np.ndarray, changes: ModelChanges = NO_CHANGES
     ) -> np.ndarray:
-        """Return the states after each period, `(N, T, S)`, of commands `(N, T, J)`; nothing in a function can be changed."""
+        """Return the states after each control period; see `Plant.run`."""
         found = np.empty((*commands.shape[:2], state.shape[1]))
         for k in range(commands.shape[1]):
-            command = commands[:, k]
-            if self._is_vectorised:
-                state = self._call(state, command)
-            else:
-                rows = [self._call(*one) for one in zip(state, command, strict=True)]
-                state = np.stack(rows) if rows else state
+            state = self._call_step(state, commands[:, k])
             found[:, k] = state
         return found
 
-    def _call(self, state: np.ndarray, command: np.ndarray) -> np.ndarray:
+    def _call_step(self, state: np.ndarray, command: np.ndarray) -> np.ndarray:
+        return self._call(self._step, "step(state, command)", state, command)
+
+    def _call(self, function: Callable[..., Any], told: str, *given: np.ndarray) -> np.ndarray:
+        """Return what a function of the user makes of arrays."""
         try:
-            return np.asarray(self._step(state.copy(), command.copy()), dtype=float)
+            return np.asarray(function(*(one.copy() for one in given)), dtype=float)
         except Exception as error:
+            shapes = " and ".join(str(one.shape) for one in given)
             raise ConfigError(
-                f"simulator={self._name}: step(state, command) failed with {type(error).__name__}: {error}; "
-                f"it got a state of shape {state.shape} and a command of shape {command.shape}"
+                f"simulator={self._name}: {told} failed with {type(error).__name__}: {error}; "
+                f"it got arrays of the shapes {shapes}"
             ) from error
 
-    def _agrees_in_rows(self, state: np.ndarray, command: np.ndarray, rows: np.ndarray) -> bool:
-        try:
-            found = self._call(state, command)
-        except ConfigError:
-            return False
-        return found.shape == rows.shape and bool(
-            np.allclose(found, rows, rtol=0, atol=TRIAL_TOLERANCE)
-        )
+
+def _are_same(some: np.ndarray, others: np.ndarray) -> bool:
+    """Return whether states are the same but for rounding."""
+    return some.shape == others.shape and np.allclose(some, others, rtol=0, atol=TRIAL_TOLERANCE)
 
 
 @lru_cache(maxsize=8)
-def _load_file(path: Path, changed_ns: int, machine: Machine) -> Any:
+def _load_file(path: Path, changed_ns: int, machine: Machine) -> Plant:
     from diagnosis.mjcf.plant import MjcfPlant  # MuJoCo is not in every installation
 
     return MjcfPlant(path, machine)

@@ -79,7 +79,7 @@ class SimulatorProof(RepairProof):
 
     def _simulate(self, effects: frozenset[str], half: int) -> np.ndarray:
         some = [one for one in self._fitted[half] if one.kind.name in effects]
-        return self._search.whole.simulate(some)
+        return self._search.whole.simulate(some)[0]
 
     @cached_property
     def sizes(self) -> dict[str, SizesByName]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from actuators.open_loop import FreeRunWindows, run_freely
 from actuators.scales import choose_horizon_s, scale_time
 from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.errors import BrokkError, RecordingError
+from brokk_rl.errors import BrokkError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
@@ -37,6 +36,7 @@ LEAST_DEVIATION = 1e-6
 """Smallest deviation of an error, over the travel: rounding of single precision."""
 STEP = 0.05
 """Finite difference, of the typical size."""
+NO_TRIALS: NumberTrials = {}
 BATCH_ROWS = 1536
 """Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
 
@@ -90,14 +90,9 @@ class EffectSimulator:
             BrokkError: the model ran into NaN.
         """
         effects = sorted(effects, key=lambda one: one[0].order)
-        found = np.empty((count, *self.cut.measured.shape), dtype=np.float32)
-        at_once = max(1, BATCH_ROWS // len(self.cut.q))
-        batches = [
-            np.arange(start, min(start + at_once, count)) for start in range(0, count, at_once)
-        ]
-        runs = map_parallel(lambda batch: self._run(effects, batch), batches)
-        for batch, paths in zip(batches, runs, strict=True):
-            found[batch] = paths
+        num_batches = -(-count * len(self.cut.q) // BATCH_ROWS)
+        batches = np.array_split(np.arange(count), min(count, num_batches))
+        found = np.concatenate(map_parallel(lambda batch: self._run(effects, batch), batches))
         if not np.isfinite(found).all():
             names = ", ".join(kind.name for kind, _ in effects) or "no effect"
             raise BrokkError(
@@ -167,27 +162,17 @@ def cut_simulator_runs(
         RecordingError: no recording is long enough.
     """
     horizon_s = horizon_s or choose_horizon_s(machine)
-    before, steps = open_loop.count_samples_before(machine), round(horizon_s / machine.period_s)
+    before = open_loop.count_samples_before(machine)
     stride = round((stride_s or horizon_s) / machine.period_s)
-    cuts, source, row, running_s = [], [], [], []
     begun_s = begun_s or estimate_running_s(recordings)
-    for number, recording in enumerate(recordings):
-        if recording.num_samples < before + steps:
-            continue
-        cut = open_loop.cut_windows([recording], machine, horizon_s, stride * machine.period_s)
-        rows = before + stride * np.arange(len(cut.q))
-        cuts.append(replace(cut, run=np.full(len(cut.q), f"{number}")))
-        source += [number] * len(rows)
-        row += rows.tolist()
-        running_s += (begun_s[number] + recording.t_s[rows]).tolist()
-    if not cuts:
-        raise RecordingError(
-            f"too little data: no recording is long enough for a free run of {horizon_s:g} s"
-        )
-    places = (np.array(source), np.array(row))
-    windows = open_loop.join_windows(cuts)
+    # Each recording is a run, so that windows tell theirs.
+    named = [replace(one, metadata={"run": str(k)}) for k, one in enumerate(recordings)]
+    cut = open_loop.cut_windows(named, machine, horizon_s, stride * machine.period_s)
+    source = cut.run.astype(int)
+    row = before + stride * (np.arange(len(source)) - np.searchsorted(source, source))
+    running_s = [begun_s[k] + recordings[k].t_s[at] for k, at in zip(source, row, strict=True)]
     viewed = view_recordings(recordings, machine)
-    return EffectSimulator(actuator, machine, viewed, *places, windows, np.array(running_s), seed)
+    return EffectSimulator(actuator, machine, viewed, source, row, cut, np.array(running_s), seed)
 
 
 class FreeRunLikelihood:
@@ -218,14 +203,12 @@ class FreeRunLikelihood:
     def settle(self, effects: Sequence[GrownEffect]) -> None:
         """Let the deviation of the errors be that beside effects, and new candidates be put beside these."""
         self._effects = effects
-        self._deviation = self._weigh_motion(self.simulate(effects))
+        self._deviation = self._weigh_motion(self.simulate(effects)[0])
 
-    def simulate(self, effects: Sequence[GrownEffect]) -> np.ndarray:
-        """Return free runs with effects, `(W, K, J)`."""
-        return self._simulate_trials(effects, {})[0]
-
-    def _simulate_trials(self, effects: Sequence[GrownEffect], trials: NumberTrials) -> np.ndarray:
-        """Return free runs with trials of some numbers, `(C, W, K, J)`."""
+    def simulate(
+        self, effects: Sequence[GrownEffect], trials: NumberTrials = NO_TRIALS
+    ) -> np.ndarray:
+        """Return free runs with effects and trials of some of their numbers, `(C, W, K, J)`."""
         count = len(next(iter(trials.values()))) if trials else 1
         given = []
         for place, one in enumerate(effects):
@@ -263,7 +246,7 @@ class FreeRunLikelihood:
         self, effects: Sequence[GrownEffect], trials: NumberTrials, used: np.ndarray | None
     ) -> np.ndarray:
         """Return the errors of free runs over their relative deviation, `(C, W, I, J)`."""
-        paths = self._simulate_trials(effects, trials)
+        paths = self.simulate(effects, trials)
         errors = (self._measured - self._reduce(paths)) / self._deviation
         return errors if used is None else errors[:, used]
 
@@ -281,7 +264,7 @@ class FreeRunLikelihood:
     def weigh(
         self,
         effects: Sequence[GrownEffect],
-        trials: NumberTrials = MappingProxyType({}),
+        trials: NumberTrials = NO_TRIALS,
         used: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return the log likelihood with trials of some numbers, nats, `(C, J)`.

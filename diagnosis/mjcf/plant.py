@@ -8,7 +8,6 @@ state.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -17,6 +16,7 @@ from mujoco import rollout
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from diagnosis.own_simulator import NO_CHANGES, ModelChanges, Plant
 
 STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 MAX_STATES = 4_000_000
@@ -26,15 +26,12 @@ REFERENCE_TRAVEL = 0.05
 hand: a drive that holds an arm errs by a few percent."""
 QUANTITIES = ("friction", "damping", "armature", "gain", "limit")
 """Numbers that a row may change; see `MjcfPlant.read_references`."""
-ModelChanges = Mapping[str, np.ndarray]
-"""Changes of these by name."""
-
 
 MAX_DAMPING_LOSS = 0.95
 """Largest share of the damping of joint and drive that an effect takes away: a rest keeps joints stable."""
 
 
-class MjcfPlant:
+class MjcfPlant(Plant):
     """Joints and drives of an MJCF file, named as those of a machine.
 
     Args:
@@ -67,8 +64,8 @@ class MjcfPlant:
             )
         self._data = mujoco.MjData(self.model)
         # MuJoCo's order of a full state: time, qpos, qvel, act, …
-        self._q_at = 1 + self.model.jnt_qposadr[joints]
-        self._speed_at = 1 + self.model.nq + self.dofs
+        q_at, speed_at = 1 + self.model.jnt_qposadr[joints], 1 + self.model.nq + self.dofs
+        super().__init__(q_at, speed_at)
         gear = self.model.actuator_gear[self.drives, 0]
         self._per_command = 1.0 / gear if machine.interface == "torque" else gear
         self._models: dict[bytes, mujoco.MjModel] = {}
@@ -86,27 +83,10 @@ class MjcfPlant:
         mujoco.mj_getState(self.model, self._data, state, STATE)
         return self.place(np.repeat(state[None], len(q), 0), q, speed)
 
-    def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return states moved to positions and speeds `(N, J)`."""
-        state = state.copy()
-        state[:, self._q_at] = q
-        state[:, self._speed_at] = speed
-        return state
-
-    def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and speeds of states, each `(…, J)`."""
-        return state[..., self._q_at], state[..., self._speed_at]
-
     def run(
-        self, state: np.ndarray, commands: np.ndarray, changes: ModelChanges | None = None
+        self, state: np.ndarray, commands: np.ndarray, changes: ModelChanges = NO_CHANGES
     ) -> np.ndarray:
-        """Return the states after each control period, `(N, T, S)`.
-
-        Args:
-            state: Where the rows begin, `(N, S)`.
-            commands: Targets (rad, m), speeds (rad/s, m/s) or torques (Nm, N), `(N, T, J)`.
-            changes: `QUANTITIES` by name, each `(N, J)`, in the units of `change_model`.
-        """
+        """Return the states after each control period; changes as in `change_model`, see `Plant.run`."""
         count, periods = commands.shape[:2]
         models = self._list_models(count, changes)
         found = np.empty((count, periods, state.shape[1]))
@@ -193,7 +173,7 @@ class MjcfPlant:
         mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by
         return model
 
-    def _list_models(self, count: int, changes: ModelChanges | None) -> list[mujoco.MjModel]:
+    def _list_models(self, count: int, changes: ModelChanges) -> list[mujoco.MjModel]:
         if not changes:
             return [self.model] * count
         names = sorted(changes)

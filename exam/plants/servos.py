@@ -100,7 +100,7 @@ class ServoArm(PlantLink):
         cogging = n["cogging_n_m"] * np.sin(COGS * q + n["cogging_phase"])
         pull = n["pull_n_m"] * np.cos(q - self._middle)
         torque = motor - lost + cogging + pull
-        self._state = self._plant.run(self._state, torque[:, None], self._changes or None)[:, 0]
+        self._state = self._plant.run(self._state, torque[:, None], self._changes)[:, 0]
 
     def _measure(self) -> np.ndarray:
         step = self._n["step_rad"]
