@@ -73,11 +73,6 @@ class ObservationTerm:
     std: np.ndarray
     clip: float | None
 
-    @property
-    def size(self) -> int:
-        """Numbers in the observation vector."""
-        return self.samples * len(self.columns)
-
     def list_numbers(self) -> list[str]:
         """Return a name for each number, oldest sample first."""
         found = []
@@ -110,7 +105,7 @@ class PolicyContract:
     @property
     def size(self) -> int:
         """Length of the observation vector, `O`."""
-        return sum(term.size for term in self.terms)
+        return len(self.labels)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -127,8 +122,9 @@ class PolicyContract:
         """Place of each term in the observation vector."""
         found, at = {}, 0
         for term in self.terms:
-            found[term.name] = slice(at, at + term.size)
-            at += term.size
+            end = at + term.samples * len(term.columns)
+            found[term.name] = slice(at, end)
+            at = end
         return found
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm, PolicyContract
@@ -139,10 +140,8 @@ def hold(values: np.ndarray, phase: float, every: int) -> np.ndarray:
 
 def smooth(values: np.ndarray, weight: float) -> np.ndarray:
     """Return values behind a first-order low-pass; `weight` is that of the newest value."""
-    smoothed = values.copy()
-    for row in range(1, len(values)):
-        smoothed[row] = weight * values[row] + (1.0 - weight) * smoothed[row - 1]
-    return smoothed
+    begin = (1.0 - weight) * values[:1]
+    return lfilter([weight], [1.0, weight - 1.0], values, axis=0, zi=begin)[0]
 
 
 def exchange(points: np.ndarray, number: float, axes: np.ndarray) -> np.ndarray:

@@ -42,8 +42,7 @@ from diagnosis.deployment.replay import (
 from diagnosis.deployment.training_range import RangeEvidence, compare_with_training
 
 DoctorVerdict = Literal["code", "actuator", "task", "nothing", "cannot_tell"]
-StageName = Literal["observation", "network", "policy", "delivery"]
-WAYS: dict[StageName, tuple[str, str]] = {
+WAYS = {
     "observation": ("log", "vector"),
     "network": ("vector", "command"),
     "policy": ("log", "command"),
@@ -233,7 +232,7 @@ class Deployment:
         every = distortions.list_distortions(self.policy, self.others)
 
         def make_stage(
-            name: StageName, predict: Predict, logged: np.ndarray, floor: np.ndarray | float
+            name: str, predict: Predict, logged: np.ndarray, floor: np.ndarray | float
         ) -> ReplayStage:
             begin, end = WAYS[name]
             some = [one for one in every if one.acts_between(begin, end)]

@@ -9,7 +9,8 @@ Axes: `T` rows, `R` rows that are asked for, `D` numbers that are compared.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ NUM_FIRST, PAIR_GAIN = 2, 0.3
 loss that a first one removes at least. Chosen by hand."""
 NUM_RANKED = 5
 """Mistakes and numbers of a ranking that are told."""
+GAIN = attrgetter("gain")
 TOLERANCE_REFINED = 1e-5
 """Relative tolerance of a refined number."""
 
@@ -130,14 +132,14 @@ class StageResult:
     num_rows: int
     departed: np.ndarray
     residual: np.ndarray
-    named: tuple[FittedDistortion, ...]
-    alike: tuple[FittedDistortion, ...]
-    ranking: tuple[FittedDistortion, ...]
+    named: tuple[FittedDistortion, ...] = ()
+    alike: tuple[FittedDistortion, ...] = ()
+    ranking: tuple[FittedDistortion, ...] = ()
 
     @property
     def departs(self) -> bool:
         """True if more rows depart than rounding explains."""
-        return is_departure(len(self.departed), self.num_rows)
+        return len(self.departed) >= max(LEAST_ROWS, LEAST_SHARE * self.num_rows)
 
     def rank_labels(self) -> list[tuple[str, float]]:
         """Return the compared numbers by their share of departing rows, largest first."""
@@ -167,11 +169,6 @@ class StageResult:
         }
 
 
-def is_departure(num_departed: int, num_rows: int) -> bool:
-    """Return whether so many departing rows are more than chance."""
-    return num_departed >= max(LEAST_ROWS, LEAST_SHARE * num_rows)
-
-
 def judge_stage(stage: ReplayStage) -> StageResult:
     """Compare a stage with the log; search for the mistake where it departs."""
     rows = stage.rows
@@ -179,14 +176,15 @@ def judge_stage(stage: ReplayStage) -> StageResult:
     residual[rows] = stage.predict((), rows) - stage.logged[rows]
     rows = rows[np.isfinite(residual[rows]).all(1)]
     departed = rows[(np.abs(residual[rows]) > stage.floor[rows]).any(1)]
+    result = StageResult(stage, len(rows), departed, residual)
+    if not result.departs:
+        return result
     settled = rows[rows >= stage.num_start + MAX_DELAY]
-    named = alike = ranking = ()
-    if is_departure(len(departed), len(rows)):
-        judged = rows if len(settled) < LEAST_ROWS else settled
-        search = _FaultSearch(stage, residual, judged, int(departed[0]))
-        ranking = search.rank(())
-        named, alike = search.choose(ranking)
-    return StageResult(stage, len(rows), departed, residual, named, alike, ranking)
+    judged = rows if len(settled) < LEAST_ROWS else settled
+    search = _FaultSearch(stage, residual, judged, int(departed[0]))
+    ranking = search.rank(())
+    named, alike = search.choose(ranking)
+    return replace(result, named=named, alike=alike, ranking=ranking)
 
 
 class _FaultSearch:
@@ -209,10 +207,10 @@ class _FaultSearch:
         for distortion in self._stage.distortions:
             values = distortion.values or self._begins
             tried = [self._try(distortion, one, given, self._sample) for one in values]
-            screened.append(max(tried, key=_get_gain))
-        screened.sort(key=_get_gain, reverse=True)
+            screened.append(max(tried, key=GAIN))
+        screened.sort(key=GAIN, reverse=True)
         refined = [self._refine(one, given) for one in screened[:NUM_SCREENED]]
-        refined.sort(key=_get_gain, reverse=True)
+        refined.sort(key=GAIN, reverse=True)
         everywhere = np.arange(len(self._rows))
         found = []
         for one in refined[:NUM_REFINED]:
@@ -228,7 +226,7 @@ class _FaultSearch:
             best = fitting[0]
             alike = [one for one in fitting[1:] if one.explained >= best.explained - ALIKE]
             return (best,), tuple(alike)
-        for first in sorted(ranking, key=_get_gain, reverse=True)[:NUM_FIRST]:
+        for first in sorted(ranking, key=GAIN, reverse=True)[:NUM_FIRST]:
             if first.gain < PAIR_GAIN:
                 break
             change = first.distortion.build(first.value)
@@ -251,7 +249,7 @@ class _FaultSearch:
             options={"xatol": TOLERANCE_REFINED * max(abs(low), abs(high))},
         )
         refined = self._try(distortion, float(best.x), given, self._sample)
-        return max(screened, refined, key=_get_gain)
+        return max(screened, refined, key=GAIN)
 
     def _try(
         self, distortion: Distortion, value: float, given: tuple[Change, ...], places: np.ndarray
@@ -276,10 +274,6 @@ class _FaultSearch:
         )
 
 
-def _get_gain(one: FittedDistortion) -> float:
-    return one.gain
-
-
 def _rank_fit(one: FittedDistortion) -> tuple[float, int, float]:
     """Return the key by which fits are ordered: explained share, free numbers, gain."""
     return -round(one.explained / ALIKE), int(bool(one.distortion.parameter)), -one.gain
@@ -299,6 +293,5 @@ def _find_segment(gained: np.ndarray) -> tuple[tuple[int, int], float]:
 
 
 def _select_evenly(places: np.ndarray, most: int) -> np.ndarray:
-    if len(places) <= most:
-        return places
-    return places[np.linspace(0, len(places) - 1, most).round().astype(int)]
+    count = min(most, len(places))
+    return places[np.linspace(0, len(places) - 1, count).round().astype(int)]

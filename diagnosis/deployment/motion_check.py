@@ -19,7 +19,6 @@ from actuators import open_loop
 from actuators.scales import choose_horizon_s
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.errors import RecordingError
-from brokk_rl.history import History
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -177,7 +176,7 @@ class _DrawnMachines:
     effects: Mapping[str, Effect]
     num_windows: int
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> Any:
         model = self.actuator.build(machine, num_envs, device)
         for effect in self.effects.values():
             model = effect.wrap(model, machine, num_envs, device)
@@ -185,12 +184,13 @@ class _DrawnMachines:
 
 
 class _SharedDraws:
+    """A model whose draws are, after each reset, those of the first of some windows in a row."""
+
     def __init__(self, model: ActuatorModel, num_windows: int) -> None:
         self._model, self._num_windows = model, num_windows
 
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        return self._model.state
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._model, name)
 
     def reset(self, mask: torch.Tensor) -> None:
         self._model.reset(mask)
@@ -198,6 +198,3 @@ class _SharedDraws:
             if "drawn" in path.split("."):
                 first = value[:: self._num_windows]
                 value.copy_(first.repeat_interleave(self._num_windows, 0))
-
-    def step(self, history: History) -> torch.Tensor:
-        return self._model.step(history)

@@ -55,18 +55,9 @@ class PolicyReplay:
         self._all = np.arange(len(log.t_s))
 
     @cached_property
-    def encoded(self) -> np.ndarray:
-        """Observation vectors as the contract says, `(T, O)`; the log is complete."""
-        return self._encode((), self._all)
-
-    @cached_property
     def nominal(self) -> np.ndarray:
         """Commands as the contract says, `(T, J)`."""
         return self._answer((), self._all)
-
-    def encode(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
-        """Return observation vectors, `(R, O)`."""
-        return self._encode(changes, rows) if changes else self.encoded[rows]
 
     def command(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
         """Return commands, `(R, J)`: answers to the logged observation where there is one."""
@@ -82,7 +73,8 @@ class PolicyReplay:
         assert self.log.commanded is not None, "a stage is judged where its beginning was logged"
         return apply_changes(changes, "command", self.log.commanded)[rows]
 
-    def _encode(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
+    def encode(self, changes: Sequence[Change], rows: np.ndarray) -> np.ndarray:
+        """Return observation vectors, `(R, O)`; the log is complete."""
         parts = []
         for term in self.policy.contract.terms:
             values = apply_changes(changes, f"signal {term.name}", self.log.signals[term.name])
@@ -106,8 +98,9 @@ class PolicyReplay:
     def spread(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest effect of the log's rounding on observation vector and command, `(T, O)` and `(T, J)`."""
         answer, terms = self.policy.network.answer, self.policy.contract.terms
-        nominal = answer(self.encoded)
-        largest_vector, largest = np.zeros_like(self.encoded), np.zeros_like(nominal)
+        encoded = self.encode((), self._all)
+        nominal = answer(encoded)
+        largest_vector, largest = np.zeros_like(encoded), np.zeros_like(nominal)
         for _ in range(NUM_DRAWS):
             change = {}
             for term in terms:
@@ -116,8 +109,8 @@ class PolicyReplay:
                 jitter = self._generator.uniform(-1.0, 1.0, shape) if self.log.is_measured else None
                 units = np.array([self.log.units[name] for name in term.columns])
                 change[f"signal {term.name}"] = partial(_vary, share * units, jitter)
-            drawn = self._encode([change], self._all)
-            largest_vector = np.maximum(largest_vector, np.abs(drawn - self.encoded))
+            drawn = self.encode([change], self._all)
+            largest_vector = np.maximum(largest_vector, np.abs(drawn - encoded))
             largest = np.maximum(largest, np.abs(answer(drawn) - nominal))
         return largest_vector, largest
 

@@ -64,21 +64,17 @@ class DoctorPolicy:
             CheckpointError: A policy cannot be used.
             StorageError: Something could not be written.
         """
-        found = self.examine()
-        folder = self.session.folder
-        found.write(folder)
-        page.write_page(found, folder)
-        print_answer(found, folder)
-
-    def examine(self) -> DoctorAnswer:
-        """Return the answer; errors as in `run`."""
         asked = self.doctor
         policy = load_policy(asked.policy, self.machine)
         others = {folder: load_policy(folder, self.machine) for folder in asked.others}
         deployment = Deployment(policy, self.machine, others, asked.target_in_base_m, asked.sent)
         recordings = record.read_recordings(asked.log, self.machine)
         seed = self.session.stream("doctor")
-        return deployment.examine(recordings, self.actuator, self.effect, seed)
+        found = deployment.examine(recordings, self.actuator, self.effect, seed)
+        folder = self.session.folder
+        found.write(folder)
+        page.write_page(found, folder)
+        print_answer(found, folder)
 
 
 def print_answer(found: DoctorAnswer, folder: Path) -> None:
