@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
-from math import factorial
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -62,15 +63,13 @@ def compute_shapley(
 ) -> dict[str, Any]:
     """Return the Shapley value of each effect, a number or an array: its mean contribution over all orders of adding."""
     count, found = len(names), dict.fromkeys(names, 0.0)
-    value = {}
-    for size in range(count + 1):
-        for some in combinations(names, size):
-            value[frozenset(some)] = closed_by(frozenset(some))
+    value = cache(closed_by)
     for name in names:
+        others = [one for one in names if one != name]
         for size in range(count):
-            chance = factorial(size) * factorial(count - size - 1) / factorial(count)
-            for rest in combinations([n for n in names if n != name], size):
-                found[name] += chance * (value[frozenset(rest) | {name}] - value[frozenset(rest)])
+            for some in map(frozenset, combinations(others, size)):
+                chance = 1.0 / (count * comb(count - 1, size))
+                found[name] += chance * (value(some | {name}) - value(some))
     return found
 
 

@@ -68,11 +68,9 @@ class GrownEffect:
 
 def list_candidates(kind: EffectType) -> dict[str, np.ndarray]:
     """Return the numbers of an effect in all forms and sizes, `(C, J)` or `(C, 1)` each."""
-    forms: list[tuple[str, ...]] = [(name,) for name in kind.fitted]
-    if not kind.target.smooth:
-        forms = [kind.fitted]
-    if kind.target.smooth and len(kind.fitted) > 1:
-        forms.append(kind.fitted)
+    forms = [kind.fitted]
+    if kind.target.smooth:
+        forms = [*((name,) for name in kind.fitted), kind.fitted]
     rows = []
     for shape in _list_shapes(kind):
         for form in forms:

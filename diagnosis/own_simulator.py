@@ -224,15 +224,12 @@ class Plant(ABC):
     Args:
         q_at: Places of the positions in a state, `(J,)`.
         speed_at: Those of the speeds.
+        has_memory: A state holds more than these.
     """
 
-    def __init__(self, q_at: np.ndarray, speed_at: np.ndarray) -> None:
+    def __init__(self, q_at: np.ndarray, speed_at: np.ndarray, has_memory: bool) -> None:
         self._q_at, self._speed_at = q_at, speed_at
-
-    @property
-    @abstractmethod
-    def has_memory(self) -> bool:
-        """True if a state holds more than positions and speeds."""
+        self.has_memory = has_memory
 
     @abstractmethod
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
@@ -292,7 +289,7 @@ class FunctionPlant(Plant):
         name: str,
     ) -> None:
         places = np.arange(2 * machine.num_joints).reshape(2, -1)
-        super().__init__(*places)
+        super().__init__(*places, has_memory=start is not None)
         self._step, self._start, self._name = step, start, name
         middle = 0.5 * (machine.lower + machine.upper)
         q = np.stack([middle, middle + 0.1 * (machine.upper - machine.lower)])
@@ -322,11 +319,6 @@ class FunctionPlant(Plant):
             is_vectorised = False
         if not is_vectorised:
             self._step = np.vectorize(step, otypes=[float], signature="(s),(j)->(s)")
-
-    @property
-    def has_memory(self) -> bool:
-        """True if a state holds more than positions and speeds."""
-        return self._start is not None
 
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """Return states at positions and speeds `(N, J)`, `(N, S)`."""

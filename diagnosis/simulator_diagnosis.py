@@ -14,7 +14,6 @@ import numpy as np
 
 from actuators.models.linear import Hold
 from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.machine import Machine
 from diagnosis import sensors
 from diagnosis.answer import Answer, Outcome, Ranked
 from diagnosis.case import GapCase
@@ -83,9 +82,25 @@ class SimulatorProof(RepairProof):
 
     @cached_property
     def sizes(self) -> dict[str, SizesByName]:
-        """Sizes of each effect."""
-        numbers = estimate_numbers(self._search, self.effects, self.machine)
-        return {one.kind.name: own for one, own in zip(self.effects, numbers, strict=True)}
+        """Sizes of each effect with their 95 % intervals."""
+        deviations = self._search.whole.linearise(self.effects).estimate_deviations()
+        names, found = self.machine.joint_names, {}
+        for place, one in enumerate(self.effects):
+            sizes = found[one.kind.name] = {}
+            for name, value in one.values.items():
+                least, most = one.kind.limits(name)
+                off = value - (one.kind.numbers[name].none or 0.0)
+                width = SIGMAS * np.hypot(deviations[place, name], FORM_ERROR * off)
+                low, high = np.clip([value - width, value + width], least, most)
+                at_bound = np.isclose(value, least) | np.isclose(value, most)
+                where = {"machine": 0}
+                if one.kind.numbers[name].per_joint:
+                    where = {names[j]: j for j in np.flatnonzero(one.joints)}
+                sizes[name] = {}
+                for joint, j in where.items():
+                    interval = (float(low[j]), float(high[j]))
+                    sizes[name][joint] = Estimate(float(value[j]), interval, bool(at_bound[j]))
+        return found
 
     @cached_property
     def floor_squares(self) -> np.ndarray:
@@ -195,30 +210,3 @@ def describe_doubts(case: GapCase, why: str) -> Outcome:
         reason=f"cannot tell, because {why}",
     )
     return Outcome(answer, runs.view(runs.plain_runs), None)
-
-
-def estimate_numbers(
-    search: SimulatorSearch, effects: Sequence[GrownEffect], machine: Machine
-) -> list[dict[str, dict[str, Estimate]]]:
-    """Return the numbers of each effect with 95 % intervals, by name and joint (or `machine`)."""
-    deviations = search.whole.linearise(effects).estimate_deviations()
-    found = []
-    for place, one in enumerate(effects):
-        numbers: dict[str, dict[str, Estimate]] = {}
-        for name, value in one.values.items():
-            least, most = one.kind.limits(name)
-            off = value - (one.kind.numbers[name].none or 0.0)
-            width = SIGMAS * np.hypot(deviations[place, name], FORM_ERROR * off)
-            low, high = np.clip([value - width, value + width], least, most)
-            at_bound = np.isclose(value, least) | np.isclose(value, most)
-            rows = zip(value.tolist(), low.tolist(), high.tolist(), at_bound.tolist(), strict=True)
-            every = [Estimate(mean, (lower, upper), end) for mean, lower, upper, end in rows]
-            if not one.kind.numbers[name].per_joint:
-                numbers[name] = {"machine": every[0]}
-                continue
-            own = {}
-            for j in np.flatnonzero(one.joints).tolist():
-                own[machine.joint_names[j]] = every[j]
-            numbers[name] = own
-        found.append(numbers)
-    return found

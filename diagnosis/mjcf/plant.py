@@ -8,6 +8,7 @@ state.
 from __future__ import annotations
 
 import copy
+from functools import lru_cache
 from pathlib import Path
 
 import mujoco
@@ -65,16 +66,13 @@ class MjcfPlant(Plant):
         self._data = mujoco.MjData(self.model)
         # MuJoCo's order of a full state: time, qpos, qvel, act, …
         q_at, speed_at = 1 + self.model.jnt_qposadr[joints], 1 + self.model.nq + self.dofs
-        super().__init__(q_at, speed_at)
+        beyond = mujoco.mj_stateSize(self.model, STATE) - 1 - self.model.nq - self.model.nv
+        # such as activations or delayed commands
+        super().__init__(q_at, speed_at, has_memory=beyond > 0)
         gear = self.model.actuator_gear[self.drives, 0]
         self._per_command = 1.0 / gear if machine.interface == "torque" else gear
-        self._models: dict[bytes, mujoco.MjModel] = {}
-
-    @property
-    def has_memory(self) -> bool:
-        """True if a state holds more than positions and speeds, such as activations or delayed commands."""
-        beyond = mujoco.mj_stateSize(self.model, STATE) - 1 - self.model.nq - self.model.nv
-        return beyond > 0
+        # Candidates of a search seldom come back later.
+        self._remember = lru_cache(maxsize=512)(self._build)
 
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """Return states at positions and speeds `(N, J)`, `(N, S)`; other joints are where the file has them."""
@@ -176,17 +174,13 @@ class MjcfPlant(Plant):
     def _list_models(self, count: int, changes: ModelChanges) -> list[mujoco.MjModel]:
         if not changes:
             return [self.model] * count
-        names = sorted(changes)
+        names = tuple(sorted(changes))
         rows = np.stack([changes[name] for name in names], 1).astype(np.float64)  # (N, Q, J)
-        models = []
-        for row in rows:
-            key = "".join(names).encode() + row.tobytes()
-            if key not in self._models:
-                if len(self._models) > 512:  # candidates of a search seldom come back so late
-                    self._models.clear()
-                self._models[key] = self.change_model(dict(zip(names, row, strict=True)))
-            models.append(self._models[key])
-        return models
+        return [self._remember(names, row.tobytes()) for row in rows]
+
+    def _build(self, names: tuple[str, ...], row: bytes) -> mujoco.MjModel:
+        values = np.frombuffer(row).reshape(len(names), -1)
+        return self.change_model(dict(zip(names, values, strict=True)))
 
 
 def _find_joint(model: mujoco.MjModel, path: Path, name: str) -> int:

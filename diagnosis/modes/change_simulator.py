@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -15,7 +13,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from diagnosis import answer, effect_library, effects_file
-from diagnosis.answer import Answer
 from diagnosis.own_simulator import OwnSimulator
 
 MJCF_FILE = "changed.xml"
@@ -72,31 +69,22 @@ class ChangeSimulator:
         kinds = effect_library.load_effects(self.machine, None, own)
         folder.mkdir(parents=True, exist_ok=True)
         effects_file.write_ranges(given, kinds, folder / effects_file.RANGES_FILE)
-        told: dict[str, Any] = {"changes": [], "not_in_the_file": {}}
+        changes, left = [], {}
         if own.path is not None:
-            told = self._change_file(own.path, given)
+            from diagnosis.mjcf import changes as mjcf  # MuJoCo is not in every installation
+
+            about = own.path, self.machine, given.selected
+            changes, left = mjcf.write_changed_mjcf(*about, folder / MJCF_FILE)
+        told = {"changes": [asdict(one) for one in changes], "not_in_the_file": left}
         write_json(folder / CHANGES_FILE, told)
-        _print(told, effects_file.describe_parts(given), folder)
-
-    def _change_file(self, path: Path, given: Answer) -> dict[str, Any]:
-        """Write the changed MJCF; return what was done."""
-        from diagnosis.mjcf import changes as mjcf_changes  # MuJoCo is not in every installation
-
-        changed = self.session.folder / MJCF_FILE
-        changes, left = mjcf_changes.write_changed_mjcf(path, self.machine, given.selected, changed)
-        return {"changes": [asdict(one) for one in changes], "not_in_the_file": left}
-
-
-def _print(told: dict[str, Any], parts: Sequence[str], folder: Path) -> None:
-    if told["changes"]:
         rows = []
-        for one in told["changes"]:
-            changed = f"{one['element']} {one['attribute']}"
-            numbers = (f"{one['before']:.4g}", f"{one['after']:.4g}")
-            rows.append((one["effect"], one["joint"], changed, *numbers))
-        print_table(("finding", "joint", "attribute", "before", "after"), rows)
-    for name, reason in told["not_in_the_file"].items():
-        print_text(f"not in {MJCF_FILE}: {name}: {reason}")
-    for part in parts:
-        print_text(part)
-    print_text(f"written: {folder}")
+        for one in changes:
+            attribute = f"{one.element} {one.attribute}"
+            rows.append((one.effect, one.joint, attribute, f"{one.before:.4g}", f"{one.after:.4g}"))
+        if rows:
+            print_table(("finding", "joint", "attribute", "before", "after"), rows)
+        for name, reason in left.items():
+            print_text(f"not in {MJCF_FILE}: {name}: {reason}")
+        for part in effects_file.describe_parts(given):
+            print_text(part)
+        print_text(f"written: {folder}")
