@@ -8,9 +8,10 @@ Axes: `T` rows, `R` rows that are asked for, `H` samples (oldest first), `C` col
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -29,32 +30,6 @@ Spoil = Callable[[np.ndarray, float], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Place:
-    """Columns at a point of the way.
-
-    Attributes:
-        point: See `diagnosis.deployment.replay`.
-        columns: Those that are spoiled; `None`: all.
-        order: Column that the code takes for each of them; `None`: the right one.
-    """
-
-    point: str
-    columns: tuple[int, ...] | None = None
-    order: Order | None = None
-
-    def change(self, spoil: Spoil, number: float, values: np.ndarray) -> np.ndarray:
-        """Return the values of the point with the wrong ones among them."""
-        if self.order is not None:
-            values = values[..., list(self.order)]
-        if self.columns is None:
-            return spoil(values, number)
-        columns = list(self.columns)
-        changed = values.copy()
-        changed[..., columns] = spoil(values[..., columns], number)
-        return changed
-
-
-@dataclass(frozen=True)
 class Distortion:
     """A mistake: a row of the table, and where the code makes it.
 
@@ -67,7 +42,7 @@ class Distortion:
         parameter: Name of the number, with its unit; empty where it is not told.
         is_continuous: The number is refined between those of `values`.
         field: Where it acts, in words: `q.q3`, `u`, `target.y`, `command.q2`, `observation`.
-        places: Where it acts.
+        changes: What it spoils, by point of the way (`diagnosis.deployment.replay`).
     """
 
     kind: str
@@ -77,29 +52,39 @@ class Distortion:
     parameter: str = ""
     is_continuous: bool = False
     field: str = ""
-    places: tuple[Place, ...] = ()
+    changes: Mapping[str, Spoil] = dataclasses.field(default_factory=dict)
 
-    def put(self, field: str, *places: Place) -> Distortion:
-        """Return the mistake at some places."""
+    def put(self, field: str, *points: str, columns: Sequence[int] = ()) -> Distortion:
+        """Return the mistake at some points of the way, on some of their columns; none: on all."""
+        spoil = partial(spoil_columns, spoil=self.spoil, columns=columns) if columns else self.spoil
         text = self.text.replace("{field}", field)
-        return replace(self, text=text, field=field, places=places)
+        return replace(self, text=text, field=field, changes=dict.fromkeys(points, spoil))
 
     def acts_between(self, begin: str, end: str) -> bool:
         """Return whether it acts behind one point of the way, and at another one or before."""
-        first = min(POINTS.index(place.point.split()[0]) for place in self.places)
+        first = min(POINTS.index(point.split()[0]) for point in self.changes)
         return POINTS.index(begin) < first <= POINTS.index(end)
 
     def build(self, number: float) -> Change:
         """Return the change of the replay with this number."""
         changes = {}
-        for place in self.places:
-            changes[place.point] = partial(place.change, self.spoil, number)
+        for point, spoil in self.changes.items():
+            changes[point] = lambda values, spoil=spoil: spoil(values, number)
         return changes
 
 
-def keep(values: np.ndarray, number: float) -> np.ndarray:
-    """Return right values: only their order is wrong."""
-    return values
+def spoil_columns(
+    values: np.ndarray, number: float, spoil: Spoil, columns: Sequence[int]
+) -> np.ndarray:
+    """Return values with wrong ones in some columns."""
+    changed = values.copy()
+    changed[..., columns] = spoil(values[..., columns], number)
+    return changed
+
+
+def reorder(values: np.ndarray, number: float, order: Order) -> np.ndarray:
+    """Return right values in another order of columns."""
+    return values[..., list(order)]
 
 
 def scale(values: np.ndarray, factor: float) -> np.ndarray:
@@ -234,16 +219,14 @@ ALL_CLIPPED = replace(CLIPPED, text="the {field} is clipped at ±{value}")
 
 
 def spread(
-    rows: Iterable[Distortion], field: str, names: Sequence[str], *places: Place
+    rows: Sequence[Distortion], field: str, names: Sequence[str], *points: str
 ) -> Iterator[Distortion]:
-    """Yield each row at all columns of places together, then at each column, whose name joins the field."""
-    rows = tuple(rows)
+    """Yield each row on all columns of points together, then on each column, whose name joins the field."""
     for row in rows:
-        yield row.put(field, *places)
+        yield row.put(field, *points)
     for column, name in enumerate(names if len(names) > 1 else ()):
-        single = [replace(place, columns=(column,)) for place in places]
         for row in rows:
-            yield row.put(f"{field}.{name}", *single)
+            yield row.put(f"{field}.{name}", *points, columns=[column])
 
 
 def list_distortions(policy: LoadedPolicy, others: Mapping[str, LoadedPolicy]) -> list[Distortion]:
@@ -262,18 +245,18 @@ def list_distortions(policy: LoadedPolicy, others: Mapping[str, LoadedPolicy]) -
         if other.contract.size == policy.contract.size:
             network = lambda vectors, _, other=other: other.network.answer(vectors)  # noqa: E731
             row = Distortion("network", f"the network is that of {name}", network)
-            found.append(row.put("network", Place("network")))
-    joints, command = policy.contract.joints, Place("command")
+            found.append(row.put("network", "network"))
+    joints = policy.contract.joints
     found += [_make_command_order(joints, order) for order in list_orders(joints)]
-    found += spread(ON_COMMANDS, "command", joints, command)
-    found += [row.put("command", command) for row in ON_ROWS]
+    found += spread(ON_COMMANDS, "command", joints, "command")
+    found += [row.put("command", "command") for row in ON_ROWS]
     return found
 
 
 def _list_term_mistakes(term: ObservationTerm) -> Iterator[Distortion]:
     """Yield mistakes of one term."""
     name, names = term.name, name_columns(term)
-    signal, scaled = Place(f"signal {name}"), Place(f"scaled {name}")
+    signal, scaled = f"signal {name}", f"scaled {name}"
     yield from spread(ON_SIGNALS, name, names, signal)
     yield from spread([OFFSET], name, names, scaled)
     for row in (*_list_normalisations(term.mean, term.std), *ON_SCALED):
@@ -298,7 +281,7 @@ def _list_normalisations(mean: np.ndarray, std: np.ndarray) -> Iterator[Distorti
 
 
 def _make_orders(
-    terms: Sequence[ObservationTerm], names: Sequence[str], order: Order, *after: Place
+    terms: Sequence[ObservationTerm], names: Sequence[str], order: Order, after: bool = False
 ) -> Iterator[Distortion]:
     """Yield the mistake that terms of the observation are in another order.
 
@@ -308,18 +291,19 @@ def _make_orders(
         terms: The terms.
         names: Names of their columns.
         order: The other order.
-        after: Where the commands are taken to be in that order too.
+        after: Commands are taken to be in that order too.
     """
-    words = [term.name for term in terms] + ["the commands"] * len(after)
+    words = [term.name for term in terms] + ["the commands"] * after
     listed = " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
     verb = "are" if len(words) > 1 else "is"
     text = f"{listed} {verb} in another order: {describe_order(names, order)}"
-    row = Distortion("order", text, keep)
+    row = Distortion("order", text, partial(reorder, order=order))
+    undone = {"answer": partial(reorder, order=invert_order(order))} if after else {}
     field = "joints" if len(terms) > 1 else terms[0].name
-    yield row.put(field, *(Place(f"signal {term.name}", order=order) for term in terms), *after)
-    if any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms):
-        scaled = [Place(f"scaled {term.name}", order=order) for term in terms]
-        yield row.put(field, *scaled, *after)
+    is_scaled = any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms)
+    for point in ("signal", "scaled") if is_scaled else ("signal",):
+        put = row.put(field, *(f"{point} {term.name}" for term in terms))
+        yield replace(put, changes={**put.changes, **undone})
 
 
 def list_matched_orders(
@@ -362,12 +346,12 @@ def _list_shared_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
         return
     for order in list_orders(names):
         yield from _make_orders(by_joint, names, order)
-        yield from _make_orders(by_joint, names, order, Place("answer", order=invert_order(order)))
-    yield from spread([SIGN], "joints", names, *(Place(f"signal {term.name}") for term in by_joint))
-    long = [Place(f"scaled {term.name}") for term in terms if term.samples > 1]
+        yield from _make_orders(by_joint, names, order, after=True)
+    yield from spread([SIGN], "joints", names, *(f"signal {term.name}" for term in by_joint))
+    long = [f"scaled {term.name}" for term in terms if term.samples > 1]
     if long:
         yield ALL_FILLED.put("observation", *long)
-    yield ALL_LATE.put("observation", *(Place(f"signal {term.name}") for term in terms))
+    yield ALL_LATE.put("observation", *(f"signal {term.name}" for term in terms))
 
 
 def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
@@ -376,9 +360,10 @@ def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
     for order in itertools.permutations(slices):
         if list(order) != list(slices):
             places = [np.arange(slices[name].start, slices[name].stop) for name in order]
-            row = Distortion("order", f"the terms are in the order {', '.join(order)}", keep)
-            yield row.put("observation", Place("vector", order=tuple(np.concatenate(places))))
-    yield ALL_CLIPPED.put("observation", Place("vector"))
+            text = f"the terms are in the order {', '.join(order)}"
+            row = Distortion("order", text, partial(reorder, order=tuple(np.concatenate(places))))
+            yield row.put("observation", "vector")
+    yield ALL_CLIPPED.put("observation", "vector")
 
 
 def _list_frame_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
@@ -386,7 +371,6 @@ def _list_frame_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
     terms = {term.name: term for term in policy.contract.terms}
     if "target" not in terms or len(terms["target"].columns) != 3:
         return
-    place = Place("signal target")
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             if order == (0, 1, 2) and sum(sign < 0 for sign in signs) < 2:
@@ -397,20 +381,24 @@ def _list_frame_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
             if min(signs) > 0:
                 kind, text = "order", f"target has its axes in the order {named}"
             axes = np.diag(signs) @ np.eye(3)[list(order)]
-            yield Distortion(kind, text, partial(exchange, axes=axes)).put("target", place)
+            yield Distortion(kind, text, partial(exchange, axes=axes)).put(
+                "target", "signal target"
+            )
     for axis, letter in enumerate("xyz"):
         text = f"target is in a frame turned by {{value}} rad about {letter}"
         about = partial(turn, axis=letter)
-        yield Distortion("frame", text, about, ANGLES_RAD, "angle_rad", True).put("target", place)
+        yield Distortion("frame", text, about, ANGLES_RAD, "angle_rad", True).put(
+            "target", "signal target"
+        )
         text = f"target is in a frame shifted by {{value}} m along {letter}"
         row = Distortion("frame", text, shift, SHIFTS_M, "shift_m", True)
-        yield row.put(f"target.{letter}", replace(place, columns=(axis,)))
+        yield row.put(f"target.{letter}", "signal target", columns=[axis])
 
 
 def _make_command_order(names: Sequence[str], order: Order) -> Distortion:
     """Return the mistake that commands reach the joints in another order."""
     text = "commands reach the joints in another order: " + describe_order(names, order)
-    return Distortion("order", text, keep).put("command", Place("command", order=order))
+    return Distortion("order", text, partial(reorder, order=order)).put("command", "command")
 
 
 def describe_order(names: Sequence[str], order: Order) -> str:

@@ -78,12 +78,6 @@ class ReplayStage:
     distortions: Sequence[Distortion]
     num_start: int
 
-    @property
-    def rows(self) -> np.ndarray:
-        """Rows that can be compared."""
-        rows = np.flatnonzero(np.isfinite(self.logged).all(1))
-        return rows[rows >= self.num_start]
-
 
 @dataclass(frozen=True)
 class FittedDistortion:
@@ -171,7 +165,8 @@ class StageResult:
 
 def judge_stage(stage: ReplayStage) -> StageResult:
     """Compare a stage with the log; search for the mistake where it departs."""
-    rows = stage.rows
+    rows = np.flatnonzero(np.isfinite(stage.logged).all(1))
+    rows = rows[rows >= stage.num_start]
     residual = np.full(stage.logged.shape, np.nan)
     residual[rows] = stage.predict((), rows) - stage.logged[rows]
     rows = rows[np.isfinite(residual[rows]).all(1)]

@@ -25,9 +25,6 @@ MAX_STATES = 4_000_000
 REFERENCE_TRAVEL = 0.05
 """Error of position, over the travel, at which a position drive gives its reference torque. Chosen by
 hand: a drive that holds an arm errs by a few percent."""
-QUANTITIES = ("friction", "damping", "armature", "gain", "limit")
-"""Numbers that a row may change; see `MjcfPlant.read_references`."""
-
 MAX_DAMPING_LOSS = 0.95
 """Largest share of the damping of joint and drive that an effect takes away: a rest keeps joints stable."""
 
@@ -102,7 +99,7 @@ class MjcfPlant(Plant):
         return found
 
     def read_references(self) -> dict[str, np.ndarray]:
-        """Return the unit of each of `QUANTITIES` on each joint, `(J,)`.
+        """Return the unit of each number that a row may change, on each joint, `(J,)`.
 
         Friction is counted in the torque that a drive gives for an error of 5 % of the travel
         (position), at full speed (velocity), or at full command (torque), Nm or N. Damping is counted
