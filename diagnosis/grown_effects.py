@@ -40,10 +40,6 @@ class GrownEffect:
     joints: np.ndarray
     nats: float
 
-    def repeat(self, count: int) -> dict[str, np.ndarray]:
-        """Return its numbers for some candidates, `(C, J)` or `(C, 1)` each."""
-        return {name: np.repeat(value[None], count, 0) for name, value in self.values.items()}
-
     def count_numbers(self) -> int:
         """Return how many numbers make the effect; one that joints share counts once."""
         count = 0

@@ -212,9 +212,9 @@ class FreeRunLikelihood:
         count = len(next(iter(trials.values()))) if trials else 1
         given = []
         for place, one in enumerate(effects):
-            values = one.repeat(count)
-            for name in values:
-                values[name] = trials.get((place, name), values[name])
+            values = {}
+            for name, value in one.values.items():
+                values[name] = trials.get((place, name), np.repeat(value[None], count, 0))
             given.append((one.kind, values))
         return self.runs.simulate(given, count)
 

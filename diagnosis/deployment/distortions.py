@@ -56,7 +56,9 @@ class Distortion:
 
     def put(self, field: str, *points: str, columns: Sequence[int] = ()) -> Distortion:
         """Return the mistake at some points of the way, on some of their columns; none: on all."""
-        spoil = partial(spoil_columns, spoil=self.spoil, columns=columns) if columns else self.spoil
+        spoil = (
+            partial(change_columns, spoil=self.spoil, columns=columns) if columns else self.spoil
+        )
         text = self.text.replace("{field}", field)
         return replace(self, text=text, field=field, changes=dict.fromkeys(points, spoil))
 
@@ -73,7 +75,7 @@ class Distortion:
         return changes
 
 
-def spoil_columns(
+def change_columns(
     values: np.ndarray, number: float, spoil: Spoil, columns: Sequence[int]
 ) -> np.ndarray:
     """Return values with wrong ones in some columns."""
@@ -82,7 +84,7 @@ def spoil_columns(
     return changed
 
 
-def reorder(values: np.ndarray, number: float, order: Order) -> np.ndarray:
+def permute(values: np.ndarray, number: float, order: Order) -> np.ndarray:
     """Return right values in another order of columns."""
     return values[..., list(order)]
 
@@ -129,7 +131,7 @@ def smooth(values: np.ndarray, weight: float) -> np.ndarray:
     return lfilter([weight], [1.0, weight - 1.0], values, axis=0, zi=begin)[0]
 
 
-def exchange(points: np.ndarray, number: float, axes: np.ndarray) -> np.ndarray:
+def mirror(points: np.ndarray, number: float, axes: np.ndarray) -> np.ndarray:
     """Return points `(T, 3)` in a frame with other `axes`, `(3, 3)`."""
     return points @ axes.T
 
@@ -297,8 +299,8 @@ def _make_orders(
     listed = " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
     verb = "are" if len(words) > 1 else "is"
     text = f"{listed} {verb} in another order: {describe_order(names, order)}"
-    row = Distortion("order", text, partial(reorder, order=order))
-    undone = {"answer": partial(reorder, order=invert_order(order))} if after else {}
+    row = Distortion("order", text, partial(permute, order=order))
+    undone = {"answer": partial(permute, order=invert_order(order))} if after else {}
     field = "joints" if len(terms) > 1 else terms[0].name
     is_scaled = any(np.ptp(term.mean) > 0 or np.ptp(term.std) > 0 for term in terms)
     for point in ("signal", "scaled") if is_scaled else ("signal",):
@@ -361,7 +363,7 @@ def _list_vector_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
         if list(order) != list(slices):
             places = [np.arange(slices[name].start, slices[name].stop) for name in order]
             text = f"the terms are in the order {', '.join(order)}"
-            row = Distortion("order", text, partial(reorder, order=tuple(np.concatenate(places))))
+            row = Distortion("order", text, partial(permute, order=tuple(np.concatenate(places))))
             yield row.put("observation", "vector")
     yield ALL_CLIPPED.put("observation", "vector")
 
@@ -381,15 +383,12 @@ def _list_frame_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
             if min(signs) > 0:
                 kind, text = "order", f"target has its axes in the order {named}"
             axes = np.diag(signs) @ np.eye(3)[list(order)]
-            yield Distortion(kind, text, partial(exchange, axes=axes)).put(
-                "target", "signal target"
-            )
+            yield Distortion(kind, text, partial(mirror, axes=axes)).put("target", "signal target")
     for axis, letter in enumerate("xyz"):
         text = f"target is in a frame turned by {{value}} rad about {letter}"
         about = partial(turn, axis=letter)
-        yield Distortion("frame", text, about, ANGLES_RAD, "angle_rad", True).put(
-            "target", "signal target"
-        )
+        row = Distortion("frame", text, about, ANGLES_RAD, "angle_rad", True)
+        yield row.put("target", "signal target")
         text = f"target is in a frame shifted by {{value}} m along {letter}"
         row = Distortion("frame", text, shift, SHIFTS_M, "shift_m", True)
         yield row.put(f"target.{letter}", "signal target", columns=[axis])
@@ -398,7 +397,7 @@ def _list_frame_mistakes(policy: LoadedPolicy) -> Iterator[Distortion]:
 def _make_command_order(names: Sequence[str], order: Order) -> Distortion:
     """Return the mistake that commands reach the joints in another order."""
     text = "commands reach the joints in another order: " + describe_order(names, order)
-    return Distortion("order", text, partial(reorder, order=order)).put("command", "command")
+    return Distortion("order", text, partial(permute, order=order)).put("command", "command")
 
 
 def describe_order(names: Sequence[str], order: Order) -> str:

@@ -69,7 +69,6 @@ class _Editor:
         self.place = self.machine.joint_names.index(joint)
         self.joint = spec.joint(joint)
         self.drive = spec.actuators[int(plant.drives[self.place])]
-        self.timestep_s = float(plant.model.opt.timestep)
         self.changes: list[MjcfChange] = []
 
     def list_sizes(self, number: str) -> list[float]:
@@ -216,7 +215,9 @@ def _add_delay(to: _Editor) -> str | None:
     if to.list_sizes("dead_time_s")[0] < 0.0:
         return "the machine answers sooner than the file; lower its own delay"
     to.write("delay", 0, "dead_time_s", lambda old, new: old + max(0.0, new))
-    to.drive.nsample = max(to.drive.nsample, math.ceil(to.drive.delay / to.timestep_s) + 2)
+    to.drive.nsample = max(
+        to.drive.nsample, math.ceil(to.drive.delay / to.plant.model.opt.timestep) + 2
+    )
     to.drive.interp = 1  # a delay that is no multiple of the time step would be rounded up
     return None
 
@@ -228,7 +229,7 @@ def _add_lag(to: _Editor) -> str | None:
     to.drive.dynprm = np.zeros_like(to.drive.dynprm)
     # The effect holds each period's last value, half a period ahead of a continuous filter.
     ahead_s = 0.5 * to.machine.period_s
-    later = lambda old, new: max(new - ahead_s, to.timestep_s)  # noqa: E731
+    later = lambda old, new: max(new - ahead_s, to.plant.model.opt.timestep)  # noqa: E731
     to.write("dynprm", 0, "time_constant_s", later)
     return None
 

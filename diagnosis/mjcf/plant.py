@@ -17,7 +17,7 @@ from mujoco import rollout
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from diagnosis.own_simulator import NO_CHANGES, ModelChanges, Plant
+from diagnosis.plant import NO_CHANGES, ModelChanges, Plant
 
 STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 MAX_STATES = 4_000_000
