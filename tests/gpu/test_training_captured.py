@@ -74,6 +74,23 @@ def test_each_level_is_captured_with_any_noise(machine: Machine, level: str) -> 
     assert all(torch.isfinite(value).all() for value in loop.get_observations().values())
 
 
+OUTSIDE = ("library", "clock_offset", "encoder_scale", "link_length", "base_tilt", "extrinsics")
+"""Effects that the library does not draw, and the library itself."""
+
+
+@pytest.mark.parametrize("actuator", ["lag", "hydraulic", "mlp"])
+def test_actuators_and_all_effects_are_captured(machine: Machine, actuator: str) -> None:
+    effects = option("effect", "library").effects | {
+        name: option("effect", name) for name in OUTSIDE
+    }
+    plant = replace(runs.plant(machine, sim=WARP), actuator=option("actuator", actuator))
+    loop = replace(plant, effect=effects).build(CUDA, NUM, 256, 5)
+    loop.capture()
+    assert loop.graph_active
+    push(loop, 30)
+    assert all(torch.isfinite(value).all() for value in loop.get_observations().values())
+
+
 # --- figures of the reward ---
 
 

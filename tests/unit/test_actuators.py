@@ -14,7 +14,6 @@ from motion import rest
 
 from actuators.models.hydraulic import Hydraulic
 from actuators.models.lag import FirstOrderLag
-from actuators.models.parameters import open_valve
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -88,23 +87,9 @@ def test_lag_follows_the_analytic_step_response(machine: Machine) -> None:
     np.testing.assert_allclose(path[:, 0, 0], expected, atol=2e-6)
 
 
-def test_a_dead_time_between_samples_is_exact(machine: Machine) -> None:
-    # 0.33 s = 6.6 periods: after 7 periods the joint has moved for 0.4 of one, 0.4 * 0.05 s * 0.4
-    # rad/s
-    path = roll(lag(dead_time_s=0.33), machine, held(machine, 8, q1=1.0))
-    np.testing.assert_allclose(path[[6, 7, 8], 0, 0], [0.0, 0.008, 0.028], atol=1e-6)
-
-
 def test_the_machines_dead_time_shifts_by_eleven_periods(machine: Machine) -> None:
     path = roll(lag(dead_time_s=None), machine, held(machine, 13, q1=1.0))
     np.testing.assert_allclose(path[[11, 12, 13], 0, 0], [0.0, 0.02, 0.04], atol=1e-6)
-
-
-def test_the_dead_band_ends_on_each_side_by_itself() -> None:
-    u = torch.tensor([-1.0, -0.6, -0.2, 0.0, 0.1, 0.55, 1.0])
-    expected = [-1.0, -0.5, 0.0, 0.0, 0.0, 0.5, 1.0]  # (0.6 - 0.2) / 0.8 and (0.55 - 0.1) / 0.9
-    found = open_valve(u, torch.tensor(0.1), torch.tensor(0.2))
-    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("dead_time_s", [0.61, 2.0])

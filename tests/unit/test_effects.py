@@ -12,10 +12,9 @@ import torch
 from composed import option
 from motion import draw_commands, roll
 
-from actuators.effects.effect import EffectChain, EffectSpec
+from actuators.effects.effect import EffectSpec
 from brokk_rl.checks import NUM_ENVS, check_actuator_model
 from brokk_rl.errors import ConfigError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
 CPU = torch.device("cpu")
@@ -205,62 +204,3 @@ def test_the_first_effect_is_nearest_to_the_machine(machine: Machine) -> None:
     for first, second, shown in ((biased, coarse, 0.11), (coarse, biased, 0.106)):
         seen = wrap(machine, first, second).measure(q)
         assert seen[0, 0].item() == pytest.approx(shown, abs=1e-6)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize(
-    ("actuator", "those"),
-    [
-        ("lag", FIXED),
-        ("lag", ["library"]),
-        ("ideal", ["encoder_bias"]),
-        ("hydraulic", ["encoder_bias"]),
-        ("mlp", ["encoder_bias"]),
-    ],
-)
-def test_actuators_and_effects_can_be_captured_in_a_cuda_graph(
-    actuator: str, those: list[str], machine: Machine
-) -> None:
-    device, num = torch.device("cuda"), 8
-    torch.manual_seed(0)
-    u = draw_commands(machine, 40, num).to(device)
-    home = torch.as_tensor(machine.home, dtype=torch.float32, device=device).expand(num, 5)
-
-    def run(captured: bool) -> torch.Tensor:
-        model = option("actuator", actuator).build(machine, num, device)
-        for name in those:
-            model = option("effect", name).wrap(model, machine, num, device)
-        assert isinstance(model, EffectChain)
-        shape = (num, machine.num_history, machine.num_joints)
-        history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
-        command, seen = torch.zeros(num, 5, device=device), torch.zeros(num, 8, device=device)
-        mask = torch.zeros(num, dtype=torch.bool, device=device)
-
-        def period() -> None:
-            history.push_u(command)
-            history.push_q(model.step(history))
-            history.reset(mask, home)
-            model.reset(mask)
-            q = history.q[:, -1]
-            seen.copy_(torch.cat((model.measure(q), model.misplacement(q)), 1))
-
-        start = {key: value.clone() for key, value in model.state.items()}
-        graph, path = torch.cuda.CUDAGraph(), []
-        for _ in range(3):
-            period()
-        if captured:
-            torch.cuda.synchronize()
-            with torch.cuda.graph(graph):
-                period()
-        for key, value in model.state.items():
-            value.copy_(start[key])
-        history.reset(torch.ones_like(mask), home)
-        for k, row in enumerate(u):
-            command.copy_(row)
-            mask.copy_(torch.arange(num, device=device) == k % 20)
-            graph.replay() if captured else period()
-            path.append(torch.cat((history.q[:, -1], seen), 1))
-        return torch.stack(path)
-
-    with torch.no_grad():
-        torch.testing.assert_close(run(False), run(True), rtol=0, atol=1e-5)

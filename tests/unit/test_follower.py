@@ -242,17 +242,6 @@ def loop_with(machine: Machine, follower: Any) -> ControlLoop:
     return runs.plant(machine, task, follower=follower).build(CPU, 8, 64, 5)
 
 
-def test_a_loop_behind_a_perfect_person_is_the_loop_without_one(machine: Machine) -> None:
-    loops = [loop_with(machine, follower) for follower in (option("follower", "none"), person())]
-    actions = 2 * torch.randn(30, 8, 5)
-    for loop in loops:
-        torch.manual_seed(1)
-        for action in actions:
-            loop.step(action)
-    alone, behind = (runs.take_state(loop) for loop in loops)
-    assert all(torch.equal(value, behind[name]) for name, value in alone.items())
-
-
 def test_histories_and_recordings_hold_what_was_given(machine: Machine) -> None:
     loop = loop_with(machine, person(delay_s=0.1, gain=0.5))
     proposed = []

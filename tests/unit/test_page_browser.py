@@ -42,6 +42,12 @@ def opened(browser: Any) -> Iterator[Callable[..., Any]]:
         yield found
 
 
+@pytest.fixture
+def page(port: int, opened: Callable[..., Any]) -> Any:
+    """A page that shows the feed."""
+    return opened(port)
+
+
 def drawn(page: Any) -> dict[str, tuple[float, float]]:
     """Returns where each mark is drawn, of full travel: psi to the right, theta up."""
     text = page.evaluate(
@@ -55,10 +61,7 @@ def drawn(page: Any) -> dict[str, tuple[float, float]]:
     return found
 
 
-def test_levers_are_drawn_where_they_are_and_should_be(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
+def test_levers_are_drawn_where_they_are_and_should_be(feed: Scripted, page: Any) -> None:
     feed.now = replace(feed.now, state=replace(STATE, lever=lever(0.5, -0.25, -1.0, 1.0)))
     feed.advise(2, left_theta=-0.75, left_psi=1.0, right_theta=0.1, right_psi=-0.6)
     eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
@@ -69,10 +72,7 @@ def test_levers_are_drawn_where_they_are_and_should_be(
     assert found["right advised"] == pytest.approx((-0.6, 0.1), abs=1e-3)
 
 
-def test_the_button_is_announced_and_then_green(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
+def test_the_button_is_announced_and_then_green(feed: Scripted, page: Any) -> None:
     button = page.locator("#button")
     assert button.inner_text().strip() == "", "no instruction where there is none"
     feed.now = change_state(SHOWN, button_right=True)
@@ -92,10 +92,7 @@ def test_the_button_is_announced_and_then_green(
     assert page.locator("#right text", has_text="Arm 1").count() == 1
 
 
-def test_what_is_stale_is_grey_and_says_so(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
+def test_what_is_stale_is_grey_and_says_so(feed: Scripted, page: Any) -> None:
     feed.advise(2, due_s=0.0, button_right=True, right_theta=0.5)
     page.wait_for_selector("#button.now")
     old = tuple(
@@ -185,12 +182,8 @@ def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_sho
 
 
 def test_words_follow_the_mode(
-    feed: Scripted,
-    port: int,
-    opened: Callable[..., Any],
-    record_property: Callable[[str, object], None],
+    feed: Scripted, page: Any, record_property: Callable[[str, object], None]
 ) -> None:
-    page = opened(port)
     start, advice = page.locator("#start b"), page.locator("#advice")
     assert (start.inner_text(), advice.inner_text()) == ("Guide me", "Bring your levers to green")
     feed.now = replace(SHOWN, commands=True)
@@ -202,10 +195,7 @@ def test_words_follow_the_mode(
     eventually(lambda: advice.inner_text() == "Nothing is sent")
 
 
-def test_a_touch_answers_the_question_whether_somebody_is_there(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
+def test_a_touch_answers_the_question_whether_somebody_is_there(feed: Scripted, page: Any) -> None:
     page.click("#levers")
     feed.now = change_state(SHOWN, prompt=True)
     eventually(lambda: "Still there?" in page.locator("#alarms").inner_text())
@@ -214,10 +204,7 @@ def test_a_touch_answers_the_question_whether_somebody_is_there(
     eventually(lambda: feed.requests == [OperatorRequest("present", "")])
 
 
-def test_safety_and_connection_are_told_apart_in_words(
-    feed: Scripted, port: int, opened: Callable[..., Any]
-) -> None:
-    page = opened(port)
+def test_safety_and_connection_are_told_apart_in_words(feed: Scripted, page: Any) -> None:
     assert page.locator("#safety.good").inner_text() == "Listens only"
     latched = change_state(SHOWN, guard=GuardState.LATCHED, trip=GuardTrip.CHANNEL_INVALID)
     feed.now = replace(latched, commands=True)
@@ -233,9 +220,8 @@ def test_safety_and_connection_are_told_apart_in_words(
 
 
 def test_alarms_are_listed_by_gravity_and_stay_a_while_after_they_have_passed(
-    feed: Scripted, port: int, opened: Callable[..., Any]
+    feed: Scripted, page: Any
 ) -> None:
-    page = opened(port)
     assert page.locator("#alarms").is_hidden()
     dead = (SourceAge("camera", 3.0, 1.0), *SHOWN.streams)
     health = replace(SHOWN.health, delay_s=0.09, supervisor_silent=True)
@@ -257,9 +243,8 @@ def test_alarms_are_listed_by_gravity_and_stay_a_while_after_they_have_passed(
 
 
 def test_depth_lateral_distance_and_angle_are_shown_and_inserted_is_said(
-    feed: Scripted, port: int, opened: Callable[..., Any]
+    feed: Scripted, page: Any
 ) -> None:
-    page = opened(port)
     assert page.locator("#insertion").is_hidden(), "nothing is measured yet"
     feed.now = replace(SHOWN, insertion=READING)
     page.wait_for_selector("#insertion:not([hidden])")
@@ -284,8 +269,7 @@ def test_depth_lateral_distance_and_angle_are_shown_and_inserted_is_said(
     page.wait_for_selector("#insertion.stale:not(.in)")
 
 
-def test_the_night_is_dark_and_can_be_read(port: int, opened: Callable[..., Any]) -> None:
-    page = opened(port)
+def test_the_night_is_dark_and_can_be_read(page: Any) -> None:
 
     def luminance(name: str, what: str) -> float:
         text = page.locator(name).first.evaluate(f"node => getComputedStyle(node).{what}")
@@ -363,8 +347,7 @@ def test_without_dead_man_or_token_nothing_is_done_and_the_page_says_why(
     assert len(feed.requests) == 1
 
 
-def test_the_token_leaves_the_address_bar(port: int, opened: Callable[..., Any]) -> None:
-    page = opened(port)
+def test_the_token_leaves_the_address_bar(page: Any) -> None:
     assert TOKEN not in page.url
     page.reload()
     until(page, "() => window.measured?.allowed === true")
@@ -397,10 +380,9 @@ def _share(page: Any, name: str, color: list[int], within: int = 25) -> float:
 
 
 def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
-    feed: Scripted, port: int, opened: Callable[..., Any]
+    feed: Scripted, page: Any
 ) -> None:
     feed.now = replace(SHOWN, streams=(*SHOWN.streams, SourceAge("camera", 0.0, 1e6)))
-    page = opened(port)
     until(page, "!document.getElementById('camera').hidden")
     box = page.locator("#picture").bounding_box()
     page.locator("#picture").click(position={"x": 0.25 * box["width"], "y": 0.6 * box["height"]})

@@ -81,21 +81,6 @@ def test_what_was_handed_out_does_not_change_later(machine: Machine) -> None:
     assert torch.equal(seen["policy"], kept)
 
 
-def test_a_restored_loop_goes_on_exactly(machine: Machine) -> None:
-    loop = make(machine)
-    actions = 2 * torch.randn(40, 8, 5)
-    for action in actions[:20]:
-        loop.step(action)
-    state, random = loop.state_dict(), torch.get_rng_state()
-    first = [(loop.step(action)[1].clone(), loop.get_observations()) for action in actions[20:]]
-    other = make(machine)
-    other.load_state_dict(state)
-    torch.set_rng_state(random)
-    for action, (reward, seen) in zip(actions[20:], first, strict=True):
-        found = other.step(action)
-        assert torch.equal(found[1], reward) and (found[0] == seen).all()
-
-
 def test_statistics_count_what_ended_since_they_were_last_asked(machine: Machine) -> None:
     loop = make(machine, episode_s=0.2)
     loop.statistics()
