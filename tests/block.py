@@ -26,7 +26,6 @@ FARTHEST_M = 12.0
 
 def seen_at(frame: Frame, center_m: np.ndarray) -> tuple[float, float]:
     """Returns where in the picture a point of the base frame is, as parts of width and height."""
-    assert frame.base_from_camera is not None
     from_base = np.linalg.inv(frame.base_from_camera)
     u, v, w = frame.camera_matrix @ (from_base[:3, :3] @ center_m + from_base[:3, 3])
     height, width = frame.depth_m.shape

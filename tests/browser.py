@@ -77,7 +77,6 @@ READING = InsertionReading(
 
 def change_state(shown: PageState, **changes: Any) -> PageState:
     """Return what is shown with changes of the machine's, operator's or guard's state."""
-    assert shown.state is not None
     return replace(shown, state=replace(shown.state, **changes))
 
 

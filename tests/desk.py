@@ -45,7 +45,6 @@ NO_VCAN = not Path(f"/sys/class/net/{VCAN}").exists()
 
 def command(stop: Callable[[], bool], home: np.ndarray, memory: LoopMemory) -> None:
     """Asks for motion twenty times a second, as a policy would: to and fro, so that no joint ever comes to its end."""
-    assert memory.request is not None
     u = np.array(COMMAND)
     while not stop():
         state = memory.state.read()

@@ -157,7 +157,6 @@ class Bridge:
         if name in self.alter:
             layout = self._layouts[frame.frame_id]
             values = self._remote._description.decode(layout, frame.data)
-            assert isinstance(values, dict)
             counter = int(values["Counter"])
             self.alter[name](values)
             data = self._remote._description.encode(name, values, counter)

@@ -87,7 +87,6 @@ def has_picture(shown: dict[str, Any]) -> bool:
 
 def _photograph(folder: Path) -> None:
     """Leaves a folder with a frame of the demo's camera."""
-    assert FRAME.base_from_camera is not None
     folder.mkdir()
     Image.fromarray(FRAME.color).save(folder / "0.color.png")
     np.save(folder / "0.depth.npy", FRAME.depth_m)

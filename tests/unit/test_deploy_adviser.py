@@ -99,7 +99,6 @@ class Desk:
 
     @property
     def request(self) -> Any:
-        assert self.memory.request is not None
         return self.memory.request.read()
 
     @property

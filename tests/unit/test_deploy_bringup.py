@@ -20,7 +20,6 @@ from brokk_rl.machine import Machine
 from deploy.bringup import JointResponse, _StateChecks, describe_joint, find_pushes
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
-from deploy.kernel.protection import MessageFault
 from deploy.twin.rehearsal import RehearsalBench, ScriptedPerson
 from deploy.twin.remote import RadioRemote
 
@@ -144,7 +143,6 @@ def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
         remote.hear(CanFrame(status.frame_id, told))
         assert remote.is_ready
         values = description.decode(remote._layout, remote.build_frame().data)
-        assert not isinstance(values, MessageFault)
         assert values["Stamp"] == pytest.approx(stamp_s, abs=0.01)
 
 

@@ -39,7 +39,6 @@ def test_commands_arrive_as_they_were_sent_to_half_a_step(
     names = [f"Command_q{j}" for j in range(1, 6)]
     data = bus.encode("ValveCmd", dict(zip(names, u, strict=True)) | {"CommandMode": 1}, counter)
     values = bus.decode(bus.command, data)
-    assert isinstance(values, dict)
     assert values["Counter"] == counter % 16
     assert values["CommandMode"] == 1
     for name, wanted in zip(names, u, strict=True):

@@ -213,7 +213,6 @@ def test_the_records_of_the_others_reach_the_logic(rig: Rig) -> None:
     assert empty == BusInputs(None, None, None, None)
     memory.controls.write(controls)
     memory.page.write(page)
-    assert memory.request is not None
     memory.request.write(request)
     target = memory.target.new()
     target["t_s"], target["center_in_base_m"] = BEGIN_S - 7.0, (2.5, 0.1, 0.8)

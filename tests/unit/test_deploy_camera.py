@@ -65,7 +65,6 @@ def test_a_click_into_a_borehole_gives_its_centre_though_its_mouth_has_no_depth(
 ) -> None:
     place = seen_at(FRAME, np.array(target.center_in_base_m))
     found = locate_borehole(FRAME, *place, target.radius_m)
-    assert found is not None
     off_m = np.linalg.norm(found[0] - np.array(target.center_in_base_m))
     assert off_m < 0.012 and 0.005 < found[1] < 0.05
 
@@ -98,7 +97,6 @@ def show(exchange: LoopMemory, *poses: HolePose, now_s: float | None = None) -> 
 
 def aimed(exchange: LoopMemory) -> list[float]:
     record = exchange.target.read()
-    assert record is not None
     return [round(float(value), 4) for value in record["center_in_base_m"]]
 
 
@@ -170,7 +168,6 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     center_m = np.array(TARGETS[1].center_in_base_m)
     point = OperatorRequest("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
     assert not feed.submit(point), "there is no picture yet"
-    assert exchange.frame is not None
     perception_process._publish_frame(exchange.frame, FRAME, PIXELS, time.monotonic())
     assert feed.submit(point)
     wanted.refresh()
@@ -265,7 +262,6 @@ def test_pictures_are_recorded_as_often_as_asked_and_come_back(
 ) -> None:
     import cv2
 
-    assert exchange.frame is not None
     pictures = PictureSampler(exchange.frame, 2.0)
     assert pictures.due() is None
     with CaptureWriter(

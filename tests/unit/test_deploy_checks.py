@@ -170,14 +170,12 @@ def find_reach_m() -> float:
     """Length of the stretched arm from the slew axis: 0.25, 0.28 m to the boom, its links, the tool."""
     lengths_m = []
     for joint in MACHINE.joints[1:]:
-        assert joint.body is not None
         lengths_m.append(math.hypot(*(one.value for one in joint.body.origin_m)))
     return sum(lengths_m) + math.hypot(*MACHINE.tip_m)
 
 
 def test_reach_is_that_of_the_stretched_arm_within_the_slew() -> None:
     first = MACHINE.joints[0]
-    assert first.body is not None
     height_m, reach_m = first.body.origin_m[2].value, find_reach_m()
     for yaw in (0.0, 1.5, -1.5):
         ahead = math.cos(yaw), math.sin(yaw)
@@ -200,7 +198,6 @@ def test_without_bodies_or_a_slew_there_is_no_such_limit() -> None:
     assert name_fault((-50.0, 0.0, -3.0), check=check) is GuardTrip.NONE
     joints = list(MACHINE.joints)
     body = joints[0].body
-    assert body is not None
     for change in ({"body": replace(body, axis=(0.0, 1.0, 0.0))}, {"kind": "slide"}):
         joints[0] = replace(MACHINE.joints[0], **change)
         other = TargetCheck(GUARD.target, replace(MACHINE, joints=tuple(joints)), None, UP)

@@ -48,7 +48,6 @@ def measure_clearance(envelope: Envelope, q: np.ndarray) -> np.ndarray:
 
 
 def build_envelope(**change: object) -> Envelope:
-    assert SHAPES is not None
     return make_envelope(replace(LIMITS, **change), SHAPES)
 
 
@@ -88,7 +87,6 @@ def read_spec() -> mujoco.MjSpec:
     """The MJCF with the axes of the machine's file; it holds none of its own."""
     spec = mujoco.MjSpec.from_file(str(MJCF))
     for joint in MACHINE.joints:
-        assert joint.body is not None
         spec.joint(joint.name).axis = joint.body.axis
     return spec
 
@@ -107,7 +105,6 @@ def build_own_model() -> tuple[mujoco.MjModel, list[int], list[int]]:
     for geom in list(spec.geoms):
         spec.delete(geom)
     add_ground_and_wall(spec)
-    assert SHAPES is not None
     kinds = mujoco.mjtGeom
     for number, one in enumerate(SHAPES.arm):
         body = spec.body(BODIES[one.link + 1])
@@ -161,7 +158,6 @@ def test_shapes_enclose_what_mujoco_draws_and_little_more() -> None:
 
 
 def test_distances_beyond_interest_may_be_left_out_but_no_near_one_is_missed() -> None:
-    assert SHAPES is not None
     # Without the undercarriage, near whose turntable the boom always is.
     posts = {}
     for number, (x, y) in enumerate(((1.5, 0.3), (2.0, -0.8), (2.6, 0.9), (1.2, 1.6))):
@@ -542,7 +538,6 @@ def test_shapes_that_cannot_be_read_or_withhold_nothing_are_refused(
 def test_a_longer_link_has_longer_capsules() -> None:
     joints = list(MACHINE.joints)
     body = joints[3].body
-    assert body is not None
     longer = replace(body.origin_m[0], value=2.5)
     joints[3] = replace(joints[3], body=replace(body, origin_m=(longer, *body.origin_m[1:])))
     found = describe_shapes(replace(MACHINE, joints=tuple(joints)))["arm"]

@@ -77,7 +77,6 @@ def test_what_must_stop_the_machine_stops_it_in_time_and_for_good(
     stage.fault(fault, message)
     assert stage.stops_within_s() <= limit_s + 0.011  # the twin takes a fault up in its next cycle
     state = stage.view.state
-    assert state is not None
     assert state.guard.name == "LATCHED" or fault == "deadman_released"
     assert not any(state.sent)
     stage.fault("none")

@@ -106,7 +106,6 @@ def test_numbers_on_the_bus_mean_what_the_description_says() -> None:
     signals = BUS._messages["MachineStatus"]
     states = signals.get_signal_by_name("GatewayState").choices
     sources = signals.get_signal_by_name("FlowSource").choices
-    assert states is not None and sources is not None
     described = {number: str(name) for number, name in states.items()}
     assert {one.value: one.name.lower() for one in GatewayState} == described
     described = {number: str(name) for number, name in sources.items()}

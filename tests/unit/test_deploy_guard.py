@@ -434,7 +434,6 @@ def test_a_direction_is_remembered_through_zero_and_the_first_is_no_change(first
 def test_numbers_of_the_states_mean_what_the_description_says() -> None:
     bus = BusDescription(DBC, option("machine", "brokk170"))
     choices = bus._messages["PcHeartbeat"].get_signal_by_name("PcState").choices
-    assert choices is not None
     described = {number: str(name) for number, name in choices.items()}
     assert {one.value: one.name.lower() for one in GuardState} == described
     assert [one.sends for one in GuardState] == [False, True, True, True]

@@ -92,7 +92,6 @@ class Loop:
         for frame in frames:
             layout = self.bus.by_id[frame.frame_id]
             values = self.bus.decode(layout, frame.data)
-            assert isinstance(values, dict)
             self.sent.append((self.now_s, layout.name, values))
             if layout.name == "ValveCmd" and self.follows:
                 for joint in MACHINE.joint_names:  # the gateway follows
@@ -116,12 +115,10 @@ class Loop:
 
     @property
     def state(self) -> GuardState:
-        assert self.logic.decision is not None
         return self.logic.decision.state
 
     @property
     def trip(self) -> GuardTrip:
-        assert self.logic.decision is not None
         return self.logic.decision.trip
 
 

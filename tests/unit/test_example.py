@@ -26,7 +26,6 @@ POLICIES = ("borehole_insertion", "behind_a_person", "unidentified_machine")
 @pytest.fixture(scope="module")
 def example() -> Any:
     made = importlib.util.spec_from_file_location("run_policy", FILE)
-    assert made is not None and made.loader is not None
     module = importlib.util.module_from_spec(made)
     made.loader.exec_module(module)
     return module

@@ -161,7 +161,6 @@ def test_the_hand_changes_over_when_the_person_sees_it(machine: Machine) -> None
 def test_before_the_valves_of_a_machine_stands_the_same_filter(machine: Machine) -> None:
     assert PolicyBundle("tasks:policies/borehole_insertion", machine).hand is None
     hand = PolicyBundle("tasks:policies/unidentified_machine", machine).hand
-    assert hand is not None
     model = option("follower", "filter").build(machine, 1, CPU)
     proposed = exclusive_proposals(machine, 60)[:, 0]
     proposed[20:25] = 0.0
@@ -268,7 +267,6 @@ def test_the_controller_beside_an_unadvised_policy_keeps_its_advice(caplog: Any)
     classical = {"_target_": CLASSICAL, "task": None}
     cfg = OmegaConf.create({"task": task | {"advice": advice}, "rivals": {"classical": classical}})
     stored = find_policy("tasks:policies/borehole_insertion")
-    assert stored.task is not None
     _insert_behaviour(cfg, stored.task, set(), stored)
     assert cfg.task.advice is None
     assert cfg.rivals.classical.task.advice == advice

@@ -27,7 +27,6 @@ def test_the_dead_time_is_found_to_the_hundredth_where_a_joint_is_commanded(
     plant = replace(PLANT, dead_time_s=0.43, time_constant_s=0.0)
     runs = driven(axis, 8, 60.0, 0, plant)
     delay = dead_time.estimate_dead_times(runs, axis, np.random.default_rng(0))["q3"]
-    assert delay is not None
     assert delay.value_s == pytest.approx(0.43, abs=0.011)
     assert delay.ci95_s[0] - 0.011 <= 0.43 <= delay.ci95_s[1] + 0.011
     assert delay.explained > 0.98

@@ -81,7 +81,6 @@ def test_levers_are_parts_of_full(memory: LoopMemory, feed: LoopFeed) -> None:
     advise(memory, lever_rad=[FULL_RAD, -FULL_RAD / 2, 0.0, FULL_RAD / 4])
     shown = feed.read_state()
     assert shown.own == LeverPositions(0.1, -0.2, 0.3, -0.4, False)
-    assert shown.advice is not None
     assert shown.advice.levers == LeverPositions(1.0, -0.5, 0.0, 0.25, False)
     assert (shown.advice.valid, shown.advice.number) == (True, 5)
     assert shown.alive and shown.deadman

@@ -39,7 +39,6 @@ def test_the_page_is_to_scale(brokk: Callable[..., Any], tmp_path: Path) -> None
     done = brokk("mode=board", "board.square_m=0.05", "board.marker_m=0.0375", f"session.out={out}")
     assert done.code == 0, done.err
     box = re.search(rb"/MediaBox\s*\[([^\]]+)\]", (out / "board.pdf").read_bytes())
-    assert box is not None
     # 8 x 6 squares of 5 cm, 3 cm of margin on each side: 46 x 36 cm
     size = [float(value) for value in box.group(1).split()][2:]
     np.testing.assert_allclose(size, np.array([0.46, 0.36]) * POINTS_PER_M, atol=0.01)

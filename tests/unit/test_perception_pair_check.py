@@ -12,7 +12,7 @@ from drawn import K, as_color, drawn
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from brokk_rl.contracts.vision import Ellipse, HolePose
+from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import pair_check
@@ -70,7 +70,6 @@ def test_pitch_and_roll_of_a_pair_are_measured() -> None:
     check = load_part("pair_check")
 
     def measure(frame: Frame) -> pair_check.PairAlignment:
-        assert frame.right is not None
         matches = check.match_features(frame.color, frame.right)
         return pair_check.fit_alignment(matches, frame, check.alike)
 
@@ -103,7 +102,6 @@ def turn(frame: Frame, quarters: int) -> Frame:
     """Returns a frame whose pictures are turned, with a camera matrix of their own."""
     matrix = frame.camera_matrix.copy()
     matrix[:2, 2] = matrix[[1, 0], 2]
-    assert frame.right is not None
     return replace(
         frame, camera_matrix=matrix,
         color=np.ascontiguousarray(np.rot90(frame.color, quarters)),
@@ -114,7 +112,6 @@ def turn(frame: Frame, quarters: int) -> Frame:
 
 def test_every_slip_of_a_pair_has_its_name() -> None:
     good = pair(0.0, 0.0)
-    assert good.right is not None
     blank = np.full_like(good.color, 128)
     unknown = replace(good, depth_m=np.full_like(good.depth_m, np.nan))
     assert fault(good) is None
@@ -159,11 +156,7 @@ def test_the_shared_covariance_is_what_a_wrong_disparity_does() -> None:
     frame = replace(frame, baseline_m=BASELINE_M)
     plain = estimator.estimate(replace(frame, disparity_std_px=0.0), masks, ellipse)
     told = estimator.estimate(replace(frame, disparity_std_px=std_px), masks, ellipse)
-    assert isinstance(plain, HolePose)
-    assert isinstance(told, HolePose)
     assert plain.shared_m2 is None
-    assert told.shared_m2 is not None
-    assert told.shared_rad2 is not None
     np.testing.assert_allclose(told.cov_m2 - plain.cov_m2, told.shared_m2, atol=1e-15)
     rows, columns = np.mgrid[0:480, 0:640]
     x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
@@ -173,7 +166,6 @@ def test_the_shared_covariance_is_what_a_wrong_disparity_does() -> None:
         depth_m = (pull_px / disparity).astype(np.float32)
         wrong = replace(frame, depth_m=depth_m, disparity_std_px=0.0)
         pose = estimator.estimate(wrong, masks, ellipse)
-        assert isinstance(pose, HolePose)
         moved_m2 += np.outer(pose.center_m - plain.center_m, pose.center_m - plain.center_m)
         turned_rad2 += np.outer(pose.axis - plain.axis, pose.axis - plain.axis)
     # relative to the largest entry: the circle on the plane moves a little with it

@@ -32,7 +32,6 @@ def estimator():
 
 def test_a_hole_is_where_it_was_drawn(estimator) -> None:
     pose = estimator.estimate(*drawn())
-    assert isinstance(pose, HolePose)
     # 0.3 px: the lit wall beyond the far rim blurs into it
     assert pose.center_m == pytest.approx(CENTER, abs=8e-4)
     assert pose.axis == pytest.approx(AXIS, abs=1e-3)
@@ -47,7 +46,6 @@ def test_a_third_of_a_rim_that_is_hidden_is_not_missed(estimator) -> None:
     # an ellipse that takes the arm's edge for the rim
     hidden = replace(ellipse, x=ellipse.x - 1.5, a=ellipse.a - 1.5)
     pose = estimator.estimate(replace(frame, color=color, depth_m=depth_m), masks, hidden)
-    assert isinstance(pose, HolePose)
     assert pose.center_m == pytest.approx(CENTER, abs=1.5e-3)
     assert float(pose.axis @ AXIS) > np.cos(np.radians(0.2))
 
@@ -86,9 +84,7 @@ def test_in_noise_a_face_is_aligned_without_bias_and_as_surely_as_is_claimed() -
         color, partner = map(as_color, dusty)
         seen = replace(frame, color=color, right=partner, baseline_m=0.12, depth_m=depth)
         both = alignment.crop_pair(seen, convert_to_gray(seen), begin.m, row, begin.extent)
-        assert both is not None
         found = alignment.align_plane(both, begin, seen, masks.block > 0.5, row, 1.25, 24)
-        assert found is not None
         errors.append(float((found.m - m) @ ray) * pull_px)
         claims.append(float(np.sqrt(ray @ found.cov @ ray)) * pull_px)
     assert abs(np.mean(errors)) < 0.02, "of the 0.3 px that it began with"
@@ -110,18 +106,14 @@ def test_the_right_picture_mends_what_the_matcher_got_wrong_all_over_a_face() ->
     allowed = masks.block > 0.5
     points = plane.collect_support(depth, allowed, K, row, 0.05, 1.25, 2.6, 7.0, 8000, 24)
     face = plane.fit_plane(points, (2.6, 7.0), 2e-4, generator)
-    assert face is not None
     both = alignment.crop_pair(frame, convert_to_gray(frame), face.m, row, face.extent)
-    assert both is not None
     face = replace(face, cov=face.cov + np.diag([0.0, 0.0, 1e-6]))
     mended = alignment.align_plane(both, face, frame, allowed, row, 1.25, 24)
     shifted = replace(frame, right=np.roll(partner, 7, 0))
     other = alignment.crop_pair(shifted, convert_to_gray(frame), face.m, row, face.extent)
-    assert other is not None
     # rows that belong to others
     assert alignment.align_plane(other, face, shifted, allowed, row, 1.25, 24) is None
     ray = CENTER / CENTER[2]
-    assert mended is not None
     assert (face.m - m) @ ray == pytest.approx(off, rel=0.2)
     assert abs((mended.m - m) @ ray) < 0.2 * off
     assert float(mended.normal @ AXIS) > np.cos(np.radians(0.3))
@@ -187,7 +179,6 @@ def test_a_plane_among_gross_errors_is_as_uncertain_as_it_varies() -> None:
         radii = np.sort(chance.uniform(1.25, 12.0, 1500))
         points = plane.FaceSupport(rays, rays @ true + noise, radii, np.arange(1500) % 40)
         face = plane.fit_plane(points, (2.6, 4.0, 7.0, 12.0), 1e-4, np.random.default_rng(0))
-        assert face is not None
         off = face.m - true
         sigmas.append(off @ np.linalg.solve(face.cov, off))
     # chi-squared with three degrees of freedom: its mean is 3, that of 60 within 0.95 in 3 sigma
@@ -264,7 +255,6 @@ def test_an_inside_that_is_nearer_than_its_face_is_no_hole(estimator) -> None:
     inside = np.hypot(columns - ellipse.x, rows - ellipse.y) < 1.1 * ellipse.a
     near_m = np.where(inside, np.float32(CENTER[2] - 0.1), frame.depth_m)
     found = estimator.estimate(replace(frame, depth_m=near_m.astype(np.float32)), masks, ellipse)
-    assert isinstance(found, Rejection)
     assert found.reason == consistency.NEARER and found.value > found.limit
 
 
@@ -289,7 +279,6 @@ def test_a_focal_length_with_which_no_rim_is_round_is_refused_by_its_name(
     # depth of a pair grows with the focal length that it is told
     stretched = replace(frame, camera_matrix=wrong, depth_m=frame.depth_m * np.float32(factor))
     found = estimator.estimate(stretched, masks, ellipse)
-    assert isinstance(found, Rejection)
     assert found.reason == consistency.STRETCH
     assert found.value == pytest.approx(factor, rel=0.02)
 
@@ -301,7 +290,6 @@ def test_a_baseline_by_which_a_rim_has_another_size_is_refused_by_its_factor(
     frame, masks, ellipse = drawn()
     scaled = replace(frame, depth_m=frame.depth_m * np.float32(factor))
     found = estimator.estimate(scaled, masks, ellipse)
-    assert isinstance(found, Rejection)
     assert found.reason == consistency.SIZE
     assert found.value == pytest.approx(factor, rel=0.01)
 
@@ -333,7 +321,6 @@ def test_the_centre_of_a_broken_rim_is_that_of_its_whole_pieces(broken: float) -
     chart = rim.build_chart(CENTER, M, K)
     start_m = np.array([0.012, -0.008])
     found = broken_rim.fit_broken_rim(draw_broken(depths_m), chart, None, start_m, 0.05, 0.024)
-    assert found is not None
     assert found.coverage > 0.7
     off = found.center_m - CENTER
     assert np.linalg.norm(off) < 3e-3
@@ -355,7 +342,6 @@ def test_the_depth_of_a_break_is_read_from_both_pictures() -> None:
     both = alignment.crop_pair(frame, convert_to_gray(frame), M, row, 4.0)
     chart = rim.build_chart(CENTER, M, K)
     profiles = rim.find_profile_edges(convert_to_gray(frame), row, 10.0, chart)
-    assert both is not None and profiles is not None
     odds = broken_rim.compare_depths(both, chart, profiles, float(np.sqrt(row[2] * row[3])))
     assert broken_rim.DEPTHS_M[int(np.argmax(odds.sum(0)))] == pytest.approx(0.016, abs=2e-3)
 

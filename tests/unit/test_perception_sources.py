@@ -65,7 +65,6 @@ def test_frames_come_back_as_they_were_written(frames: Path) -> None:
     assert (first.depth_m[10:] == 2.0).all()
     assert (second.depth_m[10:] == 3.0).all()
     blue_first = cv2.imread(str(frames / "00000.color.png"))
-    assert blue_first is not None
     np.testing.assert_array_equal(first.color, blue_first[..., ::-1])
     assert folder(frames).build().num_frames == 2
 
@@ -378,7 +377,6 @@ def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(
         frame = source.read_latest()
         assert source._device._camera.fill is False
     assert StubZed.opened is None
-    assert frame is not None and frame.right is not None
     # The SDK gives BGRA.
     assert frame.color[0, 0].tolist() == [12, 11, 10] and frame.right[0, 0].tolist() == [22, 21, 20]
     assert np.isnan(frame.depth_m[0, :3]).all() and (frame.depth_m[1:] == 1.5).all()
@@ -446,7 +444,6 @@ def test_a_realsense_gives_depth_aligned_to_colour(monkeypatch: pytest.MonkeyPat
         with pytest.raises(FrameError, match="no new frame"):
             source.read_latest()
     assert stopped == [True]
-    assert frame is not None
     assert np.isnan(frame.depth_m[0]).all()
     assert frame.depth_m[1, 0] == pytest.approx(1.5)
     assert ("color", 1280, 720, "rgb8", 15) in streams

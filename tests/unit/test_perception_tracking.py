@@ -98,7 +98,6 @@ def test_the_shared_covariance_is_what_a_displaced_camera_does() -> None:
     tracker, noise = replace(FUSION, memory=1000).build(), np.eye(3) * 0.002**2
     for number in range(20):
         (hole,) = tracker.update([replace(pose, cov_m2=pose.cov_m2 + noise)], 0.1 * number)
-    assert pose.shared_m2 is not None
     np.testing.assert_allclose(hole.pose.cov_m2, pose.shared_m2 + noise / 20, rtol=1e-3, atol=1e-9)
 
 

@@ -166,7 +166,6 @@ def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(machine:
     guards = replace(OPEN, max_tool_speed_m_s=0.4)
     free, slow = (played([[segment]], machine, one) for one in (OPEN, guards))
     fast, guarded = (measure_speed(machine, track.q[:, 0]) for track in (free, slow))
-    assert fast is not None and guarded is not None
     assert fast.max() > 0.8 and 0.35 < guarded.max() < 0.42
     u = slow.u[(slow.phase[:, 0] == PLAY), 0]
     assert u[:, 3] == pytest.approx(0.5 * u[:, 0]) and u[:, 0].max() < 1.0
