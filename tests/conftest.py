@@ -117,24 +117,30 @@ class Done:
     err: str
 
 
+Brokk = Callable[..., Done]
+Note = Callable[[str, object], None]
+"""Fixture `record_property`: notes a figure for benchmarks/results/found.json."""
+
+
 @pytest.fixture
 def brokk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> Callable[..., Done]:
-    """Runs the command in this process, in an empty folder that is the working directory."""
+) -> Brokk:
+    """Runs the command in this process, in an empty folder, and sees it end with `code`, 0 unless told otherwise."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     for name in ("HYDRA_FULL_ERROR", "BROKK_TRACE"):
         monkeypatch.delenv(name, raising=False)
 
-    def run(*arguments: str) -> Done:
+    def run(*arguments: str, code: int = 0) -> Done:
         monkeypatch.setattr("sys.argv", ["brokk", *arguments])
         capfd.readouterr()
         try:
-            code = cli.main()
-        except SystemExit as left:
-            code = int(left.code or 0)
+            left = cli.main()
+        except SystemExit as raised:
+            left = int(raised.code or 0)
         written = capfd.readouterr()
-        return Done(code, written.out, written.err)
+        assert left == code, written.err
+        return Done(left, written.out, written.err)
 
     return run

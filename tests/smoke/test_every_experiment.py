@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
-from conftest import Done
+from conftest import Brokk
 
 from brokk_rl import cli, registry
 from brokk_rl.extensions import load_mode
@@ -80,23 +79,20 @@ def read(path: Path) -> Any:
 
 @pytest.mark.parametrize(("words", "shared"), list_cases())
 def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
-    words: tuple[str, ...], shared: tuple[str, ...], tmp_path: Path, brokk: Callable[..., Done]
+    words: tuple[str, ...], shared: tuple[str, ...], tmp_path: Path, brokk: Brokk
 ) -> None:
-    def command(*arguments: str) -> None:
-        assert (done := brokk(*arguments)).code == 0, done.err
-
-    command(*words, *TRAINED, *SHORT, "session.out=run")
+    brokk(*words, *TRAINED, *SHORT, "session.out=run")
     made = read(tmp_path / "run" / "policy.json")
     assert made["task"]["fingerprint"] == describe_words(words)
 
-    command("mode=evaluate", "policy=./run", *shared, *SHORT, "session.out=seen")
+    brokk("mode=evaluate", "policy=./run", *shared, *SHORT, "session.out=seen")
     found = read(tmp_path / "seen" / "evaluation.json")
     assert found["task"] == made["task"]
     if shared:  # on the same plant the figures are those of the training
         of_training = read(tmp_path / "run" / "evaluation.json")["policies"]
         assert found["policies"]["trained"] == of_training["trained"]
 
-    command("mode=export", "policy=./run", "session.out=export")
+    brokk("mode=export", "policy=./run", "session.out=export")
     exported = read(tmp_path / "export" / "policy.json")
     assert exported["task"] == made["task"] and exported["parity"]["largest_difference"] < 1e-3
     golden = read(tmp_path / "run" / "golden.json")
@@ -109,9 +105,9 @@ def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
 
 
 def test_training_that_begins_with_a_policy_keeps_the_task_of_that_policy(
-    tmp_path: Path, brokk: Callable[..., Done]
+    tmp_path: Path, brokk: Brokk
 ) -> None:
     """The shipped policy corrects the classical controller of its time, not the one of today."""
-    assert brokk(*TRAINED, *SHORT, "actuator=lag", f"policy={SHIPPED}", "session.out=run").code == 0
+    brokk(*TRAINED, *SHORT, "actuator=lag", f"policy={SHIPPED}", "session.out=run")
     shipped = Path(cli.__file__).parents[1] / SHIPPED.replace(":", "/")
     assert read(tmp_path / "run/policy.json")["task"] == read(shipped / "policy.json")["task"]

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib import util
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import hydra
 import pytest
 import torch
+from conftest import Brokk
 from omegaconf import OmegaConf
 
 pytestmark = pytest.mark.slow
@@ -229,11 +229,11 @@ def test_optuna_chooses_values_and_run_again_repeats_nothing(tmp_path: Path) -> 
 
 
 def test_a_search_without_optuna_says_what_to_install(
-    brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    brokk: Brokk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if util.find_spec("optuna") is not None:
         with hydra.initialize_config_module("conf", version_base="1.3"):
             assert hydra.compose("config", overrides=["search=learning_rate"])
         return
-    done = brokk("search=learning_rate")
-    assert done.code == 2 and "brokk-rl[optuna]" in done.err
+    done = brokk("search=learning_rate", code=2)
+    assert "brokk-rl[optuna]" in done.err

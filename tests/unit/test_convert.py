@@ -162,7 +162,7 @@ def test_pieces_are_written_by_log_and_a_bad_log_leaves_none_of_the_others(
     assert names == ["dig_00.parquet", "dig_01.parquet", "lift_00.parquet"]
     assert [recording.run for recording in recordings] == ["dig", "dig", "lift"]
     logged(Path("logs"), put(7, 1, "off"), name="zoom.csv")
-    done = brokk("mode=convert", *options, "session.out=none")
+    done = brokk("mode=convert", *options, "session.out=none", code=2)
     assert done.code == 2
     assert "zoom.csv: line 9 (row 7), column 'Boom Cmd': 'off' is not a number" in done.err
     assert not list(Path("none").rglob("*.parquet"))

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from composed import option
+from conftest import Note
 from stage import DBC, Mode, Stage
 
 from brokk_rl.kinematics import compute_tool_kinematics
@@ -26,7 +27,6 @@ from deploy.kernel.limits import StayOutBox
 from deploy.page.alarms import list_alarms
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 
-Note = Callable[[str, object], None]
 IN_TIME_MS = 100
 
 

@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ import onnx
 import pytest
 import torch
 from composed import option
+from conftest import Note
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -297,7 +297,7 @@ def write_network(folder: Path, kind: str) -> None:
     "kind", ["newer format", "nested metadata", "weights left behind", "weights beside it"]
 )
 def test_networks_of_other_tools_work_or_are_refused(
-    machine: Machine, copied: Path, kind: str, record_property: Callable[[str, object], None]
+    machine: Machine, copied: Path, kind: str, record_property: Note
 ) -> None:
     write_network(copied, kind)
     runs = kind == "weights beside it"
@@ -313,11 +313,7 @@ NO_FILES += [("golden.json", "wide"), ("golden.json", "pipe"), ("policy.onnx", "
 
 @pytest.mark.parametrize(("name", "kind"), NO_FILES)
 def test_what_is_no_file_of_a_policy_is_refused_at_once(
-    machine: Machine,
-    copied: Path,
-    name: str,
-    kind: str,
-    record_property: Callable[[str, object], None],
+    machine: Machine, copied: Path, name: str, kind: str, record_property: Note
 ) -> None:
     path, begun_s = copied / name, time.monotonic()
     path.unlink()
@@ -349,10 +345,7 @@ def test_what_is_no_file_of_a_policy_is_refused_at_once(
     ],
 )
 def test_golden_answers_that_are_none_are_refused(
-    machine: Machine,
-    copied: Path,
-    golden: dict[str, Any],
-    record_property: Callable[[str, object], None],
+    machine: Machine, copied: Path, golden: dict[str, Any], record_property: Note
 ) -> None:
     record_property("files: golden answers that are none; answer", "refused")
     (copied / "golden.json").write_text(json.dumps(golden))

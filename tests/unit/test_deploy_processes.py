@@ -8,11 +8,12 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from composed import option
+from conftest import Note
 from desk import NO_VCAN, VCAN, Desk
 
 from brokk_rl.machine import Machine
@@ -56,7 +57,7 @@ def test_the_pages_stop_needs_nobody_but_the_bus_process(desk: Desk) -> None:
 @pytest.mark.parametrize("name", ["commander", "bus", "page"])
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_process_that_dies_or_hangs_stops_the_machine(
-    desk: Desk, name: str, number: signal.Signals, record_property: Callable[[str, object], None]
+    desk: Desk, name: str, number: signal.Signals, record_property: Note
 ) -> None:
     desk.set_moving()
     since_s = desk.signal(name, number)

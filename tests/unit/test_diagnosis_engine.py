@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Brokk
 
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
@@ -84,7 +84,7 @@ def test_rivals_share_what_the_first_name_leaves(machine: Machine) -> None:
 
 
 def test_training_takes_the_found_effects_as_they_are(
-    tmp_path: Path, machine: Machine, brokk: Callable[..., Any]
+    tmp_path: Path, machine: Machine, brokk: Brokk
 ) -> None:
     path = tmp_path / effects_file.EFFECTS_FILE
     effects_file.write_effects(said(), effect_library.load_effects(machine), path)

@@ -7,7 +7,6 @@ import json
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from composed import option
+from conftest import Brokk
 from small_exam import SMALL
 
 from brokk_rl import record
@@ -117,24 +117,23 @@ def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
 
 
 def test_an_exam_is_sat_and_scored_and_its_ledger_knows_the_engine_before_the_labels(
-    exam: Path, brokk: Callable[..., Any], tmp_path: Path
+    exam: Path, brokk: Brokk, tmp_path: Path
 ) -> None:
     answers = tmp_path / "answers"
     about = ("mode=exam", f"exam.folder={exam}", "exam_candidate=always_none")
     run = (*about, "exam.do=run", f"session.out={answers}")
-    assert brokk(*run).code == 0
-    assert brokk(*run, f"resume={answers}").code == 0
-    assert brokk(*run).code != 0
-    other = brokk(*run, f"resume={answers}", "exam_candidate=most_frequent")
-    assert other.code == 2 and "answers of two candidates" in other.err
+    brokk(*run)
+    brokk(*run, f"resume={answers}")
+    brokk(*run, code=2)
+    other = brokk(*run, f"resume={answers}", "exam_candidate=most_frequent", code=2)
+    assert "answers of two candidates" in other.err
     (begun,) = read_ledger(exam)
     facts = json.loads((exam / "exam.json").read_text())
     assert begun["event"] == BEGUN and begun["run"]["labels_sha256"] == facts["labels_sha256"]
     score = (*about, "exam.do=score", f"+exam.answers.none={answers}")
     for count in range(2):
         marks = tmp_path / f"marks_{count}"
-        done = brokk(*score, f"session.out={marks}")
-        assert done.code == 0, done.err
+        brokk(*score, f"session.out={marks}")
         found = json.loads((marks / "marks.json").read_text())
         (said,) = found["exam"]["ledger"]
         assert "registered before" in said and f"opened {count} times" in said
@@ -151,12 +150,12 @@ def test_an_exam_is_sat_and_scored_and_its_ledger_knows_the_engine_before_the_la
     assert {one["labels_sha256"] for one in said} == {facts["labels_sha256"]}
     noted = json.loads((answers / "run.json").read_text())
     (answers / "run.json").write_text(json.dumps(noted | {"labels_sha256": "other"}))
-    refused = brokk(*score, f"session.out={tmp_path / 'refused'}")
-    assert refused.code == 2 and "got answers to others" in refused.err
+    refused = brokk(*score, f"session.out={tmp_path / 'refused'}", code=2)
+    assert "got answers to others" in refused.err
 
 
 def test_a_make_that_was_interrupted_goes_on_and_gives_the_cases_of_its_salt(
-    made: Path, brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    made: Path, brokk: Brokk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     part, (labels, text) = tmp_path / "part", dataset.open_labels(made)
     again = (*SMALL, *SEALED, f"session.out={part}")
@@ -170,20 +169,19 @@ def test_a_make_that_was_interrupted_goes_on_and_gives_the_cases_of_its_salt(
 
     with monkeypatch.context() as patch:
         patch.setattr(CaseRecorder, "write", fail_on_second)
-        assert brokk(*again, f"exam.salt={labels['salt']}").code != 0
+        brokk(*again, f"exam.salt={labels['salt']}", code=2)
     assert [path.name for path in (part / CASES_FOLDER).iterdir()] == ["0000"]
     sealed = part / dataset.LABELS_FILE
     assert sealed.read_text() == text and sealed.stat().st_mode & 0o777 == 0o600
     # nobody answers half of an exam, and its labels stay closed
     answers = (f"exam.folder={part}", "exam_candidate=always_none", f"session.out={tmp_path / 'x'}")
     for step in (("exam.do=run",), ("exam.do=score", f"+exam.answers.a={part}")):
-        refused = brokk("mode=exam", *step, *answers)
-        assert refused.code == 2 and "exam.do=make resume=" in refused.err
+        refused = brokk("mode=exam", *step, *answers, code=2)
+        assert "exam.do=make resume=" in refused.err
     first = part / CASES_FOLDER / "0000/field/01.parquet"
     first.unlink()  # a file that is lost is made again, a label that was never sealed is not
-    assert brokk(*again, f"resume={part}", "session.seed=1235").code == 2
-    done = brokk(*again, f"resume={part}")
-    assert done.code == 0, done.err
+    brokk(*again, f"resume={part}", "session.seed=1235", code=2)
+    brokk(*again, f"resume={part}")
     assert dataset.open_labels(part)[1] == text
     withheld = {path.parent.name for path in (made / WITHHELD_FOLDER).rglob("*.parquet")}
     assert withheld == {"0000", "0001", UNCHANGED_FOLDER}
@@ -197,7 +195,7 @@ def sit(candidate: run_cases.Candidate, cases: list[Path], answers: Path, machin
 
 
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
-    exam: Path, machine: Machine, brokk: Callable[..., Any], tmp_path: Path, caplog: Any
+    exam: Path, machine: Machine, brokk: Brokk, tmp_path: Path, caplog: Any
 ) -> None:
     first, second = sorted((exam / CASES_FOLDER).iterdir())
     answers = tmp_path / "answers"
@@ -207,8 +205,7 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
     for sat, missed in ((2, 1), (1, 0)):
         marks = tmp_path / f"marks_{missed}"
-        done = brokk(*score, f"session.out={marks}")
-        assert done.code == 0, done.err
+        brokk(*score, f"session.out={marks}")
         found = json.loads((marks / "marks.json").read_text())["candidates"]["it"]
         assert found["sat"] == {"value": sat, "of": 2} and found["failed"] == missed
         assert ("1 of 2 cases were not begun" in caplog.text) is (missed == 0)

@@ -122,7 +122,9 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[
     assert read_guesses("log.position_unit=cm")["joint: unit"].sureness == "sure"
     assert draft_file(MACHINE_TEMPLATE, "log.position_unit=cm")["joints"][0]["kind"] == "slide"
     assert read_guesses("log.position_unit={joint: mm}")["joint: unit"].value == "mm"
-    done = brokk("mode=import", "log.input=a.csv", "log.position_unit=furlong", "session.out=three")
+    done = brokk(
+        "mode=import", "log.input=a.csv", "log.position_unit=furlong", "session.out=three", code=2
+    )
     assert done.code == 2 and "unknown unit 'furlong'" in done.err
 
 
@@ -166,7 +168,7 @@ def test_columns_that_no_name_tells_are_given_with_the_torque_that_they_set(
         "import=@draft/column_map.yaml",
         "convert.input=a.csv",
     )
-    done = brokk("mode=convert", *options, "session.out=out")
+    done = brokk("mode=convert", *options, "session.out=out", code=2)
     assert done.code == 2 and "max_force.value has no value: fill in ???" in done.err
     machine = Path("draft/machine.yaml")
     machine.write_text(machine.read_text().replace('value: "???"', "value: 40.0"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from composed import option
+from conftest import Brokk
 from motion import build_nominal_tables, make_recording
 
 from brokk_rl.errors import ConfigError
@@ -60,7 +60,7 @@ def test_thresholds_raise_no_alarm_where_they_come_from_and_one_beyond() -> None
 
 
 def test_the_command_writes_a_file_that_names_its_recordings_and_counts_others(
-    brokk: Callable[..., Any],
+    brokk: Brokk,
 ) -> None:
     for name, jump_rad in (("own", 0.05), ("other", 0.2)):
         write_recording(record(jump_rad), Path(f"{name}.parquet"))

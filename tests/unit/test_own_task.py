@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import pytest
 import torch
 import training as runs
 from composed import option, own_task
-from conftest import Done
+from conftest import Brokk
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
@@ -195,13 +194,13 @@ FEW = ("evaluation.num_recorded=1", "evaluation.video=false", "actuator=lag", "s
 
 
 def test_values_of_an_experiment_yield_to_the_policy(
-    brokk: Callable[..., Done], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    brokk: Brokk, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     other = "# @package _global_\ntask: {episode_s: 1.0, switch: {rule: text}}\n"
     (tmp_path / "other.yaml").write_text(other)
     caplog.set_level("INFO")
-    done = brokk(*EVALUATE, *FEW, "experiment=@other.yaml")
-    assert done.code == 0 and " task.switch.rule=" in caplog.text, done.err
+    brokk(*EVALUATE, *FEW, "experiment=@other.yaml")
+    assert " task.switch.rule=" in caplog.text
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert found["task"] == json.loads((SHIPPED / "policy.json").read_text())["task"]
 
@@ -220,11 +219,10 @@ def foreign(shallow: Path, tmp_path: Path) -> Path:
 
 
 def test_a_policy_brings_its_machine_and_the_actuator_of_its_training(
-    foreign: Path, brokk: Callable[..., Done], tmp_path: Path
+    foreign: Path, brokk: Brokk, tmp_path: Path
 ) -> None:
     few = [word for word in FEW if not word.startswith("actuator")]
-    done = brokk(*EVALUATE, *few, "task.episode_s=1.0", f"policy={foreign}")
-    assert done.code == 0, done.err
+    brokk(*EVALUATE, *few, "task.episode_s=1.0", f"policy={foreign}")
     record = json.loads((tmp_path / "run" / "session.json").read_text())
     assert record["machine"] == "foreign"
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
@@ -232,15 +230,15 @@ def test_a_policy_brings_its_machine_and_the_actuator_of_its_training(
 
 
 def test_what_contradicts_a_policy_or_its_folder_is_refused(
-    foreign: Path, brokk: Callable[..., Done], tmp_path: Path
+    foreign: Path, brokk: Brokk, tmp_path: Path
 ) -> None:
     (foreign.parent / "session.json").write_text('{"mode": "train"}')
     before = sorted(tmp_path.rglob("*"))
     words = ("policy=policies/foreign", "machine=brokk170")
-    done = brokk("mode=evaluate", *words)
-    assert done.code == 2 and "=foreign, but machine=brokk170" in done.err
-    done = brokk("mode=train", "policy=policies/foreign", "session.out=policies")
-    assert done.code == 2 and "policies already holds a run" in done.err
+    done = brokk("mode=evaluate", *words, code=2)
+    assert "=foreign, but machine=brokk170" in done.err
+    done = brokk("mode=train", "policy=policies/foreign", "session.out=policies", code=2)
+    assert "policies already holds a run" in done.err
     assert sorted(tmp_path.rglob("*")) == before
 
 

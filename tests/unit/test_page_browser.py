@@ -25,6 +25,7 @@ from browser import (
     served,
     until,
 )  # fmt: skip
+from conftest import Note
 from PIL import Image
 
 from brokk_rl.signals import Frame
@@ -150,7 +151,7 @@ def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_sho
     feed: Scripted,
     opened: Callable[..., Any],
     monkeypatch: pytest.MonkeyPatch,
-    record_property: Callable[[str, object], None],
+    record_property: Note,
 ) -> None:
     active = change_state(SHOWN, guard=GuardState.ACTIVE, trip=GuardTrip.NONE)
     feed.now = replace(active, commands=True)
@@ -181,9 +182,7 @@ def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_sho
     until(page, NOT_CONFIRMED, 1.0)
 
 
-def test_words_follow_the_mode(
-    feed: Scripted, page: Any, record_property: Callable[[str, object], None]
-) -> None:
+def test_words_follow_the_mode(feed: Scripted, page: Any, record_property: Note) -> None:
     start, advice = page.locator("#start b"), page.locator("#advice")
     assert (start.inner_text(), advice.inner_text()) == ("Guide me", "Bring your levers to green")
     feed.now = replace(SHOWN, commands=True)
@@ -406,7 +405,7 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
     opened: Callable[..., Any],
     size: tuple[int, int],
     language: str,
-    record_property: Callable[[str, object], None],
+    record_property: Note,
 ) -> None:
     streams = (*SHOWN.streams, SourceAge("camera", 0.0, 1e6))
     failed = replace(SHOWN, commands=True, streams=streams, recording=FAILED, insertion=READING)

@@ -7,7 +7,6 @@ import json
 import math
 import re
 import zlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from browser import SHOWN, TOKEN, change_state
 from composed import option
+from conftest import Note
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -45,7 +45,7 @@ MINE = access.list_own_names("127.0.0.1", ())
     "host", ["localhost:8170", "127.0.0.1:8170", "[::1]:8170", "localhost:19000", "localhost"]
 )
 def test_a_page_of_this_server_may_connect_through_a_forwarded_port_too(
-    host: str, record_property: Callable[[str, object], None]
+    host: str, record_property: Note
 ) -> None:
     record_property("page: through a forwarded port; answer", "opens")
     assert access.is_same_origin(f"http://{host}", host, MINE)
@@ -252,7 +252,7 @@ def test_alarms_name_what_has_failed_and_nothing_else(shown: PageState, names: l
 
 @pytest.mark.parametrize("before", ["link", "open", "none"])
 def test_the_link_with_the_token_is_its_owners_alone(
-    tmp_path: Path, before: str, record_property: Callable[[str, object], None]
+    tmp_path: Path, before: str, record_property: Note
 ) -> None:
     path, other = tmp_path / "page.url", tmp_path / "other"
     (tmp_path / "run/page.url").mkdir(parents=True)

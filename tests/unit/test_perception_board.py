@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from composed import option
+from conftest import Brokk
 from drawn import as_color, blank
 
 from brokk_rl import record
@@ -34,10 +34,9 @@ from perception.render.stereo_camera import StereoRig
 POINTS_PER_M = 72.0 / 0.0254
 
 
-def test_the_page_is_to_scale(brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_page_is_to_scale(brokk: Brokk, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = brokk("mode=board", "board.square_m=0.05", "board.marker_m=0.0375", f"session.out={out}")
-    assert done.code == 0, done.err
+    brokk("mode=board", "board.square_m=0.05", "board.marker_m=0.0375", f"session.out={out}")
     box = re.search(rb"/MediaBox\s*\[([^\]]+)\]", (out / "board.pdf").read_bytes())
     # 8 x 6 squares of 5 cm, 3 cm of margin on each side: 46 x 36 cm
     size = [float(value) for value in box.group(1).split()][2:]

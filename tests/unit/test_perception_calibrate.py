@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from composed import option
+from conftest import Brokk
 from drawn import K, drawn
 from motion import make_recording
 from scipy.spatial.transform import Rotation
@@ -157,11 +157,10 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_command_finds_the_camera_and_sources_take_its_file(
-    brokk: Callable[..., Any], footage: Path
+    brokk: Brokk, footage: Path
 ) -> None:
     command = ("mode=calibrate", f"calibration.source.folder={footage}")
-    done = brokk(*command, f"calibration.joints={footage / 'joints.yaml'}", "session.out=run")
-    assert done.code == 0, done.err
+    brokk(*command, f"calibration.joints={footage / 'joints.yaml'}", "session.out=run")
     told = yaml.safe_load(Path("run/calibration.yaml").read_text())
     mm, degrees = off(np.array(told["T_base_cam"]))
     assert mm < 6.0 and degrees < 0.2
@@ -182,36 +181,35 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     np.testing.assert_allclose(frame.camera_cov, np.array(told["covariance"]), atol=1e-12)
     Path("other.yaml").write_text("schema: 7\n")
     look = ("mode=perceive", f"perceive.input={footage}", "session.out=look")
-    lost = brokk(*look, "source.base_from_camera=other.yaml")
-    assert lost.code == 2 and "no calibration of schema 1" in lost.err
+    lost = brokk(*look, "source.base_from_camera=other.yaml", code=2)
+    assert "no calibration of schema 1" in lost.err
 
 
 def test_poses_that_tell_too_little_are_refused_with_those_that_are_missing(
-    brokk: Callable[..., Any], footage: Path
+    brokk: Brokk, footage: Path
 ) -> None:
     same = {}
     for number in range(16):
         same[f"{number:03d}"] = (board.MIDDLE + 0.02 * number * np.eye(5)[4]).tolist()
     Path("same.yaml").write_text(yaml.safe_dump(same))
     command = ("mode=calibrate", f"calibration.source.folder={footage}", "session.out=run")
-    done = brokk(*command, "calibration.joints=same.yaml")
-    assert done.code == 2
+    done = brokk(*command, "calibration.joints=same.yaml", code=2)
     assert "do not determine where the camera is" in done.err
     assert "q1 stays within" in done.err
     assert not Path("run/calibration.yaml").exists()
     Path("few").mkdir()
     for name in ("camera.yaml", "000.color.png"):
         Path("few", name).write_bytes((footage / name).read_bytes())
-    done = brokk(*command, "calibration.source.folder=few", "calibration.joints=same.yaml")
-    assert done.code == 2 and "1 frames show the board" in done.err
+    done = brokk(*command, "calibration.source.folder=few", "calibration.joints=same.yaml", code=2)
+    assert "1 frames show the board" in done.err
     Path("degrees.yaml").write_text(yaml.safe_dump({"000": [0.0, -43.0, 34.0, 28.0, 28.0]}))
-    done = brokk(*command, "calibration.joints=degrees.yaml")
-    assert done.code == 2 and "are these degrees?" in done.err
+    done = brokk(*command, "calibration.joints=degrees.yaml", code=2)
+    assert "are these degrees?" in done.err
 
 
 @pytest.mark.slow
 def test_a_board_filmed_while_the_arm_moves_is_enough(
-    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
+    brokk: Brokk, machine: Machine, tmp_path: Path
 ) -> None:
     poses, t_s = board.posed(machine, 12, 1), np.arange(0.0, 14.0, 0.05)
     # Of each second, 0.6 s on the way to the next pose.
@@ -226,8 +224,7 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
         dataset.write_picture(tmp_path / f"{number:03d}.color.png", board.picture(seen, chance))
     source = (f"calibration.source.folder={tmp_path}", "calibration.source.rate_hz=2.5")
     joints = f"calibration.joints={tmp_path / 'run.parquet'}"
-    done = brokk("mode=calibrate", *source, joints, "session.out=run")
-    assert done.code == 0, done.err
+    brokk("mode=calibrate", *source, joints, "session.out=run")
     told = yaml.safe_load(Path("run/calibration.yaml").read_text())
     # The folder's first frame is at 0 s, the recording's clock says 0.5 + 0.12 s then.
     assert told["clock"]["trusted"] and told["clock"]["offset_s"] == pytest.approx(0.62, abs=0.01)
@@ -273,16 +270,15 @@ def test_a_fit_is_judged_by_what_it_leaves_out_and_what_it_lacks() -> None:
 
 
 def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
-    brokk: Callable[..., Any], footage: Path
+    brokk: Brokk, footage: Path
 ) -> None:
     told = yaml.safe_load((footage / "joints.yaml").read_text())
     wrong = {name: [*q[:2], 1.1 * q[2], *q[3:]] for name, q in told.items()}
     Path("wrong.yaml").write_text(yaml.safe_dump(wrong))
     done = brokk(
         "mode=calibrate", f"calibration.source.folder={footage}", "calibration.joints=wrong.yaml",
-        "session.out=run",
+        "session.out=run", code=2,
     )  # fmt: skip
-    assert done.code == 2
     assert "not to be trusted: the arm would be" in done.err
     content = yaml.safe_load(Path("run/calibration.yaml").read_text())
     assert content["verdict"]["status"] == "not to be trusted"

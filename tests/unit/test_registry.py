@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import hydra
 import pandas as pd
 import pytest
+from conftest import Brokk
 from omegaconf import OmegaConf
 
 import brokk_rl
@@ -19,9 +18,8 @@ from brokk_rl.modes import doctor
 from brokk_rl.modes.doctor import Doctor, DoctorFinding
 
 
-def test_the_version_needs_no_configuration(brokk: Callable[..., Any]) -> None:
+def test_the_version_needs_no_configuration(brokk: Brokk) -> None:
     done = brokk("--version")
-    assert done.code == 0
     assert done.out.strip() == f"brokk {brokk_rl.__version__}"
 
 
@@ -34,7 +32,7 @@ def test_a_reader_that_stops_early_causes_no_traceback() -> None:
         assert process.wait(timeout=60) != 0
 
 
-def test_the_list_can_be_narrowed_to_a_group(brokk: Callable[..., Any]) -> None:
+def test_the_list_can_be_narrowed_to_a_group(brokk: Brokk) -> None:
     done = brokk("mode=list", "list.group=perception")
     assert "truth" in done.out
     assert "borehole_insertion" not in done.out
@@ -78,7 +76,7 @@ def test_a_full_disk_is_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["train", "export", "deploy", "study"])
-def test_every_value_of_a_mode_is_listed(name: str, brokk: Callable[..., Any]) -> None:
+def test_every_value_of_a_mode_is_listed(name: str, brokk: Brokk) -> None:
     done = brokk(f"mode={name}", "--help")
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", [f"mode={name}", *(["policy=trained"] * (name == "export"))])
@@ -90,16 +88,16 @@ def test_every_value_of_a_mode_is_listed(name: str, brokk: Callable[..., Any]) -
 
 @pytest.mark.parametrize("words", [(), ("--help",)], ids=str)
 def test_the_command_alone_says_how_to_begin_and_starts_nothing(
-    words: tuple[str, ...], brokk: Callable[..., Any], tmp_path: Path
+    words: tuple[str, ...], brokk: Brokk, tmp_path: Path
 ) -> None:
     done = brokk(*words)
-    assert done.code == 0 and not list(tmp_path.iterdir())
+    assert not list(tmp_path.iterdir())
     for name in MAIN_MODES:
         assert f"brokk mode={name} " in done.out
     assert len(done.out.splitlines()) < 25
 
 
-def test_values_that_bear_the_name_of_a_group_are_values(brokk: Callable[..., Any]) -> None:
+def test_values_that_bear_the_name_of_a_group_are_values(brokk: Brokk) -> None:
     told = brokk("mode=bench", "--help").out
     assert "bench.num_envs=[128,256]" in told and "bench=[" not in told
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
 
 import pytest
-from conftest import Done
+from conftest import Brokk
 
 from brokk_rl import extensions
 from diagnosis import story
@@ -50,11 +49,10 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Played:
 
 
 def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
-    played: Played, brokk: Callable[..., Done], tmp_path: Path
+    played: Played, brokk: Brokk, tmp_path: Path
 ) -> None:
     changes = ("session.device=cpu", "rl.budget.max_seconds=7", "sim.num_worlds=3")
-    done = brokk("experiment=gap_loop", "session.out=story", "evaluation.episodes=5", *changes)
-    assert done.code == 0, done.err
+    brokk("experiment=gap_loop", "session.out=story", "evaluation.episodes=5", *changes)
     folder = tmp_path / "story"
     stages = "reference simulator policy believed changed field diagnosis retrained"
     assert " ".join(played.commands) == f"{stages} in_simulator in_repaired on_machine"
@@ -68,16 +66,14 @@ def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
     assert (folder / "case/field").readlink() == folder / "field/recordings"
 
 
-def test_a_failed_stage_ends_the_story(played: Played, brokk: Callable[..., Done]) -> None:
+def test_a_failed_stage_ends_the_story(played: Played, brokk: Brokk) -> None:
     played.failing = "policy"
-    done = brokk("experiment=gap_loop", "session.out=story")
-    assert done.code == 2 and "the stage 'policy' failed" in done.err
+    done = brokk("experiment=gap_loop", "session.out=story", code=2)
+    assert "the stage 'policy' failed" in done.err
     assert list(played.commands) == ["reference", "simulator", "policy"]
 
 
-def test_without_a_found_effect_nothing_is_retrained(
-    played: Played, brokk: Callable[..., Done]
-) -> None:
+def test_without_a_found_effect_nothing_is_retrained(played: Played, brokk: Brokk) -> None:
     played.found = "# none: nothing was found\n"
-    assert brokk("experiment=gap_loop", "session.out=story").code == 0
+    brokk("experiment=gap_loop", "session.out=story")
     assert list(played.commands)[-1] == "diagnosis"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ import torch
 import yaml
 from arm import make_machine, run_servo
 from composed import option
+from conftest import Brokk
 
 from actuators.contracts import FitTask
 from actuators.models.servo import Servo
@@ -48,7 +47,7 @@ def record(servo: Servo, machine: Machine, count: int, seconds: float = 16.0) ->
 
 @pytest.mark.parametrize("name", LOOPS)
 def test_known_numbers_are_found_and_an_option_holds_them(
-    name: str, tmp_path: Path, brokk: Callable[..., Any]
+    name: str, tmp_path: Path, brokk: Brokk
 ) -> None:
     truth = LOOPS[name]
     runs = record(replace(option("actuator", "servo"), **truth), ARM, 2)
