@@ -200,16 +200,6 @@ def units(sources: Mapping[str, str]) -> list[str]:
     return found
 
 
-def lengths(sources: Mapping[str, str], limit: int, reasons: Mapping[str, str]) -> list[str]:
-    """No module is longer than `limit` lines without a reason."""
-    counts = {module: text.count("\n") for module, text in sources.items()}
-    return [
-        f"{module} has {count} lines, over {limit}"
-        for module, count in counts.items()
-        if count > limit and module not in reasons
-    ]
-
-
 PREDICATES = ("is", "has", "can", "does", "may", "needs", "as", "to", "from", "main")
 """First words of names that need no verb: predicates, conversions and the entry of a script."""
 VERBS = frozenset(Path(__file__).with_name("verbs.txt").read_text().split())

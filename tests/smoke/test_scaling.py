@@ -32,8 +32,11 @@ BENCH = (
 )  # fmt: skip
 
 
-def started(folder: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+def started(
+    folder: Path, *arguments: str, code: int = 0, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Runs a command to its end, which is to be this exit code."""
+    done = subprocess.run(
         arguments,
         cwd=folder,
         env=os.environ | {"OMP_NUM_THREADS": "1"} | environment,
@@ -41,6 +44,8 @@ def started(folder: Path, *arguments: str, **environment: str) -> subprocess.Com
         text=True,
         timeout=240,
     )
+    assert done.returncode == code, done.stderr
+    return done
 
 
 def together(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -57,7 +62,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two processes: four iterations, checkpoints after the first, third and fourth."""
     folder = tmp_path_factory.mktemp("together")
     done = together(folder, "mode=train", "session.out=run", "rl.budget.max_env_steps=3072", *SMALL)
-    assert done.returncode == 0, done.stderr
     assert done.stderr.count("evaluating trained") == 1, "the others are quiet"
     return folder / "run"
 
@@ -80,7 +84,7 @@ def test_two_processes_that_were_stopped_go_on_exactly(run: Path) -> None:
     arguments = ("mode=train", "session.out=parts", *SMALL)
     first, second = "rl.budget.max_env_steps=2304", "rl.budget.max_env_steps=3072"
     for words in ((first,), (second, "policy=parts")):
-        assert together(run.parent, *arguments, *words).returncode == 0
+        together(run.parent, *arguments, *words)
     paths = [folder / "model_4.pt" for folder in (run, run.parent / "parts")]
     whole, parts = (torch.load(path, weights_only=True) for path in paths)
     for network in ("actor_state_dict", "critic_state_dict"):
@@ -103,8 +107,8 @@ except DistributedError as error:
 
 def test_processes_that_no_longer_agree_stop(tmp_path: Path) -> None:
     (tmp_path / "differ.py").write_text(DIFFER)
-    done = started(tmp_path, *TORCHRUN, "differ.py")
-    assert done.returncode == 1 and "exitcode  : 7" in done.stderr
+    done = started(tmp_path, *TORCHRUN, "differ.py", code=1)
+    assert "exitcode  : 7" in done.stderr
 
 
 LEARN = """
@@ -143,8 +147,7 @@ with TrainingGroup(torch.device(name)) as group:
 def _learn_together(folder: Path, device: str) -> None:
     (folder / "learn.py").write_text(LEARN)
     tests = str(Path(__file__).parents[1] / "unit")
-    done = started(folder, *TORCHRUN, "learn.py", device, PYTHONPATH=tests)
-    assert done.returncode == 0, done.stderr
+    started(folder, *TORCHRUN, "learn.py", device, PYTHONPATH=tests)
 
 
 def test_two_processes_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
@@ -159,7 +162,7 @@ def test_two_gpus_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
 
 
 def test_the_bench_adds_up_what_two_processes_reach(tmp_path: Path) -> None:
-    assert together(tmp_path, *BENCH, "session.out=run").returncode == 0
+    together(tmp_path, *BENCH, "session.out=run")
     found = read(tmp_path / "run" / "benchmark.json")
     rates = [rank["train_env_steps_per_s"] for rank in found["per_rank"]]
     assert found["ranks"] == len(rates) == 2
@@ -170,8 +173,7 @@ def test_a_local_sweep_run_again_does_only_what_is_missing(tmp_path: Path) -> No
     words = ("-m", *BENCH, "hydra/launcher=submitit_local", "session.seed=0,1", "session.out=sweep")
 
     def sweep() -> None:
-        done = started(tmp_path, str(BIN / "brokk"), *words, BROKK_PLACES="cpu,cpu")
-        assert done.returncode == 0, done.stderr
+        started(tmp_path, str(BIN / "brokk"), *words, BROKK_PLACES="cpu,cpu")
 
     sweep()
     jobs = sorted(path.parent for path in (tmp_path / "sweep").glob("[01]*/session.json"))
@@ -200,19 +202,17 @@ def test_a_sweep_for_slurm_asks_for_a_gpu_for_each_job(tmp_path: Path) -> None:
     slurm = ("hydra/launcher=submitit_slurm", "hydra.launcher.partition=gpu")
     path = f"{tmp_path / 'bin'}:{os.environ['PATH']}"
     words = ("-m", *BENCH, *slurm, "session.seed=0,1,2", "session.out=sweep")
-    started(tmp_path, str(BIN / "brokk"), *words, PATH=path, KEPT=str(tmp_path / "kept.sh"))
+    started(tmp_path, str(BIN / "brokk"), *words, code=1, PATH=path, KEPT=str(tmp_path / "kept.sh"))
     script = (tmp_path / "kept.sh").read_text()
     lines = {line.removeprefix("#SBATCH ") for line in script.splitlines()}
     assert lines >= ASKED
     assert "srun" in script and "submitit.core._submit" in script
 
 
-def optuna() -> pytest.MarkDecorator:
-    there = util.find_spec("optuna") is not None
-    return pytest.mark.skipif(not there, reason="needs the extra: pip install 'brokk-rl[optuna]'")
+HAS_OPTUNA = util.find_spec("optuna") is not None
 
 
-@optuna()
+@pytest.mark.skipif(not HAS_OPTUNA, reason="needs the extra: pip install 'brokk-rl[optuna]'")
 def test_optuna_chooses_values_and_run_again_repeats_nothing(tmp_path: Path) -> None:
     search = (
         str(BIN / "brokk"), "search=learning_rate", "hydra/launcher=basic", "hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=1",
@@ -220,7 +220,6 @@ def test_optuna_chooses_values_and_run_again_repeats_nothing(tmp_path: Path) -> 
     )  # fmt: skip
     for _ in range(2):
         done = started(tmp_path, *search)
-        assert done.returncode == 0, done.stderr
         best = OmegaConf.load(tmp_path / "sweep" / "optimization_results.yaml")
         records = [read(tmp_path / "sweep" / str(job) / "session.json") for job in range(2)]
         assert best.best_value == max(record["objective"] for record in records)
@@ -231,7 +230,7 @@ def test_optuna_chooses_values_and_run_again_repeats_nothing(tmp_path: Path) -> 
 def test_a_search_without_optuna_says_what_to_install(
     brokk: Brokk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if util.find_spec("optuna") is not None:
+    if HAS_OPTUNA:
         with hydra.initialize_config_module("conf", version_base="1.3"):
             assert hydra.compose("config", overrides=["search=learning_rate"])
         return

@@ -118,10 +118,9 @@ def test_a_dead_time_beyond_the_commands_of_the_history_fails_the_check(
     dead_s: float, passed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # 13 commands of 50 ms: the oldest began 0.65 s before the newest position.
-    machine = option("machine", "brokk170")
-    checks = _StateChecks(SimpleNamespace(), machine, SimpleNamespace(memory=None), print)  # type: ignore[arg-type]
+    checks = _StateChecks(SimpleNamespace(), MACHINE, SimpleNamespace(memory=None), print)  # type: ignore[arg-type]
     found = {}
-    for name in machine.joint_names:
+    for name in MACHINE.joint_names:
         found[name] = JointResponse(name, (name,), True, 0.5, 0.2, 1.0)
     found["q2"] = replace(found["q2"], dead_time_s=dead_s)
     monkeypatch.setattr(checks, "_watch_joints", lambda: found)
@@ -130,9 +129,8 @@ def test_a_dead_time_beyond_the_commands_of_the_history_fails_the_check(
 
 def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
     """Its stamps would jump at the first message it hears, and look like those of late copies."""
-    machine = option("machine", "brokk170")
-    description = BusDescription(DBC, machine)
-    remote = RadioRemote(description, machine)
+    description = BusDescription(DBC, MACHINE)
+    remote = RadioRemote(description, MACHINE)
     status = description.layouts[description.message_of("EStop")]
     assert not remote.is_ready
     remote.hear(CanFrame(status.frame_id, bytes(8)))
@@ -148,7 +146,7 @@ def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
 
 def sample_person(fails: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A round of the scripted person: commands, dead-man and emergency stop every 20 ms."""
-    person = ScriptedPerson(option("machine", "brokk170"), fails, 1.0, 43210)
+    person = ScriptedPerson(MACHINE, fails, 1.0, 43210)
     times = np.arange(0.0, person.round_s, 0.02)
     held = [[person.holds(name, t_s) for t_s in times] for name in ("dead-man", "e-stop")]
     return np.array([person.command(t_s) for t_s in times]), *map(np.array, held)
@@ -167,10 +165,9 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     begins = np.flatnonzero(moves.any(1)[1:] & ~moves.any(1)[:-1]) + 1
     for begin in begins:
         assert not moves[begin - 50 : begin].any()
-    machine = option("machine", "brokk170")
-    person = ScriptedPerson(machine, None, 1.0, 43210)
+    person = ScriptedPerson(MACHINE, None, 1.0, 43210)
     assert not person.command(-1.0).any() and not person.holds("dead-man", -person.round_s + 0.5)
-    remote = RadioRemote(BusDescription(DBC, machine), machine)
+    remote = RadioRemote(BusDescription(DBC, MACHINE), MACHINE)
     person.move(remote, 2.2 + 1.2)
     assert min(remote.levers) == pytest.approx(-0.6) and not remote.button_right
     person.move(remote, 2.2 + 4.8 + 1.2)
@@ -182,7 +179,7 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
 def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:
     twin = build_twin(wire("udp"), remote=False, fault_port=43210)
     bench = RehearsalBench(twin=twin, plant=NominalMachine(), rest_s=1.0, fails=None)  # type: ignore[arg-type]
-    found = bench.companions(option("machine", "brokk170"), None)  # type: ignore[arg-type]
+    found = bench.companions(MACHINE, None)  # type: ignore[arg-type]
     assert [one.name for one in found] == ["twin", "operator"]
     for change in ({"twin": replace(twin, remote=True)}, {"twin": replace(twin, fault_port=None)}):
         with pytest.raises(ConfigError, match=r"twin\.remote=false and a twin\.fault_port"):
